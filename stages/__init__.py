@@ -1,0 +1,1 @@
+"""The method: plain callables over the data types of `stages.data`."""

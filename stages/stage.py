@@ -1,0 +1,38 @@
+"""What every stage shares: parameters that carry their unit, range and meaning, checked when the stage is made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+
+def parameter(
+    default: Any,
+    help: str,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: Sequence[Any] | None = None,
+) -> Any:
+    """A dataclass field for a stage parameter: its default, meaning, unit ("m", "rad", "px", "s") and closed range."""
+    return field(
+        default=default, metadata={"help": help, "unit": unit, "low": low, "high": high, "choices": choices}
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Base of the stages: a frozen dataclass whose fields are its parameters and whose `__call__` is the work."""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value, meta = getattr(self, item.name), item.metadata
+            where = f"{type(self).__name__}.{item.name}"
+            choices, low, high, unit = (meta.get(key) for key in ("choices", "low", "high", "unit"))
+            if choices is not None and value not in choices:
+                raise ValueError(f"{where} must be one of {', '.join(map(str, choices))}, not {value}")
+            if (low is not None and not value >= low) or (high is not None and not value <= high):
+                bounds = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
+                raise ValueError(f"{where} must be {bounds}{f' {unit}' if unit else ''}, not {value}")
