@@ -1,0 +1,303 @@
+"""Alignment: joining streams that run on different clocks, with a bound on how long to wait for a partner.
+
+Each aligner is a small state machine fed with messages in log-time order. It answers with tokens, one for every stamp
+of the clock it aligns to: the joined item, or `Absent` with the ledger entry that says why. What it decides depends on
+nothing but the order of the log, so that a replay always decides the same.
+
+Its watermark: a waiting message gives up when its partner's stream has moved past it, or when the log's clock has
+moved on by `patience` since it arrived, whichever comes first.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, get_type_hints
+
+from flow.ledger import Absent, Entry, Reason
+
+
+@dataclass(frozen=True)
+class Token:
+    """What one stream has for one stamp: an item, or `Absent`."""
+
+    stamp: int
+    value: Any
+
+
+Answer = Token | Entry
+Answers = Iterable[Answer]
+
+
+def _parameter(default: int | None, help: str) -> Any:
+    return field(default=default, metadata={"help": help, "unit": "ns", "low": 0})
+
+
+def _ms(nanoseconds: int) -> str:
+    return f"{nanoseconds / 1e6:.1f} ms"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Joins two streams of the same rate into one new stream through the left item's `pair_with(right)`.
+
+    Partners are the first two not yet paired whose stamps differ by at most `slop`; the pair carries the left's stamp.
+    """
+
+    slop: int = _parameter(5_000_000, "largest difference between the two stamps")
+    patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for a partner")
+
+    ports = ("left", "right")
+    clock = None  # pairs are the beat of a clock of their own
+
+    @staticmethod
+    def output(kinds: dict[str, type]) -> type:
+        """The type of the pairs; raises TypeError where the left type cannot be paired with the right one."""
+        method = getattr(kinds["left"], "pair_with", None)
+        hints = get_type_hints(method) if method else {}
+        if not issubclass(kinds["right"], hints.get("right", ())):
+            raise TypeError(f"a {kinds['left'].__name__} cannot be paired with a {kinds['right'].__name__}")
+        return hints["return"]  # type: ignore[no-any-return]
+
+    def start(self, name: str, inputs: dict[str, str]) -> PairState:
+        """A running aligner; `inputs` maps ports to stream names."""
+        return PairState(self, name, inputs)
+
+
+class PairState:
+    """The lefts and rights still waiting for each other."""
+
+    def __init__(self, rule: Pair, name: str, inputs: dict[str, str]) -> None:
+        self.rule, self.name, self.inputs = rule, name, inputs
+        self.waiting: dict[str, deque[tuple[int, Token]]] = {"left": deque(), "right": deque()}
+
+    def push(self, port: str, log_time: int, token: Token) -> Answers:
+        """A message of `port` has arrived."""
+        self.waiting[port].append((log_time, token))
+        yield from self._match()
+
+    def _match(self) -> Answers:
+        lefts, rights = self.waiting["left"], self.waiting["right"]
+        while lefts and rights:
+            left, right = lefts[0][1], rights[0][1]
+            apart = right.stamp - left.stamp
+            if apart > self.rule.slop:
+                yield self._unmatched("left", f"the next {self.inputs['right']} is {_ms(apart)} later")
+            elif apart < -self.rule.slop:
+                yield self._unmatched("right", f"the next {self.inputs['left']} is {_ms(-apart)} later")
+            else:
+                lefts.popleft(), rights.popleft()
+                yield Token(left.stamp, joined(self.name, left, right, lambda a, b, _: a.pair_with(b)))
+
+    def tick(self, log_time: int) -> Answers:
+        """The log's clock has moved to `log_time`."""
+        for port, queue in self.waiting.items():
+            while queue and queue[0][0] + self.rule.patience < log_time:
+                yield self._unmatched(port, f"no partner within {_ms(self.rule.patience)} of log time")
+
+    def end(self) -> Answers:
+        """The log has ended."""
+        for port, queue in self.waiting.items():
+            while queue:
+                yield self._unmatched(port, "the log ended before its partner came")
+
+    def _unmatched(self, port: str, why: str) -> Entry:
+        _, token = self.waiting[port].popleft()
+        return Entry(self.inputs[port], token.stamp, self.name, Reason.UNMATCHED, why)
+
+
+@dataclass(frozen=True)
+class _Sampler:
+    """Looks up `stream` at the stamps of `at`; its tokens run on the clock of `at`."""
+
+    ports = ("stream", "at")
+    clock = "at"
+
+    @staticmethod
+    def output(kinds: dict[str, type]) -> type:
+        """The type of the samples."""
+        return kinds["stream"]
+
+    def start(self, name: str, inputs: dict[str, str]) -> SamplerState:
+        """A running aligner; `inputs` maps ports to stream names."""
+        return SamplerState(self, name, inputs)
+
+    @property
+    def reach(self) -> int:
+        """How far (ns) before a stamp a sample may still be of use, besides the last one."""
+        raise NotImplementedError
+
+    @property
+    def wait(self) -> int:
+        """How long (ns of log time) a stamp waits for the stream to catch up."""
+        raise NotImplementedError
+
+    def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
+        """The value at `stamp`, or a sentence (str) why there is none, or None to wait (never when `final`)."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Interpolate(_Sampler):
+    """Interpolates `stream` at the stamps of `at`, through the earlier sample's `interpolated(later, stamp)`."""
+
+    max_gap: int = _parameter(200_000_000, "largest distance between the two neighbours")
+    patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for the later neighbour")
+
+    @staticmethod
+    def output(kinds: dict[str, type]) -> type:
+        """The type of the samples; raises TypeError where they cannot be interpolated."""
+        if not hasattr(kinds["stream"], "interpolated"):
+            raise TypeError(f"a {kinds['stream'].__name__} cannot be interpolated")
+        return kinds["stream"]
+
+    @property
+    def reach(self) -> int:
+        return self.max_gap
+
+    @property
+    def wait(self) -> int:
+        return self.patience
+
+    def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
+        before, after = _neighbours(samples, stamp)
+        if before is not None and before.stamp == stamp:
+            return before.value
+        if after is None and not final:
+            return None
+        if before is None or after is None:
+            return f"no {name} sample {'before' if before is None else 'after'} it"
+        if after.stamp - before.stamp > self.max_gap:
+            return f"{name} has a gap of {_ms(after.stamp - before.stamp)}, more than {_ms(self.max_gap)}"
+        return joined(name, before, after, lambda a, b, at: a.interpolated(b, at), stamp)
+
+
+@dataclass(frozen=True)
+class Nearest(_Sampler):
+    """The sample of `stream` nearest to each stamp of `at`, at most `slop` away."""
+
+    slop: int = _parameter(50_000_000, "largest distance from the stamp")
+    patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for a nearer sample")
+
+    @property
+    def reach(self) -> int:
+        return self.slop
+
+    @property
+    def wait(self) -> int:
+        return self.patience
+
+    def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
+        before, after = _neighbours(samples, stamp)
+        if after is None and not final and not (before is not None and before.stamp == stamp):
+            return None
+        found = min((s for s in (before, after) if s is not None), key=lambda s: abs(s.stamp - stamp), default=None)
+        if found is None or abs(found.stamp - stamp) > self.slop:
+            return f"no {name} sample within {_ms(self.slop)}"
+        return found.value
+
+
+@dataclass(frozen=True)
+class Latest(_Sampler):
+    """The last sample of `stream` at or before each stamp of `at`, of those that the log has brought by then."""
+
+    max_age: int | None = _parameter(None, "oldest sample that still counts; none: any age")
+    patience: int = _parameter(0, "how long on the log's clock to wait for samples that are logged late")
+
+    @property
+    def reach(self) -> int:
+        return 0
+
+    @property
+    def wait(self) -> int:
+        return self.patience
+
+    def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
+        before, after = _neighbours(samples, stamp)
+        if after is None and not final and self.patience:
+            return None
+        if before is None:
+            return f"no {name} sample at or before it"
+        if self.max_age is not None and stamp - before.stamp > self.max_age:
+            return f"the last {name} sample is {_ms(stamp - before.stamp)} old, more than {_ms(self.max_age)}"
+        return before.value
+
+
+class SamplerState:
+    """Stamps that wait for their sample, and the samples that may still be wanted."""
+
+    def __init__(self, rule: _Sampler, name: str, inputs: dict[str, str]) -> None:
+        self.rule, self.name, self.stream = rule, name, inputs["stream"]
+        self.wanted: deque[tuple[int, Token]] = deque()
+        self.samples: deque[Token] = deque()
+        self.arrivals: deque[int] = deque()
+
+    def push(self, port: str, log_time: int, token: Token) -> Answers:
+        """A message of `port` has arrived."""
+        if port == "stream":
+            if not isinstance(token.value, Absent):
+                self.samples.append(token)
+                self.arrivals.append(log_time)
+        else:
+            self.wanted.append((log_time, token))
+        yield from self._answer(log_time)
+        self._forget(log_time)
+
+    def tick(self, log_time: int) -> Answers:
+        """The log's clock has moved to `log_time`."""
+        yield from self._answer(log_time)
+
+    def end(self) -> Answers:
+        """The log has ended."""
+        yield from self._answer(None)
+
+    def _answer(self, log_time: int | None) -> Answers:
+        while self.wanted:
+            arrived, token = self.wanted[0]
+            final = log_time is None or arrived + self.rule.wait < log_time
+            value = self.rule.choose(self.stream, token.stamp, self.samples, final)
+            if value is None:
+                return
+            self.wanted.popleft()
+            if isinstance(value, str):
+                value = Absent(Entry(self.name, token.stamp, self.name, Reason.UNALIGNED, value))
+            yield Token(token.stamp, value)
+
+    def _forget(self, log_time: int) -> None:
+        """Drop samples that no stamp can want any more; the last one before every stamp to come stays."""
+        useful = self.rule.reach + self.rule.wait
+        oldest = self.wanted[0][1].stamp if self.wanted else None
+        while (
+            len(self.samples) > 1
+            and self.arrivals[1] + useful < log_time
+            and (oldest is None or self.samples[1].stamp <= oldest)
+        ):
+            self.samples.popleft(), self.arrivals.popleft()
+
+
+def _neighbours(samples: deque[Token], stamp: int) -> tuple[Token | None, Token | None]:
+    """The last sample at or before `stamp` and the first one after it."""
+    before = None
+    for sample in samples:
+        if sample.stamp > stamp:
+            return before, sample
+        before = sample
+    return before, None
+
+
+def joined(
+    name: str, first: Token, second: Token, join: Callable[[Any, Any, int], Any], stamp: int | None = None
+) -> Any:
+    """`join` of two items, or `Absent` if one is absent or they do not fit."""
+    at = first.stamp if stamp is None else stamp
+    for token in (first, second):
+        if isinstance(token.value, Absent):
+            return token.value
+    try:
+        return join(first.value, second.value, at)
+    except ValueError as error:
+        return Absent(Entry(name, at, name, Reason.FAILED, str(error)))
+
+
+pair, interpolate, nearest, latest = Pair, Interpolate, Nearest, Latest

@@ -1,0 +1,272 @@
+"""The command line, and the one place where runtime, stages and recordings meet.
+
+Heavy modules are imported by the command that needs them, so that `roverflow --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from flow.errors import RoverflowError, UsageError
+
+COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    options = parser().parse_args(arguments)
+    logging.basicConfig(level=logging.DEBUG if options.debug else logging.ERROR, format="%(message)s")
+    logging.getLogger("numba").setLevel(logging.WARNING)
+    try:
+        return int(options.command(options))
+    except KeyboardInterrupt:
+        print("roverflow: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except Exception as error:
+        if options.debug:
+            raise
+        print(f"roverflow: {_sentence(error)}", file=sys.stderr)
+        return _exit_code(error)
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, RoverflowError) or _is_log_error(error):
+        return str(error)
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return f"internal failure, {type(error).__name__}: {error} (--debug shows where)"
+
+
+def _exit_code(error: Exception) -> int:
+    if isinstance(error, RoverflowError):
+        return error.exit_code
+    return UNUSABLE if _is_log_error(error) or isinstance(error, OSError) else FAILED
+
+
+def _is_log_error(error: Exception) -> bool:
+    from recordings.errors import LogError
+
+    return isinstance(error, LogError)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line's grammar."""
+    top = argparse.ArgumentParser(prog="roverflow", description="Replay rover traverses into terrain one can trust.")
+    top.add_argument("--version", action="version", version=f"roverflow {_version()}")
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name: str, work: Callable[[argparse.Namespace], int], help: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+        sub.add_argument("--debug", action="store_true", help="show tracebacks")
+        sub.set_defaults(command=work)
+        return sub
+
+    demo = command("demo", _demo, "simulate a short traverse, run it and score it against the truth")
+    demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder for the results (demo)")
+    demo.add_argument("--frames", type=int, default=8, metavar="N", help="frames to simulate (8)")
+
+    run = command("run", _run, "replay a log through a pipeline")
+    run.add_argument("log", type=Path, metavar="LOG.mcap")
+    _pipeline_options(run)
+    run.add_argument("-o", "--out", type=Path, metavar="OUT.mcap", help="result log (LOG-nav.mcap)")
+    recording = run.add_mutually_exclusive_group()
+    recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
+    recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
+    run.add_argument("--start", type=float, metavar="T", help="begin T seconds after the log's first message")
+    run.add_argument("--end", type=float, metavar="T", help="stop T seconds after the log's first message")
+    run.add_argument("--workers", type=_count, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
+    run.add_argument("--summary", type=Path, metavar="OUT.json", help="counts, drops, times and verdict as JSON")
+
+    info = command("info", _info, "what a log holds, and what is missing")
+    info.add_argument("log", type=Path, metavar="LOG.mcap")
+    info.add_argument("--json", action="store_true", help="print JSON")
+
+    graph = command("graph", _graph, "draw the dataflow of a pipeline")
+    _pipeline_options(graph)
+    graph.add_argument("--format", choices=("text", "mermaid", "svg"), default="text")
+
+    simulate = command("simulate", _simulate, "make a synthetic traverse with ground truth topics under /truth")
+    simulate.add_argument("out", type=Path, metavar="OUT.mcap")
+    _simulation_options(simulate)
+
+    imports = command("import", _import, "make a log out of other recordings")
+    imports.add_argument("kind", choices=("images",), metavar="KIND", help="images")
+    imports.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
+    imports.add_argument("out", type=Path, metavar="OUT.mcap")
+    _image_options(imports)
+
+    score = command("score", _score, "errors of a result log against ground truth")
+    score.add_argument("result", type=Path, metavar="OUT.mcap")
+    score.add_argument("--truth", type=Path, metavar="LOG.mcap", help="log with the /truth topics (the result itself)")
+    score.add_argument("--json", type=Path, metavar="FILE", help="write every figure as JSON")
+    return top
+
+
+def _pipeline_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("-p", "--pipeline", default="rover", help="rover, paper, or a YAML file (rover)")
+    sub.add_argument(
+        "--set", action="append", default=[], metavar="STREAM.PARAM=VALUE", help="change a parameter of the pipeline"
+    )
+
+
+def _simulation_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--frames", type=_count, help="stereo frames (default 12)")
+    sub.add_argument("--seed", type=int, help="another seed, another terrain")
+    sub.add_argument("--size", metavar="WxH", help="image size (1280x960); the field of view stays")
+    sub.add_argument("--rocks", type=float, metavar="K", help="share of the ground covered by rocks (Golombek's k)")
+    sub.add_argument("--slope", type=float, metavar="DEG", help="RMS slope of the terrain")
+    sub.add_argument("--tilt-noise", type=float, metavar="DEG", help="inclinometer noise, one sigma")
+
+
+def _image_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--calibration", type=Path, required=True, metavar="CAM.yaml", help="fx, fy, cx, cy, baseline")
+    sub.add_argument("--pitch-down", type=float, required=True, metavar="DEG", help="how far the camera looks down")
+    sub.add_argument("--roll", type=float, default=0.0, metavar="DEG", help="camera roll, right side down positive")
+    sub.add_argument("--height", type=float, required=True, metavar="M", help="camera height above the ground")
+    sub.add_argument("--rate", type=float, default=1.0, metavar="HZ", help="frames per second of the log (1)")
+
+
+def _count(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not '{text}'")
+    return value
+
+
+def _version() -> str:
+    try:
+        return version("roverflow")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _run(options: argparse.Namespace) -> int:
+    out = options.out or options.log.with_name(f"{options.log.stem}-nav.mcap")
+    rrd = None if options.no_rrd else options.rrd or out.with_suffix(".rrd")
+    summary = replay(
+        options.log, options.pipeline, out, rrd,
+        overrides=options.set, workers=options.workers, start=options.start, end=options.end,
+    )  # fmt: skip
+    if options.summary:
+        options.summary.write_text(json.dumps(summary, indent=2) + "\n")
+    _report(summary, [out, *([rrd] if rrd else [])])
+    if summary["interrupted"]:
+        return INTERRUPTED
+    return COMPLETE if summary["verdict"] == "COMPLETE" else INCOMPLETE
+
+
+def replay(
+    log: Path,
+    pipeline: str,
+    out: Path,
+    rrd: Path | None,
+    *,
+    overrides: Sequence[str] = (),
+    workers: int = 2,
+    start: float | None = None,
+    end: float | None = None,
+) -> dict[str, Any]:
+    """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary."""
+    import cv2
+    from threadpoolctl import threadpool_limits
+    from tqdm import tqdm
+
+    from flow import pipeline as pipelines
+    from flow.run import Stop, interrupts, run
+
+    graph = pipelines.load(pipeline, overrides)
+    outputs = {}
+    for use, sink in graph.sinks:
+        path = {".mcap": out, ".rrd": rrd}.get(sink.suffix)
+        if path is not None:
+            if path.exists() and path.samefile(log):
+                raise UsageError(f"{path} is the log itself; choose another name for the result (-o, --rrd)")
+            outputs[use] = path
+    cv2.setNumThreads(1)  # frames in flight fill the cores, not threads inside one call
+    stop = Stop()
+    with graph.source.open(log, start=start, end=end) as opened, threadpool_limits(1):
+        about = {
+            "roverflow": _version(),
+            "pipeline": graph.text,
+            "overrides": "\n".join(overrides),
+            "log": log.name,
+            **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
+        }
+        with tqdm(total=opened.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
+            drops = 0
+
+            def on_frame(whole: bool) -> None:
+                nonlocal drops
+                drops += not whole
+                bar.set_postfix(dropped=drops, refresh=False)
+                bar.update()
+
+            with interrupts(stop, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)):
+                return run(graph, opened, outputs, workers=workers, about=about, stop=stop, on_frame=on_frame)
+
+
+def _report(summary: dict[str, Any], outputs: Sequence[Path]) -> None:
+    rate = f"{summary['frames_per_second']:.2f} frames/s"
+    print(f"{summary['verdict']}: {summary['frames_out']} of {summary['frames_in']} frames whole, {rate}")
+    for reason, count in summary["drops"].items():
+        first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
+        print(f"  {count} {reason}, first: {first['stream']} at {first['stamp']}: {first['detail']}")
+    for path in outputs:
+        print(f"  {path} ({path.stat().st_size / 1e6:.1f} MB)")
+
+
+def _info(options: argparse.Namespace) -> int:
+    from recordings import McapSource
+    from recordings.inventory import describe, format_description
+
+    description = describe(options.log, McapSource())
+    print(json.dumps(description, indent=2) if options.json else format_description(description))
+    return COMPLETE
+
+
+def _graph(options: argparse.Namespace) -> int:
+    from flow.draw import draw
+    from flow.pipeline import load
+
+    print(draw(load(options.pipeline, options.set), options.format))
+    return COMPLETE
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    raise NotImplementedError
+
+
+def _import(options: argparse.Namespace) -> int:
+    raise NotImplementedError
+
+
+def _score(options: argparse.Namespace) -> int:
+    from recordings.scoring import format_score, score
+
+    result = score(options.result, options.truth or options.result)
+    if options.json:
+        options.json.write_text(json.dumps(result.as_dict(), indent=2) + "\n")
+    print(format_score(result))
+    return COMPLETE
+
+
+def _demo(options: argparse.Namespace) -> int:
+    raise NotImplementedError
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,196 @@
+"""The graph of a pipeline: a source, nodes joined by named typed streams, and sinks.
+
+Every stream has a clock, the stream whose messages give it its stamps: a source stream has its own, a pair founds one,
+an aligned stream takes the clock it is aligned to, and a stage's output that of its inputs. The stages and sinks of a
+graph share one clock; joining others is the aligners' work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from types import UnionType
+from typing import Any, Protocol, Union, get_args, get_origin, get_type_hints
+
+from flow.errors import PipelineError
+
+
+class Sink(Protocol):
+    """Where frames go. `write` is called once for every frame, in stamp order, by one thread at a time."""
+
+    suffix: str
+
+    def wants(self, stream: str, kind: type) -> bool:
+        """Whether the sink has a use for a stream of this name and type."""
+
+    def open(self, path: Any, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
+        """Begin an output; nothing stands under `path` itself until `close`."""
+
+    def write(self, record: Any) -> None:
+        """Take one `flow.engine.FrameRecord`."""
+
+    def close(self, summary: Mapping[str, Any]) -> None:
+        """Finish the output and give it its name."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where something stands: a line of a pipeline file, or a setting on the command line (`line` is then None)."""
+
+    file: str
+    line: int | None
+
+    def error(self, sentence: str) -> PipelineError:
+        """The error to raise about it."""
+        where = self.file if self.line is None else f"{self.file}:{self.line}"
+        return PipelineError(f"{where}: {sentence}")
+
+
+@dataclass(frozen=True)
+class Node:
+    """A stage or an aligner: `actor` turns `inputs` (port -> stream) into the stream `name` of type `output`."""
+
+    name: str
+    use: str
+    actor: Any
+    inputs: Mapping[str, str]
+    output: type
+    clock: str
+    optional: bool
+    place: Place
+
+    @property
+    def aligns(self) -> bool:
+        """Whether the actor is an aligner, fed in log order, and not a stage."""
+        return is_aligner(type(self.actor))
+
+    @property
+    def ordered(self) -> bool:
+        """Whether the stage remembers, and so must see frames one at a time in stamp order."""
+        return bool(getattr(self.actor, "ordered", False))
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A checked pipeline. nodes: in an order in which every stream comes before its use."""
+
+    name: str
+    text: str
+    source: Any
+    source_use: str
+    nodes: tuple[Node, ...]
+    sinks: tuple[tuple[str, Sink], ...]
+    kinds: Mapping[str, type] = field(default_factory=dict)
+
+    @property
+    def clock(self) -> str:
+        """The one clock of all stages."""
+        return next(node.clock for node in self.nodes if not node.aligns)
+
+    @property
+    def stages(self) -> tuple[Node, ...]:
+        """The nodes that are stages."""
+        return tuple(node for node in self.nodes if not node.aligns)
+
+    @property
+    def aligners(self) -> tuple[Node, ...]:
+        """The nodes that align."""
+        return tuple(node for node in self.nodes if node.aligns)
+
+    @property
+    def frame_streams(self) -> dict[str, type]:
+        """The streams that every frame has one item of, in order: what sinks can be given."""
+        clocks = {node.name: node.clock for node in self.nodes} | {self.clock: self.clock}
+        return {name: self.kinds[name] for name in clocks if clocks[name] == self.clock}
+
+    @property
+    def source_streams(self) -> set[str]:
+        """The source's streams that the nodes read."""
+        made = {node.name for node in self.nodes}
+        return {stream for node in self.nodes for stream in node.inputs.values()} - made
+
+    def without(self, missing: Mapping[str, str]) -> Graph:
+        """The graph without the optional nodes that need a stream in `missing` (stream -> why it is missing).
+
+        Raises PipelineError with that sentence where a node that is not optional needs one.
+        """
+        gone = dict(missing)
+        kept = []
+        for node in self.nodes:
+            why = next((gone[stream] for stream in node.inputs.values() if stream in gone), None)
+            if why is None:
+                kept.append(node)
+            elif node.optional:
+                gone[node.name] = why
+            else:
+                raise PipelineError(why)
+        return Graph(self.name, self.text, self.source, self.source_use, tuple(kept), self.sinks, self.kinds)
+
+
+def is_aligner(kind: type) -> bool:
+    """Whether objects of this class align streams (see `flow.align`) rather than being called once per frame."""
+    return hasattr(kind, "start") and hasattr(kind, "ports")
+
+
+def ports_of(kind: type) -> tuple[dict[str, type], set[str]]:
+    """Input ports of a stage or aligner class (name -> type), and which of them may stay unconnected."""
+    if is_aligner(kind):
+        return dict.fromkeys(kind.ports, object), set()  # type: ignore[attr-defined]
+    hints = get_type_hints(kind.__call__)
+    hints.pop("return", None)
+    defaults = kind.__call__.__defaults__ or ()
+    names = list(hints)
+    return hints, set(names[len(names) - len(defaults) :])
+
+
+def accepts(wanted: Any, given: type) -> bool:
+    """Whether a port annotated `wanted` takes items of type `given`."""
+    if get_origin(wanted) in (Union, UnionType):
+        return any(accepts(option, given) for option in get_args(wanted))
+    wanted = get_origin(wanted) or wanted
+    return wanted is Any or (isinstance(wanted, type) and issubclass(given, wanted))
+
+
+def output_of(actor: Any, kinds: dict[str, type], place: Place) -> type:
+    """The type of the stream that `actor` makes out of inputs of these types."""
+    if is_aligner(type(actor)):
+        try:
+            return actor.output(kinds)  # type: ignore[no-any-return]
+        except TypeError as error:
+            raise place.error(f"{error}") from error
+    returned = get_type_hints(type(actor).__call__).get("return")
+    if not isinstance(returned, type):
+        raise place.error(f"{type(actor).__name__}.__call__ does not say what it returns")
+    return returned
+
+
+def clock_of(name: str, actor: Any, clocks: dict[str, str], place: Place) -> str:
+    """The clock of stream `name`; `clocks` maps input ports to theirs."""
+    if is_aligner(type(actor)):
+        return name if actor.clock is None else clocks[actor.clock]
+    if len(set(clocks.values())) > 1:
+        mixed = ", ".join(f"{port} on '{clock}'" for port, clock in clocks.items())
+        raise place.error(f"'{name}' joins streams of different clocks ({mixed}); align them first (flow.align)")
+    return next(iter(clocks.values()))
+
+
+def in_order(inputs: Mapping[str, Iterable[str]], places: Mapping[str, Place]) -> list[str]:
+    """Names sorted so that each comes after its inputs; raises PipelineError naming the streams of a cycle."""
+    done: list[str] = []
+    path: list[str] = []
+
+    def visit(name: str) -> None:
+        if name in done or name not in inputs:
+            return
+        if name in path:
+            cycle = " -> ".join([*path[path.index(name) :], name])
+            raise places[name].error(f"the streams run in a circle: {cycle}")
+        path.append(name)
+        for stream in inputs[name]:
+            visit(stream)
+        path.pop()
+        done.append(name)
+
+    for name in inputs:
+        visit(name)
+    return done

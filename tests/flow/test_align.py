@@ -1,0 +1,139 @@
+"""Alignment joins clocks as the stamps say, gives up in bounded time, and accounts for every message."""
+
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flow.align import Interpolate, Latest, Nearest, Pair, Token
+from flow.ledger import Absent, Entry, Reason
+from tests.flow.toys import Number
+
+MS = 1_000_000
+
+
+def feed(aligner, *messages):
+    """Feed (port, stamp, value[, log time]) messages; all answers, with `end` last."""
+    answers = []
+    for port, stamp, value, *log_time in messages:
+        at = log_time[0] if log_time else stamp
+        answers += aligner.tick(at)
+        answers += aligner.push(port, at, Token(stamp, Number(stamp, value)))
+    return [*answers, *aligner.end()]
+
+
+def pairing(*messages, **rule):
+    return feed(Pair(**rule).start("stereo", {"left": "left", "right": "right"}), *messages)
+
+
+def sampling(rule, *messages):
+    return feed(rule.start("tilt", {"stream": "level", "at": "stereo"}), *messages)
+
+
+def values(answers):
+    return [(a.stamp, a.value.value) for a in answers if isinstance(a, Token) and not isinstance(a.value, Absent)]
+
+
+def reasons(answers):
+    return [a.value.cause.reason for a in answers if isinstance(a, Token) and isinstance(a.value, Absent)]
+
+
+def test_a_pair_carries_the_left_stamp():
+    assert values(pairing(("left", 10, 1.0), ("right", 12, 2.0), slop=5)) == [(10, 3.0)]
+
+
+def test_partners_further_apart_than_the_slop_are_both_unmatched():
+    answers = pairing(("left", 10, 1.0), ("right", 20, 2.0), slop=5)
+    assert values(answers) == []
+    assert {(a.stream, a.reason) for a in answers} == {("left", Reason.UNMATCHED), ("right", Reason.UNMATCHED)}
+
+
+def test_a_missing_right_costs_one_left_and_nothing_else():
+    answers = pairing(
+        ("left", 0, 1.0), ("right", 0, 1.0), ("left", 100, 2.0), ("left", 200, 3.0), ("right", 200, 3.0), slop=5
+    )
+    assert values(answers) == [(0, 2.0), (200, 6.0)]
+    assert [(a.stream, a.stamp) for a in answers if isinstance(a, Entry)] == [("left", 100)]
+
+
+def test_a_partner_that_does_not_come_is_given_up_after_the_patience_of_log_time():
+    answers = pairing(("left", 0, 1.0, 0), ("left", 1, 1.0, 2000 * MS), slop=5)
+    first = answers[0]
+    assert isinstance(first, Entry)
+    assert first.stamp == 0
+    assert "1000.0 ms" in first.detail
+
+
+def test_items_that_do_not_fit_make_a_frame_that_is_lost_with_its_reason():
+    (answer,) = pairing(("left", 10, -1.0), ("right", 10, 2.0))
+    assert answer.stamp == 10
+    assert answer.value.cause.reason is Reason.FAILED
+    assert "negative" in answer.value.cause.detail
+
+
+@given(
+    lefts=st.lists(st.integers(0, 300), unique=True, max_size=30),
+    rights=st.lists(st.integers(0, 300), unique=True, max_size=30),
+)
+def test_every_message_is_in_a_pair_or_in_the_ledger_but_never_in_both(lefts, rights):
+    messages = sorted([("left", s, 1.0) for s in lefts] + [("right", s, 1.0) for s in rights], key=lambda m: m[1])
+    answers = pairing(*messages, slop=4)
+    pairs = [a for a in answers if isinstance(a, Token)]
+    lost = Counter(a.stream for a in answers if isinstance(a, Entry))
+    assert len(pairs) + lost["left"] == len(lefts)
+    assert len(pairs) + lost["right"] == len(rights)
+    assert [p.stamp for p in pairs] == sorted(p.stamp for p in pairs)
+
+
+def test_interpolation_is_exact_at_and_between_samples():
+    answers = sampling(
+        Interpolate(), ("stream", 0, 0.0), ("at", 0, 0.0), ("at", 25, 0.0), ("stream", 100, 10.0), ("at", 100, 0.0)
+    )
+    assert values(answers) == [(0, 0.0), (25, 2.5), (100, 10.0)]
+
+
+def test_interpolation_refuses_a_gap_and_says_how_long_it_is():
+    answers = sampling(Interpolate(max_gap=50 * MS), ("stream", 0, 0.0), ("at", MS, 0.0), ("stream", 80 * MS, 1.0))
+    assert reasons(answers) == [Reason.UNALIGNED]
+    assert "80.0 ms" in answers[0].value.cause.detail
+
+
+def test_interpolation_never_extrapolates():
+    early = sampling(Interpolate(), ("at", 0, 0.0), ("stream", 10, 1.0), ("stream", 20, 1.0))
+    late = sampling(Interpolate(), ("stream", 10, 1.0), ("at", 30, 0.0))
+    assert reasons(early) == reasons(late) == [Reason.UNALIGNED]
+
+
+def test_a_sample_logged_late_is_still_used_within_the_patience():
+    messages = [("stream", 0, 0.0, 0), ("at", 50, 0.0, 50), ("stream", 100, 1.0, 900 * MS)]
+    assert values(sampling(Interpolate(), *messages)) == [(50, 0.5)]
+    assert reasons(sampling(Interpolate(patience=10 * MS), *messages)) == [Reason.UNALIGNED]
+
+
+def test_nearest_takes_the_nearer_neighbour_within_the_slop():
+    messages = [("stream", 0, 1.0), ("at", 60, 0.0), ("stream", 100, 2.0), ("at", 400, 0.0)]
+    answers = sampling(Nearest(slop=50), *messages)
+    assert values(answers) == [(60, 2.0)]
+    assert reasons(answers) == [Reason.UNALIGNED]
+
+
+def test_latest_takes_what_the_log_has_brought_by_then():
+    messages = [("stream", 0, 1.0), ("at", 60, 0.0), ("stream", 100, 2.0), ("at", 400, 0.0)]
+    assert values(sampling(Latest(), *messages)) == [(60, 1.0), (400, 2.0)]
+    assert reasons(sampling(Latest(max_age=100), *messages)) == [Reason.UNALIGNED]
+
+
+@given(st.lists(st.integers(0, 1000), min_size=2, unique=True).map(sorted), st.integers(0, 50))
+def test_every_wanted_stamp_gets_exactly_one_answer_in_order(stamps, gap):
+    messages = [("at" if i % 2 else "stream", s, float(s)) for i, s in enumerate(stamps)]
+    answers = sampling(Interpolate(max_gap=gap), *messages)
+    assert [a.stamp for a in answers] == [s for p, s, _ in messages if p == "at"]
+    assert all(value == pytest.approx(stamp) for stamp, value in values(answers))
+
+
+def test_old_samples_are_forgotten():
+    aligner = Interpolate().start("tilt", {"stream": "level", "at": "stereo"})
+    for stamp in range(0, 100_000 * MS, 10 * MS):
+        list(aligner.push("stream", stamp, Token(stamp, Number(stamp, 0.0))))
+    assert len(aligner.samples) < 200

@@ -1,0 +1,105 @@
+"""A pipeline file that cannot run is refused before anything runs, with file, line and the nearest valid name."""
+
+import textwrap
+
+import pytest
+
+from flow.errors import PipelineError, UsageError
+from flow.pipeline import load
+
+GOOD = """\
+source: {use: tests.flow.toys.Source, gain: 2.5}
+streams:
+  both:   {use: flow.align.pair, left: left, right: right, slop: 5 ms}
+  height: {use: flow.align.interpolate, stream: level, at: both, max_gap: 0.2 s}
+  twice:  {use: tests.flow.toys.Scale, couple: both, factor: 25 cm, bad: [1, 2.5]}
+  sum:    {use: tests.flow.toys.Add, a: twice, b: height}
+sinks:
+  - {use: tests.flow.toys.Keep}
+"""
+
+
+def loaded(tmp_path, text=GOOD, overrides=()):
+    file = tmp_path / "toy.yaml"
+    file.write_text(textwrap.dedent(text))
+    return load(str(file), overrides)
+
+
+def test_a_good_file_becomes_a_graph_with_units_converted(tmp_path):
+    graph = loaded(tmp_path)
+    nodes = {node.name: node for node in graph.nodes}
+    assert nodes["both"].actor.slop == 5_000_000
+    assert nodes["height"].actor.max_gap == 200_000_000
+    assert nodes["twice"].actor.factor == 0.25
+    assert nodes["twice"].actor.bad == (1.0, 2.5)
+    assert graph.source.gain == 2.5
+    assert graph.clock == "both"
+    assert list(graph.frame_streams) == ["both", "height", "twice", "sum"]
+
+
+def test_streams_may_be_written_in_any_order(tmp_path):
+    lines = GOOD.splitlines()
+    swapped = "\n".join([*lines[:2], *reversed(lines[2:6]), *lines[6:]])
+    assert [node.name for node in loaded(tmp_path, swapped).nodes][-1] == "sum"
+
+
+def test_a_setting_from_the_command_line_replaces_one_in_the_file(tmp_path):
+    graph = loaded(tmp_path, overrides=["twice.factor=3 m", "source.gain=1"])
+    assert {n.name: n for n in graph.nodes}["twice"].actor.factor == 3.0
+    assert graph.source.gain == 1.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ("factor", "faktor", 5, ["no input or parameter 'faktor'", "did you mean 'factor'"]),
+        ("25 cm", "quick", 5, ["factor", "'quick' is not a number"]),
+        ("25 cm", "25 ms", 5, ["'25 ms' is a time", "expected a length in m"]),
+        ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'"]),
+        ("25 cm", "-1", 5, ["at least 0 m"]),
+        ("25 cm", "true", 5, ["expected a number in m"]),
+        ("5 ms", "5", 3, ["needs a unit"]),
+        ("[1, 2.5]", "3", 5, ["expected a list"]),
+        ("a: twice", "a: thrice", 6, ["no stream 'thrice'", "did you mean 'twice'"]),
+        ("a: twice, ", "", 6, ["lacks its input 'a'"]),
+        ("a: twice", "a: height", 6, ["takes a Couple as 'a'", "'height' is a Number"]),
+        ("couple: both", "couple: left", 5, ["takes a Couple", "'left' is a Number"]),
+        ("couple: both", "couple: sum", 5, ["circle", "twice -> sum -> twice"]),
+        ("right: right", "right: words", 3, ["a Number cannot be paired with a Text"]),
+        ("stream: level", "stream: words", 4, ["a Text cannot be interpolated"]),
+        ("stream: level, at: both", "stream: level, at: right", 6, ["different clocks", "align them first"]),
+        ("toys.Scale", "toys.Scael", 5, ["no 'Scael'", "did you mean 'Scale'"]),
+        ("flow.toys.Scale", "flaw.toys.Scale", 5, ["cannot import 'tests.flaw.toys'"]),
+        ("toys.Scale", "toys.Keep", 5, ["Keep is no stage"]),
+        ("gain: 2.5", "gian: 2.5", 1, ["no parameter 'gian'", "did you mean 'gain'"]),
+        ("sinks:", "sinkz:", 7, ["no 'sinkz'", "did you mean 'sinks'"]),
+        ("  both:", "  left:", 3, ["'left' is already a stream of the source"]),
+        ("  sum: ", "  both:", 6, ["'both' stands here twice"]),
+        ("  - {use", "  - {use: [", 8, ["not valid YAML"]),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(tmp_path, old, new, line, words):
+    assert old in GOOD
+    with pytest.raises(PipelineError) as caught:
+        loaded(tmp_path, GOOD.replace(old, new, 1))
+    message = str(caught.value)
+    assert message.startswith(f"toy.yaml:{line}: "), message
+    for word in words:
+        assert word in message
+
+
+@pytest.mark.parametrize("text", ["", "just words", "[1, 2]", "streams: {}", "source: 3\nstreams: 4\nsinks: 5"])
+def test_a_file_that_is_no_pipeline_is_refused(tmp_path, text):
+    with pytest.raises(PipelineError, match=r"toy\.yaml:1"):
+        loaded(tmp_path, text)
+
+
+@pytest.mark.parametrize("setting", ["nonsense", "twice=3", "twise.factor=3", "twice.faktor=3", "twice.bad=[", "a.b"])
+def test_a_bad_setting_is_named(tmp_path, setting):
+    with pytest.raises((PipelineError, UsageError), match="--set"):
+        loaded(tmp_path, overrides=[setting])
+
+
+def test_an_unknown_pipeline_lists_those_that_ship():
+    with pytest.raises(UsageError, match="did you mean 'rover'"):
+        load("rovr")

@@ -1,0 +1,142 @@
+"""A small world for the runtime's tests: numbers instead of images, so that nothing but the dataflow is at work."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+
+@dataclass(frozen=True)
+class Couple:
+    stamp: int
+    value: float
+
+
+@dataclass(frozen=True)
+class Number:
+    stamp: int
+    value: float
+
+    def pair_with(self, right: Number) -> Couple:
+        if self.value < 0:
+            raise ValueError(f"the left number {self.value} is negative")
+        return Couple(self.stamp, self.value + right.value)
+
+    def interpolated(self, later: Number, stamp: int) -> Number:
+        share = (stamp - self.stamp) / (later.stamp - self.stamp)
+        return Number(stamp, (1 - share) * self.value + share * later.value)
+
+
+@dataclass(frozen=True)
+class Text:
+    stamp: int
+    text: str
+
+
+@dataclass(frozen=True)
+class Source:
+    streams: ClassVar[Mapping[str, type]] = {"left": Number, "right": Number, "level": Number, "words": Text}
+    gain: float = 1.0
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Multiplies; fails on the values of `bad`; sleeps up to `nap` seconds to shuffle the order of completion."""
+
+    factor: float = field(default=1.0, metadata={"unit": "m", "low": 0})
+    bad: tuple[float, ...] = ()
+    nap: float = field(default=0.0, metadata={"unit": "s"})
+
+    def __post_init__(self) -> None:
+        if not self.factor >= 0:
+            raise ValueError(f"Scale.factor must be at least 0 m, not {self.factor}")
+
+    def __call__(self, couple: Couple) -> Couple:
+        time.sleep(self.nap * random.random())
+        if couple.value in self.bad:
+            raise ValueError(f"cannot scale {couple.value}")
+        return Couple(couple.stamp, couple.value * self.factor)
+
+
+@dataclass(frozen=True)
+class Add:
+    def __call__(self, a: Couple, b: Couple | Number) -> Couple:
+        return Couple(a.stamp, a.value + b.value)
+
+
+@dataclass(frozen=True)
+class Total:
+    """Remembers: the running sum of all frames."""
+
+    ordered: ClassVar[bool] = True
+    seen: list[float] = field(default_factory=list, init=False)
+
+    def __call__(self, couple: Couple) -> Couple:
+        self.seen.append(couple.value)
+        return Couple(couple.stamp, sum(self.seen))
+
+
+@dataclass(frozen=True)
+class Liar:
+    def __call__(self, couple: Couple) -> Couple:
+        return Text(couple.stamp, "not a couple")  # type: ignore[return-value]
+
+
+class Meter:
+    """Counts how many calls are inside at once."""
+
+    def __init__(self) -> None:
+        self.lock, self.inside, self.most = threading.Lock(), 0, 0
+
+    def __enter__(self) -> None:
+        with self.lock:
+            self.inside += 1
+            self.most = max(self.most, self.inside)
+
+    def __exit__(self, *_: object) -> None:
+        with self.lock:
+            self.inside -= 1
+
+
+@dataclass
+class Keep:
+    """A sink that keeps what it is given."""
+
+    suffix: ClassVar[str] = ".txt"
+    fail_at: int | None = None
+    records: list[Any] = field(default_factory=list, init=False)
+    summary: dict[str, Any] | None = field(default=None, init=False)
+    meter: Meter = field(default_factory=Meter, init=False)
+
+    def wants(self, stream: str, kind: type) -> bool:
+        return True
+
+    def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
+        self.streams = streams
+
+    def write(self, record: Any) -> None:
+        with self.meter:
+            if record.index == self.fail_at:
+                raise OSError("No space left on device")
+            self.records.append(record)
+
+    def close(self, summary: Mapping[str, Any]) -> None:
+        self.summary = dict(summary)
+
+    def values(self, stream: str) -> dict[int, float]:
+        return {r.stamp: r.items[stream].value for r in self.records if stream in r.items}
+
+
+class Log:
+    """A log of given events; `endless` logs repeat a frame every second for ever."""
+
+    def __init__(self, events: list[tuple[int, str, Any]], missing: dict[str, str] | None = None) -> None:
+        self.events, self.missing = events, missing or {}
+
+    def __iter__(self) -> Iterator[tuple[int, str, Any]]:
+        yield from self.events

@@ -1,0 +1,45 @@
+"""The house's own rules: who may import whom, and that a package speaks of nothing it does not know."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+ROOMS = {"flow", "stages", "recordings"}
+COMPOSITION_ROOT = ROOT / "flow" / "cli.py"
+
+
+def imported(file):
+    """Dotted names that a file imports, `from a import b` as a.b."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file} imports relatively"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("room", sorted(ROOMS))
+def test_imports_run_one_way(room):
+    for file in sorted((ROOT / room).rglob("*.py")):
+        if file == COMPOSITION_ROOT:
+            continue
+        strangers = [name for name in imported(file) if name.split(".")[0] in ROOMS - {room}]
+        if room == "recordings":
+            strangers = [name for name in strangers if not name.startswith("stages.data")]
+        assert strangers == [], f"{file.relative_to(ROOT)} must not import {strangers}"
+
+
+def test_the_rule_would_notice_a_stranger(tmp_path):
+    file = tmp_path / "wrong.py"
+    file.write_text("from stages import Match\nimport recordings.ros2\n")
+    assert list(imported(file)) == ["stages.Match", "recordings.ros2"]
+
+
+def test_importing_a_stage_does_not_import_files_or_viewers():
+    import subprocess
+    import sys
+
+    code = "import sys, stages; print([m for m in ('rerun', 'mcap', 'rosbags', 'flow') if m in sys.modules])"
+    assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "[]"
