@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -123,7 +124,7 @@ def _pipeline_options(sub: argparse.ArgumentParser) -> None:
 def _simulation_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--frames", type=_count, help="stereo frames (default 12)")
     sub.add_argument("--seed", type=int, help="another seed, another terrain")
-    sub.add_argument("--size", metavar="WxH", help="image size (1280x960); the field of view stays")
+    sub.add_argument("--size", type=_size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
     sub.add_argument("--rocks", type=float, metavar="K", help="share of the ground covered by rocks (Golombek's k)")
     sub.add_argument("--slope", type=float, metavar="DEG", help="RMS slope of the terrain")
     sub.add_argument("--tilt-noise", type=float, metavar="DEG", help="inclinometer noise, one sigma")
@@ -145,6 +146,13 @@ def _count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not '{text}'")
     return value
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, such as 640x480, not '{text}'")
+    return int(width), int(height)
 
 
 def _version() -> str:
@@ -247,7 +255,31 @@ def _graph(options: argparse.Namespace) -> int:
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    raise NotImplementedError
+    settings = {
+        "frames": options.frames,
+        "seed": options.seed,
+        "abundance": options.rocks,
+        "slope": None if options.slope is None else math.radians(options.slope),
+        "tilt_noise": None if options.tilt_noise is None else math.radians(options.tilt_noise),
+    }
+    width, height = options.size
+    simulate(options.out, width=width, height=height, **{k: v for k, v in settings.items() if v is not None})
+    return COMPLETE
+
+
+def simulate(out: Path, **settings: Any) -> None:
+    """Write a simulated traverse; `settings` are fields of `recordings.simulator.Simulation`."""
+    from tqdm import tqdm
+
+    from recordings.simulator import Simulation
+
+    try:
+        simulation = Simulation(**settings)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    with tqdm(total=simulation.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
+        simulation.write(out, lambda done, total: bar.update(done - bar.n))
+    print(f"{out}: {simulation.frames} frames with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
 
 
 def _import(options: argparse.Namespace) -> int:

@@ -44,38 +44,43 @@ def _mermaid(graph: Graph) -> str:
 
 
 def _svg(graph: Graph) -> str:
+    """Boxes in columns by their distance from the source; arrows carry stream and type as tooltips."""
     column = {"source": 0}
     for node in graph.nodes:
         column[node.name] = 1 + max(column.get(stream, 0) for stream in node.inputs.values())
-    boxes = {"source": ("source", graph.source_use), **{n.name: (n.name, n.use) for n in graph.nodes}}
+    boxes = {"source": ("source", graph.source_use), **{node.name: (node.name, node.use) for node in graph.nodes}}
+    last = max(column.values()) + 1
     for use, _ in graph.sinks:
-        column[use], boxes[use] = max(column.values()) + (use == graph.sinks[0][0]), ("sink", use)
+        column[use], boxes[use] = last, ("sink", use)
     rows: dict[int, int] = defaultdict(int)
     place = {}
     for name in boxes:
-        x = _MARGIN + column[name] * (_BOX_WIDTH + _GAP_X)
-        y = _MARGIN + rows[column[name]] * (_BOX_HEIGHT + _GAP_Y)
-        place[name] = (x, y)
+        place[name] = (
+            _MARGIN + column[name] * (_BOX_WIDTH + _GAP_X),
+            _MARGIN + rows[column[name]] * (_BOX_HEIGHT + _GAP_Y),
+        )
         rows[column[name]] += 1
-    width = _MARGIN + (max(column.values()) + 1) * (_BOX_WIDTH + _GAP_X)
+    width = 2 * _MARGIN + last * (_BOX_WIDTH + _GAP_X) + _BOX_WIDTH
     height = 2 * _MARGIN + max(rows.values()) * (_BOX_HEIGHT + _GAP_Y)
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif">',
-        f'<rect width="{width}" height="{height}" fill="white"/>',
-    ]
-    for start, end, stream, kind in _edges(graph):
-        (x0, y0), (x1, y1) = place[start], place[end]
-        points = [(x0 + _BOX_WIDTH, y0 + _BOX_HEIGHT / 2), (x1, y1 + _BOX_HEIGHT / 2)]
-        bends = [(x + dx, y) for (x, y), dx in zip(points, (_GAP_X / 2, -_GAP_X / 2), strict=True)]
-        path = " ".join(f"{x:g},{y:g}" for x, y in (points[0], *bends, points[1]))
-        parts.append(
-            f'<path d="M{path.replace(" ", " C", 1)}" fill="none" stroke="#888"><title>{escape(stream)}: {kind}</title></path>'
-        )
-    for name, (title, use) in boxes.items():
-        x, y = place[name]
-        parts.append(
-            f'<rect x="{x}" y="{y}" width="{_BOX_WIDTH}" height="{_BOX_HEIGHT}" rx="6" fill="#f4efe6" stroke="#a0522d"/>'
-            f'<text x="{x + 8}" y="{y + 18}" font-size="13" font-weight="bold">{escape(title)}</text>'
-            f'<text x="{x + 8}" y="{y + 34}" font-size="11" fill="#555">{escape(use)}</text>'
-        )
-    return "\n".join([*parts, "</svg>"])
+    arrows = [_arrow(place[start], place[end], f"{stream}: {kind}") for start, end, stream, kind in _edges(graph)]
+    arrows += [_arrow(place[graph.nodes[-1].name], place[use], "every stream of the frame") for use, _ in graph.sinks]
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif">'
+    paper = f'<rect width="{width}" height="{height}" fill="white"/>'
+    return "\n".join([head, paper, *arrows, *(_box(place[name], *boxes[name]) for name in boxes), "</svg>"])
+
+
+def _arrow(start: tuple[int, int], end: tuple[int, int], title: str) -> str:
+    (x0, y0), (x1, y1) = start, end
+    x0, y0, y1 = x0 + _BOX_WIDTH, y0 + _BOX_HEIGHT // 2, y1 + _BOX_HEIGHT // 2
+    bend = _GAP_X // 2
+    curve = f"M{x0},{y0} C{x0 + bend},{y0} {x1 - bend},{y1} {x1},{y1}"
+    return f'<path d="{curve}" fill="none" stroke="#999"><title>{escape(title)}</title></path>'
+
+
+def _box(corner: tuple[int, int], title: str, use: str) -> str:
+    x, y = corner
+    return (
+        f'<rect x="{x}" y="{y}" width="{_BOX_WIDTH}" height="{_BOX_HEIGHT}" rx="6" fill="#f4efe6" stroke="#a0522d"/>\n'
+        f'<text x="{x + 8}" y="{y + 18}" font-size="13" font-weight="bold">{escape(title)}</text>\n'
+        f'<text x="{x + 8}" y="{y + 34}" font-size="11" fill="#555">{escape(use)}</text>'
+    )

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 import re
 
-# unit -> (what it measures, factor to that quantity's base unit)
+# unit -> (what it measures, its size); sizes are whole numbers where they can be, so that conversions stay exact
 UNITS: dict[str, tuple[str, float]] = {
-    "ns": ("time", 1e-9),
-    "us": ("time", 1e-6),
-    "ms": ("time", 1e-3),
-    "s": ("time", 1.0),
-    "min": ("time", 60.0),
-    "mm": ("length", 1e-3),
-    "cm": ("length", 1e-2),
-    "m": ("length", 1.0),
-    "km": ("length", 1e3),
+    "ns": ("time", 1.0),
+    "us": ("time", 1e3),
+    "ms": ("time", 1e6),
+    "s": ("time", 1e9),
+    "min": ("time", 60e9),
+    "mm": ("length", 1.0),
+    "cm": ("length", 10.0),
+    "m": ("length", 1e3),
+    "km": ("length", 1e6),
     "rad": ("angle", 1.0),
     "deg": ("angle", math.pi / 180),
     "px": ("pixels", 1.0),
@@ -41,8 +41,8 @@ def quantity(text: str, unit: str) -> float:
         return number
     if given not in UNITS:
         raise ValueError(f"'{text}' has the unknown unit '{given}'; expected {unit or 'a plain number'}")
-    kind, factor = UNITS[given]
-    wanted, base = UNITS[unit]
+    kind, size = UNITS[given]
+    wanted, base = UNITS.get(unit, (unit, 1.0))
     if kind != wanted:
         raise ValueError(f"'{text}' is a {kind}; expected {f'a {wanted} in {unit}' if unit else 'a plain number'}")
-    return number if given == unit else number * factor / base
+    return number if given == unit else number * size / base

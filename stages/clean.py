@@ -1,0 +1,84 @@
+"""Clean: drop far points and outliers (paper section 4, "Outlier Removal & ROI Limitation").
+
+The paper's k-nearest-neighbour filter measures distances in space, which on the ground grow with the square of the
+range: it mistakes distance for error. The default here asks the image instead: a point stays where enough of its
+neighbours in the image see the same surface, judged in inverse depth, in which near and far ground look alike. It takes
+time linear in the points; the paper's filter remains as method "knn".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from stages.data import Array, PointCloud
+from stages.kernels.outliers import supported
+from stages.stage import Stage, parameter
+
+
+@dataclass(frozen=True)
+class Clean(Stage):
+    """Crops a cloud about its camera, then removes outliers.
+
+    The crop comes first, so that the far field has no say in what is an outlier near by. It is a ball about the camera
+    of `region` + `margin`: before levelling nobody knows what is horizontal, and with the margin it holds all ground
+    within the region for any camera up to 4 m above it. Voxelise cuts the exact circle.
+    """
+
+    method: str = parameter("organised", "outlier removal", choices=("organised", "knn"))
+    region: float = parameter(8.0, "horizontal range wanted in the map", unit="m", low=0.1)
+    margin: float = parameter(1.0, "added to region to crop by distance from the camera", unit="m", low=0.0)
+    deviations: float = parameter(
+        3.0, "organised: difference of neighbours that noise may explain, in standard deviations; knn: threshold above "
+        "the mean distance, in standard deviations of it", low=0.0,
+    )  # fmt: skip
+    spread: float = parameter(2.0, "organised: steepest slope of a surface, in multiples of the ground's", low=0.0)
+    share: float = parameter(0.3, "organised: part of the 32 neighbours that must agree", low=0.0, high=1.0)
+    least: int = parameter(4, "organised: neighbours without which a point cannot be judged, and goes", low=1, high=32)
+    neighbours: int = parameter(20, "knn: number of nearest neighbours", low=1)
+
+    def __call__(self, cloud: PointCloud) -> PointCloud:
+        """The points of `cloud`, in their order, that are near and no outliers; there may be none."""
+        if cloud.sensor is not None:
+            raise ValueError(f"Clean: the cloud is in frame '{cloud.frame_id}', not its camera's; Clean precedes Level")
+        keep = self._organised(cloud) if self.method == "organised" else self._knn(cloud)
+        return replace(
+            cloud,
+            points=cloud.points[keep],
+            colors=cloud.colors[keep],
+            sigma=cloud.sigma[keep],
+            pixel=cloud.pixel[keep],
+        )
+
+    def _organised(self, cloud: PointCloud) -> Array:
+        """Indices of the points that stay, by their neighbours in the image."""
+        if cloud.shape is None:
+            raise ValueError("Clean: the cloud does not say its image's shape; set it, or use method: knn")
+        if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < cloud.shape[0] * cloud.shape[1]:
+            raise ValueError(f"Clean: the cloud has pixel indices outside its image of shape {cloud.shape}")
+        return np.flatnonzero(
+            supported(
+                cloud.points,
+                cloud.sigma,
+                cloud.pixel,
+                cloud.shape,
+                self.region + self.margin,
+                self.deviations,
+                self.spread,
+                self.share,
+                self.least,
+            )
+        )
+
+    def _knn(self, cloud: PointCloud) -> Array:
+        """Indices of the points that stay, by the mean distance to their nearest neighbours in space."""
+        points = cloud.points.astype(np.float64)
+        near = np.flatnonzero(np.einsum("ij,ij->i", points, points) <= (self.region + self.margin) ** 2)
+        if len(near) <= self.neighbours:
+            return near
+        distance, _ = cKDTree(points[near]).query(points[near], k=self.neighbours + 1, workers=1)
+        mean = distance[:, 1:].mean(axis=1)
+        kept: Array = near[mean <= mean.mean() + self.deviations * mean.std()]
+        return kept

@@ -1,0 +1,119 @@
+"""Least-squares planes over a square window about every cell of a grid, cells without weight left out.
+
+A fit needs nine sums over the window. They are kept running, first down the columns and then along the row, so a cell
+costs the same whatever the window's size; coordinates are shifted to the window's centroid before anything is divided.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from stages.data import Array
+
+
+def fit_planes(heights: Array, use: Array, radius: int, leverage: float) -> Array:
+    """The plane fitted to the window of (2 * radius + 1)^2 cells about each cell.
+
+    heights: (rows, cols) float64, finite where `use`; use: (rows, cols) bool, the cells that count; leverage: the
+    largest variance of the plane's height at the cell, in multiples of one cell's (1 / n in the middle of n cells, more
+    at their edge), for a fit to be believed.
+
+    Returns (4, rows, cols) float64: the plane's height at the cell, its slopes per cell along columns (x) and rows (y),
+    and the root mean square of the window's residuals. NaN where the cells used are too few, or too nearly in a line.
+    """
+    planes = np.full((4, *heights.shape), np.nan)
+    _fit_planes(np.ascontiguousarray(heights), np.ascontiguousarray(use), int(radius), float(leverage), planes)
+    return planes
+
+
+@numba.njit(nogil=True, cache=True)
+def _add_row(sums, heights, use, row, sign):  # type: ignore[no-untyped-def]
+    """Add (sign 1) or take away (sign -1) one row from the six sums of every column."""
+    for col in range(heights.shape[1]):
+        if use[row, col]:
+            z = heights[row, col]
+            column = sums[col]
+            column[0] += sign
+            column[1] += sign * row
+            column[2] += sign * row * row
+            column[3] += sign * z
+            column[4] += sign * row * z
+            column[5] += sign * z * z
+
+
+@numba.njit(nogil=True, cache=True)
+def _fit_planes(heights, use, radius, leverage, planes):  # type: ignore[no-untyped-def]
+    rows, cols = heights.shape
+    sums = np.zeros((cols, 6), np.float64)
+    for row in range(min(radius, rows)):
+        _add_row(sums, heights, use, row, 1.0)
+    for row in range(rows):
+        if row + radius < rows:
+            _add_row(sums, heights, use, row + radius, 1.0)
+        if row - radius - 1 >= 0:
+            _add_row(sums, heights, use, row - radius - 1, -1.0)
+        n = sx = sxx = sy = syy = sxy = sz = sxz = syz = szz = 0.0
+        for ahead in range(-radius, cols):
+            for side in range(2):
+                # The column that enters on the right, then the one that leaves on the left.
+                col = ahead + radius if side == 0 else ahead - radius - 1
+                if col < 0 or col >= cols:
+                    continue
+                sign = 1.0 if side == 0 else -1.0
+                x, s = float(col), sums[col]
+                n += sign * s[0]
+                sx += sign * x * s[0]
+                sxx += sign * x * x * s[0]
+                sy += sign * s[1]
+                sxy += sign * x * s[1]
+                syy += sign * s[2]
+                sz += sign * s[3]
+                sxz += sign * x * s[3]
+                syz += sign * s[4]
+                szz += sign * s[5]
+            if ahead >= 0 and n >= 3.0:
+                _solve(planes[:, row, ahead], row, ahead, leverage, n, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz)
+
+
+@numba.njit(nogil=True, cache=True)
+def _solve(plane, row, col, leverage, n, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz):  # type: ignore[no-untyped-def]
+    mx, my, mz = sx / n, sy / n, sz / n
+    vxx, vxy, vyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+    vxz, vyz, vzz = sxz / n - mx * mz, syz / n - my * mz, szz / n - mz * mz
+    determinant = vxx * vyy - vxy * vxy
+    # determinant / trace is close to the smaller eigenvalue: a band less than about two cells wide has no cross slope.
+    if determinant < 0.4 * (vxx + vyy):
+        return
+    dx, dy = col - mx, row - my
+    if 1.0 + (vyy * dx * dx - 2.0 * vxy * dx * dy + vxx * dy * dy) / determinant > leverage * n:
+        return
+    gx = (vyy * vxz - vxy * vyz) / determinant
+    gy = (vxx * vyz - vxy * vxz) / determinant
+    plane[0] = mz + gx * dx + gy * dy
+    plane[1] = gx
+    plane[2] = gy
+    plane[3] = np.sqrt(max(0.0, vzz - gx * vxz - gy * vyz))
+
+
+def fit_planes_reference(heights: Array, use: Array, radius: int, leverage: float) -> Array:
+    """The same as `fit_planes`: numpy's least squares, one window at a time."""
+    planes = np.full((4, *heights.shape), np.nan)
+    for row, col in np.ndindex(*heights.shape):
+        top, left = max(0, row - radius), max(0, col - radius)
+        window = np.s_[top : row + radius + 1, left : col + radius + 1]
+        dy, dx = np.nonzero(use[window])
+        n, z = len(dx), heights[window][dy, dx]
+        if n < 3:
+            continue
+        dx, dy = dx + left - col, dy + top - row
+        spread = np.cov(dx, dy, bias=True)
+        if np.linalg.det(spread) < 0.4 * np.trace(spread):
+            continue
+        design = np.column_stack([np.ones(n), dx, dy]).astype(float)
+        if np.linalg.inv(design.T @ design)[0, 0] > leverage:
+            continue
+        fit = np.linalg.lstsq(design, z, rcond=None)[0]
+        planes[:3, row, col] = fit
+        planes[3, row, col] = np.sqrt(np.mean((z - design @ fit) ** 2))
+    return planes

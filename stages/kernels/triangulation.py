@@ -1,0 +1,113 @@
+"""Triangulation of a rectified disparity image (paper section 4, "Depth Estimation").
+
+Z = fx * baseline / (d + cx_right - cx). One pass counts the pixels that have a point, a second one writes them, so the
+cloud is allocated at its own size and comes out in raster order.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from stages.data import Array, Source, StereoCamera
+
+_FILLED = int(Source.FILLED)
+_UNKNOWN = int(Source.UNKNOWN)
+
+
+def triangulate(
+    disparity: Array,
+    source: Array,
+    confidence: Array,
+    colors: Array,
+    camera: StereoCamera,
+    max_depth: float,
+    filled: bool,
+    sigmas: tuple[float, float, float],
+) -> tuple[Array, Array, Array, Array]:
+    """The points of a disparity image, in the left optical frame, in raster order.
+
+    disparity: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `Source`; confidence: (H, W) float32;
+    colors: (H, W) or (H, W, 3) uint8; max_depth: m; filled: whether pixels of source FILLED become points;
+    sigmas: standard deviation of the disparity, px, at confidence 1, at confidence 0, and at least for filled pixels.
+
+    Returns points (N, 3) float32 m, colors (N, 3) uint8, depth standard deviation (N,) float32 m, pixel (N,) int32.
+    """
+    return _triangulate(  # type: ignore[no-any-return]
+        np.ascontiguousarray(disparity).ravel(),
+        np.ascontiguousarray(source).ravel(),
+        np.ascontiguousarray(confidence).ravel(),
+        np.ascontiguousarray(colors).reshape(disparity.size, -1),
+        disparity.shape[1],
+        (camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline, camera.cx_right - camera.cx),
+        float(max_depth),
+        bool(filled),
+        (float(sigmas[0]), float(sigmas[1]), float(sigmas[2])),
+    )
+
+
+@numba.njit(nogil=True, cache=True)
+def _depth(disparity, source, shift, focal_baseline, max_depth, filled):  # type: ignore[no-untyped-def]
+    """Depth of a pixel, or 0 where it has no point."""
+    if source == _UNKNOWN or (source == _FILLED and not filled):
+        return 0.0
+    effective = disparity + shift
+    # Written so that NaN, a point behind the camera and one beyond max_depth all fail the one comparison.
+    return focal_baseline / effective if effective * max_depth >= focal_baseline and np.isfinite(effective) else 0.0
+
+
+@numba.njit(nogil=True, cache=True)
+def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, sigmas):  # type: ignore[no-untyped-def]
+    fx, fy, cx, cy, focal_baseline, shift = camera
+    sigma_best, sigma_worst, sigma_filled = sigmas
+    count = 0
+    for i in range(disparity.size):
+        if _depth(float(disparity[i]), source[i], shift, focal_baseline, max_depth, filled) > 0.0:
+            count += 1
+    points = np.empty((count, 3), np.float32)
+    rgb = np.empty((count, 3), np.uint8)
+    sigma = np.empty(count, np.float32)
+    pixel = np.empty(count, np.int32)
+    green, blue = (1, 2) if colors.shape[1] == 3 else (0, 0)
+    n = 0
+    for i in range(disparity.size):
+        z = _depth(float(disparity[i]), source[i], shift, focal_baseline, max_depth, filled)
+        if z > 0.0:
+            points[n, 0] = (i % width - cx) * z / fx
+            points[n, 1] = (i // width - cy) * z / fy
+            points[n, 2] = z
+            rgb[n, 0], rgb[n, 1], rgb[n, 2] = colors[i, 0], colors[i, green], colors[i, blue]
+            trust = min(float(confidence[i]), 1.0) if confidence[i] > 0.0 else 0.0
+            sigma_d = sigma_worst + (sigma_best - sigma_worst) * trust
+            if source[i] == _FILLED:
+                sigma_d = max(sigma_d, sigma_filled)
+            sigma[n] = z * z / focal_baseline * sigma_d
+            pixel[n] = i
+            n += 1
+    return points, rgb, sigma, pixel
+
+
+def triangulate_reference(
+    disparity: Array,
+    source: Array,
+    confidence: Array,
+    colors: Array,
+    camera: StereoCamera,
+    max_depth: float,
+    filled: bool,
+    sigmas: tuple[float, float, float],
+) -> tuple[Array, Array, Array, Array]:
+    """The same as `triangulate`, in plain numpy."""
+    effective = disparity.astype(np.float64) + camera.cx_right - camera.cx
+    wanted = np.isfinite(effective) & (source != Source.UNKNOWN) & (filled | (source != Source.FILLED))
+    wanted &= np.where(wanted, effective, 0) * max_depth >= camera.fx * camera.baseline
+    v, u = np.nonzero(wanted)
+    z = camera.fx * camera.baseline / effective[v, u]
+    points = np.column_stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z])
+    rgb = colors[v, u] if colors.ndim == 3 else np.repeat(colors[v, u][:, None], 3, axis=1)
+    trust = np.clip(np.nan_to_num(confidence[v, u].astype(np.float64)), 0, 1)
+    sigma_d = sigmas[1] + (sigmas[0] - sigmas[1]) * trust
+    sigma_d = np.where(source[v, u] == Source.FILLED, np.maximum(sigma_d, sigmas[2]), sigma_d)
+    sigma = z * z / (camera.fx * camera.baseline) * sigma_d
+    pixel = v * disparity.shape[1] + u
+    return points.astype(np.float32), rgb, sigma.astype(np.float32), pixel.astype(np.int32)

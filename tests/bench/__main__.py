@@ -1,0 +1,5 @@
+"""Everything `make bench` prints."""
+
+from tests.bench import pipeline
+
+pipeline.main()

@@ -1,0 +1,104 @@
+"""Scenes with an exact truth for the terrain tests: a plane with rocks seen by a camera, and terrain grids with rocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.data import Array, Disparity, ElevationMap, Source, StereoCamera, StereoFrame
+
+# The Devon Island camera at half size.
+CAMERA = StereoCamera(484.5, 484.5, 317.3, 231.5, 0.24, 640, 480)
+HEIGHT, PITCH = 1.0, np.deg2rad(15.0)
+UP = np.array([0.0, -np.cos(PITCH), -np.sin(PITCH)])
+# Middle (x, y) and radius of spheres half sunk into the ground, m, in the level frame below the camera.
+ROCKS = ((3.0, 0.4, 0.3), (4.5, -0.8, 0.4), (6.0, 0.9, 0.3), (2.5, -0.5, 0.2))
+
+
+def level_from_camera() -> Array:
+    """Rotation: the camera looks along level x, PITCH below the horizon."""
+    x = np.array([0, -np.sin(PITCH), np.cos(PITCH)])
+    return np.stack([x, np.cross(UP, x), UP])
+
+
+def seen_disparity(rocks: tuple[tuple[float, float, float], ...] = ROCKS, camera: StereoCamera = CAMERA) -> Array:
+    """Exact disparity (H, W) float64 of the plane z = 0 with rocks; NaN where no ray meets it."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    rays = rays @ level_from_camera().T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(rays[..., 2] < 0, -HEIGHT / rays[..., 2], np.nan)
+        for x, y, radius in rocks:
+            middle = np.array([x, y, -HEIGHT])
+            a, b, c = (rays**2).sum(-1), rays @ middle, middle @ middle - radius**2
+            hit = (b - np.sqrt(b * b - a * c)) / a
+            depth = np.fmin(depth, hit)
+        return camera.fx * camera.baseline / depth
+
+
+def blank_frame(camera: StereoCamera = CAMERA, stamp: int = 7) -> StereoFrame:
+    image = np.full((camera.height, camera.width), 90, np.uint8)
+    return StereoFrame(stamp, image, image, camera)
+
+
+def as_disparity(pixels: Array, camera: StereoCamera = CAMERA, stamp: int = 7) -> Disparity:
+    known = np.isfinite(pixels)
+    source = np.where(known, Source.MEASURED, Source.UNKNOWN).astype(np.uint8)
+    return Disparity(stamp, pixels.astype(np.float32), source, known.astype(np.float32), camera=camera)
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """A terrain grid with what is true of it: base (ground), above (mean and highest of the rock over it), rock (index
+    of the rock in each cell, 0 for none)."""
+
+    elevation: ElevationMap
+    base: Array
+    above_mean: Array
+    above_top: Array
+    rock: Array
+
+
+def rolling_terrain(
+    seed: int,
+    *,
+    amplitude: float = 0.0,
+    wavelength: float = 6.0,
+    slope: float = 0.0,
+    rocks: int = 12,
+    noise: float = 0.01,
+    cells: int = 160,
+    resolution: float = 0.05,
+) -> Terrain:
+    """Sloping, rolling ground with half-ellipsoid rocks 0.22 to 0.5 m high, averaged over cells, every cell observed."""
+    random = np.random.default_rng(seed)
+    fine = 4
+    extent = cells * resolution / 2
+    axis = (np.arange(cells * fine) + 0.5) * resolution / fine - extent
+    x, y = np.meshgrid(axis, axis)
+    heading, px, py = random.uniform(0, 2 * np.pi, 3)
+    base = np.tan(slope) * (np.cos(heading) * x + np.sin(heading) * y)
+    base += amplitude * np.sin(2 * np.pi * x / wavelength + px) * np.sin(2 * np.pi * y / wavelength + py)
+    above, index, placed = np.zeros_like(base), np.zeros(base.shape, int), list[tuple[float, float, float]]()
+    while len(placed) < rocks:
+        cx, cy = random.uniform(-extent + 0.6, extent - 0.6, 2)
+        height = random.uniform(0.22, 0.5)
+        radius = height * random.uniform(0.8, 1.2)
+        if any(np.hypot(cx - qx, cy - qy) < radius + r + 0.2 for qx, qy, r in placed):
+            continue
+        placed.append((cx, cy, radius))
+        inside = 1 - ((x - cx) ** 2 + (y - cy) ** 2) / radius**2
+        above = np.maximum(above, height * np.sqrt(np.maximum(inside, 0)))
+        index[inside > 0] = len(placed)
+
+    def blocks(field: Array) -> Array:
+        return field.reshape(cells, fine, cells, fine).swapaxes(1, 2).reshape(cells, cells, -1)
+
+    z = blocks(base + above)
+    error = noise * random.standard_normal((cells, cells))
+    layers = {"elevation": z.mean(-1), "minimum": z.min(-1), "maximum": z.max(-1)}
+    published = {name: (layer + error).astype(np.float32) for name, layer in layers.items()}
+    published["count"] = np.full((cells, cells), 16, np.float32)
+    grid = ElevationMap(7, published, resolution, (-extent, -extent), "level")
+    return Terrain(grid, blocks(base).mean(-1), blocks(above).mean(-1), blocks(above).max(-1), blocks(index).max(-1))

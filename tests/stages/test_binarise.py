@@ -1,0 +1,206 @@
+"""Binarise finds what stops a rover, on any slope it can climb, and calls nothing free that nobody saw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.binarise import Binarise
+from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason
+from stages.kernels.footprint import fit_planes, fit_planes_reference
+from tests.stages.terrain_scene import Terrain, rolling_terrain
+
+TEN_DEGREES = float(np.deg2rad(10))
+
+
+def map_of(elevation: Array, resolution: float = 0.05, **layers: Array) -> ElevationMap:
+    named = {"elevation": elevation, **layers}
+    return ElevationMap(1, {k: v.astype(np.float32) for k, v in named.items()}, resolution, (0.0, 0.0), "level")
+
+
+def grid(cells: int = 80) -> tuple[Array, Array]:
+    axis = (np.arange(cells) + 0.5) * 0.05
+    x, y = np.meshgrid(axis, axis)
+    return x, y
+
+
+def with_plane(elevation: ElevationMap, gx: float, gy: float, offset: float = 0.0) -> ElevationMap:
+    rows, cols = elevation.shape
+    plane = offset + elevation.resolution * (gx * np.arange(cols)[None, :] + gy * np.arange(rows)[:, None])
+    layers = {
+        name: layer if name == "count" else (layer.astype(np.float64) + plane).astype(np.float32)
+        for name, layer in elevation.layers.items()
+    }
+    return replace(elevation, layers=layers)
+
+
+def shares(terrain: Terrain, result: NavigationMap) -> tuple[float, float, float, float]:
+    """Recall of cells 0.2 m above the ground, share of them called free, false alarms, share of rocks found."""
+    hazard = result.cells == Cell.HAZARD
+    high, clear = terrain.above_mean >= 0.2, terrain.rock == 0
+    found = [hazard[terrain.rock == k].any() for k in range(1, terrain.rock.max() + 1)]
+    free = (result.cells == Cell.FREE)[high].mean()
+    return float(hazard[high].mean()), float(free), float(hazard[clear].mean()), float(np.mean(found))
+
+
+@pytest.mark.parametrize(
+    "ground",
+    [
+        {"amplitude": 0.0},
+        {"slope": TEN_DEGREES},
+        {"slope": float(np.deg2rad(18))},
+        {"amplitude": 0.15, "wavelength": 6.0},
+        {"amplitude": 0.15, "wavelength": 8.0, "slope": float(np.deg2rad(5))},
+        {"noise": 0.02},
+    ],
+    ids=["flat", "10 degrees", "18 degrees", "rolling", "rolling slope", "noisy"],
+)
+def test_every_rock_on_every_ground_is_found_with_few_false_alarms(ground: dict[str, float]) -> None:
+    results = []
+    for seed in range(3):
+        terrain = rolling_terrain(seed, **ground)
+        results.append(shares(terrain, Binarise()(terrain.elevation)))
+    recall, free, alarms, found = np.mean(results, axis=0)
+    assert found == 1.0
+    assert recall >= 0.99
+    assert free <= 0.005
+    assert alarms <= 0.002
+
+
+@settings(max_examples=25, deadline=None)
+@given(degrees=st.floats(0, 19.9), heading=st.floats(0, 2 * np.pi), offset=st.floats(-50, 50))
+def test_a_tilted_plane_within_the_slope_limit_is_free_wherever_it_was_seen(
+    degrees: float, heading: float, offset: float
+) -> None:
+    x, y = grid()
+    z = offset + np.tan(np.deg2rad(degrees)) * (np.cos(heading) * x + np.sin(heading) * y)
+    seen = np.hypot(x, y) > 1.0
+    result = Binarise()(map_of(np.where(seen, z, np.nan)))
+    assert (result.cells[seen] == Cell.FREE).all()
+    assert (result.cells[~seen] == Cell.UNKNOWN).all()
+
+
+def test_a_plane_beyond_the_slope_limit_is_a_hazard_for_its_slope() -> None:
+    x, _ = grid()
+    result = Binarise()(map_of(np.tan(np.deg2rad(21)) * x))
+    assert (result.reason == Reason.SLOPE).all()
+    assert (result.cells == Cell.HAZARD).all()
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1000), gx=st.floats(-0.2, 0.2), gy=st.floats(-0.2, 0.2), offset=st.floats(-5, 5))
+def test_tilting_and_raising_the_scene_changes_no_cell(seed: int, gx: float, gy: float, offset: float) -> None:
+    terrain = rolling_terrain(seed, rocks=5, cells=80)
+    plain, moved = Binarise()(terrain.elevation), Binarise()(with_plane(terrain.elevation, gx, gy, offset))
+    # float32 heights round; a cell that lies on a threshold may fall to the other side.
+    assert (plain.cells != moved.cells).mean() <= 0.0005
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_a_mirrored_map_gives_the_mirrored_result(seed: int) -> None:
+    elevation = rolling_terrain(seed, amplitude=0.1, rocks=5, cells=80).elevation
+    mirrored = replace(elevation, layers={name: layer[::-1] for name, layer in elevation.layers.items()})
+    plain, other = Binarise()(elevation), Binarise()(mirrored)
+    assert (other.cells[::-1] != plain.cells).mean() <= 0.0005
+
+
+def test_a_rock_on_a_slope_is_a_hazard_and_the_slope_beside_it_is_free() -> None:
+    x, y = grid()
+    distance = np.hypot(x - 2, y - 2)
+    z = np.tan(TEN_DEGREES) * x + np.where(distance < 0.3, np.sqrt(np.maximum(0.09 - distance**2, 0)), 0)
+    result = Binarise()(map_of(z))
+    assert (result.reason[distance < 0.18] == Reason.STEP).all()
+    assert (result.cells[distance > 0.35] == Cell.FREE).all()
+
+
+def test_a_pit_is_a_hazard_too() -> None:
+    x, y = grid()
+    pit = np.hypot(x - 2, y - 2) < 0.25
+    result = Binarise()(map_of(np.where(pit, -0.4, 0.0)))
+    assert (result.reason[pit] == Reason.STEP).all()
+
+
+def test_noise_of_two_centimetres_is_no_hazard() -> None:
+    for seed in range(3):
+        noise = np.random.default_rng(seed).normal(0, 0.02, (160, 160))
+        assert (Binarise()(map_of(noise, maximum=noise + 0.02, minimum=noise - 0.02)).cells == Cell.FREE).all()
+
+
+def test_one_stray_point_in_a_cell_is_no_hazard_but_a_point_on_a_rock_is() -> None:
+    flat = np.zeros((80, 80))
+    top = flat.copy()
+    top[40, 40] = 0.5
+    assert (Binarise()(map_of(flat, maximum=top, minimum=flat)).cells == Cell.FREE).all()
+    assert Binarise()(map_of(top * 0.5, maximum=top, minimum=flat)).cells[40, 40] == Cell.HAZARD
+
+
+def test_rubble_too_low_to_be_a_step_is_too_rough() -> None:
+    random = np.random.default_rng(5)
+    rubble = np.where(random.random((80, 80)) < 0.4, 0.15, 0.0)
+    result = Binarise()(map_of(rubble))
+    assert (result.reason == Reason.ROUGHNESS).mean() > 0.95
+
+
+def test_what_was_not_seen_is_unknown_never_free() -> None:
+    terrain = rolling_terrain(2)
+    seen = np.random.default_rng(0).random((160, 160)) > 0.3
+    layers = {name: np.where(seen, layer, np.nan).astype(np.float32) for name, layer in terrain.elevation.layers.items()}
+    layers["count"] = np.nan_to_num(layers["count"])
+    for method in ("footprint", "absolute"):
+        result = Binarise(method=method)(replace(terrain.elevation, layers=layers))
+        assert (result.cells[~seen] == Cell.UNKNOWN).all()
+        assert (result.reason[~seen] == Reason.UNOBSERVED).all()
+        np.testing.assert_array_equal(result.cells == Cell.FREE, result.reason == Reason.CLEAR)
+        np.testing.assert_array_equal(result.cells == Cell.UNKNOWN, result.reason == Reason.UNOBSERVED)
+
+
+def test_ground_that_nothing_surrounds_is_unknown_and_a_high_face_alone_is_a_hazard() -> None:
+    lone = np.full((80, 80), np.nan)
+    lone[40, 40:42] = 0.0
+    lone[10, :] = 0.0
+    assert (Binarise()(map_of(lone)).cells == Cell.UNKNOWN).all()
+    face = Binarise()(map_of(lone, minimum=lone - 0.3, maximum=lone + 0.3))
+    assert face.cells[40, 40] == Cell.HAZARD
+    assert face.reason[40, 40] == Reason.STEP
+
+
+def test_cells_of_fewer_points_than_wanted_and_empty_maps_are_unknown() -> None:
+    flat = np.zeros((40, 40))
+    count = np.full((40, 40), 5.0)
+    count[7, 9] = 2
+    result = Binarise(min_points=3)(map_of(flat, count=count))
+    assert result.cells[7, 9] == Cell.UNKNOWN
+    assert (result.cells == Cell.FREE).sum() == 1599
+    assert (Binarise()(map_of(np.full((40, 40), np.nan))).cells == Cell.UNKNOWN).all()
+
+
+def test_the_papers_rule_calls_a_gentle_slope_a_hazard_and_the_default_does_not() -> None:
+    x, _ = grid(160)
+    gentle = map_of(np.tan(np.deg2rad(3)) * x)
+    absolute = Binarise(method="absolute")(gentle)
+    np.testing.assert_array_equal(absolute.reason == Reason.ELEVATION, gentle.layers["elevation"] > 0.2)
+    assert (absolute.cells == Cell.HAZARD).mean() > 0.5
+    assert (Binarise()(gentle).cells == Cell.FREE).all()
+
+
+def test_the_grid_of_the_map_is_kept() -> None:
+    elevation = rolling_terrain(0).elevation
+    result = Binarise()(elevation)
+    assert (result.stamp, result.resolution, result.origin, result.frame_id) == (7, 0.05, (-4.0, -4.0), "level")
+    assert result.cells.shape == elevation.shape
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), radius=st.integers(1, 4), share=st.floats(0.1, 1.0))
+def test_plane_kernel_equals_the_plain_reference(seed: int, radius: int, share: float) -> None:
+    random = np.random.default_rng(seed)
+    heights = random.normal(0, 1, (12, 15))
+    use = random.random(heights.shape) < share
+    got, want = fit_planes(heights, use, radius, 0.25), fit_planes_reference(heights, use, radius, 0.25)
+    np.testing.assert_array_equal(np.isnan(got), np.isnan(want))
+    np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)

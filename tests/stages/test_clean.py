@@ -1,0 +1,152 @@
+"""Clean finds gross errors at every range, and takes little else with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.clean import Clean
+from stages.data import LEVEL_FRAME, Array, PointCloud, Transform
+from stages.kernels.outliers import supported, supported_reference
+from stages.reproject import Reproject
+from tests.stages.terrain_scene import (
+    CAMERA,
+    HEIGHT,
+    ROCKS,
+    as_disparity,
+    blank_frame,
+    level_from_camera,
+    seen_disparity,
+)
+
+RINGS = ((0, 2), (2, 4), (4, 6), (6, 8))
+
+
+def cloud_with_noise(seed: int = 0, sigma: float = 0.25, rocks: tuple[tuple[float, float, float], ...] = ROCKS) -> PointCloud:
+    d = seen_disparity(rocks)
+    return Reproject(max_depth=50)(blank_frame(), as_disparity(d + np.random.default_rng(seed).normal(0, sigma, d.shape)))
+
+
+def with_floaters(cloud: PointCloud, share: float, seed: int = 1) -> tuple[PointCloud, Array]:
+    """Some points moved along their pixels' rays, off the ground by 0.5 m or more."""
+    random = np.random.default_rng(seed)
+    floats = random.random(len(cloud.points)) < share
+    factor = random.uniform(0.15, 0.6, len(cloud.points))
+    height = cloud.points.astype(np.float64) @ level_from_camera()[2]
+    floats &= (height < -0.6) & (np.abs(height) * (1 - factor) >= 0.5)
+    points = cloud.points.copy()
+    points[floats] *= factor[floats, None].astype(np.float32)
+    return replace(cloud, points=points), floats
+
+
+def horizontal_range(cloud: PointCloud) -> Array:
+    return np.hypot(*(cloud.points @ level_from_camera().T)[:, :2].T)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.25])
+def test_finds_98_percent_of_floaters_and_loses_half_a_percent_of_valid_points_in_every_ring(noise: float) -> None:
+    clean = cloud_with_noise(sigma=noise)
+    distance = horizontal_range(clean)
+    cloud, floats = with_floaters(clean, 0.02)
+    kept = np.isin(cloud.pixel, Clean()(cloud).pixel)
+    assert floats.sum() > 1500
+    assert (~kept[floats]).mean() >= 0.98
+    for low, high in RINGS:
+        ring = (distance >= low) & (distance < high) & ~floats
+        assert ring.sum() > 5000
+        assert (~kept[ring]).mean() <= 0.005
+
+
+@pytest.mark.parametrize("stride", [2, 3, 4])
+def test_a_cloud_of_every_nth_pixel_is_judged_as_well(stride: int) -> None:
+    cloud, floats = with_floaters(cloud_with_noise(), 0.02)
+    row, col = np.divmod(cloud.pixel, CAMERA.width)
+    take = (row % stride == 0) & (col % stride == 0)
+    thin = replace(cloud, points=cloud.points[take], colors=cloud.colors[take], sigma=cloud.sigma[take],
+                   pixel=cloud.pixel[take])  # fmt: skip
+    kept = np.isin(thin.pixel, Clean()(thin).pixel)
+    inside = np.linalg.norm(thin.points, axis=1) < 9
+    assert (~kept[floats[take]]).mean() >= 0.98
+    assert (~kept[inside & ~floats[take]]).mean() <= 0.005
+
+
+def test_points_off_their_pixels_rays_go_too() -> None:
+    cloud = cloud_with_noise()
+    lifted = np.random.default_rng(4).random(len(cloud.points)) < 0.01
+    points = cloud.points - np.where(lifted, 0.5, 0)[:, None].astype(np.float32) * level_from_camera()[2] * -1
+    kept = np.isin(cloud.pixel, Clean()(replace(cloud, points=points.astype(np.float32))).pixel)
+    inside = np.linalg.norm(points, axis=1) < 9
+    assert (~kept[lifted]).mean() >= 0.98
+    assert (~kept[inside & ~lifted]).mean() <= 0.005
+
+
+def test_a_speck_of_three_by_three_pixels_goes_and_a_rock_stays() -> None:
+    d = seen_disparity(((4.0, 0.0, 0.25),))
+    d[300:303, 100:103] *= 2
+    rock = seen_disparity(((4.0, 0.0, 0.25),)) - seen_disparity(()) > 1.0
+    pixels = Clean()(Reproject()(blank_frame(), as_disparity(d))).pixel
+    assert not np.isin([300 * 640 + 100, 301 * 640 + 101, 302 * 640 + 102], pixels).any()
+    assert np.isin(np.flatnonzero(rock), pixels).mean() > 0.99
+
+
+def test_kernel_equals_the_plain_reference() -> None:
+    cloud, _ = with_floaters(cloud_with_noise(5), 0.05)
+    random = np.random.default_rng(6)
+    some = random.random(len(cloud.points)) < 0.4
+    arguments = (cloud.points[some], cloud.sigma[some], cloud.pixel[some], (480, 640), 9.0, 3.0, 2.0, 0.3, 4)
+    got, want = supported(*arguments), supported_reference(*arguments)
+    assert 0 < got.sum() < some.sum()
+    assert (got != want).mean() < 1e-5
+
+
+@settings(max_examples=10, deadline=None)
+@given(scale=st.sampled_from([0.25, 0.5, 2.0, 4.0]))
+def test_a_scene_twice_as_large_seen_with_twice_the_baseline_is_judged_alike(scale: float) -> None:
+    cloud, _ = with_floaters(cloud_with_noise(), 0.02)
+    larger = replace(cloud, points=cloud.points * np.float32(scale), sigma=cloud.sigma * np.float32(scale))
+    once, again = Clean(margin=0)(cloud), Clean(region=8 * scale, margin=0)(larger)
+    np.testing.assert_array_equal(once.pixel, again.pixel)
+
+
+def test_crops_about_the_camera_before_it_judges() -> None:
+    cloud = cloud_with_noise()
+    kept = Clean(region=5.0, margin=0.5)(cloud)
+    assert 5.4 < np.linalg.norm(kept.points, axis=1).max() <= 5.5
+    assert np.all(np.diff(kept.pixel) > 0)
+    on_the_ground = horizontal_range(cloud) < 5.0
+    assert np.isin(cloud.pixel[on_the_ground], kept.pixel).mean() > 0.995
+
+
+def test_the_papers_filter_takes_out_points_far_from_all_others() -> None:
+    d = np.full((480, 640), np.nan)
+    d[300:340, 300:380] = seen_disparity(())[300:340, 300:380]
+    d[320, 340] *= 0.6
+    cloud = Reproject()(blank_frame(), as_disparity(d))
+    kept = Clean(method="knn")(cloud)
+    assert 320 * 640 + 340 not in kept.pixel
+    assert len(kept.points) > 0.95 * len(cloud.points)
+
+
+@pytest.mark.parametrize("method", ["organised", "knn"])
+def test_a_cloud_of_no_or_one_point_is_legal(method: str) -> None:
+    nothing = Reproject()(blank_frame(), as_disparity(np.full((480, 640), np.nan)))
+    assert len(Clean(method=method)(nothing).points) == 0
+    d = np.full((480, 640), np.nan)
+    d[300, 300] = 40
+    one = Clean(method=method)(Reproject()(blank_frame(), as_disparity(d)))
+    assert len(one.points) == (0 if method == "organised" else 1)
+
+
+def test_refuses_a_levelled_cloud_and_one_without_its_image() -> None:
+    cloud = cloud_with_noise()
+    sensor = Transform(LEVEL_FRAME, cloud.frame_id, level_from_camera(), np.array([0, 0, HEIGHT]))
+    with pytest.raises(ValueError, match="precedes Level"):
+        Clean()(replace(cloud, sensor=sensor, frame_id=LEVEL_FRAME))
+    with pytest.raises(ValueError, match="method: knn"):
+        Clean()(replace(cloud, shape=None))
+    with pytest.raises(ValueError, match="outside its image"):
+        Clean()(replace(cloud, shape=(100, 100)))

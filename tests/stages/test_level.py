@@ -1,0 +1,124 @@
+"""Level stands the world upright, whatever the rover's attitude and however the sensors are mounted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Tilt, Transform
+from stages.kernels.rigid import transform_points, transform_points_reference
+from stages.level import Level, level_transform
+from tests.stages.terrain_scene import HEIGHT, UP, level_from_camera
+
+BARE = Mount(0, np.eye(3))
+# Optical axes in base axes: x right is -y, y down is -z, z forward is x.
+BASE_FROM_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+rotations = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1).map(
+    lambda q: Rotation.from_quat(q).as_matrix()
+)  # fmt: skip
+
+
+def cloud_of(points: Array, frame_id: str = "camera") -> PointCloud:
+    n = len(points)
+    return PointCloud(
+        3, points.astype(np.float32), np.zeros((n, 3), np.uint8), np.ones(n, np.float32), np.arange(n, dtype=np.int32),
+        frame_id, (1, max(n, 1)),
+    )  # fmt: skip
+
+
+def scattered(n: int = 200) -> Array:
+    return np.random.default_rng(0).uniform(-4, 4, (n, 3)) + np.array([0, 0, 5])
+
+
+def test_ground_below_a_pitched_camera_becomes_level_at_height_zero() -> None:
+    ground = np.column_stack([np.random.default_rng(1).uniform(-5, 5, (500, 2)) + [6, 0], np.zeros(500)])
+    seen = (ground - [0, 0, HEIGHT]) @ level_from_camera()
+    cloud = Level(camera_height=HEIGHT)(cloud_of(seen), Tilt(3, UP), BARE)
+    np.testing.assert_allclose(cloud.points, ground, atol=2e-6)
+    assert cloud.frame_id == LEVEL_FRAME
+    assert cloud.sensor is not None
+    assert (cloud.sensor.parent, cloud.sensor.child) == (LEVEL_FRAME, "camera")
+    np.testing.assert_allclose(cloud.sensor.translation, [0, 0, HEIGHT], atol=1e-12)
+    np.testing.assert_allclose(cloud.sensor(seen), ground, atol=1e-12)
+
+
+@settings(max_examples=50, deadline=None)
+@given(turn=rotations)
+def test_distances_and_handedness_survive_and_up_becomes_z(turn: Array) -> None:
+    up = turn @ UP
+    assume(abs(up[2]) < 0.98)
+    transform = level_transform(Tilt(0, up), BARE, "camera")
+    np.testing.assert_allclose(transform.rotation @ up, [0, 0, 1], atol=1e-9)
+    axis = transform.rotation @ [0, 0, 1]
+    assert axis[0] > 0
+    assert axis[1] == pytest.approx(0, abs=1e-9)
+    assert np.linalg.det(transform.rotation) == pytest.approx(1)
+
+
+@settings(max_examples=50, deadline=None)
+@given(turn=rotations)
+def test_how_the_inclinometer_sits_does_not_matter(turn: Array) -> None:
+    level = Level()(cloud_of(scattered()), Tilt(0, UP), BARE)
+    turned = Level()(cloud_of(scattered()), Tilt(0, turn.T @ UP), Mount(0, turn))
+    np.testing.assert_allclose(turned.points, level.points, atol=1e-5)
+
+
+@settings(max_examples=50, deadline=None)
+@given(turn=rotations)
+def test_turning_the_camera_on_the_rover_leaves_the_levelled_cloud_alone(turn: Array) -> None:
+    """With base_link known, the same world seen by a camera turned in its place levels to the same cloud."""
+    points, place = scattered(), np.array([0.3, 0.12, 0.9])
+    up_in_base = Rotation.from_euler("xyz", [0.2, -0.3, 0]).apply([0, 0, 1])
+
+    def levelled(base_from_camera: Array, seen: Array) -> PointCloud:
+        mount = Mount(0, base_from_camera.T, Transform("base_link", "camera", base_from_camera, place))
+        return Level()(cloud_of(seen), Tilt(0, up_in_base), mount)
+
+    usual = levelled(BASE_FROM_OPTICAL, points)
+    turned = levelled(BASE_FROM_OPTICAL @ turn, points @ turn)
+    np.testing.assert_allclose(turned.points, usual.points, atol=1e-5)
+
+
+def test_with_base_link_known_its_origin_and_heading_are_the_level_frames() -> None:
+    aside = Rotation.from_euler("z", 30, degrees=True).as_matrix() @ BASE_FROM_OPTICAL
+    base_from_camera = Transform("base_link", "camera", aside, np.array([0.5, -0.1, 1.2]))
+    transform = level_transform(Tilt(0, np.array([0, -1.0, 0])), Mount(0, np.eye(3), base_from_camera), "camera", 99.0)
+    np.testing.assert_allclose(transform.translation, [0.5, -0.1, 1.2], atol=1e-12)
+    np.testing.assert_allclose(transform.rotation, aside, atol=1e-12)
+
+
+def test_a_nose_up_rover_sees_the_hill_behind_the_horizon() -> None:
+    """Nose up by 10 degrees, a point on the optical axis is above the camera."""
+    a = np.deg2rad(10)
+    cloud = Level(camera_height=0)(cloud_of(np.array([[0, 0, 8.0]])), Tilt(0, np.array([0, -np.cos(a), np.sin(a)])), BARE)
+    np.testing.assert_allclose(cloud.points[0], [8 * np.cos(a), 0, 8 * np.sin(a)], atol=1e-6)
+
+
+def test_a_heading_straight_down_a_wrong_mount_and_a_second_levelling_are_refused() -> None:
+    with pytest.raises(ValueError, match="nearly vertical"):
+        level_transform(Tilt(0, np.array([0, 0, -1.0])), BARE, "camera")
+    with pytest.raises(ValueError, match="not a rotation"):
+        level_transform(Tilt(0, UP), Mount(0, 2 * np.eye(3)), "camera")
+    once = Level()(cloud_of(scattered()), Tilt(0, UP), BARE)
+    with pytest.raises(ValueError, match="only once"):
+        Level()(once, Tilt(0, UP), BARE)
+
+
+def test_only_place_changes_and_an_empty_cloud_stays_empty() -> None:
+    cloud = cloud_of(scattered())
+    level = Level()(cloud, Tilt(0, UP), BARE)
+    for name in ("colors", "sigma", "pixel"):
+        np.testing.assert_array_equal(getattr(level, name), getattr(cloud, name))
+    assert (level.stamp, level.shape) == (cloud.stamp, cloud.shape)
+    assert len(Level()(cloud_of(np.zeros((0, 3))), Tilt(0, UP), BARE).points) == 0
+
+
+def test_kernel_equals_the_plain_reference() -> None:
+    cloud = replace(cloud_of(scattered()), frame_id="camera")
+    arguments = (cloud.points, level_from_camera(), np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(transform_points(*arguments), transform_points_reference(*arguments), rtol=1e-6, atol=1e-6)

@@ -1,0 +1,81 @@
+"""Plane per superpixel: exact on planes, blind to outliers, the same for the same seed, equal to its reference."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.kernels.planes import fit_planes, fit_planes_reference, render_planes, segment_pixels
+
+SHAPE = (48, 60)
+
+
+@pytest.fixture
+def tiles():
+    """Six segments of 24x20 px, each its own plane, with noise, a fifth of outliers and a tenth of holes."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    labels = (y // 24 * 3 + x // 20).astype(np.int32)
+    truth = rng.uniform([-0.3, -0.3, 20], [0.3, 0.3, 60], (6, 3))
+    a, b, c = truth[labels].transpose(2, 0, 1)
+    disparity = a * x + b * y + c + rng.normal(0, 0.05, SHAPE)
+    outlier = rng.random(SHAPE) < 0.2
+    disparity[outlier] += rng.uniform(3, 30, outlier.sum())
+    disparity[rng.random(SHAPE) < 0.1] = np.nan
+    return disparity.astype(np.float32), labels, truth
+
+
+def test_outliers_and_holes_do_not_move_the_planes(tiles):
+    disparity, labels, truth = tiles
+    planes = fit_planes(disparity, labels, 6)
+    clean = render_planes(truth, labels)
+    assert np.abs(render_planes(planes.coefficients, labels) - clean).max() < 0.05
+    assert planes.inlier_share == pytest.approx(0.8, abs=0.06)
+    assert planes.valid_share == pytest.approx(0.9, abs=0.05)
+
+
+def test_equals_the_plain_reference_with_the_same_draws(tiles):
+    disparity, labels, _ = tiles
+    ours = fit_planes(disparity, labels, 6, hypotheses=16, seed=11)
+    plain = fit_planes_reference(disparity, labels, 6, hypotheses=16, seed=11)
+    assert ours.coefficients[:, :2] == pytest.approx(plain.coefficients[:, :2], abs=2e-5)
+    images = [render_planes(planes.coefficients, labels) for planes in (ours, plain)]
+    assert images[0] == pytest.approx(images[1], abs=1e-4)
+    assert np.array_equal(ours.inlier_share, plain.inlier_share)
+    assert np.array_equal(ours.valid_share, plain.valid_share)
+
+
+def test_a_segment_is_fitted_alike_whatever_the_others_hold(tiles):
+    disparity, labels, _ = tiles
+    alone = np.where(labels == 4, disparity, np.float32(np.nan))
+    assert np.array_equal(
+        fit_planes(disparity, labels, 6, seed=9).coefficients[4], fit_planes(alone, labels, 6, seed=9).coefficients[4]
+    )
+
+
+def test_the_seed_decides_the_draws(tiles):
+    disparity, labels, _ = tiles
+    runs = [fit_planes(disparity, labels, 6, hypotheses=1, seed=seed).coefficients for seed in (1, 1, 2, -1)]
+    assert np.array_equal(runs[0], runs[1], equal_nan=True)
+    assert not np.array_equal(runs[0], runs[2], equal_nan=True)
+
+
+def test_too_few_or_collinear_pixels_give_no_plane():
+    labels = np.zeros((10, 30), np.int32)
+    labels[:, 15:] = 1
+    disparity = np.full((10, 30), np.nan, np.float32)
+    disparity[0, :5] = 7
+    disparity[3, 15:] = 7
+    planes = fit_planes(disparity, labels, 2)
+    assert np.isnan(planes.coefficients).all()
+    assert (planes.inlier_share == 0).all()
+    assert np.isnan(render_planes(planes.coefficients, labels)).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 9), st.integers(0, 2**31))
+def test_segment_pixels_lists_each_pixel_once_under_its_label(height, width, count, seed):
+    labels = np.random.default_rng(seed).integers(0, count, (height, width), dtype=np.int32)
+    start, index = segment_pixels(labels, count)
+    assert np.array_equal(np.sort(index), np.arange(labels.size))
+    assert np.array_equal(labels.ravel()[index], np.repeat(np.arange(count), np.diff(start)))

@@ -1,0 +1,103 @@
+"""Reproject puts every known pixel where it is, says how well it knows, and makes nothing of what it does not know."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.data import CameraModel, Disparity, Source, StereoCamera, StereoFrame
+from stages.kernels.triangulation import triangulate, triangulate_reference
+from stages.reproject import Reproject
+from tests.stages.terrain_scene import CAMERA, as_disparity, blank_frame, seen_disparity
+
+SMALL = StereoCamera(100.0, 110.0, 7.5, 5.25, 0.2, 16, 12, cx_right=9.0)
+
+
+def test_points_project_back_to_their_pixels_and_disparities() -> None:
+    cloud = Reproject()(blank_frame(), as_disparity(seen_disparity()))
+    x, y, z = cloud.points.T.astype(np.float64)
+    v, u = np.divmod(cloud.pixel, CAMERA.width)
+    assert len(cloud.points) > 200_000
+    np.testing.assert_allclose(x / z * CAMERA.fx + CAMERA.cx, u, atol=1e-3)
+    np.testing.assert_allclose(y / z * CAMERA.fy + CAMERA.cy, v, atol=1e-3)
+    np.testing.assert_allclose(CAMERA.fx * CAMERA.baseline / z, seen_disparity()[v, u], rtol=1e-6)
+    assert cloud.frame_id == CAMERA.frame_id
+    assert cloud.shape == (480, 640)
+    assert cloud.stamp == 7
+    assert cloud.sensor is None
+
+
+def test_principal_points_of_both_cameras_enter_the_depth() -> None:
+    cloud = Reproject()(blank_frame(SMALL), as_disparity(np.full((12, 16), 3.5), SMALL))
+    assert cloud.points[:, 2] == pytest.approx(100.0 * 0.2 / (3.5 + 1.5))
+
+
+def test_kernel_equals_the_plain_reference() -> None:
+    random = np.random.default_rng(1)
+    pixels = random.uniform(-4, 20, (12, 16)).astype(np.float32)
+    pixels[random.random(pixels.shape) < 0.2] = np.nan
+    pixels[0, :3] = np.inf, -np.inf, -1.5
+    source = random.integers(0, 4, pixels.shape).astype(np.uint8)
+    confidence = random.uniform(-0.1, 1.1, pixels.shape).astype(np.float32)
+    confidence[0, 5] = np.nan
+    for colors in (random.integers(0, 256, (12, 16, 3), np.uint8), random.integers(0, 256, (12, 16), np.uint8)):
+        for filled in (False, True):
+            arguments = (pixels, source, confidence, colors, SMALL, 8.0, filled, (0.25, 1.0, 3.0))
+            for got, want in zip(triangulate(*arguments), triangulate_reference(*arguments), strict=True):
+                assert got.dtype == want.dtype
+                np.testing.assert_allclose(got, want, rtol=1e-6)
+
+
+def test_a_filled_disparity_is_left_out_or_marked_as_uncertain_and_a_plane_is_kept() -> None:
+    source = np.array([[Source.MEASURED, Source.PLANE, Source.FILLED, Source.UNKNOWN]], np.uint8)
+    camera = StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 4, 1)
+    disparity = Disparity(0, np.full((1, 4), 5, np.float32), source, np.ones((1, 4), np.float32))
+    frame = blank_frame(camera)
+    assert Reproject()(frame, disparity).pixel.tolist() == [0, 1]
+    cloud = Reproject(filled=True, sigma_best=0.2, sigma_filled=3.0)(frame, disparity)
+    assert cloud.pixel.tolist() == [0, 1, 2]
+    assert cloud.sigma == pytest.approx(np.array([0.2, 0.2, 3.0]) * 4.0**2 / (100 * 0.2))
+
+
+def test_depth_uncertainty_predicts_the_scatter_of_noisy_disparities() -> None:
+    camera = StereoCamera(969.0, 969.0, 320.0, 240.0, 0.24, 640, 480)
+    d = 30 + np.random.default_rng(2).normal(0, 0.25, (480, 640))
+    cloud = Reproject(sigma_best=0.25)(blank_frame(camera), as_disparity(d, camera))
+    assert cloud.points[:, 2].std() == pytest.approx(cloud.sigma.mean(), rel=0.02)
+
+
+def test_uncertainty_grows_as_confidence_falls() -> None:
+    camera = StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 5, 1)
+    confidence = np.linspace(1, 0, 5, dtype=np.float32)[None]
+    disparity = Disparity(0, np.full((1, 5), 5, np.float32), np.ones((1, 5), np.uint8), confidence)
+    assert np.all(np.diff(Reproject()(blank_frame(camera), disparity).sigma) > 0)
+
+
+def test_nothing_beyond_max_depth_and_nothing_at_all_is_a_legal_cloud() -> None:
+    near = Reproject(max_depth=5.0)(blank_frame(), as_disparity(seen_disparity()))
+    assert 4.9 < near.points[:, 2].max() <= 5.0
+    none = Reproject()(blank_frame(), as_disparity(np.full((480, 640), np.nan)))
+    assert none.points.shape == (0, 3)
+    assert none.pixel.shape == none.sigma.shape == (0,)
+
+
+def test_colours_come_from_the_left_image_whatever_its_depth() -> None:
+    random = np.random.default_rng(3)
+    left = random.integers(0, 2**16, (12, 16, 3), np.uint16)
+    disparity = as_disparity(np.full((12, 16), 5.0), SMALL)
+    deep = Reproject()(StereoFrame(0, left, left, SMALL), disparity)
+    np.testing.assert_array_equal(deep.colors, (left // 256).reshape(-1, 3))
+    gray = (left[..., 0] // 256).astype(np.uint8)
+    flat = Reproject()(StereoFrame(0, gray, gray, SMALL), disparity)
+    np.testing.assert_array_equal(flat.colors, np.repeat(gray.reshape(-1, 1), 3, axis=1))
+
+
+def test_a_disparity_of_another_size_and_an_unrectified_frame_are_refused() -> None:
+    with pytest.raises(ValueError, match="join the disparity with the rectified frame"):
+        Reproject()(blank_frame(), as_disparity(np.ones((12, 16)), SMALL))
+    model = CameraModel(16, 12, np.eye(3), np.zeros(5), np.eye(3), np.eye(3, 4))
+    raw = StereoCamera(100.0, 100.0, 8.0, 6.0, 0.2, 16, 12, raw=(model, model))
+    with pytest.raises(ValueError, match="put Rectify before"):
+        Reproject()(blank_frame(raw), as_disparity(np.ones((12, 16)), SMALL))
+    with pytest.raises(ValueError, match="sigma_worst must be at least"):
+        Reproject(sigma_best=2.0)

@@ -1,0 +1,84 @@
+"""Superpixels: connected, deterministic, and as good as scikit-image's at explaining the image."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+from skimage import data, segmentation
+
+from stages.kernels import slic
+
+
+@pytest.fixture(scope="module")
+def photo():
+    return np.ascontiguousarray(data.astronaut()[:400, 50:450])
+
+
+def explained_variance(image, labels):
+    pixels, flat = image.reshape(-1, 3).astype(float), labels.ravel()
+    counts = np.bincount(flat)
+    means = np.stack([np.bincount(flat, channel) / np.maximum(counts, 1) for channel in pixels.T], axis=1)
+    return ((means[flat] - pixels.mean(0)) ** 2).sum() / ((pixels - pixels.mean(0)) ** 2).sum()
+
+
+def boundary_recall(image, labels, reach=2):
+    edges = np.hypot(*np.gradient(ndimage.gaussian_filter(image.mean(axis=2), 1)))
+    strong = edges > np.percentile(edges, 95)
+    near = ndimage.binary_dilation(segmentation.find_boundaries(labels), iterations=reach)
+    return near[strong].mean()
+
+
+def pieces(labels):
+    """How many 4-connected pieces the segments fall into."""
+    horizontal, vertical = labels[:, 1:] == labels[:, :-1], labels[1:] == labels[:-1]
+    index = np.arange(labels.size).reshape(labels.shape)
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    start = np.concatenate([index[:, :-1][horizontal], index[:-1][vertical]])
+    stop = np.concatenate([index[:, 1:][horizontal], index[1:][vertical]])
+    graph = coo_array((np.ones(start.size), (start, stop)), shape=(labels.size, labels.size))
+    return connected_components(graph, directed=False)[0]
+
+
+def test_explains_the_image_as_well_as_scikit_image(photo):
+    ours, count = slic.superpixels(photo, 600)
+    theirs = segmentation.slic(photo, n_segments=600, compactness=10, start_label=0)
+    assert explained_variance(photo, ours) > explained_variance(photo, theirs) - 0.01
+    assert boundary_recall(photo, ours) > boundary_recall(photo, theirs) - 0.02
+    assert 480 <= count <= 720
+
+
+def test_every_segment_is_one_connected_piece(photo):
+    labels, count = slic.superpixels(photo, 600)
+    assert labels.min() == 0
+    assert labels.max() == count - 1 == len(np.unique(labels)) - 1
+    assert pieces(labels) == count
+
+
+def test_an_edge_of_the_image_is_an_edge_of_segments():
+    image = np.full((120, 160), 60, np.uint8)
+    image[:, 83:] = 180
+    labels, _ = slic.superpixels(image, 48)
+    assert not set(labels[:, :83].ravel()) & set(labels[:, 83:].ravel())
+
+
+def test_assignment_is_the_nearest_of_nine_centres(photo):
+    image = photo[:90, :131]
+    colour, rows, cols = slic._colour_planes(image), 6, 9
+    centres = slic._grid_centres(colour, rows, cols)
+    labels, sums = np.empty(image.shape[:2], np.int32), np.empty((rows * cols, 6))
+    slic._assign(colour, centres, rows, cols, np.float32(0.4), labels, sums)
+    expected = slic.assign_reference(colour, centres, rows, cols, 0.4)
+    assert (labels == expected).mean() > 0.999  # float32 may break a tie differently
+    assert np.array_equal(sums[:, 5], np.bincount(labels.ravel(), minlength=rows * cols))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 70), st.integers(1, 70), st.integers(1, 400), st.integers(0, 2**31))
+def test_any_size_and_count_gives_connected_labels_twice_the_same(height, width, count, seed):
+    image = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
+    labels, total = slic.superpixels(image, count)
+    assert pieces(labels) == total == labels.max() + 1
+    assert np.array_equal(labels, slic.superpixels(image, count)[0])
