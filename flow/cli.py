@@ -172,6 +172,10 @@ def _run(options: argparse.Namespace) -> int:
     if options.summary:
         options.summary.write_text(json.dumps(summary, indent=2) + "\n")
     _report(summary, [out, *([rrd] if rrd else [])])
+    return _exit_code_of(summary)
+
+
+def _exit_code_of(summary: dict[str, Any]) -> int:
     if summary["interrupted"]:
         return INTERRUPTED
     return COMPLETE if summary["verdict"] == "COMPLETE" else INCOMPLETE
@@ -224,7 +228,8 @@ def replay(
                 bar.update()
 
             with interrupts(stop, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)):
-                return run(graph, opened, outputs, workers=workers, about=about, stop=stop, on_frame=on_frame)
+                summary = run(graph, opened, outputs, workers=workers, about=about, stop=stop, on_frame=on_frame)
+    return {name: value for name, value in summary.items() if name != "entries"}  # those stand in "ledger", as JSON
 
 
 def _report(summary: dict[str, Any], outputs: Sequence[Path]) -> None:
@@ -278,12 +283,20 @@ def simulate(out: Path, **settings: Any) -> None:
     except ValueError as error:
         raise UsageError(str(error)) from None
     with tqdm(total=simulation.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
-        simulation.write(out, lambda done, total: bar.update(done - bar.n))
+        simulation.write(out, lambda done, total: bar.update(done - bar.n) and None)
     print(f"{out}: {simulation.frames} frames with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
 
 
 def _import(options: argparse.Namespace) -> int:
-    raise NotImplementedError
+    from recordings.image_log import import_images, pair_images
+
+    left, right = pair_images(options.source)
+    frames = import_images(
+        left, right, options.calibration, options.out,
+        pitch_down=options.pitch_down, roll=options.roll, height=options.height, rate=options.rate,
+    )  # fmt: skip
+    print(f"{options.out}: {frames} stereo frames ({options.out.stat().st_size / 1e6:.1f} MB)")
+    return COMPLETE
 
 
 def _score(options: argparse.Namespace) -> int:
@@ -291,13 +304,28 @@ def _score(options: argparse.Namespace) -> int:
 
     result = score(options.result, options.truth or options.result)
     if options.json:
-        options.json.write_text(json.dumps(result.as_dict(), indent=2) + "\n")
+        options.json.write_text(result.to_json() + "\n")
     print(format_score(result))
     return COMPLETE
 
 
 def _demo(options: argparse.Namespace) -> int:
-    raise NotImplementedError
+    from recordings.pictures import draw
+    from recordings.scoring import format_score, score
+
+    folder = options.out
+    folder.mkdir(parents=True, exist_ok=True)
+    log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
+    print("Simulating a traverse ...", flush=True)
+    simulate(log, frames=options.frames)
+    print("Replaying it through the pipeline 'rover' ...", flush=True)
+    summary = replay(log, "rover", out, rrd, workers=os.cpu_count() or 1)
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    _report(summary, [out, rrd])
+    print(f"\n{format_score(score(out, log))}")
+    pictures = draw(out, folder / "pictures")
+    print(f"\n{len(pictures)} pictures in {folder / 'pictures'}; the timeline: rerun {rrd}")
+    return _exit_code_of(summary)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,22 @@
+"""Where data comes in and goes out: logs, recordings, data sets, the simulator. The only place for file formats."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from recordings.mcap_sink import McapSink
+    from recordings.mcap_source import McapSource
+    from recordings.rerun_sink import RerunSink
+
+__all__ = ["McapSink", "McapSource", "RerunSink"]
+
+_HOMES = {"McapSink": "mcap_sink", "McapSource": "mcap_source", "RerunSink": "rerun_sink"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import on first use: reading a log should not wait for the viewer's library."""
+    if name in _HOMES:
+        return getattr(import_module(f"recordings.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'recordings' has no attribute '{name}'")

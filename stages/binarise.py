@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import label
 
 from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason
 from stages.kernels.footprint import fit_planes
@@ -21,6 +22,8 @@ _LEVERAGE = 0.25
 # How far above the wide plane ground may lie, round by round, in shares of max_step: first hardly at all, so that the
 # plane sinks off the rocks, whose sides and tops would else hold it up.
 _ABOVE = (0.05, 0.05, 0.15, 0.15, 0.15)
+# How far below the wide plane ground may lie in the end: deeper is a pit, which would pull the narrow planes down.
+_BELOW = 0.5
 # How far off the footprint's plane ground may lie, both ways. Ground is found anew each round, and with it a crest that
 # bends away from the wide plane comes back, from its sides inwards.
 _ABOUT = (0.25, 0.25, 0.25)
@@ -33,7 +36,8 @@ class Binarise(Stage):
     """Classifies each cell as free, hazard or unknown, with the reason.
 
     method "footprint": a hazard is a cell that
-    - STEP: reaches `max_step` above the ground about it, or below, or within itself;
+    - STEP: reaches `max_step` above the ground about it, or below, or within itself, or is part of an obstacle that
+      does: off the ground by `skirt` and joined to such a cell by others like it;
     - SLOPE: lies on ground steeper than `max_slope` over the rover's footprint;
     - ROUGHNESS: has heights about it whose root mean square off their plane exceeds `max_roughness`.
     A cell without points, or with so few cells about it that the ground is not determined, is unknown (UNOBSERVED),
@@ -51,6 +55,7 @@ class Binarise(Stage):
     surroundings: float = parameter(2.5, "width of the window in which an obstacle stands out", unit="m", low=0.05)
     margin: float = parameter(0.03, "a step this close to max_step counts as reaching it: cells blunt a peak", unit="m",
                               low=0.0)  # fmt: skip
+    skirt: float = parameter(0.05, "a cell this far off the ground belongs to the obstacle it touches", unit="m", low=0.0)
     min_points: int = parameter(1, "points without which a cell is unknown, where the map counts them", low=1)
 
     def __call__(self, elevation: ElevationMap) -> NavigationMap:
@@ -74,6 +79,7 @@ class Binarise(Stage):
     def _footprint(self, elevation: ElevationMap, height: Array, observed: Array) -> Array:
         level, slope, known = self._ground(height, observed, elevation.resolution)
         step = observed & self._step(elevation, height, level)
+        step = _whole_obstacles(step, observed & (np.abs(height - level) >= self.skirt))
         passable = observed & ~step
         radius = _cells(self.footprint, elevation.resolution)
         roughness = fit_planes(height, passable, radius, _LEVERAGE)[3]
@@ -96,6 +102,7 @@ class Binarise(Stage):
         for share in _ABOVE:
             around = fit_planes(height, ground, wide, _LEVERAGE)
             ground = observed & ~(height - around[0] > share * self.max_step)
+        ground &= ~(around[0] - height > _BELOW * self.max_step)
         for share in _ABOUT:
             local = fit_planes(height, ground, near, _LEVERAGE)
             level = np.where(np.isfinite(local[0]), local[0], around[0])
@@ -118,6 +125,14 @@ class Binarise(Stage):
         below = (level - bottom >= limit) & (level - height >= limit / 4)
         within = (top - bottom >= limit) & (height - bottom >= limit / 4) & (top - height >= limit / 4)
         return above | below | within
+
+
+def _whole_obstacles(peaks: Array, raised: Array) -> Array:
+    """The cells of all connected sets of `raised` cells that have one of `peaks` among them, (rows, cols) bool."""
+    obstacles, _ = label(raised | peaks, np.ones((3, 3)))
+    dangerous = np.bincount(obstacles[peaks], minlength=obstacles.max() + 1) > 0
+    dangerous[0] = False
+    return dangerous[obstacles]  # type: ignore[no-any-return]
 
 
 def _cells(width: float, resolution: float) -> int:

@@ -3,7 +3,8 @@
 The paper's k-nearest-neighbour filter measures distances in space, which on the ground grow with the square of the
 range: it mistakes distance for error. The default here asks the image instead: a point stays where enough of its
 neighbours in the image see the same surface, judged in inverse depth, in which near and far ground look alike. It takes
-time linear in the points; the paper's filter remains as method "knn".
+time linear in the points. Patches that support themselves but touch nothing else go as well. The paper's filter remains
+as method "knn".
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from stages.data import Array, PointCloud
-from stages.kernels.outliers import supported
+from stages.kernels.outliers import supported, usual_slope
+from stages.kernels.patches import depth_images, patch_sizes
 from stages.stage import Stage, parameter
 
 
@@ -25,6 +27,8 @@ class Clean(Stage):
     The crop comes first, so that the far field has no say in what is an outlier near by. It is a ball about the camera
     of `region` + `margin`: before levelling nobody knows what is horizontal, and with the margin it holds all ground
     within the region for any camera up to 4 m above it. Voxelise cuts the exact circle.
+
+    method "organised" needs at least every 4th pixel of a row and of a column; sparser clouds have no neighbours.
     """
 
     method: str = parameter("organised", "outlier removal", choices=("organised", "knn"))
@@ -37,6 +41,10 @@ class Clean(Stage):
     spread: float = parameter(2.0, "organised: steepest slope of a surface, in multiples of the ground's", low=0.0)
     share: float = parameter(0.3, "organised: part of the 32 neighbours that must agree", low=0.0, high=1.0)
     least: int = parameter(4, "organised: neighbours without which a point cannot be judged, and goes", low=1, high=32)
+    patch: float = parameter(
+        5e-4, "organised: part of the cloud below which a patch with nothing around it at its depth goes",
+        low=0.0, high=1.0,
+    )  # fmt: skip
     neighbours: int = parameter(20, "knn: number of nearest neighbours", low=1)
 
     def __call__(self, cloud: PointCloud) -> PointCloud:
@@ -46,10 +54,10 @@ class Clean(Stage):
         keep = self._organised(cloud) if self.method == "organised" else self._knn(cloud)
         return replace(
             cloud,
-            points=cloud.points[keep],
-            colors=cloud.colors[keep],
-            sigma=cloud.sigma[keep],
-            pixel=cloud.pixel[keep],
+            points=cloud.points.take(keep, axis=0),
+            colors=cloud.colors.take(keep, axis=0),
+            sigma=cloud.sigma.take(keep),
+            pixel=cloud.pixel.take(keep),
         )
 
     def _organised(self, cloud: PointCloud) -> Array:
@@ -58,7 +66,7 @@ class Clean(Stage):
             raise ValueError("Clean: the cloud does not say its image's shape; set it, or use method: knn")
         if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < cloud.shape[0] * cloud.shape[1]:
             raise ValueError(f"Clean: the cloud has pixel indices outside its image of shape {cloud.shape}")
-        return np.flatnonzero(
+        kept = np.flatnonzero(
             supported(
                 cloud.points,
                 cloud.sigma,
@@ -71,6 +79,13 @@ class Clean(Stage):
                 self.least,
             )
         )
+        return kept[self._patches(cloud, kept, cloud.shape) >= self.patch * len(kept)]
+
+    def _patches(self, cloud: PointCloud, kept: Array, shape: tuple[int, int]) -> Array:
+        """Of each point that was kept, how many points its patch has."""
+        inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, kept, shape, self.deviations)
+        sizes = patch_sizes(inverse, tolerance, self.spread * usual_slope(inverse))
+        return sizes.ravel().take(cloud.pixel.take(kept))
 
     def _knn(self, cloud: PointCloud) -> Array:
         """Indices of the points that stay, by the mean distance to their nearest neighbours in space."""

@@ -11,6 +11,10 @@ import numpy as np
 
 from stages.data import Array
 
+# Least determinant / trace of the cells' spread, which is close to its smaller eigenvalue: a band less than three cells
+# wide has no slope across. No ratio of small integers equals it, so that rounding does not decide.
+_NARROWEST = 0.4142
+
 
 def fit_planes(heights: Array, use: Array, radius: int, leverage: float) -> Array:
     """The plane fitted to the window of (2 * radius + 1)^2 cells about each cell.
@@ -61,7 +65,7 @@ def _fit_planes(heights, use, radius, leverage, planes):  # type: ignore[no-unty
                 if col < 0 or col >= cols:
                     continue
                 sign = 1.0 if side == 0 else -1.0
-                x, s = float(col), sums[col]
+                x, s = np.float64(col), sums[col]
                 n += sign * s[0]
                 sx += sign * x * s[0]
                 sxx += sign * x * x * s[0]
@@ -82,8 +86,7 @@ def _solve(plane, row, col, leverage, n, sx, sy, sz, sxx, sxy, syy, sxz, syz, sz
     vxx, vxy, vyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
     vxz, vyz, vzz = sxz / n - mx * mz, syz / n - my * mz, szz / n - mz * mz
     determinant = vxx * vyy - vxy * vxy
-    # determinant / trace is close to the smaller eigenvalue: a band less than about two cells wide has no cross slope.
-    if determinant < 0.4 * (vxx + vyy):
+    if determinant < _NARROWEST * (vxx + vyy):
         return
     dx, dy = col - mx, row - my
     if 1.0 + (vyy * dx * dx - 2.0 * vxy * dx * dy + vxx * dy * dy) / determinant > leverage * n:
@@ -108,7 +111,7 @@ def fit_planes_reference(heights: Array, use: Array, radius: int, leverage: floa
             continue
         dx, dy = dx + left - col, dy + top - row
         spread = np.cov(dx, dy, bias=True)
-        if np.linalg.det(spread) < 0.4 * np.trace(spread):
+        if np.linalg.det(spread) < _NARROWEST * np.trace(spread):
             continue
         design = np.column_stack([np.ones(n), dx, dy]).astype(float)
         if np.linalg.inv(design.T @ design)[0, 0] > leverage:

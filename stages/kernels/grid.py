@@ -46,7 +46,8 @@ def _cell_statistics(points, noise, lever, cells_per_metre, x0, y0, size, region
     cells[:, :, 3] = np.inf
     cells[:, :, 4] = -np.inf
     for i in range(points.shape[0]):
-        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        # numba's float() of a float32 stays a float32.
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if not (x * x + y * y <= region * region and np.isfinite(z)):
             continue
         col = int(np.floor((x - x0) * cells_per_metre))

@@ -92,7 +92,7 @@ def pixel_rays(points: Array, pixel: Array, width: int) -> Array:
 def _inverse_depth(points, pixel, height, width, reach):  # type: ignore[no-untyped-def]
     inverse = np.full((height, width), np.nan, np.float32)
     for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if z > 0.0 and x * x + y * y + z * z <= reach * reach:
             inverse[pixel[i] // width, pixel[i] % width] = 1.0 / z
     return inverse
@@ -104,7 +104,7 @@ def _supported(points, sigma, pixel, inverse, offsets, deviations, slope, share,
     enough = int(np.ceil(share * len(offsets)))
     keep = np.zeros(points.shape[0], np.bool_)
     for i in range(points.shape[0]):
-        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if not (z > 0.0 and x * x + y * y + z * z <= reach * reach):
             continue
         row, col = pixel[i] // width, pixel[i] % width
@@ -144,7 +144,7 @@ def supported_reference(
     p = points.astype(np.float64)
     near = (p[:, 2] > 0) & ((p**2).sum(axis=1) <= reach**2)
     inverse = np.full(shape, np.nan, np.float32)
-    inverse.ravel()[pixel[near]] = 1 / points[near, 2]
+    inverse.ravel()[pixel[near]] = 1 / p[near, 2]
     slope = spread * usual_slope(inverse)
     rays = pixel_rays(points, pixel, shape[1])
     row, col = np.divmod(pixel, shape[1])

@@ -27,7 +27,7 @@ def transform_points(points: Array, rotation: Array, translation: Array) -> Arra
 def _transform_points(points, r, t):  # type: ignore[no-untyped-def]
     moved = np.empty(points.shape, np.float32)
     for i in range(points.shape[0]):
-        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         moved[i, 0] = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]
         moved[i, 1] = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]
         moved[i, 2] = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]

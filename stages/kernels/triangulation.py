@@ -62,7 +62,7 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
     sigma_best, sigma_worst, sigma_filled = sigmas
     count = 0
     for i in range(disparity.size):
-        if _depth(float(disparity[i]), source[i], shift, focal_baseline, max_depth, filled) > 0.0:
+        if _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled) > 0.0:
             count += 1
     points = np.empty((count, 3), np.float32)
     rgb = np.empty((count, 3), np.uint8)
@@ -71,13 +71,13 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
     green, blue = (1, 2) if colors.shape[1] == 3 else (0, 0)
     n = 0
     for i in range(disparity.size):
-        z = _depth(float(disparity[i]), source[i], shift, focal_baseline, max_depth, filled)
+        z = _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled)
         if z > 0.0:
             points[n, 0] = (i % width - cx) * z / fx
             points[n, 1] = (i // width - cy) * z / fy
             points[n, 2] = z
             rgb[n, 0], rgb[n, 1], rgb[n, 2] = colors[i, 0], colors[i, green], colors[i, blue]
-            trust = min(float(confidence[i]), 1.0) if confidence[i] > 0.0 else 0.0
+            trust = min(np.float64(confidence[i]), 1.0) if confidence[i] > 0.0 else 0.0
             sigma_d = sigma_worst + (sigma_best - sigma_worst) * trust
             if source[i] == _FILLED:
                 sigma_d = max(sigma_d, sigma_filled)

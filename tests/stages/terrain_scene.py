@@ -1,4 +1,4 @@
-"""Scenes with an exact truth for the terrain tests: a plane with rocks seen by a camera, and terrain grids with rocks."""
+"""Scenes with an exact truth for the terrain tests: a plane with rocks seen by a camera; terrain grids."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def rolling_terrain(
     cells: int = 160,
     resolution: float = 0.05,
 ) -> Terrain:
-    """Sloping, rolling ground with half-ellipsoid rocks 0.22 to 0.5 m high, averaged over cells, every cell observed."""
+    """Sloping, rolling ground with half-ellipsoid rocks 0.22 to 0.5 m high, averaged over cells, all observed."""
     random = np.random.default_rng(seed)
     fine = 4
     extent = cells * resolution / 2

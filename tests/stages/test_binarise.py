@@ -149,7 +149,8 @@ def test_rubble_too_low_to_be_a_step_is_too_rough() -> None:
 def test_what_was_not_seen_is_unknown_never_free() -> None:
     terrain = rolling_terrain(2)
     seen = np.random.default_rng(0).random((160, 160)) > 0.3
-    layers = {name: np.where(seen, layer, np.nan).astype(np.float32) for name, layer in terrain.elevation.layers.items()}
+    complete = terrain.elevation.layers
+    layers = {name: np.where(seen, layer, np.nan).astype(np.float32) for name, layer in complete.items()}
     layers["count"] = np.nan_to_num(layers["count"])
     for method in ("footprint", "absolute"):
         result = Binarise(method=method)(replace(terrain.elevation, layers=layers))
@@ -201,6 +202,6 @@ def test_plane_kernel_equals_the_plain_reference(seed: int, radius: int, share: 
     random = np.random.default_rng(seed)
     heights = random.normal(0, 1, (12, 15))
     use = random.random(heights.shape) < share
-    got, want = fit_planes(heights, use, radius, 0.25), fit_planes_reference(heights, use, radius, 0.25)
+    got, want = fit_planes(heights, use, radius, 0.2503), fit_planes_reference(heights, use, radius, 0.2503)
     np.testing.assert_array_equal(np.isnan(got), np.isnan(want))
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from stages.clean import Clean
 from stages.data import LEVEL_FRAME, Array, PointCloud, Transform
 from stages.kernels.outliers import supported, supported_reference
+from stages.kernels.patches import patch_sizes, patch_sizes_reference
 from stages.reproject import Reproject
 from tests.stages.terrain_scene import (
     CAMERA,
     HEIGHT,
-    ROCKS,
     as_disparity,
     blank_frame,
     level_from_camera,
@@ -26,9 +26,10 @@ from tests.stages.terrain_scene import (
 RINGS = ((0, 2), (2, 4), (4, 6), (6, 8))
 
 
-def cloud_with_noise(seed: int = 0, sigma: float = 0.25, rocks: tuple[tuple[float, float, float], ...] = ROCKS) -> PointCloud:
-    d = seen_disparity(rocks)
-    return Reproject(max_depth=50)(blank_frame(), as_disparity(d + np.random.default_rng(seed).normal(0, sigma, d.shape)))
+def cloud_with_noise(seed: int = 0, sigma: float = 0.25) -> PointCloud:
+    d = seen_disparity()
+    d = d + np.random.default_rng(seed).normal(0, sigma, d.shape)
+    return Reproject(max_depth=50)(blank_frame(), as_disparity(d))
 
 
 def with_floaters(cloud: PointCloud, share: float, seed: int = 1) -> tuple[PointCloud, Array]:
@@ -91,6 +92,25 @@ def test_a_speck_of_three_by_three_pixels_goes_and_a_rock_stays() -> None:
     pixels = Clean()(Reproject()(blank_frame(), as_disparity(d))).pixel
     assert not np.isin([300 * 640 + 100, 301 * 640 + 101, 302 * 640 + 102], pixels).any()
     assert np.isin(np.flatnonzero(rock), pixels).mean() > 0.99
+
+
+def test_a_mismatch_of_a_hundred_pixels_that_supports_itself_goes() -> None:
+    d = seen_disparity()
+    d[300:308, 100:112] *= 2
+    cloud = Reproject()(blank_frame(), as_disparity(d))
+    patch = (np.arange(300, 308)[:, None] * 640 + np.arange(100, 112)).ravel()
+    assert not np.isin(patch, Clean()(cloud).pixel).any()
+    assert np.isin(patch[20:70], Clean(patch=0.0)(cloud).pixel).any()
+
+
+def test_patch_kernel_equals_scipys_connected_components() -> None:
+    random = np.random.default_rng(7)
+    inverse = random.integers(1, 4, (40, 50)).astype(np.float32)
+    inverse[random.random(inverse.shape) < 0.4] = np.nan
+    tolerance = random.uniform(0, 0.6, inverse.shape).astype(np.float32)
+    got, want = patch_sizes(inverse, tolerance, 0.2), patch_sizes_reference(inverse, tolerance, 0.2)
+    assert len(np.unique(want)) > 8
+    np.testing.assert_array_equal(got, want)
 
 
 def test_kernel_equals_the_plain_reference() -> None:

@@ -90,8 +90,11 @@ def test_variance_is_that_of_the_mean_when_errors_are_independent() -> None:
     seen = truth + ray * (random.normal(0, 0.05, len(truth)) / depth)[:, None]
     grid = Voxelise(correlated=1.0)(cloud_of(seen, sigma=0.05))
     full = grid.layers["count"] > 60
+    # Away from the ground's edges, where only points thrown outwards arrive.
+    x = grid.origin[0] + (np.arange(320) + 0.5) * 0.05
+    full &= (x > 3.3) & (x < 4.7)
     ratio = grid.layers["elevation"][full] ** 2 / grid.layers["variance"][full]
-    # Scatter and depth noise are the same error here, counted twice on purpose: a cell never claims less than it should.
+    # Scatter and depth noise are the same error here, counted twice on purpose: a cell never claims too little.
     assert 0.4 < ratio.mean() < 0.6
     correlated = Voxelise(correlated=25.0)(cloud_of(seen, sigma=0.05)).layers["variance"][full]
     np.testing.assert_allclose(correlated, grid.layers["variance"][full] * 25, rtol=1e-4)
@@ -109,7 +112,8 @@ def test_kernel_equals_the_plain_reference() -> None:
 
 def test_a_cloud_that_is_not_level_is_refused() -> None:
     cloud = PointCloud(
-        0, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32), "cam"
+        0, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32),
+        "cam",
     )  # fmt: skip
     with pytest.raises(ValueError, match="'cam', not 'level'"):
         Voxelise()(cloud)

@@ -1,0 +1,216 @@
+"""Makes our data of ROS 2 messages: images, calibrations, tilts and poses, whatever encoding they came in.
+
+Every function raises LogError, with what is wrong, for a message that does not hold what it should. A tilt is a
+direction, never angles: a quaternion turns the world's z axis into the sensor's frame; bare pitch and roll become a
+direction by the model that the pipeline file names.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from recordings.errors import LogError
+from recordings.ros2 import stamp_of
+from stages.data import Array, CameraModel, Pose, Tilt, Transform
+
+# Encoding -> (dtype, channels in the message, conversion to gray or RGB)
+_PLAIN: dict[str, tuple[str, int, int | None]] = {
+    "mono8": ("u1", 1, None),
+    "8UC1": ("u1", 1, None),
+    "mono16": ("u2", 1, None),
+    "16UC1": ("u2", 1, None),
+    "rgb8": ("u1", 3, None),
+    "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
+    "8UC3": ("u1", 3, cv2.COLOR_BGR2RGB),  # OpenCV's own name for its own order
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB),
+    "8UC4": ("u1", 4, cv2.COLOR_BGRA2RGB),
+    "rgb16": ("u2", 3, None),
+    "bgr16": ("u2", 3, cv2.COLOR_BGR2RGB),
+}
+# OpenCV's short names say what is at (1, 1), ROS names say what is at (0, 0): the long names of OpenCV agree with ROS.
+_BAYER = {
+    "bayer_rggb": cv2.COLOR_BayerRGGB2RGB,
+    "bayer_bggr": cv2.COLOR_BayerBGGR2RGB,
+    "bayer_gbrg": cv2.COLOR_BayerGBRG2RGB,
+    "bayer_grbg": cv2.COLOR_BayerGRBG2RGB,
+}
+_ENCODINGS = _PLAIN | {f"{name}{bits}": (f"u{bits // 8}", 1, code) for name, code in _BAYER.items() for bits in (8, 16)}
+
+
+def stamp_or(header: Any, log_time: int) -> int:
+    """The header's stamp, ns; where the sender left it zero, the time the message was logged."""
+    stamp = stamp_of(header)
+    if stamp < 0:
+        raise LogError(f"its stamp is negative ({stamp} ns)")
+    return stamp or log_time
+
+
+def pixels_of(message: Any) -> Array:
+    """Gray (H, W) or RGB (H, W, 3) pixels, uint8 or uint16, of a sensor_msgs Image or CompressedImage."""
+    return _raw_pixels(message) if hasattr(message, "encoding") else _compressed_pixels(message)
+
+
+def _raw_pixels(message: Any) -> Array:
+    if message.encoding not in _ENCODINGS:
+        known = ", ".join(_ENCODINGS)
+        raise LogError(f"image encoding '{message.encoding}' is not one of those that can be read ({known})")
+    kind, channels, conversion = _ENCODINGS[message.encoding]
+    height, width, data = int(message.height), int(message.width), np.asarray(message.data, np.uint8)
+    row = width * channels * int(kind[1])
+    step = int(message.step) or row
+    if height == 0 or width == 0:
+        raise LogError(f"the image is empty ({width}x{height})")
+    if step < row:
+        raise LogError(f"the image's step of {step} bytes is shorter than a row of {width} {message.encoding} pixels")
+    needed = (height - 1) * step + row  # the last row need not be padded
+    if data.size < needed:
+        raise LogError(f"the image is cut: {data.size} of {needed} bytes are there")
+    rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
+    order = ">" if message.is_bigendian else "<"
+    pixels = np.ascontiguousarray(rows).view(f"{order}{kind}").astype(kind, copy=False)
+    pixels = pixels.reshape((height, width) if channels == 1 else (height, width, channels))
+    return _converted(pixels, conversion)
+
+
+def _compressed_pixels(message: Any) -> Array:
+    data = np.ascontiguousarray(message.data, np.uint8)
+    content = data.tobytes()
+    # OpenCV fills the missing part of a cut picture with gray and says nothing.
+    whole = {b"\xff\xd8": content.rstrip(b"\0").endswith(b"\xff\xd9"), b"\x89P": b"IEND" in content[-64:]}
+    if not whole.get(content[:2], True):
+        raise LogError(f"the compressed image is cut after {data.size} bytes")
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        raise LogError(f"the compressed image (format '{message.format}') cannot be decoded; it should be JPEG or PNG")
+    encoding = message.format.split(";")[0].strip()
+    if pixels.ndim == 2:
+        return _converted(pixels, _BAYER.get(encoding.rstrip("0123456789")))
+    return _converted(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
+
+
+def _converted(pixels: Array, conversion: int | None) -> Array:
+    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
+
+
+def camera_model(info: Any) -> CameraModel:
+    """The calibration of a sensor_msgs/CameraInfo, as it stands."""
+    return CameraModel(
+        width=int(info.width), height=int(info.height), k=info.k.reshape(3, 3), d=info.d, r=info.r.reshape(3, 3),
+        p=info.p.reshape(3, 4), model=info.distortion_model or "plumb_bob",
+    )  # fmt: skip
+
+
+def transform_of(message: Any) -> Transform:
+    """The transform of a geometry_msgs/TransformStamped."""
+    moved, turned = message.transform.translation, message.transform.rotation
+    rotation = rotation_of(turned, f"the transform {message.header.frame_id} <- {message.child_frame_id}")
+    return Transform(
+        message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/"), rotation.as_matrix(),
+        np.array([moved.x, moved.y, moved.z]),
+    )  # fmt: skip
+
+
+def rotation_of(quaternion: Any, what: str) -> Rotation:
+    """The rotation of a geometry_msgs/Quaternion that is a unit quaternion, or nearly."""
+    values = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
+    if not abs(float(np.linalg.norm(values)) - 1) < 1e-2:
+        raise LogError(f"the quaternion of {what} is not a rotation: {values.tolist()}")
+    return Rotation.from_quat(values)
+
+
+def pose_of(message: Any, log_time: int, base_frame: str) -> Pose:
+    """The pose of nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped.
+
+    base_frame: whose pose it is where the message does not say.
+    """
+    placed = message.pose if hasattr(message.pose, "covariance") else None
+    pose = message.pose.pose if placed is not None else message.pose
+    covariance = placed.covariance.reshape(6, 6) if placed is not None else None
+    if covariance is not None and (not covariance.any() or covariance[0, 0] < 0):
+        covariance = None  # all zero or -1: not known
+    position = np.array([pose.position.x, pose.position.y, pose.position.z])
+    if not np.isfinite(position).all():
+        raise LogError(f"the pose is at {position.tolist()}")
+    child = getattr(message, "child_frame_id", "") or base_frame
+    return Pose(
+        stamp_or(message.header, log_time), position, rotation_of(pose.orientation, "the pose").as_quat(),
+        message.header.frame_id, child, covariance,
+    )  # fmt: skip
+
+
+def tilt_of(message: Any, log_time: int, frame_id: str | None = None) -> Tilt:
+    """The tilt of a sensor_msgs/Imu, geometry_msgs/QuaternionStamped or Quaternion.
+
+    The quaternion turns the sensor's frame into a world whose z is up (REP 145), so up in the sensor's frame is the
+    third row of its matrix. frame_id: the sensor's frame, where the message's own is not to be used.
+    """
+    if hasattr(message, "orientation_covariance") and message.orientation_covariance[0] == -1:
+        raise LogError("the Imu says that it has no orientation (orientation_covariance[0] is -1)")
+    quaternion = next((q for name in ("orientation", "quaternion") if (q := getattr(message, name, None))), message)
+    up = rotation_of(quaternion, "the inclinometer").as_matrix()[2]
+    return _tilt(message, log_time, frame_id, up)
+
+
+def _tilt(message: Any, log_time: int, frame_id: str | None, up: Array) -> Tilt:
+    header = getattr(message, "header", None)
+    stamp = stamp_or(header, log_time) if header is not None else log_time
+    frame = frame_id or (header.frame_id.lstrip("/") if header is not None else "") or "inclinometer"
+    return Tilt(stamp, up / np.linalg.norm(up), frame)
+
+
+@dataclass(frozen=True)
+class Angle:
+    """Where an angle stands in a message and what it means: field path ("vector.x"), unit, and sign (+1 or -1)."""
+
+    field: str
+    unit: Literal["deg", "rad"]
+    sign: int
+
+    def __call__(self, message: Any) -> float:
+        """The angle in radians, in our sense of sign."""
+        value: Any = message
+        for name in self.field.split("."):
+            if not hasattr(value, name):
+                raise LogError(f"the message has no field '{self.field}' ({type(value).__name__} has no '{name}')")
+            value = getattr(value, name)
+        if not isinstance(value, int | float) or not np.isfinite(value):
+            raise LogError(f"field '{self.field}' holds {value}, which is not an angle")
+        return self.sign * float(np.deg2rad(value) if self.unit == "deg" else value)
+
+
+@dataclass(frozen=True)
+class Angles:
+    """How bare pitch and roll make a direction, in a sensor frame x forward, y left, z up.
+
+    A positive pitch has the nose up, a positive roll the left side up (both after `sign`). model "axis": the angles of
+    the x and the y axis to the horizon, what an inclinometer measures. model "euler": pitch is that of the x axis, roll
+    turns about the pitched x axis.
+    """
+
+    pitch: Angle
+    roll: Angle
+    model: Literal["axis", "euler"]
+
+    def __call__(self, message: Any, log_time: int) -> Tilt:
+        """The tilt that a message's two angles tell."""
+        return _tilt(message, log_time, None, up_of(self.pitch(message), self.roll(message), self.model))
+
+
+def up_of(pitch: float, roll: float, model: Literal["axis", "euler"]) -> Array:
+    """The unit vector up, in x forward, y left, z up, of a pitch (nose up) and a roll (left side up), rad."""
+    if model == "euler":
+        return np.array([np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
+    forward, left = np.sin(pitch), np.sin(roll)
+    rest = 1 - forward * forward - left * left
+    if rest < 0:
+        angles = f"pitch {np.rad2deg(pitch):.1f} and roll {np.rad2deg(roll):.1f} degrees"
+        raise LogError(
+            f"{angles} cannot both be angles of perpendicular axes to the horizon; check unit and tilt_model"
+        )
+    return np.array([forward, left, np.sqrt(rest)])

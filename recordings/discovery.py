@@ -1,0 +1,245 @@
+"""Finds which topics of a log are the stereo pair, its calibrations, the inclinometer and the pose.
+
+By schema first, then by name: two image topics are a pair where exchanging left and right in one name gives the other.
+It never guesses: where two candidates are equal, or none is there, the answer is a sentence that names them and the
+setting that decides.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO = "sensor_msgs/msg/CameraInfo"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+IMU = "sensor_msgs/msg/Imu"
+TILTS = (IMU, "geometry_msgs/msg/QuaternionStamped", "geometry_msgs/msg/Quaternion")
+BARE_TILT = "geometry_msgs/msg/Vector3Stamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSES = (ODOMETRY, "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs/msg/PoseStamped")
+
+# What names the left camera, and what names its partner.
+SIDES = (
+    (re.compile("left"), "right"),
+    (re.compile("Left"), "Right"),
+    (re.compile("LEFT"), "RIGHT"),
+    (re.compile(r"(?<![A-Za-z])l(?![A-Za-z])"), "r"),
+    (re.compile(r"(?<=infra)1(?!\d)"), "2"),
+    (re.compile(r"(?<!\d)0(?!\d)"), "1"),
+)
+_TRANSPORTS = re.compile(r"/(compressed|compressedDepth|ffmpeg|theora)$")
+_NOT_SENSORS = ("/truth/", "/nav/")  # ground truth, and what an earlier run has written; used only where told
+_OTHER_IMAGES = re.compile(r"compressedDepth$|(^|[/_])(depth|disparity|mask|truth|confidence|theora)([/_]|$)")
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic that can be decoded. schema: full ROS 2 name; messages: how many the log holds."""
+
+    name: str
+    schema: str
+    messages: int
+
+
+@dataclass
+class Topics:
+    """What was found: the topic of each role (left, right, left_info, right_info, inclinometer, odometry), and for
+    each stream without one, why, and what to do."""
+
+    chosen: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+
+
+class Settings(Protocol):
+    """Topic names that the user gave, None where they are to be found."""
+
+    @property
+    def left(self) -> str | None: ...
+    @property
+    def right(self) -> str | None: ...
+    @property
+    def left_info(self) -> str | None: ...
+    @property
+    def right_info(self) -> str | None: ...
+    @property
+    def inclinometer(self) -> str | None: ...
+    @property
+    def odometry(self) -> str | None: ...
+
+
+def discover(topics: Sequence[Topic], settings: Settings, oriented: Iterable[str], bare_angles: bool) -> Topics:
+    """The topics of each role.
+
+    oriented: the Imu topics whose messages do have an orientation; bare_angles: whether the settings say how bare
+    pitch and roll are to be read.
+    """
+    told = {settings.left, settings.right, settings.inclinometer, settings.odometry}
+    topics = [topic for topic in topics if topic.name in told or not topic.name.startswith(_NOT_SENSORS)]
+    found = Topics()
+    _find_images(topics, settings, found)
+    for side in ("left", "right"):
+        if side in found.chosen:
+            _find_info(topics, settings, side, found)
+    _find_tilt(topics, settings, set(oriented), bare_angles, found)
+    _find_pose(topics, settings, found)
+    return found
+
+
+def partners(name: str) -> list[str]:
+    """The names that the right camera may have if `name` is the left one's, the likeliest first."""
+    found: list[str] = []
+    for word, other in SIDES:
+        if matches := list(word.finditer(name)):
+            found.append(word.sub(other, name))
+            found += [name[: match.start()] + other + name[match.end() :] for match in matches]
+    return list(dict.fromkeys(found))
+
+
+def _find_images(topics: Sequence[Topic], settings: Settings, found: Topics) -> None:
+    images = [topic for topic in topics if topic.schema in IMAGES]
+    names = {topic.name for topic in images}
+    for side, given in (("left", settings.left), ("right", settings.right)):
+        if given is not None and given not in names:
+            found.missing[side] = _not_there(side, given, "image", images)
+    if found.missing:
+        return
+    candidates = [topic for topic in images if topic.messages and not _OTHER_IMAGES.search(topic.name)]
+    if settings.left and settings.right:
+        found.chosen.update(left=settings.left, right=settings.right)
+        return
+    by_name = {topic.name: topic for topic in candidates}
+    pairs = [
+        (left, by_name[name])
+        for left in candidates
+        for name in partners(left.name)
+        if name in by_name
+        and settings.left in (None, left.name)
+        and settings.right in (None, name)
+        and by_name[name].schema == left.schema
+    ]
+    if not pairs:
+        listed = _listed(candidates)
+        why = {
+            0: "the log has no camera image",
+            1: f"the log has one image topic only ({listed}), stereo needs two",
+        }.get(len(candidates), f"no two image topics are named like a left and a right one ({listed})")
+        remedy = "; set 'left' and 'right' of the source to the topics" if len(candidates) > 1 else ""
+        found.missing.update(left=why + remedy, right=why + remedy)
+        return
+    best = max(map(_rank, pairs))
+    equal = [pair for pair in pairs if _rank(pair) == best]
+    if len(equal) > 1:
+        listed = ", ".join(f"{left.name} with {right.name}" for left, right in equal)
+        why = f"several stereo pairs are equally good ({listed}); set 'left' and 'right' of the source"
+        found.missing.update(left=why, right=why)
+        return
+    found.chosen.update(left=equal[0][0].name, right=equal[0][1].name)
+
+
+def _rank(pair: tuple[Topic, Topic]) -> tuple[bool, bool, bool]:
+    """Rectified before raw, uncompressed before compressed, colour before gray."""
+    name = pair[0].name
+    return looks_rectified(name), pair[0].schema == IMAGES[0], "color" in name or "rgb" in name
+
+
+def looks_rectified(topic: str) -> bool:
+    """Whether an image topic calls itself rectified, as image_proc names its output."""
+    return re.search(r"(^|[/_])rect(ified)?([/_]|$)", topic) is not None
+
+
+def _find_info(topics: Sequence[Topic], settings: Settings, side: str, found: Topics) -> None:
+    infos = [topic for topic in topics if topic.schema == INFO and topic.messages]
+    given = settings.left_info if side == "left" else settings.right_info
+    image = found.chosen[side]
+    if given is not None:
+        if given in {topic.name for topic in infos}:
+            found.chosen[f"{side}_info"] = given
+        else:
+            found.missing[side] = _not_there(f"{side}_info", given, "CameraInfo", infos)
+        return
+    base = _TRANSPORTS.sub("", image)
+    names = {topic.name for topic in infos}
+    for name in (f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info"):
+        if name in names:
+            found.chosen[f"{side}_info"] = name
+            return
+    pairs = [(left, right) for left in sorted(names) for right in partners(left) if right in names]
+    if len(pairs) == 1:
+        found.chosen[f"{side}_info"] = pairs[0][side == "right"]
+        return
+    listed = f"the log's CameraInfo topics are {_listed(infos)}" if infos else "the log has no CameraInfo"
+    remedy = f"set '{side}_info' of the source" if infos else "record it, or add it to the log"
+    found.missing[side] = f"no CameraInfo belongs to {image} ({listed}); {remedy}"
+
+
+def _find_tilt(
+    topics: Sequence[Topic], settings: Settings, oriented: set[str], bare_angles: bool, found: Topics
+) -> None:
+    given = settings.inclinometer
+    if given is not None:
+        topic = next((topic for topic in topics if topic.name == given and topic.messages), None)
+        if topic is None:
+            candidates = [topic for topic in topics if topic.schema in (*TILTS, BARE_TILT)]
+            found.missing["inclinometer"] = _not_there("inclinometer", given, "tilt", candidates)
+        elif not bare_angles and topic.schema not in TILTS:
+            found.missing["inclinometer"] = _undefined(topic)
+        else:
+            found.chosen["inclinometer"] = given
+        return
+    schemas = (*TILTS, BARE_TILT) if bare_angles else TILTS
+    candidates = [topic for topic in topics if topic.schema in schemas and topic.messages]
+    if bare_angles:
+        candidates = [topic for topic in candidates if topic.schema == BARE_TILT]
+    useful = [topic for topic in candidates if topic.schema != IMU or topic.name in oriented]
+    named = [topic for topic in useful if re.search("inclin|tilt", topic.name, re.IGNORECASE)]
+    choice = named or useful
+    if len(choice) == 1:
+        found.chosen["inclinometer"] = choice[0].name
+        return
+    bare = [topic for topic in topics if topic.schema == BARE_TILT and topic.messages]
+    if len(choice) > 1:
+        why = f"several topics could be the inclinometer ({_listed(choice)}); set 'inclinometer' of the source"
+    elif candidates:
+        why = f"{_listed(candidates)} holds no orientation (orientation_covariance[0] is -1); record one that does"
+    elif bare and not bare_angles:
+        why = _undefined(bare[0])
+    else:
+        why = "the log has no tilt (an Imu with orientation, a QuaternionStamped); set 'inclinometer' of the source"
+    found.missing["inclinometer"] = why
+
+
+def _undefined(topic: Topic) -> str:
+    return (
+        f"{topic.name} is a {topic.schema}, which does not say what its numbers mean; "
+        "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source"
+    )
+
+
+def _find_pose(topics: Sequence[Topic], settings: Settings, found: Topics) -> None:
+    poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
+    if settings.odometry is not None:
+        if settings.odometry in {topic.name for topic in poses}:
+            found.chosen["odometry"] = settings.odometry
+        else:
+            found.missing["odometry"] = _not_there("odometry", settings.odometry, "pose", poses)
+        return
+    choice = [topic for topic in poses if topic.schema == ODOMETRY]
+    if len(choice) == 1:
+        found.chosen["odometry"] = choice[0].name
+    elif choice:
+        found.missing["odometry"] = f"several odometries ({_listed(choice)}); set 'odometry' of the source"
+    else:
+        other = f" (there is {_listed(poses)}; set 'odometry' of the source to use it)" if poses else ""
+        found.missing["odometry"] = f"the log has no nav_msgs/Odometry{other}"
+
+
+def _not_there(setting: str, given: str, kind: str, topics: Sequence[Topic]) -> str:
+    listed = f"its {kind} topics are {_listed(topics)}" if topics else f"it has no {kind} topic that can be decoded"
+    return f"the source's '{setting}' is set to {given}, which is not such a topic of the log ({listed})"
+
+
+def _listed(topics: Sequence[Topic]) -> str:
+    return ", ".join(topic.name for topic in topics)

@@ -1,0 +1,283 @@
+"""What each type of `stages.data` looks like in a rerun recording: one function per type, registered with `@draws`.
+
+A picture that takes several types names them all. Its one trick: a canvas remembers what hangs where, and clears what a
+frame lacks in that frame's time step, so the viewer never shows the last frame's picture as this frame's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from recordings import paint
+from recordings.desk import Panel, Place
+from stages.data import (
+    LEVEL_FRAME,
+    Array,
+    Cell,
+    Disparity,
+    ElevationMap,
+    NavigationMap,
+    PointCloud,
+    Pose,
+    Source,
+    StereoFrame,
+    Tilt,
+)
+
+DISPARITY_STEPS = 8  # disparities are kept to 1/8 px: four fifths of the size that 1/16 px takes
+LIFT = 0.03  # m; hazards float that far above the ground, so that the surface does not swallow them
+LINE_SPACING = 2  # m, between the lines across a map
+FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+AMBER: paint.Rgb = (255, 210, 60)
+TEXT: paint.Rgb = (225, 228, 235)
+THUMBNAIL = 0.25  # size of the image in the camera's frustum
+
+Draw = Callable[..., str | None]
+PICTURES: dict[tuple[type, ...], Draw] = {}
+
+
+def draws(*kinds: type) -> Callable[[Draw], Draw]:
+    """Register a picture: `draw(canvas, path, item, ...)` logs items of these types under `path`, and may say in a few
+    words what it saw. A picture of one type is drawn for every stream of it; one of several types once a frame, from
+    the last stream of each, under the path of the first."""
+
+    def register(draw: Draw) -> Draw:
+        PICTURES[kinds] = draw
+        return draw
+
+    return register
+
+
+@dataclass(eq=False)
+class Canvas:
+    """Where pictures go: one recording, whose clocks stand at one frame.
+
+    hung: every place that ever had a picture, in the order of hanging; the desk is made from it.
+    """
+
+    recording: rr.RecordingStream
+    jpeg_quality: int
+    max_points: int
+    hung: dict[tuple[Panel, str], Place] = field(default_factory=dict)
+    _before: dict[str, type] = field(default_factory=dict)
+    _now: dict[str, type] = field(default_factory=dict)
+
+    def log(self, path: str, archetype: Any, *places: Place) -> None:
+        """Log at the frame's time; `places` are where the desk shall show it."""
+        self.recording.log(path, archetype)
+        self._now[path] = type(archetype)
+        for place in places:
+            self.hung.setdefault((place.panel, place.path), place)
+
+    def photograph(self, path: str, pixels: Array, place: Place) -> None:
+        """An image (H, W) gray or (H, W, 3) RGB, 8 or 16 bit, as JPEG."""
+        pixels = paint.eight_bit(pixels)
+        stored = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
+        self.log(path, rr.EncodedImage(contents=blob.tobytes(), media_type="image/jpeg"), place)
+
+    def labels(self, path: str, codes: Array, legend: Mapping[int, tuple[str, paint.Rgb]], place: Place) -> None:
+        """A label image (H, W); its names stand above it and appear on hover."""
+        names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
+        self.recording.log(path, rr.AnnotationContext(names), static=True)
+        self.log(f"{path}/labels", rr.SegmentationImage(codes.astype(np.uint8)), place)
+        self.legend(f"{path}/legend", codes.shape, legend.values())
+
+    def scale(self, path: str, shape: tuple[int, ...], low: float, high: float, unit: str, palette: int) -> None:
+        """The legend of a colour map: three of its values above the picture."""
+        values = np.linspace(low, high, 3)
+        colours = [(int(r), int(g), int(b)) for r, g, b in paint.colours(values, low, high, palette)]
+        names = [f"{value:.3g} {unit}" for value in values]
+        self.legend(path, shape, zip(names, colours, strict=True))
+
+    def legend(self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, paint.Rgb]]) -> None:
+        """Named dots above a picture of (H, W)."""
+        height, width = shape
+        names, colours = zip(*entries, strict=True)
+        dots = [((place + 0.5) * width / len(names), -0.14 * height) for place in range(len(names))]
+        # A label takes its dot's colour, which may be as dark as the desk: the text hangs on dots of its own.
+        self.log(path, rr.Points2D(dots, colors=colours, radii=rr.Radius.ui_points(5.0), draw_order=30.0))
+        pin = rr.Radius.ui_points(0.5)
+        texts = rr.Points2D(dots, colors=[TEXT], labels=names, show_labels=True, radii=pin, draw_order=31.0)
+        self.log(f"{path}/text", texts)
+
+    def clear_the_rest(self) -> None:
+        """Take down what hung in the frame before and was not drawn again."""
+        for path, kind in self._before.items():
+            if path in self._now:
+                continue
+            if issubclass(kind, rr.EncodedImage | rr.EncodedDepthImage):
+                # Cleared, it would go on being shown (rerun-io/rerun#12793); without bytes it is not.
+                self.recording.log(path, kind.from_fields(clear_unset=True))
+            else:
+                self.recording.log(path, rr.Clear(recursive=False))
+        self._before, self._now = self._now, {}
+
+
+@draws(StereoFrame)
+def draw_stereo(canvas: Canvas, path: str, frame: StereoFrame) -> None:
+    """Both images."""
+    canvas.photograph(f"{path}/left", frame.left, Place(Panel.LEFT, f"{path}/left", f"{path}: left"))
+    canvas.photograph(f"{path}/right", frame.right, Place(Panel.RIGHT, f"{path}/right", f"{path}: right"))
+
+
+@draws(Disparity)
+def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
+    """The disparities (hover reads them in px), where each comes from, and the superpixels' edges."""
+    steps = np.nan_to_num(disparity.pixels * DISPARITY_STEPS + 0.5).clip(0, 65535).astype(np.uint16)
+    _, blob = cv2.imencode(".png", steps, FAST_PNG)
+    limit = paint.disparity_limit(disparity.pixels)
+    image = rr.EncodedDepthImage(
+        blob.tobytes(), media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
+        depth_range=(0.0, limit * DISPARITY_STEPS),
+    )  # fmt: skip
+    canvas.log(f"{path}/pixels", image, Place(Panel.DISPARITY, f"{path}/pixels", path))
+    canvas.scale(f"{path}/pixels/scale", steps.shape, 0.0, limit, "px", cv2.COLORMAP_TURBO)
+    source = Place(Panel.SOURCE, f"{path}/source", f"{path}: source")
+    canvas.labels(f"{path}/source", disparity.source, paint.SOURCES, source)
+    if disparity.segments is not None:
+        edges = paint.segment_edges(disparity.segments).astype(np.uint8) * 255
+        _, blob = cv2.imencode(".png", edges, [*FAST_PNG, cv2.IMWRITE_PNG_BILEVEL, 1])
+        overlay = rr.EncodedImage(contents=blob.tobytes(), media_type="image/png", opacity=0.4, draw_order=10.0)
+        place = Place(Panel.SUPERPIXELS, f"{path}/superpixels", f"{path}: superpixels")
+        canvas.log(place.path, overlay, place)
+    percent = 100.0 * np.bincount(disparity.source.ravel(), minlength=len(Source)) / disparity.source.size
+    made = (f"{percent[kind]:.0f} % {kind.name.lower()}" for kind in (Source.PLANE, Source.FILLED) if percent[kind])
+    return f"{path} {', '.join([f'{100.0 - percent[Source.UNKNOWN]:.0f} % known', *made])}"
+
+
+@draws(PointCloud)
+def draw_cloud(canvas: Canvas, path: str, cloud: PointCloud) -> str:
+    """Every n-th point, where the cloud knows its sensor's place: the camera's own frame is nowhere in level space."""
+    if cloud.sensor is not None:
+        some = slice(None, None, max(1, -(-len(cloud.points) // canvas.max_points)))
+        points = rr.Points3D(cloud.points[some], colors=cloud.colors[some], radii=rr.Radius.ui_points(1.5))
+        canvas.log(f"{path}/points", points, Place(Panel.CLOUD, f"{path}/points", path, cloud.frame_id))
+        # An optical axis (z) below the horizon is pitch down, the image's right side (x) below it roll to the right.
+        for name, axis in (("camera pitch down", 2), ("camera roll right", 0)):
+            angle = float(np.degrees(np.arcsin(np.clip(-cloud.sensor.rotation[2, axis], -1.0, 1.0))))
+            canvas.log(f"{path}/{rr.escape_entity_path_part(name)}", rr.Scalars(angle))
+        canvas.hung.setdefault((Panel.ANGLE, path), Place(Panel.ANGLE, path, path))
+    return f"{path} {len(cloud.points)} points"
+
+
+@draws(Tilt)
+def draw_tilt(canvas: Canvas, path: str, tilt: Tilt) -> None:
+    """The angles of the inclinometer's axes to the horizon, up positive, in degrees."""
+    for name, along in (("x axis up", tilt.up[0]), ("y axis up", tilt.up[1])):
+        angle = float(np.degrees(np.arcsin(np.clip(along, -1.0, 1.0))))
+        place = Place(Panel.ANGLE, path, path)
+        canvas.log(f"{path}/{rr.escape_entity_path_part(name)}", rr.Scalars(angle), place)
+
+
+@draws(Pose)
+def draw_pose(canvas: Canvas, path: str, pose: Pose) -> None:
+    """An arrow along the rover's heading; the desk shows those of all frames so far."""
+    x, y, z, w = pose.quaternion
+    forward = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+    arrow = rr.Arrows3D(origins=[pose.position], vectors=[0.4 * forward], colors=[AMBER])
+    place = Place(Panel.TRAJECTORY, f"{path}/trajectory", f"{path} ({pose.frame_id})", pose.frame_id)
+    canvas.log(place.path, arrow, place)
+
+
+@draws(ElevationMap)
+def draw_terrain(canvas: Canvas, path: str, terrain: ElevationMap) -> str:
+    """Shaded relief, every layer with its values (hover reads them), and the surface in space."""
+    elevation, where = terrain.layers["elevation"], _frame_suffix(terrain.frame_id)
+    low, high = paint.elevation_limits(elevation)
+    rgb = paint.paint_elevation(terrain, (low, high))
+    relief = f"{path}/relief"
+    canvas.log(relief, rr.Image(paint.birds_eye(rgb)), Place(Panel.RELIEF, relief, f"relief{where}"))
+    canvas.scale(f"{relief}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
+    _lines_ahead(canvas, f"{relief}/lines", terrain.shape, terrain)
+    for name, layer in terrain.layers.items():
+        start, end = paint.value_limits(layer)
+        image = rr.DepthImage(
+            paint.birds_eye(layer.astype(np.float16)), meter=1.0, colormap=rr.components.Colormap.Turbo,
+            depth_range=(start - 0.1 * (end - start), end),  # the palette's darkest end is left to unknown cells
+        )  # fmt: skip
+        place = Place(Panel.LAYER, f"{path}/layers/{rr.escape_entity_path_part(name)}", f"{name}{where}")
+        canvas.log(place.path, image, place)
+    vertices, triangles = paint.surface(terrain)
+    if len(triangles):
+        known = np.isfinite(elevation)
+        mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_colors=rgb[known])
+        canvas.log(f"{path}/surface", mesh, Place(Panel.TERRAIN, f"{path}/surface", path, terrain.frame_id))
+    return f"{path} {len(vertices)} cells"
+
+
+@draws(NavigationMap)
+def draw_navigation(canvas: Canvas, path: str, navigation: NavigationMap) -> str:
+    """The three states of the cells, and their reasons."""
+    cells, where = paint.birds_eye(navigation.cells), _frame_suffix(navigation.frame_id)
+    canvas.labels(f"{path}/cells", cells, paint.CELLS, Place(Panel.MAP, f"{path}/cells", f"navigation{where}"))
+    _lines_ahead(canvas, f"{path}/cells/lines", navigation.cells.shape, navigation)
+    place = Place(Panel.REASON, f"{path}/reason", f"reason{where}")
+    canvas.labels(place.path, paint.birds_eye(navigation.reason), paint.REASONS, place)
+    free, hazard = (int(np.count_nonzero(cells == state)) for state in (Cell.FREE, Cell.HAZARD))
+    return f"{path} {free} free, {hazard} hazard"
+
+
+@draws(StereoFrame, PointCloud)
+def draw_camera(canvas: Canvas, path: str, frame: StereoFrame, cloud: PointCloud) -> None:
+    """The left image, small, in its frustum, where the cloud was seen from, and a plumb line to the ground plane."""
+    camera, sensor = frame.camera, cloud.sensor
+    if sensor is None:
+        return
+    small = cv2.resize(frame.left, None, fx=THUMBNAIL, fy=THUMBNAIL, interpolation=cv2.INTER_AREA)
+    height, width = small.shape[:2]
+    at, line = f"{path}/camera", f"{path}/plumb"
+    canvas.photograph(f"{at}/image", small, Place(Panel.CAMERA, at, path, cloud.frame_id))
+    pinhole = rr.Pinhole(
+        focal_length=(camera.fx * THUMBNAIL, camera.fy * THUMBNAIL), width=width, height=height, color=AMBER,
+        principal_point=((camera.cx + 0.5) * THUMBNAIL - 0.5, (camera.cy + 0.5) * THUMBNAIL - 0.5),
+        camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.7,
+    )  # fmt: skip
+    # Not the canvas's: a frame without a camera clears the image; the empty frustum may stay where it was last known.
+    canvas.recording.log(at, rr.Transform3D(translation=sensor.translation, mat3x3=sensor.rotation), pinhole)
+    plumb = [sensor.translation, sensor.translation * (1.0, 1.0, 0.0)]
+    strip = rr.LineStrips3D([plumb], colors=[AMBER], radii=rr.Radius.ui_points(1.0))
+    canvas.log(line, strip, Place(Panel.CAMERA, line, path, cloud.frame_id))
+
+
+@draws(NavigationMap, ElevationMap)
+def draw_hazards(canvas: Canvas, path: str, navigation: NavigationMap, terrain: ElevationMap) -> None:
+    """The hazard cells on the ground; a hazard without an elevation is only on the map."""
+    if (navigation.cells.shape, navigation.frame_id) != (terrain.shape, terrain.frame_id):
+        return
+    elevation = terrain.layers["elevation"]
+    row, col = np.nonzero((navigation.cells == Cell.HAZARD) & np.isfinite(elevation))
+    if len(row):
+        x, y = paint.cell_centres(terrain.shape, terrain.resolution, terrain.origin)
+        centres = np.column_stack([x[col], y[row], elevation[row, col] + LIFT])
+        hazards = rr.Points3D(centres, colors=[paint.CELLS[Cell.HAZARD][1]], radii=0.4 * terrain.resolution)
+        canvas.log(f"{path}/hazards", hazards, Place(Panel.TERRAIN, f"{path}/hazards", path, terrain.frame_id))
+
+
+def _frame_suffix(frame_id: str) -> str:
+    return "" if frame_id == LEVEL_FRAME else f" ({frame_id})"
+
+
+def _lines_ahead(canvas: Canvas, path: str, shape: tuple[int, int], grid: ElevationMap | NavigationMap) -> None:
+    """Lines across a bird's-eye view at every second metre of x, with their distance, and where the rover is."""
+    width = float(shape[0])
+    far, left = (start + count * grid.resolution for start, count in zip(grid.origin, shape[::-1], strict=True))
+    first, last = np.ceil(grid.origin[0] / LINE_SPACING), np.floor(far / LINE_SPACING)
+    ahead = LINE_SPACING * np.arange(first, last + 1)
+    depths = (far - ahead) / grid.resolution
+    lines = [[(0.0, depth), (width, depth)] for depth in depths]
+    thin = rr.Radius.ui_points(0.6)
+    canvas.log(path, rr.LineStrips2D(lines, colors=[(255, 255, 255, 80)], radii=thin, draw_order=20.0))
+    marks = [(width, depth) for depth in depths]
+    names = [f"{x:.0f} m" for x in ahead]
+    if grid.frame_id == LEVEL_FRAME:  # its origin is the rover
+        marks, names = [*marks, (left / grid.resolution, far / grid.resolution)], [*names, "rover"]
+    dot = rr.Radius.ui_points(2.0)
+    points = rr.Points2D(marks, labels=names, show_labels=True, colors=[(255, 255, 255)], radii=dot, draw_order=21.0)
+    canvas.log(f"{path}/distances", points)

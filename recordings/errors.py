@@ -1,0 +1,7 @@
+"""The one exception of this room: a recording that cannot be read or written, said in a sentence a user can act on."""
+
+from __future__ import annotations
+
+
+class LogError(Exception):
+    """One sentence: what is wrong, where (file, topic, stamp), and what to do about it."""

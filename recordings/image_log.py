@@ -1,0 +1,170 @@
+"""Makes a log out of stereo image files and a known camera attitude, for `roverflow import images`.
+
+The log says everything that a rover's own would: calibration, the camera's place on the rover, and an inclinometer. The
+rover stands level on the ground and the camera is mounted on it pitched and rolled, so the attitude is in /tf_static
+and the inclinometer, fixed to the rover, reads level.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from recordings.discovery import SIDES
+from recordings.errors import LogError
+from recordings.ros2 import Ros2Writer, camera_info, image, imu, transform_message
+from stages.data import Array, CameraModel, Transform
+
+SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
+FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
+CAMERAS = {"left": "left_camera_optical", "right": "right_camera_optical"}
+# A camera's axes (x right, y down, z forward) in the rover's (x forward, y left, z up), when it looks straight ahead.
+FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_REQUIRED, _OPTIONAL = ("fx", "cx", "cy", "baseline"), ("fy", "cx_right", "width", "height")
+
+
+def import_images(
+    left: Sequence[Path],
+    right: Sequence[Path],
+    calibration: Path | Mapping[str, Any],
+    out: Path,
+    *,
+    pitch_down: float,
+    roll: float = 0.0,
+    height: float,
+    rate: float = 1.0,
+) -> int:
+    """Write rectified image pairs as a log; returns how many.
+
+    calibration: YAML file or mapping with fx, cx, cy (px), baseline (m), and optionally fy, cx_right, width, height.
+    pitch_down: how far the camera looks below the horizon, deg; roll: about its line of sight, deg, right side down
+    positive; height: of the left camera above the ground, m; rate: pairs a second in the log.
+    Raises LogError for files that cannot be read or do not fit the calibration.
+    """
+    values = _calibration(calibration)
+    if len(left) != len(right) or not left:
+        raise LogError(
+            f"{len(left)} left and {len(right)} right images are not pairs; give as many of both, at least one"
+        )
+    if not rate > 0 or not height > 0:
+        raise LogError(f"rate ({rate} Hz) and height ({height} m) must be positive")
+    rotation = Rotation.from_euler("YX", [pitch_down, roll], degrees=True).as_matrix() @ FORWARD
+    mounted = Transform("base_link", CAMERAS["left"], rotation, np.array([0.0, 0.0, height]))
+    beside = Transform(CAMERAS["left"], CAMERAS["right"], np.eye(3), np.array([values["baseline"], 0.0, 0.0]))
+    sensor = Transform("base_link", "imu_link", np.eye(3), np.zeros(3))
+    period = round(1e9 / rate)
+    around = min(10_000_000, period // 4)  # ns; so that a tilt is on both sides of every frame
+    with Ros2Writer(out) as writer:
+        first = FIRST_STAMP - around
+        writer.write("/tf_static", transform_message([(t, first) for t in (mounted, beside, sensor)]), first)
+        for number, pair in enumerate(zip(left, right, strict=True)):
+            stamp = FIRST_STAMP + number * period
+            _write_tilt(writer, stamp - around)
+            _write_pair(writer, stamp, pair, values)
+            _write_tilt(writer, stamp)
+            _write_tilt(writer, stamp + around)
+    return len(left)
+
+
+def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The left and the right images of a folder, in order: a-left.png with a-right.png, left/1.png with right/1.png,
+    im0.png with im1.png. Raises LogError where there are none, or one lacks its partner."""
+    if not folder.is_dir():
+        raise LogError(f"{folder} is not a folder; give the folder that holds the left and right images")
+    files = sorted((f for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
+    names = {file.relative_to(folder).as_posix(): file for file in files}
+    for word, other in SIDES:
+        pairs = [(name, word.sub(other, name)) for name in names if word.search(name)]
+        found = [(one, two) for one, two in pairs if two in names]
+        if not found:
+            continue
+        alone = [one for one, two in pairs if two not in names]
+        if alone and word.pattern.lower() == "left":
+            raise LogError(f"{folder}: {alone[0]} has no right partner; add it, or take the image away")
+        return [names[one] for one, _ in found], [names[two] for _, two in found]
+    raise LogError(
+        f"{folder} holds no image pairs; name them alike but for left/right, l/r or 0/1 ({len(files)} images)"
+    )
+
+
+def _natural(file: Path, folder: Path) -> list[tuple[int, int, str]]:
+    """A key that sorts numbers in names by value."""
+    parts = re.split(r"(\d+)", file.relative_to(folder).as_posix())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
+
+
+def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
+    """The calibration's values, complete. Raises LogError naming what is wrong with it."""
+    where = "the calibration" if isinstance(given, Mapping) else str(given)
+    if isinstance(given, Mapping):
+        loaded: Any = dict(given)
+    else:
+        try:
+            loaded = yaml.safe_load(Path(given).read_text())
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise LogError(f"cannot read the calibration {given}: {error}") from error
+    if not isinstance(loaded, dict):
+        raise LogError(f"{where} must map names to numbers: {', '.join(_REQUIRED)}")
+    for name in _REQUIRED:
+        if name not in loaded:
+            raise LogError(
+                f"{where} lacks '{name}'; it needs {', '.join(_REQUIRED)} and may have {', '.join(_OPTIONAL)}"
+            )
+    for name, value in loaded.items():
+        if name not in (*_REQUIRED, *_OPTIONAL):
+            raise LogError(f"{where} has the unknown '{name}'; it may have {', '.join((*_REQUIRED, *_OPTIONAL))}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise LogError(f"{where}: '{name}' must be a number, not {value!r}")
+        if name in ("fx", "fy", "baseline", "width", "height") and value <= 0:
+            raise LogError(f"{where}: '{name}' must be positive, not {value}")
+    return {"fy": loaded["fx"], "cx_right": loaded["cx"], **loaded}
+
+
+def _write_tilt(writer: Ros2Writer, stamp: int) -> None:
+    writer.write("/imu/data", imu(stamp, "imu_link", np.array([0.0, 0.0, 0.0, 1.0])), stamp)
+
+
+def _write_pair(writer: Ros2Writer, stamp: int, pair: tuple[Path, Path], values: Mapping[str, float]) -> None:
+    images = [_pixels(path) for path in pair]
+    height, width = images[0].shape[:2]
+    if images[0].shape != images[1].shape or images[0].dtype != images[1].dtype:
+        shapes = " and ".join("x".join(map(str, pixels.shape)) for pixels in images)
+        raise LogError(f"{pair[0]} and {pair[1]} differ in size or kind ({shapes})")
+    if (values.get("width", width), values.get("height", height)) != (width, height):
+        raise LogError(
+            f"{pair[0]} is {width}x{height}, the calibration is for {values['width']:g}x{values['height']:g}"
+        )
+    for side, pixels in zip(("left", "right"), images, strict=True):
+        model = _model(side, width, height, values)
+        writer.write(f"/stereo/{side}/camera_info", camera_info(stamp, CAMERAS[side], model), stamp)
+        writer.write(f"/stereo/{side}/image_rect", image(stamp, CAMERAS[side], pixels), stamp)
+
+
+def _model(side: str, width: int, height: int, values: Mapping[str, float]) -> CameraModel:
+    cx = values["cx"] if side == "left" else values["cx_right"]
+    k = np.array([[values["fx"], 0.0, cx], [0.0, values["fy"], values["cy"]], [0.0, 0.0, 1.0]])
+    p = np.hstack([k, np.zeros((3, 1))])
+    if side == "right":
+        p[0, 3] = -values["fx"] * values["baseline"]
+    return CameraModel(width, height, k, np.zeros(5), np.eye(3), p)
+
+
+def _pixels(path: Path) -> Array:
+    """Gray or RGB pixels of an image file."""
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        raise LogError(f"{path} is not an image of 8 or 16 bit that can be read")
+    if pixels.ndim == 2:
+        return np.asarray(pixels)
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB))

@@ -1,0 +1,182 @@
+"""What a log holds, for `roverflow info`: topics, rates and gaps, calibration, transforms, how many frames would pair
+up, how much of the traverse has a tilt, what is missing and what is damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recordings.mcap_index import Lost
+from recordings.mcap_source import CAMERAS, McapLog, McapSource, peek_stamp
+from stages.data import Tilt
+
+SLOP = 5_000_000  # ns between the two images of a frame
+TILT_GAP = 200_000_000  # ns between the tilts around a frame
+
+Stamps = NDArray[np.int64]
+
+
+def describe(path: Path, source: McapSource) -> dict[str, Any]:
+    """The inventory of a log, as plain JSON values. Raises LogError where the file is no log that can be read.
+
+    source: how the log's streams are found, as in a pipeline file.
+    """
+    with source.open(Path(path)) as log:
+        damage = sorted({f"{lost.reason}" for lost in log.file.index.lost})
+        stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
+        tilted = _tilted(stamps["left"], _tilts(log, damage))
+        return {
+            "path": str(path),
+            "size_bytes": log.file.size,
+            "profile": log.file.index.profile,
+            "indexed": not log.file.index.walked,
+            "start": log.file.start,
+            "end": log.file.end,
+            "duration_s": (log.file.end - log.file.start) / 1e9,
+            "topics": _topics(log),
+            "streams": dict(log.topics),
+            "calibration": _calibration(log),
+            "frames": {
+                "left": len(stamps["left"]),
+                "right": len(stamps["right"]),
+                "pairs": _pairs(stamps["left"], stamps["right"]),
+                "slop_s": SLOP / 1e9,
+                "with_tilt": tilted,
+                "tilt_gap_s": TILT_GAP / 1e9,
+            },
+            "transforms": log.static.listed(),
+            "mount": _mount(log),
+            "missing": dict(log.missing),
+            "damage": damage,
+        }
+
+
+def format_description(description: dict[str, Any]) -> str:
+    """The inventory as lines for a terminal."""
+    d = description
+    how = "indexed" if d["indexed"] else "no index"
+    lines = [f"{d['path']}: {d['duration_s']:.3f} s, {d['size_bytes'] / 1e6:.1f} MB, {how}", ""]
+    rows = [("topic", "schema", "messages", "Hz", "gap", "stream")]
+    roles = {topic: stream for stream, topic in d["streams"].items()}
+    for topic in d["topics"]:
+        hz = "" if topic["hz"] is None else f"{topic['hz']:.2f}"
+        gap = "" if topic["largest_gap_s"] is None else f"{topic['largest_gap_s']:.3f} s"
+        name = topic["topic"]
+        rows.append((name, topic["schema"], str(topic["messages"]), hz, gap, roles.get(name, "")))
+    widths = [max(len(row[column]) for row in rows) for column in range(6)]
+    for row in rows:
+        cells = [
+            cell.rjust(w) if 2 <= n <= 4 else cell.ljust(w) for n, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    lines.append("")
+    if camera := d["calibration"]:
+        state = "rectified" if camera["rectified"] else "not rectified"
+        lines.append(
+            f"camera: {camera['width']}x{camera['height']}, fx {camera['fx']:.3f} px, "
+            f"baseline {camera['baseline']:.4f} m, {state}, frame '{camera['frame_id']}'"
+        )
+    frames = d["frames"]
+    lines.append(
+        f"frames: {frames['pairs']} pairs within {frames['slop_s'] * 1e3:g} ms of {frames['left']} left and "
+        f"{frames['right']} right images; {frames['with_tilt']} with a tilt around them"
+    )
+    if d["mount"]:
+        down = "unknown" if d["mount"]["base"] is None else f"in '{d['mount']['base']}' at {d['mount']['position']}"
+        lines.append(f"mount: camera {down}")
+    lines += [f"transform: {transform}" for transform in d["transforms"]]
+    lines += [f"missing: {stream}: {why}" for stream, why in d["missing"].items()]
+    lines += [f"damaged: {what}" for what in d["damage"]]
+    return "\n".join(lines)
+
+
+def _topics(log: McapLog) -> list[dict[str, Any]]:
+    index, found = log.file.index, []
+    for channel in sorted(index.channels.values(), key=lambda channel: channel.topic):
+        schema = index.schemas.get(channel.schema_id)
+        times = log.file.times(channel.topic)
+        gaps = np.diff(times)
+        span = float(times[-1] - times[0]) / 1e9 if times.size > 1 else 0.0
+        found.append(
+            {
+                "topic": channel.topic,
+                "schema": schema.name if schema else "",
+                "encoding": channel.message_encoding,
+                "messages": int(times.size),
+                "hz": (times.size - 1) / span if span > 0 else None,
+                "largest_gap_s": float(gaps.max()) / 1e9 if gaps.size else None,
+            }
+        )
+    return found
+
+
+def _stamps(log: McapLog, stream: str, damage: list[str]) -> Stamps:
+    """The stamps of a camera's images, ns, sorted, without decoding them; what is lost goes to `damage`."""
+    if stream not in log.topics:
+        return np.zeros(0, np.int64)
+    topic, stamps = log.topics[stream], []
+    for raw in log.file.messages(log.file.channels_of([topic])):
+        if not isinstance(raw, Lost):
+            stamps.append(peek_stamp(raw.data) or raw.log_time)
+        elif raw.channel is not None:
+            damage.append(f"{topic} at {raw.log_time} ns: {raw.reason}")
+    return np.sort(np.array(stamps, np.int64))
+
+
+def _tilts(log: McapLog, damage: list[str]) -> Stamps:
+    """The stamps of the tilts, ns, sorted; what cannot be read goes to `damage`."""
+    stamps = []
+    for _, stream, item in log.events(("inclinometer",)):
+        if isinstance(item, Tilt):
+            stamps.append(item.stamp)
+        elif stream == "inclinometer":
+            damage.append(str(item))
+    return np.sort(np.array(stamps, np.int64))
+
+
+def _pairs(left: Stamps, right: Stamps) -> int:
+    """How many left images have a right one within the slop, each right image used once."""
+    pairs = place = 0
+    for stamp in left.tolist():
+        while place < right.size and right[place] < stamp - SLOP:
+            place += 1
+        if place < right.size and right[place] <= stamp + SLOP:
+            pairs, place = pairs + 1, place + 1
+    return pairs
+
+
+def _tilted(left: Stamps, tilt: Stamps) -> int:
+    """How many left images lie between two tilts that are close enough to interpolate."""
+    if not tilt.size:
+        return 0
+    after = np.searchsorted(tilt, left)
+    inside = after < tilt.size
+    later = tilt[np.minimum(after, tilt.size - 1)]
+    earlier = tilt[np.maximum(after - 1, 0)]
+    return int(np.sum(inside & ((later == left) | ((after > 0) & (later - earlier <= TILT_GAP)))))
+
+
+def _calibration(log: McapLog) -> dict[str, Any] | None:
+    if log.cameras is None:
+        return None
+    left, right = (camera.model for camera in log.cameras)
+    return {
+        "width": left.width, "height": left.height, "fx": float(left.p[0, 0]), "fy": float(left.p[1, 1]),
+        "cx": float(left.p[0, 2]), "cy": float(left.p[1, 2]), "cx_right": float(right.p[0, 2]),
+        "baseline": float(left.p[0, 3] / left.p[0, 0] - right.p[0, 3] / right.p[0, 0]),
+        "rectified": log.cameras[0].rectified, "frame_id": log.cameras[0].frame_id,
+    }  # fmt: skip
+
+
+def _mount(log: McapLog) -> dict[str, Any] | None:
+    if log.mount is None:
+        return None
+    base = log.mount.base_from_camera
+    return {
+        "camera_from_inclinometer": log.mount.camera_from_inclinometer.tolist(),
+        "base": None if base is None else base.parent,
+        "position": None if base is None else base.translation.tolist(),
+    }

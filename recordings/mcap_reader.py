@@ -1,0 +1,247 @@
+"""Reads the raw messages of an MCAP file in log-time order, whatever state the file is in.
+
+Chunks wait in a queue by their start time and are opened when their turn comes, so memory holds what overlaps and no
+more. CRCs are always checked. What cannot be read comes as a `Lost` in its place in time, and reading goes on: a broken
+chunk costs its own messages, a cut file what was cut.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from heapq import heapify, heappop, heappush
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Schema
+from numpy.typing import NDArray
+
+from recordings.errors import LogError
+from recordings.mcap_index import (
+    BROKEN,
+    MAGIC,
+    RECORD,
+    Loose,
+    Lost,
+    Raw,
+    from_summary,
+    raw,
+    read,
+    records,
+    said,
+    unpacked,
+    walk,
+)
+from recordings.ros2_types import decoder_for
+
+
+class McapFile:
+    """An MCAP file open for reading; use as a context manager.
+
+    start, end: log time of the first and the last message, ns; `index.walked` tells that the file had no index (or a
+    broken one) and was read through. Raises LogError where there is nothing to read: no such file, not an MCAP file, no
+    messages.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self._file = _opened(self.path)
+        try:
+            self.size = self.path.stat().st_size
+            self.index = from_summary(self._file, self.size) or walk(self._file, self.size)
+            self.start, self.end = self._time_range()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def channel(self, number: int) -> Channel:
+        """A channel by its number."""
+        return self.index.channels[number]
+
+    def schema(self, channel: Channel) -> Schema | None:
+        """The schema of a channel's messages, None where it has none."""
+        return self.index.schemas.get(channel.schema_id)
+
+    def channels_of(self, topics: Iterable[str]) -> set[int]:
+        """The channels that carry the topics; several may carry one."""
+        wanted = set(topics)
+        return {number for number, channel in self.index.channels.items() if channel.topic in wanted}
+
+    def messages(self, channels: set[int], start: int | None = None, end: int | None = None) -> Iterator[Raw | Lost]:
+        """The messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
+
+        What is lost of them, or may be, comes in its place.
+        """
+        low, high = (0 if start is None else start), (1 << 64 if end is None else end)
+        queue = self._queue(channels)
+        found = dict.fromkeys(channels, 0)
+        while queue and queue[0][0] < high:
+            log_time, offset, _, item = heappop(queue)
+            if isinstance(item, ChunkIndex):
+                if item.message_end_time >= low:
+                    for place, inside in enumerate(self._chunk_or_lost(item)):
+                        heappush(queue, (inside[1], offset, place, inside))
+            elif item.channel is None or item.channel in channels:
+                if item.channel is not None:
+                    found[item.channel] += 1
+                if log_time >= low:
+                    yield self._loose_message(item) if isinstance(item, Loose) else item
+        if start is None and end is None:
+            yield from self._unaccounted(found)
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        """The log times of a topic's messages, ns, sorted; where the file is indexed, without reading the messages."""
+        channels, found = self.channels_of([topic]), list[int]()
+        if self.index.walked:
+            for channel in channels:
+                found.extend(self.index.times.get(channel, ()))
+        else:
+            for chunk in self._chunks(channels):
+                found.extend(item.log_time for item in self._contents(chunk) if item.channel in channels)
+        return np.sort(np.array(found, dtype=np.uint64).astype(np.int64))
+
+    def count(self, topic: str) -> int:
+        """How many messages of a topic the file holds, by its statistics or by the walk."""
+        channels, index = self.channels_of([topic]), self.index
+        if index.walked:
+            return sum(len(index.times.get(channel, ())) for channel in channels)
+        return sum(index.expected.get(channel, 0) for channel in channels)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> McapFile:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _queue(self, channels: set[int]) -> list[tuple[int, int, int, Any]]:
+        """What may be read, as a heap of (time, offset in the file, place in a chunk, thing)."""
+        index = self.index
+        queue: list[tuple[int, int, int, Any]] = []
+        queue += [(lost.log_time, self.size, place, lost) for place, lost in enumerate(index.lost)]
+        queue += [
+            (found.log_time, self.size, place - len(index.rescued), found) for place, found in enumerate(index.rescued)
+        ]
+        queue += [(loose.log_time, loose.offset, -1, loose) for loose in index.loose if loose.channel in channels]
+        queue += [(chunk.message_start_time, chunk.chunk_start_offset, -1, chunk) for chunk in self._chunks(channels)]
+        heapify(queue)
+        return queue
+
+    def _chunks(self, channels: set[int]) -> list[ChunkIndex]:
+        """The chunks that hold, or may hold, messages of the channels."""
+        chunks = self.index.chunks
+        return [c for c in chunks if not c.message_index_offsets or channels & c.message_index_offsets.keys()]
+
+    def _chunk_or_lost(self, chunk: ChunkIndex) -> list[Raw] | list[Lost]:
+        """The messages of a chunk, or one `Lost` for each that its message index knows of."""
+        try:
+            return self._chunk_messages(chunk)
+        except BROKEN as error:
+            reason = f"the chunk at byte {chunk.chunk_start_offset} is broken and its messages are lost ({said(error)})"
+        try:
+            known = self._message_index(chunk)
+        except BROKEN:
+            known = []
+        known = known or [(number, chunk.message_start_time) for number in chunk.message_index_offsets]
+        lost = [Lost(channel, log_time, reason) for channel, log_time in known]
+        return lost or [Lost(None, chunk.message_start_time, reason)]
+
+    def _chunk_messages(self, chunk: ChunkIndex) -> list[Raw]:
+        record = read(self._file, chunk.chunk_start_offset, min(chunk.chunk_length, self.size))
+        expected = (int(Opcode.CHUNK), chunk.chunk_length - RECORD.size)
+        if len(record) < RECORD.size or RECORD.unpack_from(record) != expected:
+            raise ValueError("no chunk is where the index has one")
+        inside = records(unpacked(record[RECORD.size :]))
+        return [raw(content) for opcode, content in inside if opcode == Opcode.MESSAGE]
+
+    def _loose_message(self, loose: Loose) -> Raw:
+        return Raw(loose.channel, loose.log_time, memoryview(read(self._file, loose.offset, loose.size)))
+
+    def _contents(self, chunk: ChunkIndex) -> list[Raw] | list[Lost]:
+        """Channel and log time of a chunk's messages, from its message index where it has one."""
+        try:
+            known = self._message_index(chunk)
+        except BROKEN:
+            known = []
+        return [Raw(number, time, memoryview(b"")) for number, time in known] or self._chunk_or_lost(chunk)
+
+    def _message_index(self, chunk: ChunkIndex) -> list[tuple[int, int]]:
+        """(channel, log time) of each message, from the message index behind a chunk; empty where there is none."""
+        found: list[tuple[int, int]] = []
+        first = chunk.chunk_start_offset + chunk.chunk_length
+        for opcode, content in records(read(self._file, first, min(chunk.message_index_length, self.size))):
+            if opcode == Opcode.MESSAGE_INDEX:
+                channel, size = struct.unpack_from("<HI", content)
+                pairs = np.frombuffer(content, "<u8", size // 8, 6)
+                found.extend((channel, time) for time in pairs[::2].tolist())
+        return found
+
+    def _unaccounted(self, found: dict[int, int]) -> Iterator[Lost]:
+        """Messages that the file's statistics count and that nothing else has told of."""
+        if any(item.channel is None for item in self.index.lost):
+            return
+        for channel, count in sorted(found.items()):
+            if (expected := self.index.expected.get(channel, count)) > count:
+                yield Lost(channel, self.end, f"the log's statistics count {expected} messages, {count} were found")
+
+    def _time_range(self) -> tuple[int, int]:
+        """Log time of the first and the last message, ns."""
+        index = self.index
+        if not index.times and (index.walked or not any(index.expected.values())):
+            damage = f" that can be read: {index.lost[0].reason}" if index.lost else "; record it again"
+            raise LogError(f"{self.path} holds no messages{damage}")
+        if index.walked:
+            return min(map(min, index.times.values())), max(map(max, index.times.values()))
+        filled = [chunk for chunk in index.chunks if chunk.message_end_time] or index.chunks
+        return min(c.message_start_time for c in filled), max(c.message_end_time for c in filled)
+
+
+def iter_decoded(path: Path, topics: Iterable[str] | None = None) -> Iterator[tuple[str, int, Any]]:
+    """(topic, log time in ns, decoded message) of a log's ROS 2 CDR channels, in log-time order.
+
+    topics: which (None: all that are in CDR). Raises LogError at the first thing that cannot be read.
+    """
+    wanted = None if topics is None else set(topics)
+    with McapFile(Path(path)) as log:
+        decoders: dict[int, Callable[[bytes | memoryview], Any]] = {}
+        for number, channel in log.index.channels.items():
+            schema = log.schema(channel)
+            if schema and channel.message_encoding == "cdr" and (wanted is None or channel.topic in wanted):
+                decoders[number] = decoder_for(schema.name, schema.encoding, schema.data)
+        for item in log.messages(set(decoders)):
+            if isinstance(item, Lost):
+                raise LogError(f"{path}: {item.reason}")
+            topic = log.channel(item.channel).topic
+            try:
+                yield topic, item.log_time, decoders[item.channel](item.data)
+            except Exception as error:  # foreign bytes may fail a codec in any way
+                raise LogError(f"{path}: {topic} at {item.log_time} ns cannot be decoded ({said(error)})") from error
+
+
+def _opened(path: Path) -> BinaryIO:
+    """The file, open, if it begins like an MCAP file."""
+    if path.is_dir():
+        raise LogError(f"{path} is a folder; give the .mcap file in it")
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+    start = file.read(16)
+    if start.startswith(MAGIC):
+        return file
+    file.close()
+    if not start:
+        raise LogError(f"{path} is empty (0 bytes); record it again")
+    if start.startswith(b"#ROSBAG"):
+        raise LogError(f"{path} is a ROS 1 bag; convert it to MCAP first: mcap convert IN.bag OUT.mcap")
+    if start.startswith(b"SQLite format 3"):
+        raise LogError(f"{path} is a rosbag2 SQLite bag; convert it to MCAP first: mcap convert IN.db3 OUT.mcap")
+    raise LogError(f"{path} is not an MCAP log (it does not begin like one); give a .mcap file")

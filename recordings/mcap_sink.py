@@ -1,0 +1,116 @@
+"""Writes what a pipeline made into an MCAP log, as ROS 2 messages, one set a frame.
+
+All messages of a frame carry its stamp as log time, so a result lines up with the log it was made from. Nothing that
+differs between two equal runs goes in (no times of day, no durations): equal runs give equal bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from recordings.errors import LogError
+from recordings.frame_record import FrameRecord, LossEntry
+from recordings.ros2 import (
+    Ros2Writer,
+    diagnostics,
+    disparity_image,
+    grid_map,
+    occupancy_grid,
+    odometry,
+    point_cloud,
+    transform_message,
+)
+from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose
+
+_BUILDERS: dict[type, Callable[[Any], Any]] = {
+    Disparity: disparity_image,
+    PointCloud: point_cloud,
+    ElevationMap: grid_map,
+    NavigationMap: occupancy_grid,
+    Pose: odometry,
+}
+_OK, _ERROR = 0, 2  # levels of diagnostic_msgs/DiagnosticStatus
+_COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
+
+
+@dataclass
+class McapSink:
+    """Writes streams to /nav/<stream>, the frame's transforms to /tf, its losses to /nav/diagnostics.
+
+    results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each.
+    """
+
+    results: tuple[str, ...] = ("disparity", "points", "elevation_map", "navigation_map")
+
+    suffix = ".mcap"
+    _writer: Ros2Writer | None = field(default=None, init=False, repr=False)
+    _last_stamp: int | None = field(default=None, init=False, repr=False)
+
+    def wants(self, stream: str, kind: type) -> bool:
+        """Whether a stream of data of type `kind` is to be written. Raises LogError where it is but cannot be."""
+        if stream not in self.results:
+            return False
+        if kind not in _BUILDERS:
+            known = ", ".join(builder.__name__ for builder in _BUILDERS)
+            raise LogError(
+                f"McapSink cannot write '{stream}', a {kind.__name__} (it writes {known}); leave it out of results"
+            )
+        return True
+
+    def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
+        """Start the log. about: what it was made from and with, kept as its metadata record "roverflow"."""
+        self._last_stamp = None
+        self._writer = Ros2Writer(Path(path))
+        self._writer.metadata("roverflow", about)
+
+    def write(self, record: FrameRecord) -> None:
+        """Write a frame that is through."""
+        writer, stamp = self._opened(), record.stamp
+        for stream in self.results:
+            data = record.items.get(stream)
+            if data is not None:
+                writer.write(f"/nav/{stream}", _BUILDERS[type(data)](data), stamp)
+        clouds = [item for item in record.items.values() if isinstance(item, PointCloud) and item.sensor is not None]
+        transforms = {
+            (cloud.sensor.parent, cloud.sensor.child): (cloud.sensor, stamp) for cloud in clouds if cloud.sensor
+        }
+        if transforms:
+            writer.write("/tf", transform_message(transforms.values()), stamp)
+        writer.write("/nav/diagnostics", diagnostics(stamp, _statuses(record.entries)), stamp)
+        self._last_stamp = stamp
+
+    def close(self, summary: Mapping[str, Any]) -> None:
+        """Finish the log. summary: of the run: losses after the last frame ("entries"), verdict and counts."""
+        writer, self._writer = self._opened(), None
+        if writer.closed:  # a write failed, which was told then
+            return
+        entries = list(summary.get("entries", ()))
+        if entries:
+            latest = max(max(entry.stamp for entry in entries), 0)
+            stamp = latest if self._last_stamp is None else self._last_stamp
+            writer.write("/nav/diagnostics", diagnostics(stamp, _statuses(entries)), stamp)
+        counts = {name: str(summary[name]) for name in _COUNTS if name in summary}
+        for group in ("drops", "messages"):
+            counts |= {f"{group}.{name}": str(count) for name, count in summary.get(group, {}).items()}
+        writer.metadata("roverflow.run", counts)
+        writer.close()
+
+    def _opened(self) -> Ros2Writer:
+        if self._writer is None:
+            raise LogError("McapSink has not been opened")
+        return self._writer
+
+
+def _statuses(entries: Iterable[LossEntry]) -> list[tuple[int, str, str, dict[str, str]]]:
+    """Diagnostic statuses of losses: one each, or that there is none."""
+    statuses = [
+        (
+            _ERROR, f"{entry.stage}/{entry.stream}", entry.detail,
+            {"reason": str(entry.reason), "stream": entry.stream, "stage": entry.stage, "stamp": str(entry.stamp)},
+        )
+        for entry in entries
+    ]  # fmt: skip
+    return statuses or [(_OK, "roverflow", "nothing lost", {})]

@@ -1,0 +1,173 @@
+"""Numbers to colours: disparities, sources, terrain and maps as RGB arrays, for the rerun desk and for PNG pictures.
+
+Every picture of a grid is a bird's-eye view: x (forward) up, y (left) to the left, as the driver sees it. Unknown has a
+colour of its own that no value can have, and ranges are rounded, so that neighbouring frames share their colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason, Source
+
+Rgb = tuple[int, int, int]
+
+UNKNOWN_RGB: Rgb = (46, 47, 54)
+SOURCES: Mapping[int, tuple[str, Rgb]] = {
+    Source.UNKNOWN: ("unknown", UNKNOWN_RGB),
+    Source.MEASURED: ("measured", (62, 150, 104)),
+    Source.PLANE: ("plane", (84, 132, 222)),
+    Source.FILLED: ("filled", (232, 164, 60)),
+}
+CELLS: Mapping[int, tuple[str, Rgb]] = {
+    Cell.UNKNOWN: ("unknown", UNKNOWN_RGB),
+    Cell.FREE: ("free", (196, 204, 190)),
+    Cell.HAZARD: ("hazard", (216, 62, 48)),
+}
+REASONS: Mapping[int, tuple[str, Rgb]] = {
+    Reason.CLEAR: ("clear", CELLS[Cell.FREE][1]),
+    Reason.UNOBSERVED: ("unobserved", UNKNOWN_RGB),
+    Reason.ELEVATION: ("elevation", (216, 62, 48)),
+    Reason.STEP: ("step", (240, 140, 40)),
+    Reason.SLOPE: ("slope", (168, 90, 200)),
+    Reason.ROUGHNESS: ("roughness", (90, 140, 230)),
+}
+
+_LIGHT = np.array([1.0, 1.0, np.sqrt(2.0)]) / 2.0  # from ahead on the left, 45 degrees high: the upper left of the map
+_AMBIENT = 0.35
+
+
+def colours(values: Array, low: float, high: float, palette: int) -> Array:
+    """values, any shape (..., ), as RGB uint8 (..., 3) of an OpenCV palette over [low, high]; NaN is UNKNOWN_RGB."""
+    known = np.isfinite(values)
+    share = np.where(known, np.clip((values - low) / (high - low), 0.0, 1.0), 0.0)
+    level = (share * 255.0 + 0.5).astype(np.uint8)
+    rgb: Array = _table(palette)[level]
+    rgb[~known] = UNKNOWN_RGB
+    return rgb
+
+
+def legend_colours(codes: Array, legend: Mapping[int, tuple[str, Rgb]]) -> Array:
+    """codes, integers of any shape (..., ), as RGB uint8 (..., 3) by a legend; a code that is not in it is white."""
+    rgb = np.full((*codes.shape, 3), 255, np.uint8)
+    for code, (_, colour) in legend.items():
+        rgb[codes == code] = colour
+    return rgb
+
+
+def eight_bit(pixels: Array) -> Array:
+    """An 8 or 16 bit image as 8 bit: the image's top used bit becomes bit 7, so a 12 bit camera is not black."""
+    if pixels.dtype == np.uint8:
+        return pixels
+    shift = max(0, int(pixels.max(initial=0)).bit_length() - 8)
+    return (pixels >> shift).astype(np.uint8)
+
+
+def disparity_limit(disparity: Array) -> float:
+    """The upper end of the colour range, px: the 99.5th percentile rounded up to a multiple of 16, at least 16."""
+    sample = disparity[::4, ::4]
+    known = sample[np.isfinite(sample)]
+    return 16.0 * max(1.0, np.ceil(float(np.percentile(known, 99.5)) / 16.0)) if known.size else 16.0
+
+
+def paint_disparity(disparity: Array, limit: float | None = None) -> Array:
+    """Disparities (H, W), px, as RGB (H, W, 3): near is red, far is blue."""
+    return colours(disparity, 0.0, disparity_limit(disparity) if limit is None else limit, cv2.COLORMAP_TURBO)
+
+
+def segment_edges(labels: Array) -> Array:
+    """Where a pixel's right or lower neighbour belongs to another superpixel: labels (H, W) -> bool (H, W)."""
+    edges = np.zeros(labels.shape, bool)
+    np.not_equal(labels[:, 1:], labels[:, :-1], out=edges[:, :-1])
+    edges[:-1] |= labels[1:] != labels[:-1]
+    return edges
+
+
+def birds_eye(grid: Array) -> Array:
+    """A grid (rows along y, columns along x, ...) as a picture: x forward is up, y left is left."""
+    return np.ascontiguousarray(grid.swapaxes(0, 1)[::-1, ::-1])
+
+
+def elevation_limits(elevation: Array) -> tuple[float, float]:
+    """The colour range of a terrain, m: its 1st and 99th percentile rounded outwards to 0.1 m, at least 0.2 m apart."""
+    known = elevation[np.isfinite(elevation)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.percentile(known, (1.0, 99.0)))
+    low = np.floor(low * 10.0) / 10.0
+    return low, max(np.ceil(high * 10.0) / 10.0, low + 0.2)
+
+
+def value_limits(layer: Array) -> tuple[float, float]:
+    """The colour range of any layer: its 1st and 99th percentile; (0, 1) where nothing is known, never empty."""
+    known = layer[np.isfinite(layer)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.percentile(known, (1.0, 99.0)))
+    return low, high if high > low else low + 1.0
+
+
+def hillshade(elevation: Array, resolution: float) -> Array:
+    """Brightness of sunlit ground, (rows, cols) float in [0, 1]; slopes next to unknown cells are one-sided."""
+    slope_x, slope_y = (_slope(elevation, axis) / resolution for axis in (1, 0))
+    normal = np.sqrt(slope_x**2 + slope_y**2 + 1.0)
+    lit: Array = np.clip((_LIGHT[2] - _LIGHT[0] * slope_x - _LIGHT[1] * slope_y) / normal, 0.0, 1.0)
+    return _AMBIENT + (1.0 - _AMBIENT) * lit
+
+
+def paint_elevation(terrain: ElevationMap, limits: tuple[float, float] | None = None) -> Array:
+    """Shaded relief of the layer "elevation" as RGB (rows, cols, 3), in grid order (see `birds_eye`)."""
+    elevation = terrain.layers["elevation"]
+    low, high = elevation_limits(elevation) if limits is None else limits
+    rgb = colours(elevation, low, high, cv2.COLORMAP_VIRIDIS)
+    known = np.isfinite(elevation)
+    flat = _AMBIENT + (1.0 - _AMBIENT) * _LIGHT[2]  # level ground keeps the palette's colour
+    shade = hillshade(elevation, terrain.resolution)[known] / flat
+    rgb[known] = np.clip(rgb[known] * shade[:, None], 0.0, 255.0).astype(np.uint8)
+    return rgb
+
+
+def paint_navigation(navigation: NavigationMap) -> Array:
+    """Free, hazard and unknown cells as RGB (rows, cols, 3), in grid order (see `birds_eye`)."""
+    return legend_colours(navigation.cells, CELLS)
+
+
+def cell_centres(shape: tuple[int, int], resolution: float, origin: tuple[float, float]) -> tuple[Array, Array]:
+    """x of each column (cols,) and y of each row (rows,) of a grid, m."""
+    rows, cols = shape
+    return origin[0] + (np.arange(cols) + 0.5) * resolution, origin[1] + (np.arange(rows) + 0.5) * resolution
+
+
+def surface(terrain: ElevationMap) -> tuple[Array, Array]:
+    """The terrain as a mesh: vertices (n, 3) float32, one a known cell in grid order, and triangles (m, 3) uint32.
+
+    A triangle stands only where its three cells are known: holes stay holes.
+    """
+    elevation = terrain.layers["elevation"]
+    known = np.isfinite(elevation)
+    x, y = cell_centres(terrain.shape, terrain.resolution, terrain.origin)
+    row, col = np.nonzero(known)
+    vertices = np.column_stack([x[col], y[row], elevation[known]]).astype(np.float32)
+    number = np.full(terrain.shape, -1, np.int64)
+    number[known] = np.arange(len(vertices))
+    here, east, north, across = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    halves = ((here, east, across), (here, across, north))
+    triangles = np.concatenate([np.stack(corners, -1).reshape(-1, 3) for corners in halves])
+    return vertices, triangles[(triangles >= 0).all(1)].astype(np.uint32)
+
+
+def _slope(elevation: Array, axis: int) -> Array:
+    """Mean of the rises to the two neighbours along `axis`, per cell; a missing neighbour does not count."""
+    ahead = np.diff(elevation, axis=axis, append=np.nan)
+    behind = np.diff(elevation, axis=axis, prepend=np.nan)
+    sides = np.isfinite(ahead).astype(np.float32) + np.isfinite(behind)
+    return np.asarray((np.nan_to_num(ahead) + np.nan_to_num(behind)) / np.maximum(sides, 1.0))
+
+
+def _table(palette: int) -> Array:
+    """The 256 RGB colours of an OpenCV palette, (256, 3) uint8."""
+    steps = np.arange(256, dtype=np.uint8)[:, None]
+    return np.ascontiguousarray(cv2.applyColorMap(steps, palette)[:, 0, ::-1])

@@ -1,0 +1,155 @@
+"""PNG pictures of a result log: disparity, terrain and navigation map of a few frames, with scales and legends.
+
+The result log is read back as any consumer would read it, so a picture shows what was published. Maps are bird's-eye
+views: x (forward) up, y (left) to the left, with the coordinates of the map's frame at their edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recordings import paint
+from recordings.errors import LogError
+from recordings.ros2 import iter_messages, read_disparity, read_grid_map, read_occupancy_grid
+from stages.data import Array, ElevationMap, NavigationMap
+
+MAP_HEIGHT = 900  # px; maps are enlarged by a whole factor to about that
+MARGIN = 64  # px around a picture, for its scales
+INK, PAPER = (38, 40, 46), (250, 250, 248)
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def draw(result: Path, out: Path, frames: Sequence[int] | None = None) -> list[Path]:
+    """Write `frame-NNNN-{disparity,elevation,navigation}.png` into the folder `out`; returns the files, sorted.
+
+    result: a result log; frames: numbers of frames, negative from the end; None: the first, middle and last.
+    Raises LogError where the log holds nothing to draw, ValueError for a frame it does not hold.
+    """
+    stamps = sorted({stamp for _, stamp, _ in iter_messages(result, PAINTERS)})
+    if not stamps:
+        raise LogError(f"{result} holds none of {', '.join(PAINTERS)}; draw pictures of a result log")
+    chosen = {stamps[number]: number for number in _numbers(len(stamps), frames)}
+    out.mkdir(parents=True, exist_ok=True)
+    written = []
+    for topic, stamp, message in iter_messages(result, PAINTERS):
+        if stamp in chosen:
+            name, paint_message = PAINTERS[topic]
+            path = out / f"frame-{chosen[stamp]:04d}-{name}.png"
+            _write(path, paint_message(message))
+            written.append(path)
+    return sorted(written)
+
+
+def disparity_picture(disparity: Array) -> Array:
+    """Disparities (H, W), px, NaN = unknown, as an RGB picture with a colour bar."""
+    limit = paint.disparity_limit(disparity)
+    page = _page(paint.paint_disparity(disparity, limit), "disparity, px")
+    _bar(page, 0.0, limit, cv2.COLORMAP_TURBO)
+    return page
+
+
+def elevation_picture(terrain: ElevationMap) -> Array:
+    """Shaded relief of a terrain as an RGB picture with coordinates and a colour bar."""
+    low, high = paint.elevation_limits(terrain.layers["elevation"])
+    rgb = paint.paint_elevation(terrain, (low, high))
+    page = _map_page(rgb, terrain.resolution, terrain.origin, f"elevation, m ({terrain.frame_id})")
+    _bar(page, low, high, cv2.COLORMAP_VIRIDIS)
+    return page
+
+
+def navigation_picture(navigation: NavigationMap) -> Array:
+    """A navigation map as an RGB picture with coordinates and a legend."""
+    rgb = paint.paint_navigation(navigation)
+    title = f"navigation map ({navigation.frame_id})"
+    page = _map_page(rgb, navigation.resolution, navigation.origin, title)
+    _legend(page, paint.CELLS)
+    return page
+
+
+PAINTERS: Mapping[str, tuple[str, Callable[[Any], Array]]] = {
+    "/nav/disparity": ("disparity", lambda message: disparity_picture(read_disparity(message))),
+    "/nav/elevation_map": ("elevation", lambda message: elevation_picture(read_grid_map(message))),
+    "/nav/navigation_map": ("navigation", lambda message: navigation_picture(read_occupancy_grid(message))),
+}
+
+
+def _numbers(count: int, frames: Sequence[int] | None) -> Iterable[int]:
+    if frames is None:
+        return {0, count // 2, count - 1}
+    for number in frames:
+        if not -count <= number < count:
+            raise ValueError(f"there is no frame {number}: the log holds frames 0 to {count - 1}")
+    return {number % count for number in frames}
+
+
+def _page(picture: Array, title: str) -> Array:
+    """The picture (H, W, 3) on paper, with room at the right for a colour bar or legend."""
+    height, width = picture.shape[:2]
+    page = np.full((height + 2 * MARGIN, width + 4 * MARGIN, 3), PAPER, np.uint8)
+    page[MARGIN : MARGIN + height, MARGIN : MARGIN + width] = picture
+    _text(page, title, (MARGIN, MARGIN - 20), 0.8)
+    return page
+
+
+def _map_page(rgb: Array, resolution: float, origin: tuple[float, float], title: str) -> Array:
+    """A painted grid (rows, cols, 3) as a bird's-eye view, with x at its left and y below it, at every second metre."""
+    rows, cols = rgb.shape[:2]
+    zoom = max(1, MAP_HEIGHT // max(rows, cols))
+    page = _page(paint.birds_eye(rgb).repeat(zoom, 0).repeat(zoom, 1), title)
+    bottom, right = MARGIN + cols * zoom, MARGIN + rows * zoom
+    for x in _ticks(origin[0], cols * resolution):
+        row = round(bottom - (x - origin[0]) / resolution * zoom)
+        cv2.line(page, (MARGIN - 8, row), (MARGIN, row), INK, 2)
+        _text(page, f"{x:g}", (MARGIN - 46, row + 6))
+    for y in _ticks(origin[1], rows * resolution):
+        col = round(right - (y - origin[1]) / resolution * zoom)
+        cv2.line(page, (col, bottom), (col, bottom + 8), INK, 2)
+        _text(page, f"{y:g}", (col - 12, bottom + 30))
+    _text(page, "x forward, m", (8, MARGIN - 44))
+    _text(page, "y left, m", (right + 32, bottom + 30))
+    if origin[0] <= 0.0 <= origin[0] + cols * resolution and origin[1] <= 0.0 <= origin[1] + rows * resolution:
+        centre = (round(right + origin[1] / resolution * zoom), round(bottom + origin[0] / resolution * zoom))
+        cv2.drawMarker(page, centre, (230, 60, 200), cv2.MARKER_TRIANGLE_UP, 16, 3)
+    return page
+
+
+def _ticks(start: float, length: float) -> Array:
+    return 2.0 * np.arange(np.ceil(start / 2.0), np.floor((start + length) / 2.0) + 1) + 0.0  # no minus zero
+
+
+def _bar(page: Array, low: float, high: float, palette: int) -> None:
+    """A vertical colour bar with five values, and the colour of unknown below it."""
+    height, width = page.shape[0] - 2 * MARGIN, page.shape[1]
+    left, top, length = width - 2 * MARGIN - 32, MARGIN, height * 3 // 4
+    ramp = paint.colours(np.linspace(high, low, length), low, high, palette)
+    page[top : top + length, left : left + 28] = ramp[:, None]
+    for share in np.linspace(0.0, 1.0, 5):
+        _text(page, f"{high + share * (low - high):.3g}", (left + 36, round(top + share * (length - 1)) + 6))
+    _swatch(page, (left, top + length + 20), "unknown", paint.UNKNOWN_RGB)
+
+
+def _legend(page: Array, legend: Mapping[int, tuple[str, paint.Rgb]]) -> None:
+    left = page.shape[1] - 2 * MARGIN - 32
+    for place, (name, rgb) in enumerate(legend.values()):
+        _swatch(page, (left, MARGIN + 44 * place), name, rgb)
+
+
+def _swatch(page: Array, corner: tuple[int, int], name: str, rgb: paint.Rgb) -> None:
+    x, y = corner
+    cv2.rectangle(page, (x, y), (x + 27, y + 27), rgb, cv2.FILLED)
+    cv2.rectangle(page, (x, y), (x + 27, y + 27), INK, 1)
+    _text(page, name, (x + 36, y + 20))
+
+
+def _text(page: Array, text: str, at: tuple[int, int], size: float = 0.6) -> None:
+    cv2.putText(page, text, at, _FONT, size, INK, 1, cv2.LINE_AA)
+
+
+def _write(path: Path, rgb: Array) -> None:
+    _, blob = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    path.write_bytes(blob.tobytes())

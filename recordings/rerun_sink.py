@@ -1,0 +1,197 @@
+"""Writes every intermediate of a run into a rerun recording, for the debugging desk of `recordings.desk`.
+
+The pictures are in `recordings.drawings`; this is their clock, their ledger and their file. The file grows under a
+temporary name and takes its own when it is finished; rerun's errors, by its default mere warnings, are raised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from rerun.error_utils import catch_and_log_exceptions
+
+from recordings.desk import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, Place, desk
+from recordings.drawings import PICTURES, Canvas
+from recordings.errors import LogError
+from recordings.frame_record import FrameRecord, LossEntry
+from stages.data import Array, StereoFrame
+
+END = b"RRF2FOOT"  # the last magic number of a whole recording, before a checksum of 4 bytes
+
+
+@dataclass(eq=False)
+class RerunSink:
+    """Writes a rerun recording, which `rerun FILE.rrd` opens.
+
+    application_id: recordings of one application share the viewer's saved layout.
+    max_points: of a cloud at most so many points are kept, every n-th of them; the cloud in the result log is whole.
+    jpeg_quality: of the camera images, 1 to 100.
+    """
+
+    application_id: str = "roverflow"
+    max_points: int = 50_000
+    jpeg_quality: int = 80
+
+    suffix = ".rrd"
+
+    def __post_init__(self) -> None:
+        if self.max_points < 1:
+            raise ValueError(f"RerunSink.max_points must be at least 1, not {self.max_points}")
+        if not 1 <= self.jpeg_quality <= 100:
+            raise ValueError(f"RerunSink.jpeg_quality must be 1 to 100, not {self.jpeg_quality}")
+
+    def wants(self, stream: str, kind: type) -> bool:
+        """Whether there is a picture of items of type `kind`."""
+        return any(issubclass(kind, wanted) for kinds in PICTURES for wanted in kinds)
+
+    def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
+        """Begin a recording. streams: name -> type of item, in the pipeline's order; about: what to say of the run."""
+        self._path, self._streams, self._about = Path(path), tuple(streams), dict(about)
+        self._partial = self._path.with_name(self._path.name + ".partial")
+        self._stamp: int | None = None
+        self._frames, self._hung, self._closed = 0, -1, False
+        try:
+            self._partial.open("wb").close()
+        except OSError as error:
+            raise self._unwritable(error.strerror or str(error)) from error
+        with catch_and_log_exceptions(strict=True):
+            self._recording = rr.RecordingStream(self.application_id)
+            self._recording.set_log_time_enabled(False)
+            self._recording.set_sinks(rr.FileSink(str(self._partial)))
+            self._recording.send_recording_name(self._about.get("log", self._path.stem))
+            self._recording.log(SUMMARY, _document("RUNNING", self._about), static=True)
+        self._canvas = Canvas(self._recording, self.jpeg_quality, self.max_points)
+
+    def write(self, record: FrameRecord) -> None:
+        """Draw one frame. May be called from any thread, one call at a time."""
+        with catch_and_log_exceptions(strict=True):
+            self._set_clocks(record.stamp, self._frames)
+            captions = self._draw(record.items)
+            self._plot(SECONDS, record.seconds)
+            self._plot(QUEUES, record.queues)
+            self._canvas.clear_the_rest()
+            text = "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions])
+            self._recording.log(LEDGER, rr.TextLog(text, level=rr.TextLogLevel.INFO))
+            self._enter(record.entries, self._frames)
+            self._arrange()
+        self._frames += 1
+
+    def close(self, summary: Mapping[str, Any]) -> None:
+        """End the recording with the run's verdict and give it its name. Closing twice does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        verdict = str(summary.get("verdict", "INCOMPLETE"))
+        last = max(0, self._frames - 1)
+        drops = [f"{count} {reason}" for reason, count in dict(summary.get("drops", {})).items()]
+        with catch_and_log_exceptions(strict=True):
+            self._enter(summary.get("entries", ()), last)
+            self._set_clocks(self._stamp or 0, last)
+            level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
+            text = f"{verdict}: {self._frames} frames{''.join(f', {drop}' for drop in drops)}"
+            self._recording.log(LEDGER, rr.TextLog(text, level=level))
+            facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
+            self._recording.log(SUMMARY, _document(verdict, self._about, facts), static=True)
+            self._arrange()
+        try:
+            self._publish()
+        except (OSError, RuntimeError) as error:  # rerun says RuntimeError where its file could not be written
+            self._partial.unlink(missing_ok=True)
+            raise self._unwritable(getattr(error, "strerror", None) or str(error)) from error
+
+    def _publish(self) -> None:
+        """Finish the file, and name it if its end is there: of a disk that is full rerun tells late, or nobody."""
+        self._recording.flush()
+        self._recording.disconnect()
+        with self._partial.open("rb") as file:
+            file.seek(max(0, self._partial.stat().st_size - len(END) - 4))
+            whole = END in file.read()
+        if not whole:
+            raise OSError("its end is missing, as after a full disk")
+        self._partial.replace(self._path)
+
+    def _set_clocks(self, stamp: int, frame: int) -> None:
+        """rerun's clocks belong to the calling thread, so every call from outside sets them first."""
+        self._stamp = max(stamp, self._stamp if self._stamp is not None else stamp)
+        self._recording.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
+        self._recording.set_time(FRAME, sequence=frame)
+
+    def _draw(self, items: Mapping[str, Any]) -> list[str]:
+        """Draw every picture these items allow; what the pictures say of them."""
+        present = {stream: items[stream] for stream in self._streams if stream in items}
+        captions = []
+        for stream, item in present.items():
+            if isinstance(item, StereoFrame) and _drawn_later(stream, present):
+                continue
+            for kinds, draw in PICTURES.items():
+                if len(kinds) == 1 and isinstance(item, kinds[0]):
+                    captions.append(draw(self._canvas, stream, item))
+        for kinds, draw in PICTURES.items():
+            if len(kinds) > 1:
+                chosen = [stream for kind in kinds for stream in _last(present, kind)]
+                if len(chosen) == len(kinds):
+                    captions.append(draw(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
+        return [caption for caption in captions if caption]
+
+    def _plot(self, root: str, values: Mapping[str, float]) -> None:
+        for stage, value in values.items():
+            path = f"{root}/{rr.escape_entity_path_part(stage)}"
+            self._canvas.log(path, rr.Scalars(float(value)), Place(Panel.STAGE, path, stage))
+
+    def _enter(self, entries: Iterable[LossEntry], frame: int) -> None:
+        """Losses, at their own stamps on the log's clock."""
+        losses = sorted(entries, key=lambda entry: entry.stamp)
+        if not losses:
+            return
+        stamps = np.array([entry.stamp for entry in losses], "datetime64[ns]")
+        texts = [f"{entry.stage} lost {entry.stream}: {entry.reason}. {entry.detail}" for entry in losses]
+        frames = np.full(len(losses), frame)
+        clocks = [rr.TimeColumn(CLOCK, timestamp=stamps), rr.TimeColumn(FRAME, sequence=frames)]
+        columns = rr.TextLog.columns(text=texts, level=[rr.TextLogLevel.WARN] * len(losses))
+        self._recording.send_columns(LEDGER, indexes=clocks, columns=columns, strict=True)
+        self._stamp = max(losses[-1].stamp, self._stamp if self._stamp is not None else losses[-1].stamp)
+
+    def _arrange(self) -> None:
+        """Lay out the desk again when a picture has come to it."""
+        if len(self._canvas.hung) != self._hung:
+            self._hung = len(self._canvas.hung)
+            self._recording.send_blueprint(desk(self._canvas.hung.values()))
+
+    def _unwritable(self, reason: str) -> LogError:
+        return LogError(f"cannot write {self._path}: {reason}; choose another place for the output or make room there")
+
+
+def _last(items: Mapping[str, Any], kind: type) -> list[str]:
+    return [stream for stream, item in items.items() if isinstance(item, kind)][-1:]
+
+
+def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
+    """Whether a later stereo stream has the very same pixels, as where the log was rectified already."""
+    later = islice(items.values(), list(items).index(stream) + 1, None)
+    mine = items[stream]
+    return any(
+        isinstance(item, StereoFrame) and _same(item.left, mine.left) and _same(item.right, mine.right)
+        for item in later
+    )  # fmt: skip
+
+
+def _same(one: Array, other: Array) -> bool:
+    return bool(one.__array_interface__ == other.__array_interface__)
+
+
+def _document(verdict: str, *tables: Mapping[str, Any]) -> rr.TextDocument:
+    """The verdict and tables of what is known of the run, as markdown."""
+    rows = [
+        f"| {key} | {', '.join(f'{k} {v}' for k, v in value.items()) if isinstance(value, Mapping) else value} |"
+        for table in tables
+        for key, value in table.items()
+        if value not in ({}, "")
+    ]
+    text = "\n".join([f"# {verdict}", "", "| | |", "|---|---|", *rows])
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

@@ -1,0 +1,313 @@
+"""Our data as ROS 2 messages and back, the one home of their conventions.
+
+Each builder takes a type of `stages.data` (or plain numbers) and returns a message object of the rosbags type store,
+each reader undoes its builder. The grids are where bugs live: ours grow with y (rows) and x (columns) from the
+lower-left corner; `nav_msgs/OccupancyGrid` has the same order, `grid_map_msgs/GridMap` starts at the corner of largest
+x and y, runs its first index along -x, and stores column-major.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from recordings.ros2_types import TYPES, make
+from recordings.ros2_writer import Ros2Writer
+from stages.data import (
+    Array,
+    CameraModel,
+    Cell,
+    Disparity,
+    ElevationMap,
+    NavigationMap,
+    PointCloud,
+    Pose,
+    Reason,
+    Transform,
+)
+
+__all__ = [
+    "TYPES", "Ros2Writer", "camera_info", "diagnostics", "disparity_image", "grid_map", "header", "image", "imu",
+    "iter_messages", "make", "occupancy_grid", "odometry", "point_cloud", "read_disparity", "read_grid_map",
+    "read_occupancy_grid", "stamp_of", "transform_message",
+]  # fmt: skip
+
+REASON_UNTOLD = 255  # in a map read back: a hazard, of which OccupancyGrid cannot say why
+FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32
+
+_IMAGE_ENCODINGS = {
+    (np.dtype(np.uint8), 2): "mono8",
+    (np.dtype(np.uint8), 3): "rgb8",
+    (np.dtype(np.uint16), 2): "mono16",
+    (np.dtype(np.uint16), 3): "rgb16",
+    (np.dtype(np.float32), 2): "32FC1",
+}
+
+
+def header(stamp: int, frame_id: str) -> Any:
+    """std_msgs/Header; `stamp` in ns."""
+    return make("std_msgs/msg/Header", stamp=_time(stamp), frame_id=frame_id)
+
+
+def stamp_of(message_header: Any) -> int:
+    """The stamp of a std_msgs/Header in ns."""
+    return int(message_header.stamp.sec) * 1_000_000_000 + int(message_header.stamp.nanosec)
+
+
+def image(stamp: int, frame_id: str, pixels: Array) -> Any:
+    """sensor_msgs/Image of (H, W) uint8, uint16 or float32 (NaN = unknown), or (H, W, 3) RGB uint8 or uint16."""
+    encoding = _IMAGE_ENCODINGS.get((pixels.dtype, pixels.ndim))
+    if encoding is None or (pixels.ndim == 3 and pixels.shape[2] != 3):
+        raise ValueError(f"no ROS image encoding for {pixels.dtype} {pixels.shape}")
+    height, width = pixels.shape[:2]
+    data = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)).view(np.uint8).reshape(-1)
+    return make(
+        "sensor_msgs/msg/Image", header=header(stamp, frame_id), height=height, width=width, encoding=encoding,
+        is_bigendian=0, step=data.size // height if height else 0, data=data,
+    )  # fmt: skip
+
+
+def camera_info(stamp: int, frame_id: str, model: CameraModel) -> Any:
+    """sensor_msgs/CameraInfo."""
+    return make(
+        "sensor_msgs/msg/CameraInfo", header=header(stamp, frame_id), height=model.height, width=model.width,
+        distortion_model=model.model, d=np.array(model.d), k=_flat(model.k), r=_flat(model.r), p=_flat(model.p),
+        binning_x=0, binning_y=0, roi=_region(0, 0),
+    )  # fmt: skip
+
+
+def disparity_image(disparity: Disparity) -> Any:
+    """stereo_msgs/DisparityImage, 32FC1, NaN = unknown.
+
+    As in stereo_image_proc, the principal points' difference is taken out, so Z = f * t / d holds for any consumer:
+    pixels are d + cx_right - cx. f and t are NaN where the camera is not known; delta_d is 0, disparities being
+    continuous; min_disparity and max_disparity are the image's own range (NaN where it has no value).
+    """
+    camera = disparity.camera
+    pixels = disparity.pixels
+    if camera is not None and camera.cx_right != camera.cx:
+        pixels = pixels + np.float32(camera.cx_right - camera.cx)
+    known = pixels[np.isfinite(pixels)]
+    height, width = pixels.shape
+    frame_id = camera.frame_id if camera is not None else "camera"
+    return make(
+        "stereo_msgs/msg/DisparityImage", header=header(disparity.stamp, frame_id),
+        image=image(disparity.stamp, frame_id, pixels),
+        f=camera.fx if camera is not None else np.nan, t=camera.baseline if camera is not None else np.nan,
+        valid_window=_region(width, height),
+        min_disparity=float(known.min()) if known.size else np.nan,
+        max_disparity=float(known.max()) if known.size else np.nan, delta_d=0.0,
+    )  # fmt: skip
+
+
+def read_disparity(message: Any) -> NDArray[np.float32]:
+    """The (H, W) float32 pixels of a stereo_msgs/DisparityImage, NaN = unknown, as `disparity_image` wrote them."""
+    picture = message.image
+    if picture.encoding != "32FC1":
+        raise ValueError(f"a disparity image must be 32FC1, not {picture.encoding}")
+    order = ">" if picture.is_bigendian else "<"
+    rows = np.asarray(picture.data, dtype=np.uint8).reshape(picture.height, picture.step)
+    return np.ascontiguousarray(rows[:, : 4 * picture.width]).view(f"{order}f4").astype(np.float32)
+
+
+def point_cloud(cloud: PointCloud) -> Any:
+    """sensor_msgs/PointCloud2: x, y, z, rgb (PCL's packing, 0x00RRGGBB in the bits of a float32), sigma."""
+    count = len(cloud.points)
+    packed = np.zeros((count, 5), np.dtype("<f4"))
+    packed[:, :3] = cloud.points
+    red, green, blue = (cloud.colors[:, channel].astype(np.uint32) for channel in range(3))
+    packed.view(np.dtype("<u4"))[:, 3] = red << 16 | green << 8 | blue
+    packed[:, 4] = cloud.sigma
+    fields = [
+        make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=FLOAT32, count=1)
+        for place, name in enumerate(("x", "y", "z", "rgb", "sigma"))
+    ]
+    return make(
+        "sensor_msgs/msg/PointCloud2", header=header(cloud.stamp, cloud.frame_id), height=1, width=count,
+        fields=fields, is_bigendian=False, point_step=20, row_step=20 * count,
+        data=packed.view(np.uint8).reshape(-1), is_dense=bool(np.isfinite(cloud.points).all()),
+    )  # fmt: skip
+
+
+def grid_map(terrain: ElevationMap) -> Any:
+    """grid_map_msgs/GridMap: cell (0, 0) at the corner of largest x and y, first index along -x, column-major."""
+    rows, cols = terrain.shape
+    length_x, length_y = cols * terrain.resolution, rows * terrain.resolution
+    dimension = "std_msgs/msg/MultiArrayDimension"
+    layout = make(
+        "std_msgs/msg/MultiArrayLayout",
+        dim=[
+            make(dimension, label="column_index", size=rows, stride=rows * cols),
+            make(dimension, label="row_index", size=cols, stride=cols),
+        ],
+        data_offset=0,
+    )
+    # The grid map's matrix is layer[::-1, ::-1].T; its column-major order is the row-major order of layer[::-1, ::-1].
+    data = [
+        make("std_msgs/msg/Float32MultiArray", layout=layout, data=np.ascontiguousarray(layer[::-1, ::-1]).reshape(-1))
+        for layer in terrain.layers.values()
+    ]
+    centre = (terrain.origin[0] + length_x / 2, terrain.origin[1] + length_y / 2, 0.0)
+    info = make(
+        "grid_map_msgs/msg/GridMapInfo", resolution=float(terrain.resolution), length_x=length_x, length_y=length_y,
+        pose=_pose(centre, (0.0, 0.0, 0.0, 1.0)),
+    )  # fmt: skip
+    return make(
+        "grid_map_msgs/msg/GridMap", header=header(terrain.stamp, terrain.frame_id), info=info,
+        layers=list(terrain.layers), basic_layers=["elevation"], data=data, outer_start_index=0, inner_start_index=0,
+    )  # fmt: skip
+
+
+def read_grid_map(message: Any) -> ElevationMap:
+    """The ElevationMap that `grid_map` wrote, or any axis-aligned GridMap with a layer "elevation".
+
+    A map that was moved in its circular buffer (start indices) is unrolled.
+    """
+    info, layers = message.info, {}
+    for name, array in zip(message.layers, message.data, strict=True):
+        outer, inner = array.layout.dim
+        if outer.label != "column_index":
+            raise ValueError(f"grid map layer '{name}' is stored by {outer.label}; only column-major maps are read")
+        stored = np.asarray(array.data, np.float32)[array.layout.data_offset :].reshape(outer.size, inner.size)
+        # outer_start_index counts along the matrix' first index (-x), inner_start_index along its second (-y).
+        unrolled = np.roll(stored, (-message.inner_start_index, -message.outer_start_index), axis=(0, 1))
+        layers[name] = np.ascontiguousarray(unrolled[::-1, ::-1])
+    centre = info.pose.position
+    return ElevationMap(
+        stamp_of(message.header), layers, float(info.resolution),
+        (centre.x - info.length_x / 2, centre.y - info.length_y / 2), message.header.frame_id,
+    )  # fmt: skip
+
+
+def occupancy_grid(navigation: NavigationMap) -> Any:
+    """nav_msgs/OccupancyGrid: row-major from the lower-left cell, 0 free, 100 hazard, -1 unknown."""
+    rows, cols = navigation.cells.shape
+    info = make(
+        "nav_msgs/msg/MapMetaData", map_load_time=_time(navigation.stamp), resolution=float(navigation.resolution),
+        width=cols, height=rows, origin=_pose((*navigation.origin, 0.0), (0.0, 0.0, 0.0, 1.0)),
+    )  # fmt: skip
+    data = np.ascontiguousarray(navigation.cells).reshape(-1)
+    stamped = header(navigation.stamp, navigation.frame_id)
+    return make("nav_msgs/msg/OccupancyGrid", header=stamped, info=info, data=data)
+
+
+def read_occupancy_grid(message: Any) -> NavigationMap:
+    """The NavigationMap of an OccupancyGrid. Its reasons are lost on the way: a hazard's is `REASON_UNTOLD`."""
+    info = message.info
+    cells = np.asarray(message.data, np.int8).reshape(info.height, info.width)
+    reason = np.full(cells.shape, REASON_UNTOLD, np.uint8)
+    reason[cells == Cell.FREE] = Reason.CLEAR
+    reason[cells == Cell.UNKNOWN] = Reason.UNOBSERVED
+    resolution = float(str(np.float32(info.resolution)))  # the message holds float32: 0.05 stays 0.05
+    origin = (float(info.origin.position.x), float(info.origin.position.y))
+    return NavigationMap(stamp_of(message.header), cells, reason, resolution, origin, message.header.frame_id)
+
+
+def transform_message(transforms: Iterable[tuple[Transform, int]]) -> Any:
+    """tf2_msgs/TFMessage of (transform, stamp in ns) pairs."""
+    return make("tf2_msgs/msg/TFMessage", transforms=[_transform(transform, stamp) for transform, stamp in transforms])
+
+
+def imu(stamp: int, frame_id: str, quaternion: Array, covariance: Array | None = None) -> Any:
+    """sensor_msgs/Imu that knows its orientation only: `quaternion` xyzw turns its frame into a world with z up.
+
+    covariance: (3, 3) of the orientation, rad^2, or None where it is not known (all zeros, as REP 145 has it). Rates
+    and accelerations are marked absent by a first covariance element of -1.
+    """
+    absent = np.array([-1.0, *[0.0] * 8])
+    x, y, z, w = (float(value) for value in quaternion)
+    return make(
+        "sensor_msgs/msg/Imu", header=header(stamp, frame_id), orientation=_quaternion((x, y, z, w)),
+        orientation_covariance=np.zeros(9) if covariance is None else _flat(covariance),
+        angular_velocity=_vector((0.0, 0.0, 0.0)), angular_velocity_covariance=absent,
+        linear_acceleration=_vector((0.0, 0.0, 0.0)), linear_acceleration_covariance=absent,
+    )  # fmt: skip
+
+
+def odometry(pose: Pose) -> Any:
+    """nav_msgs/Odometry of a pose; its twist is marked unknown by a first covariance element of -1."""
+    covariance = np.zeros(36) if pose.covariance is None else _flat(pose.covariance)
+    x, y, z, w = (float(value) for value in pose.quaternion)
+    placed = make(
+        "geometry_msgs/msg/PoseWithCovariance", pose=_pose(pose.position, (x, y, z, w)), covariance=covariance
+    )  # fmt: skip
+    still = make("geometry_msgs/msg/Twist", linear=_vector((0.0, 0.0, 0.0)), angular=_vector((0.0, 0.0, 0.0)))
+    twist = make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.array([-1.0, *[0.0] * 35]))
+    return make(
+        "nav_msgs/msg/Odometry", header=header(pose.stamp, pose.frame_id), child_frame_id=pose.child_frame_id,
+        pose=placed, twist=twist,
+    )  # fmt: skip
+
+
+def diagnostics(stamp: int, statuses: Iterable[tuple[int, str, str, dict[str, str]]]) -> Any:
+    """diagnostic_msgs/DiagnosticArray of (level 0 ok / 1 warn / 2 error, name, message, values)."""
+    return make(
+        "diagnostic_msgs/msg/DiagnosticArray",
+        header=header(stamp, ""),
+        status=[
+            make(
+                "diagnostic_msgs/msg/DiagnosticStatus", level=level, name=name, message=text, hardware_id="",
+                values=[make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()],
+            )
+            for level, name, text, values in statuses
+        ],
+    )  # fmt: skip
+
+
+def iter_messages(path: Path, topics: Iterable[str] | None = None) -> Iterator[tuple[str, int, Any]]:
+    """(topic, log time in ns, decoded message) of the CDR channels of a log, in log-time order.
+
+    topics: which (None: all that can be decoded). Raises LogError for a damaged log.
+    """
+    from recordings.mcap_reader import iter_decoded  # the reader builds on this file's readers
+
+    yield from iter_decoded(path, topics)
+
+
+def _time(stamp: int) -> Any:
+    seconds, nanoseconds = divmod(int(stamp), 1_000_000_000)
+    return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+
+
+def _region(width: int, height: int) -> Any:
+    return make(
+        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=height, width=width, do_rectify=False
+    )  # fmt: skip
+
+
+def _transform(transform: Transform, stamp: int) -> Any:
+    x, y, z, w = (float(value) for value in Rotation.from_matrix(transform.rotation).as_quat(canonical=True))
+    return make(
+        "geometry_msgs/msg/TransformStamped", header=header(stamp, transform.parent), child_frame_id=transform.child,
+        transform=make(
+            "geometry_msgs/msg/Transform",
+            translation=_vector(transform.translation), rotation=_quaternion((x, y, z, w)),
+        ),
+    )  # fmt: skip
+
+
+def _pose(position: Any, quaternion: tuple[float, float, float, float]) -> Any:
+    x, y, z = (float(value) for value in position)
+    return make(
+        "geometry_msgs/msg/Pose",
+        position=make("geometry_msgs/msg/Point", x=x, y=y, z=z), orientation=_quaternion(quaternion),
+    )  # fmt: skip
+
+
+def _vector(values: Any) -> Any:
+    x, y, z = (float(value) for value in values)
+    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def _quaternion(xyzw: tuple[float, float, float, float]) -> Any:
+    x, y, z, w = xyzw
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def _flat(matrix: Array) -> Array:
+    return np.array(matrix, dtype=np.float64).reshape(-1)

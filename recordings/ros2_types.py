@@ -1,0 +1,136 @@
+"""ROS 2 message types and their CDR codec, without a ROS installation.
+
+`TYPES` holds the message classes we write; `decoder_for` builds a decoder from the schema that a log carries, so that a
+vendor's own message or an older version of a known one reads as it was written. The codec is rosbags': arrays come and
+go as numpy arrays, and a decoded image is a view of the message's bytes, not a copy.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import lru_cache
+from importlib import import_module
+from threading import RLock
+from typing import Any
+
+from rosbags.typesys import get_types_from_idl, get_types_from_msg
+from rosbags.typesys.store import Typestore
+
+from recordings.errors import LogError
+
+GRID_MAP = """\
+std_msgs/Header header
+grid_map_msgs/GridMapInfo info
+string[] layers
+string[] basic_layers
+std_msgs/Float32MultiArray[] data
+uint16 outer_start_index
+uint16 inner_start_index
+"""
+GRID_MAP_INFO = """\
+float64 resolution
+float64 length_x
+float64 length_y
+geometry_msgs/Pose pose
+"""
+
+_registering = RLock()  # rosbags builds classes and codecs in module-wide state
+
+
+class SharedTypestore(Typestore):
+    """A type store that several threads may use: codecs are built on first use, one at a time."""
+
+    def get_msgdef(self, typename: str) -> Any:
+        if typename not in self.cache:
+            with _registering:
+                return super().get_msgdef(typename)
+        return self.cache[typename]
+
+
+def _typestore(name: str) -> SharedTypestore:
+    with _registering:
+        return SharedTypestore(import_module(f"rosbags.typesys.stores.{name}"))
+
+
+def _known_types() -> SharedTypestore:
+    store = _typestore("ros2_jazzy")
+    with _registering:
+        definitions = get_types_from_msg(GRID_MAP_INFO, "grid_map_msgs/msg/GridMapInfo")
+        store.register({**definitions, **get_types_from_msg(GRID_MAP, "grid_map_msgs/msg/GridMap")})
+    return store
+
+
+TYPES = _known_types()
+
+
+def make(name: str, /, **fields: Any) -> Any:
+    """A message of the type `name`, such as "std_msgs/msg/Header", with all of its fields given."""
+    cls: Any = TYPES.types[name]
+    return cls(**fields)
+
+
+def full_name(schema_name: str) -> str:
+    """The name with its interface kind: "sensor_msgs/Image" is "sensor_msgs/msg/Image"."""
+    package, _, rest = schema_name.partition("/")
+    return schema_name if "/" in rest or not rest else f"{package}/msg/{rest}"
+
+
+@lru_cache(maxsize=256)
+def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable[[bytes | memoryview], Any]:
+    """A function from CDR bytes to a message object, built from a log's schema ("ros2msg" or "ros2idl").
+
+    Raises LogError where the schema cannot be understood; the returned function raises whatever the codec does for
+    bytes that do not fit it.
+    """
+    name = full_name(schema_name)
+    if schema_encoding not in ("ros2msg", "ros2idl"):
+        raise LogError(
+            f"schema '{schema_name}' is in '{schema_encoding}', which is not a ROS 2 schema (ros2msg, ros2idl)"
+        )
+    if not text.strip():
+        if name not in TYPES.types:
+            raise LogError(
+                f"schema '{schema_name}' is empty and its type is not a standard one, so it cannot be decoded"
+            )
+        return lambda data: TYPES.deserialize_cdr(data, name)
+    try:
+        store = _store_of(name, schema_encoding, text.decode())
+        store.get_msgdef(name)
+    except Exception as error:  # a parser of foreign text may fail in any way; all mean the same here
+        raise LogError(f"schema '{schema_name}' cannot be parsed ({type(error).__name__}: {error})") from error
+    return lambda data: store.deserialize_cdr(data, name)
+
+
+def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
+    """A store of exactly the types the schema defines, completed by standard ones it refers to but leaves out."""
+    store = _typestore("empty")
+    with _registering:
+        # MCAP separates a schema's definitions by lines of '='; an IDL one is headed by "IDL: package/msg/Name".
+        if encoding == "ros2idl":
+            for part in re.split(r"^={20,}\s*$", text, flags=re.MULTILINE):
+                body = re.sub(r"^\s*IDL:.*$", "", part, count=1, flags=re.MULTILINE)
+                if body.strip():
+                    store.register(get_types_from_idl(body))
+        else:
+            store.register(get_types_from_msg(text, name))
+        pending = [name]
+        while pending:
+            for wanted in _references(store.fielddefs[pending.pop()][1]):
+                if wanted not in store.fielddefs:
+                    store.fielddefs[wanted] = TYPES.fielddefs[wanted]
+                    store.types[wanted] = TYPES.types[wanted]
+                    pending.append(wanted)
+                elif wanted not in store.cache:
+                    pending.append(wanted)
+    return store
+
+
+def _references(fields: Any) -> set[str]:
+    """The names of the message types that a list of field definitions refers to."""
+    found: set[str] = set()
+    for _, (kind, detail) in fields:
+        node, inner = (kind, detail) if int(kind) <= 2 else detail[0]
+        if int(node) == 2:
+            found.add(inner)
+    return found

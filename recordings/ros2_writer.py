@@ -1,0 +1,117 @@
+"""Writes ROS 2 messages into an MCAP log that either is whole or is not there.
+
+The file grows under a temporary name and takes its own when it is finished. Its one trick: a large message is a chunk
+of its own, so whoever wants only the small topics (tilt, calibration, transforms) decompresses no images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from mcap.writer import CompressionType, Writer
+
+from recordings.errors import LogError
+from recordings.ros2_types import TYPES
+
+LARGE = 64 * 1024  # bytes; from here a message gets a chunk of its own
+
+
+class Ros2Writer:
+    """Writes messages as `ros2msg` / CDR, log time = publish time = stamp. Same calls, same bytes.
+
+    Use as a context manager: leaving it closes the log, leaving it by an exception discards it.
+    """
+
+    def __init__(self, path: Path, profile: str = "ros2") -> None:
+        self.path = Path(path)
+        self._partial = self.path.with_name(self.path.name + ".partial")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, tuple[int, str]] = {}
+        self._counts: dict[str, int] = {}
+        try:
+            self._file = self._partial.open("wb")
+        except OSError as error:
+            raise self._unwritable(error) from error
+        self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=CompressionType.ZSTD)
+        self._writer.start(profile=profile, library="roverflow")
+
+    @property
+    def closed(self) -> bool:
+        """Whether the log is finished, or discarded."""
+        return self._file.closed
+
+    def write(self, topic: str, message: Any, stamp: int) -> None:
+        """Append one message; the topic's channel is registered by its first message and keeps that type."""
+        kind = message.__msgtype__
+        data = TYPES.serialize_cdr(message, kind)
+        try:
+            channel = self._channel(topic, kind)
+            count = self._counts[topic] = self._counts.get(topic, 0) + 1
+            large = len(data) >= LARGE
+            if large:
+                self._writer.flush()
+            self._writer.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=count)
+            if large:
+                self._writer.flush()
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Append one metadata record, its keys in sorted order."""
+        try:
+            self._writer.flush()
+            self._writer.add_metadata(name, dict(sorted(values.items())))
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def close(self) -> None:
+        """Finish the log and give it its name. Closing twice does nothing."""
+        if self._file.closed:
+            return
+        try:
+            self._writer.finish()
+            self._file.close()
+            self._partial.replace(self.path)
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def abort(self) -> None:
+        """Discard what was written so far; a log that was at `path` before stays. After `close`, does nothing."""
+        if self._file.closed:
+            return
+        with suppress(OSError):  # what could not be flushed is being discarded
+            self._file.close()
+        self._partial.unlink(missing_ok=True)
+
+    def __enter__(self) -> Ros2Writer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+    def _channel(self, topic: str, kind: str) -> int:
+        if topic not in self._channels:
+            if kind not in self._schemas:
+                text, _ = TYPES.generate_msgdef(kind, ros_version=2)
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind]), kind
+        channel, have = self._channels[topic]
+        if have != kind:
+            raise ValueError(f"topic {topic} holds {have}, so {kind} cannot be written to it")
+        return channel
+
+    def _unwritable(self, error: OSError) -> LogError:
+        """Close and remove what is half there, and say why."""
+        if hasattr(self, "_file"):
+            self.abort()
+        reason = error.strerror or str(error)
+        return LogError(f"cannot write {self.path}: {reason}; choose another place for the output or make room there")

@@ -1,0 +1,184 @@
+"""What the simulator's cameras see: texture, sunlight, cast shadows, haze, and the sensor's own faults.
+
+The texture is a function of place, so that both cameras see one surface. It is read from a pyramid of ever coarser
+tiles at the scale of the pixel's footprint, with several taps along the footprint's long side (anisotropic filtering):
+distant ground keeps its detail across the view and loses it along, as in a real picture.
+"""
+
+from __future__ import annotations
+
+from math import ceil, exp, floor, inf, log2, sqrt
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+
+from recordings.simulator.raycast import GROUND, is_hidden, normal_at, pyramid_of
+from stages.data import Array
+
+TILE = 1024
+# Period of the tile laid at three scales, m. Their ratios are no round numbers, so the sum does not visibly repeat.
+FINE, MIDDLE, BROAD = 2.56, 13.7, 97.0
+MOST_TAPS = 6
+VISIBILITY = 300.0  # m, at which haze leaves 1/e of the contrast
+SUNLIGHT, SKYLIGHT = 0.86, 0.24
+EXPOSURE, GAMMA = 0.80, 1 / 1.5
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+BLUR = 0.55  # px, standard deviation of the optics' point spread
+
+
+class Texture(NamedTuple):
+    """Pyramids of two periodic tiles: grit, micro-relief lit by the sun (mean 1), and noise (mean 0, deviation 1)."""
+
+    grit: Array
+    noise: Array
+    levels: Array
+
+
+def make_texture(rng: np.random.Generator, sun: Array) -> Texture:
+    """Tiles for a sun in direction `sun` (3,): pebbles of three sizes on grainy soil, and cloudy albedo."""
+    pixel = FINE / TILE
+    relief = 0.0016 * _band(rng, 1.0, 3, 60)
+    for size, share, depth in ((0.014, 0.9, 0.0035), (0.035, 1.25, 0.008), (0.09, 1.8, 0.016)):
+        blobs = _band(rng, 0.0, size / pixel * 0.9, size / pixel * 1.6)
+        relief = relief + depth * np.sqrt(np.maximum(blobs - share, 0))
+    east = (np.roll(relief, -1, axis=1) - np.roll(relief, 1, axis=1)) / (2 * pixel)
+    north = (np.roll(relief, -1, axis=0) - np.roll(relief, 1, axis=0)) / (2 * pixel)
+    light = (sun[2] - sun[0] * east - sun[1] * north) / np.sqrt(1 + east**2 + north**2) / sun[2]
+    grit = np.clip(light, 0.15, 1.9) * (1 + 0.10 * _band(rng, 0.4, 2, 200))
+    flat, levels = pyramid_of(np.asarray(grit / grit.mean(), dtype=np.float32), np.mean)
+    noise, _ = pyramid_of(_band(rng, 1.2, 3, TILE).astype(np.float32), np.mean)
+    return Texture(flat, noise, levels)
+
+
+def _band(rng: np.random.Generator, fall: float, shortest: float, longest: float) -> Array:
+    """Periodic noise, (TILE, TILE), deviation 1, wavelengths shortest to longest px, amplitude ~ wavelength**fall."""
+    frequency = np.hypot(np.fft.fftfreq(TILE)[:, None], np.fft.rfftfreq(TILE)[None, :])
+    frequency[0, 0] = np.inf
+    gain = frequency**-fall * np.exp(-((frequency * shortest) ** 4) * 0.7) * (1 - np.exp(-((frequency * longest) ** 4)))
+    gain[0, 0] = 0
+    picture = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((TILE, TILE))) * gain, (TILE, TILE))
+    return np.asarray(picture / picture.std())
+
+
+@njit(nogil=True, cache=True)
+def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
+    """Periodic bilinear sample at (x, y) px of the square tile of `size` that begins at `start`."""
+    ix, iy = floor(x), floor(y)
+    u, v = x - ix, y - iy
+    i, j = start + (iy & (size - 1)) * size, ix & (size - 1)
+    i1, j1 = start + ((iy + 1) & (size - 1)) * size, (ix + 1) & (size - 1)
+    low = tiles[i + j] * (1 - u) + tiles[i + j1] * u
+    return float(low * (1 - v) + (tiles[i1 + j] * (1 - u) + tiles[i1 + j1] * u) * v)
+
+
+@njit(nogil=True, cache=True)
+def sample(tiles: Any, levels: Any, period: float, x: float, y: float, width: float) -> float:
+    """The tile laid with `period`, m, at (x, y), m, averaged over about `width`, m: linear between pyramid levels."""
+    cell = period / TILE
+    level = min(max(log2(max(width, 1e-9) / cell), 0.0), levels.shape[0] - 2.001)
+    lower = int(level)
+    share, size = level - lower, TILE >> lower
+    px, py = x / period * size - 0.5, y / period * size - 0.5
+    value = _bilinear(tiles, levels[lower], size, px, py)
+    if share > 0:
+        value += share * (_bilinear(tiles, levels[lower + 1], size >> 1, px / 2 - 0.25, py / 2 - 0.25) - value)
+    return value
+
+
+@njit(nogil=True, cache=True)
+def _ground_albedo(
+    texture: Any, x: float, y: float, width: float, length: float, ux: float, uy: float
+) -> tuple[float, float]:
+    """Grit and albedo of the ground under a footprint of width x length, m, whose long side runs along (ux, uy)."""
+    taps = min(max(ceil(length / width), 1), MOST_TAPS)
+    blur = max(width, length / taps)
+    grit = 0.0
+    for k in range(taps):
+        along = ((k + 0.5) / taps - 0.5) * length
+        grit += sample(texture.grit, texture.levels, FINE, x + along * ux, y + along * uy, blur)
+    cloud = sample(texture.noise, texture.levels, MIDDLE, x, y, length)
+    broad = sample(texture.noise, texture.levels, BROAD, x + 31.0, y + 7.0, length)
+    # Where the broad pattern is high lies drifted sand, smooth and bright; elsewhere gravel.
+    sand = min(max(0.5 + 1.4 * (broad + 0.35 * cloud - 0.55), 0.0), 1.0)
+    contrast = 1.0 - 0.72 * sand
+    return 1 + contrast * (grit / taps - 1), (1 + 0.07 * cloud - 0.04 * broad) * (0.92 + 0.16 * sand)
+
+
+@njit(nogil=True, cache=True)
+def _rock_albedo(
+    texture: Any, rock: int, x: float, y: float, z: float, nx: float, ny: float, nz: float, width: float
+) -> float:
+    """Grain of a rock, projected along the axis that its face looks to most."""
+    a, b = x, y
+    if abs(nx) > abs(ny) and abs(nx) > abs(nz):
+        a, b = y, z
+    elif abs(ny) > abs(nz):
+        a, b = x, z
+    shift = 0.377 * (rock % 97)
+    grain = sample(texture.noise, texture.levels, 0.9, a + shift, b - shift, width)
+    pits = sample(texture.grit, texture.levels, 1.1, a - shift, b + shift, width)
+    return max(0.3, (1 + 0.16 * grain + 0.45 * (pits - 1)) * (0.72 + 0.5 * ((rock * 61) % 89) / 89))
+
+
+@njit(nogil=True, cache=True)
+def shade_rows(
+    scn: Any, texture: Any, sun: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float,
+    first: int, depth: Any, surface: Any, facet: Any, radiance: Any,
+) -> None:  # fmt: skip
+    """Light that reaches the pixels of `cast_rows` (same arguments): radiance (rows, W, 3) float32, about 0 to 1."""
+    for row in range(depth.shape[0]):
+        b = (first + row - cy) / fy
+        for column in range(depth.shape[1]):
+            a = (column - cx) / fx
+            dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2]
+            dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2]
+            dz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2]
+            speed = sqrt(dx * dx + dy * dy + dz * dz)
+            t, what = depth[row, column], surface[row, column]
+            up = min(max(dz / speed, 0.0) * 2.5, 1.0)
+            sky0, sky1, sky2 = 0.86 - 0.12 * up, 0.76 - 0.12 * up, 0.65 - 0.07 * up
+            if t == inf:
+                radiance[row, column, 0], radiance[row, column, 1], radiance[row, column, 2] = sky0, sky1, sky2
+                continue
+            x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
+            nx, ny, nz = normal_at(scn, what, facet[row, column], x, y, z)
+            facing = max(-(nx * dx + ny * dy + nz * dz) / speed, 0.03)
+            width = t / fx
+            if what == GROUND:
+                flat = sqrt(dx * dx + dy * dy) + 1e-12
+                grit, albedo = _ground_albedo(texture, x, y, width, width / facing, dx / flat, dy / flat)
+                red, green, blue = 0.66 * albedo, 0.47 * albedo, 0.34 * albedo
+            else:
+                grit = 1.0
+                albedo = _rock_albedo(texture, what, x, y, z, nx, ny, nz, width / sqrt(facing))
+                red, green, blue = 0.60 * albedo, 0.46 * albedo, 0.37 * albedo
+            toward = nx * sun[0] + ny * sun[1] + nz * sun[2]
+            light = 0.0
+            if toward > 0:
+                lift = 0.001 + 1e-4 * t
+                sx, sy, sz = x + lift * nx, y + lift * ny, z + lift * nz
+                if not is_hidden(scn, sx, sy, sz, sun[0], sun[1], sun[2], 0.0, 80.0):
+                    # Half Lambert, half Lommel-Seeliger, as dusty surfaces scatter (McEwen 1991).
+                    light = SUNLIGHT * grit * (0.5 * toward + toward / (toward + facing))
+            light += SKYLIGHT * (0.5 + 0.5 * nz) * (1 + 0.4 * (grit - 1))
+            clear = exp(-t * speed / VISIBILITY)
+            radiance[row, column, 0] = red * light * clear + sky0 * (1 - clear)
+            radiance[row, column, 1] = green * light * clear + sky1 * (1 - clear)
+            radiance[row, column, 2] = blue * light * clear + sky2 * (1 - clear)
+
+
+def expose(radiance: Array, gain: float, noise: float, rng: np.random.Generator, color: bool) -> Array:
+    """The 8-bit picture a camera makes of `radiance` (H, W, 3) float32: blur, vignetting, gain, shot and read noise.
+
+    noise: standard deviation at half the full scale, as a share of the full scale.
+    """
+    light = cv2.GaussianBlur(radiance if color else radiance @ LUMA, (0, 0), BLUR)
+    height, width = light.shape[:2]
+    y, x = np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    falloff = (gain * EXPOSURE * (1 - 0.07 * (x**2 + y**2))).astype(np.float32)
+    light = np.clip(light * (falloff[..., None] if color else falloff), 0, 1) ** np.float32(GAMMA)
+    spread = np.float32(noise) * np.sqrt(0.2 + np.float32(1.6) * light)
+    light += spread * rng.standard_normal(light.shape, dtype=np.float32)
+    return np.asarray(np.clip(light * 255 + 0.5, 0, 255).astype(np.uint8))

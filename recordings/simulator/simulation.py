@@ -1,0 +1,233 @@
+"""A simulated traverse: one set of parameters, from which terrain, drive, images and truth all follow.
+
+Images and truth are made by the same rays, frame by frame on demand, so a long traverse needs no more memory than a
+short one; every random stream has its own seed, so equal parameters give equal bytes whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from recordings import ros2
+from recordings.simulator import log, raycast, shading, traverse
+from recordings.simulator.terrain import Terrain, make_terrain
+from stages.data import Array, StereoCamera, Transform
+
+SECOND = 1_000_000_000
+START = 1_700_000_000 * SECOND
+MARGIN = SECOND // 2  # the slow sensors run this long before the first frame and after the last
+BLOCK = 32  # rows a thread takes at a time
+# The Devon Island rover's rectified camera (1280 pixels wide).
+DEVON_WIDTH, DEVON_F, DEVON_CX, DEVON_CY, DEVON_HEIGHT = 1280, 968.999694824, 635.139038086, 463.537109375, 960
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """Everything exact about one frame.
+
+    depth: (H, W) float64 m, inf = sky; surface: (H, W) int32 codes of the ray caster; seen: (H, W) uint8, 255 by both
+    cameras, 128 hidden from the right one, 0 no surface; images: left and right.
+    """
+
+    base: Transform
+    level: Transform
+    depth: Array
+    surface: Array
+    seen: Array
+    images: tuple[Array, Array]
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A synthetic traverse; equal simulations write equal bytes. Lengths in m, angles in rad, times in s.
+
+    frames, rate (Hz), speed (m/s): the drive; width, height: px, the Devon camera scaled to fit; baseline;
+    camera_height above base_link, pitch_down: the mast; slope: RMS over 1 m; relief_cells, relief_resolution: the
+    repeating ground tile; abundance: k of Golombek's rock law (0.05 sparse, 0.15 dense); smallest_rock, largest_rock:
+    diameters; sun_elevation, sun_azimuth: the light; color: rgb8, else mono8; noise: image noise at half scale, share
+    of full scale; tilt_noise: of one inclinometer sample; tilt_rate, odometry_rate: Hz; odometry_drift: share of the
+    way; frame_offset: of frame times after inclinometer samples; map_half_width, map_resolution: truth maps; region:
+    how far from the camera a visible cell counts; horizon: beyond it is sky; threads: change the time, not the bytes.
+    """
+
+    frames: int = 12
+    rate: float = 2.0
+    speed: float = 0.5
+    width: int = 1280
+    height: int = 960
+    baseline: float = 0.24
+    camera_height: float = 0.9
+    pitch_down: float = float(np.radians(15))
+    slope: float = float(np.radians(4))
+    relief_cells: int = 2048
+    relief_resolution: float = 0.04
+    abundance: float = 0.10
+    smallest_rock: float = 0.06
+    largest_rock: float = 1.5
+    sun_elevation: float = float(np.radians(38))
+    sun_azimuth: float = float(np.radians(140))
+    color: bool = True
+    noise: float = 0.008
+    tilt_noise: float = float(np.radians(0.1))
+    tilt_rate: float = 20.0
+    odometry_rate: float = 10.0
+    odometry_drift: float = 0.01
+    frame_offset: float = 0.013
+    map_half_width: float = 8.0
+    map_resolution: float = 0.05
+    region: float = 8.0
+    horizon: float = 300.0
+    seed: int = 1
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        least = {
+            "frames": 1, "rate": 1e-3, "speed": 0, "width": 16, "height": 16, "baseline": 1e-3, "camera_height": 0.1,
+            "slope": 0, "relief_resolution": 1e-3, "abundance": 0, "smallest_rock": 0.01, "noise": 0, "tilt_noise": 0,
+            "tilt_rate": 1, "odometry_rate": 1, "map_half_width": 0.5, "map_resolution": 1e-3, "threads": 1,
+        }  # fmt: skip
+        for name, low in least.items():
+            if not getattr(self, name) >= low:
+                raise ValueError(f"Simulation.{name} must be at least {low}, not {getattr(self, name)}")
+        if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
+            raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
+        if not 0 < self.sun_elevation <= np.pi / 2:
+            raise ValueError(f"Simulation.sun_elevation must be between 0 and pi/2 rad, not {self.sun_elevation}")
+
+    @cached_property
+    def camera(self) -> StereoCamera:
+        """The rectified stereo camera."""
+        scale = self.width / DEVON_WIDTH
+        cy = (DEVON_CY - (DEVON_HEIGHT - 1) / 2) * scale + (self.height - 1) / 2
+        return StereoCamera(
+            fx=DEVON_F * scale, fy=DEVON_F * scale, cx=(DEVON_CX + 0.5) * scale - 0.5, cy=cy, baseline=self.baseline,
+            width=self.width, height=self.height, frame_id=traverse.LEFT_FRAME,
+        )  # fmt: skip
+
+    @cached_property
+    def route(self) -> traverse.Route:
+        """The way of the rover, through the middle of the tile."""
+        middle = self.relief_cells * self.relief_resolution / 2
+        length = self.speed * (self.frames / self.rate + 2)
+        return traverse.Route((middle, middle), 0.4, 0.35, 9.0, behind=self.speed + 1, ahead=length + 1)
+
+    @cached_property
+    def terrain(self) -> Terrain:
+        """The ground and its rocks, without those the rover would have to climb."""
+        terrain = make_terrain(
+            self._rng(0), self.relief_cells, self.relief_resolution, self.slope, self.abundance, self.smallest_rock,
+            self.largest_rock,
+        )  # fmt: skip
+        path = self.route.place_at(np.arange(-self.speed, self.speed * (self.frames / self.rate + 1) + 1, 0.1))
+        return terrain.cleared(path, half_width=traverse.BODY_WIDTH / 2 + 0.1, height=0.12)
+
+    @cached_property
+    def sun(self) -> Array:
+        """Unit vector (3,) towards the sun, world frame."""
+        flat = np.cos(self.sun_elevation)
+        return np.array([flat * np.cos(self.sun_azimuth), flat * np.sin(self.sun_azimuth), np.sin(self.sun_elevation)])
+
+    @cached_property
+    def texture(self) -> shading.Texture:
+        """The look of the ground under this sun."""
+        return shading.make_texture(self._rng(1), self.sun)
+
+    @cached_property
+    def mounts(self) -> tuple[Transform, Transform, Transform]:
+        """base_link <- left camera, <- right camera, <- inclinometer."""
+        return traverse.mounts(self.baseline, self.camera_height, self.pitch_down)
+
+    def stamp(self, frame: int) -> int:
+        """Stamp of a frame, ns."""
+        return START + round((self.frame_offset + frame / self.rate) * SECOND)
+
+    @property
+    def begin(self) -> int:
+        """Time of the first sensor sample, ns."""
+        return START - MARGIN
+
+    def way(self, stamp: int) -> float:
+        """Metres driven since the nominal start, at a time, ns."""
+        return (stamp - START) / SECOND * self.speed
+
+    def base_at(self, stamp: int) -> Transform:
+        """world <- base_link at a time, ns."""
+        return traverse.base_pose(self.terrain, self.route, self.way(stamp))
+
+    def frame(self, index: int) -> FrameTruth:
+        """Images and exact geometry of one frame."""
+        base = self.base_at(self.stamp(index))
+        left, right = (base.after(mount) for mount in self.mounts[:2])
+        with ThreadPoolExecutor(self.threads) as pool:
+            depth, surface, radiance = self._render(left, pool)
+            seen = np.empty(depth.shape, np.uint8)
+            self._by_rows(
+                pool,
+                lambda rows: raycast.seen_rows(
+                    self.terrain.scene, left.translation, right.translation, left.rotation, *self._intrinsics(),
+                    rows.start, depth[rows], seen[rows],
+                ),
+            )  # fmt: skip
+            _, _, other = self._render(right, pool)
+        gain = 1 + 0.01 * float(self._rng(2).uniform(0.5, 1.0))
+        pictures = [
+            shading.expose(light, factor, self.noise, self._rng(3, index, side), self.color)
+            for side, (light, factor) in enumerate(((radiance, 1.0), (other, gain)))
+        ]
+        return FrameTruth(base, traverse.level_pose(base), depth, surface, seen, (pictures[0], pictures[1]))
+
+    def write(self, out: Path, progress: Callable[[int, int], None] | None = None) -> None:
+        """Write the log. progress: called with (frames written, frames) after each frame."""
+        with ros2.Ros2Writer(Path(out)) as writer:
+            for _, make_messages, index in sorted(self._events(), key=lambda event: event[0]):
+                for log_time, topic, message in make_messages():
+                    writer.write(topic, message, log_time)
+                if index is not None and progress is not None:
+                    progress(index + 1, self.frames)
+
+    def _events(self) -> Iterator[tuple[int, Callable[[], list[log.Logged]], int | None]]:
+        """(log time, maker of the messages then written, frame index or None), unordered; made on demand."""
+        yield self.begin, partial(log.static_transforms, self, self.begin), None
+        length = (self.stamp(self.frames - 1) + MARGIN - self.begin) / SECOND
+        sensors = ((log.inclinometer, self.tilt_rate, 4_000_000), (log.odometry, self.odometry_rate, 9_000_000))
+        for make, rate, latency in sensors:
+            for number in range(int(np.ceil(length * rate)) + 1):
+                stamp = self.begin + round(number / rate * SECOND)
+                yield stamp + latency, partial(make, self, number, stamp, stamp + latency), None
+        for index in range(self.frames):
+            at = self.stamp(index) + 21_000_000
+            yield at, partial(log.frame, self, index, at), index
+
+    def _intrinsics(self) -> tuple[float, float, float, float]:
+        return self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy
+
+    def _render(self, pose: Transform, pool: ThreadPoolExecutor) -> tuple[Array, Array, Array]:
+        """Depth, surface and radiance of one camera's image."""
+        shape = self.height, self.width
+        depth, surface, facet = np.empty(shape), np.empty(shape, np.int32), np.empty(shape, np.int8)
+        radiance = np.empty((*shape, 3), np.float32)
+
+        def render(rows: slice) -> None:
+            view = pose.translation, pose.rotation, *self._intrinsics()
+            hits = depth[rows], surface[rows], facet[rows]
+            raycast.cast_rows(self.terrain.scene, *view, self.horizon, rows.start, *hits)
+            shading.shade_rows(
+                self.terrain.scene, self.texture, self.sun, *view, rows.start, *hits, radiance[rows]
+            )  # fmt: skip
+
+        self._by_rows(pool, render)
+        return depth, surface, radiance
+
+    def _by_rows(self, pool: ThreadPoolExecutor, work: Callable[[slice], None]) -> None:
+        starts = range(0, self.height, BLOCK)
+        for _ in pool.map(work, (slice(start, min(start + BLOCK, self.height)) for start in starts)):
+            pass
+
+    def _rng(self, *stream: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, *stream])

@@ -1,0 +1,121 @@
+"""The rover of the simulator: where it drives, how the ground tilts it, and what its sensors say about that.
+
+World frame: z up. `base_link` sits on the plane that fits the ground under the body, x forward, y left; `level` shares
+its origin and heading and is not tilted. The inclinometer is bolted on askew, as real ones are, so nothing
+downstream can work by ignoring the static transforms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from recordings.simulator.terrain import Terrain
+from stages.data import LEVEL_FRAME, Array, Pose, Transform
+
+BODY_LENGTH, BODY_WIDTH = 1.0, 0.8
+LEFT_FRAME, RIGHT_FRAME = "left_camera_optical", "right_camera_optical"
+INCLINOMETER_FRAME = "inclinometer_link"
+MAST_FORWARD = 0.35  # m, of the cameras ahead of the body's centre
+# Optical axes (x right, y down, z forward) in a body frame (x forward, y left, z up).
+BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Route:
+    """A meandering path: the heading swings by `swing` rad about `heading` once every `wave` metres.
+
+    start: (x, y) m. `ahead` and `behind`: metres of path known on either side of the start.
+    """
+
+    start: tuple[float, float]
+    heading: float
+    swing: float
+    wave: float
+    behind: float
+    ahead: float
+    _nodes: tuple[Array, Array] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        way = np.arange(-np.ceil(self.behind / 0.01), np.ceil(self.ahead / 0.01) + 2) * 0.01
+        heading = self.heading_at((way[1:] + way[:-1]) / 2)
+        steps = np.diff(way)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+        places = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+        places += np.asarray(self.start) - places[int(np.argmin(np.abs(way)))]
+        object.__setattr__(self, "_nodes", (way, places))
+
+    def heading_at(self, way: Array | float) -> Array:
+        """Heading, rad from +x towards +y, after `way` metres."""
+        return np.asarray(self.heading + self.swing * np.sin(2 * np.pi * np.asarray(way) / self.wave))
+
+    def place_at(self, way: Array | float) -> Array:
+        """Position (..., 2), m, after `way` metres."""
+        nodes, places = self._nodes
+        return np.stack([np.interp(way, nodes, places[:, axis]) for axis in (0, 1)], axis=-1)
+
+
+def resting_plane(terrain: Terrain, place: Array, heading: float) -> tuple[float, Array]:
+    """Height at the centre, m, and unit normal (3,) of the plane that fits the ground under the body."""
+    along, across = np.meshgrid(np.linspace(-0.5, 0.5, 5) * BODY_LENGTH, np.linspace(-0.5, 0.5, 5) * BODY_WIDTH)
+    x = along.ravel() * np.cos(heading) - across.ravel() * np.sin(heading)
+    y = along.ravel() * np.sin(heading) + across.ravel() * np.cos(heading)
+    z = terrain.elevation(place[0] + x, place[1] + y)
+    east, north, height = np.linalg.lstsq(np.column_stack([x, y, np.ones_like(x)]), z, rcond=None)[0]
+    normal = np.array([-east, -north, 1.0])
+    return float(height), normal / np.linalg.norm(normal)
+
+
+def base_pose(terrain: Terrain, route: Route, way: float) -> Transform:
+    """world <- base_link after `way` metres."""
+    heading, place = float(route.heading_at(way)), route.place_at(way)
+    height, up = resting_plane(terrain, place, heading)
+    # In the plane, and straight above the horizontal heading.
+    forward = np.array([np.cos(heading), np.sin(heading), -(up[0] * np.cos(heading) + up[1] * np.sin(heading)) / up[2]])
+    forward /= np.linalg.norm(forward)
+    rotation = np.column_stack([forward, np.cross(up, forward), up])
+    return Transform("world", "base_link", rotation, np.array([*place, height]))
+
+
+def level_pose(base: Transform) -> Transform:
+    """world <- level for world <- base_link: same origin and heading, z up."""
+    heading = float(np.arctan2(base.rotation[1, 0], base.rotation[0, 0]))
+    return Transform("world", LEVEL_FRAME, Rotation.from_euler("z", heading).as_matrix(), base.translation)
+
+
+def mounts(baseline: float, camera_height: float, pitch_down: float) -> tuple[Transform, Transform, Transform]:
+    """base_link <- left camera, <- right camera, <- inclinometer."""
+    looking = Rotation.from_euler("y", pitch_down).as_matrix() @ BODY_FROM_OPTICAL
+    left, right = (
+        Transform("base_link", name, looking, np.array([MAST_FORWARD, side * baseline / 2, camera_height]))
+        for name, side in ((LEFT_FRAME, 1), (RIGHT_FRAME, -1))
+    )
+    askew = Rotation.from_euler("xyz", [3.0, -4.0, 7.0], degrees=True).as_matrix()
+    return left, right, Transform("base_link", INCLINOMETER_FRAME, askew, np.array([-0.2, 0.1, 0.35]))
+
+
+def inclinometer_reading(base: Transform, mount: Transform, noise: float, rng: np.random.Generator) -> Array:
+    """Quaternion xyzw that turns the inclinometer's frame into a world with z up, its heading unknown and set to 0.
+
+    noise: rad, standard deviation about each horizontal axis.
+    """
+    wobble = Rotation.from_rotvec([*rng.normal(0.0, noise, 2), 0.0]) if noise > 0 else Rotation.identity()
+    attitude = (wobble * Rotation.from_matrix(base.rotation @ mount.rotation)).as_matrix()
+    heading = float(np.arctan2(attitude[1, 0], attitude[0, 0]))
+    return np.asarray((Rotation.from_euler("z", -heading) * Rotation.from_matrix(attitude)).as_quat(canonical=True))
+
+
+def odometry_pose(stamp: int, start: Transform, now: Transform, way: float, drift: float) -> Pose:
+    """odom -> base_link: `odom` is the level frame at the start; dead reckoning loses `drift` of the way.
+
+    The error is what wheels and gyros do: a scale error of `drift` and a heading error of `drift` rad per 10 m.
+    """
+    odom = level_pose(start).inverse()
+    true = Transform("odom", "world", odom.rotation, odom.translation).after(now)
+    turn = Rotation.from_euler("z", drift * way / 10)
+    position = turn.apply(true.translation * (1 + drift * np.array([1.0, 1.0, 0.0])))
+    attitude = turn * Rotation.from_matrix(true.rotation)
+    spread = (drift * max(abs(way), 0.1)) ** 2
+    covariance = np.diag([spread, spread, spread, 1e-5, 1e-5, spread / 100 + 1e-5])
+    return Pose(stamp, position, np.asarray(attitude.as_quat(canonical=True)), "odom", "base_link", covariance)

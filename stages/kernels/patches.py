@@ -1,0 +1,123 @@
+"""Sizes of the connected patches of an organised cloud, by union-find in one scan.
+
+Two points are linked where they are next to each other in the image, with no more than a few empty pixels between, and
+their inverse depths differ by what noise and slope explain. A mismatch that covers many pixels supports itself, but it
+is an island; a rock is not, for its foot stands on the ground.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from stages.data import Array
+
+# Pixels looked ahead for the next point: a cloud may hold every 4th only.
+_GAP = 4
+
+
+def depth_images(
+    points: Array, sigma: Array, pixel: Array, kept: Array, shape: tuple[int, int], deviations: float
+) -> tuple[Array, Array]:
+    """Inverse depth, 1/m, and the difference of it that noise may explain, of the points `kept`, as images.
+
+    points: (N, 3) float32 in the camera's frame, m; sigma: (N,) float32, depth standard deviation, m; pixel: (N,)
+    int32; kept: (M,) int64, indices; shape: (H, W); deviations: of a difference, in standard deviations.
+
+    Returns two (H, W) float32 images, NaN where there is no point.
+    """
+    images = np.full((2, *shape), np.nan, np.float32)
+    _depth_images(points, sigma, pixel, kept, float(deviations) * np.sqrt(2.0), images.reshape(2, -1))
+    return images[0], images[1]
+
+
+@numba.njit(nogil=True, cache=True)
+def _depth_images(points, sigma, pixel, kept, factor, images):  # type: ignore[no-untyped-def]
+    for i in kept:
+        inverse = 1.0 / np.float64(points[i, 2])
+        images[0, pixel[i]] = inverse
+        images[1, pixel[i]] = factor * sigma[i] * inverse * inverse
+
+
+def patch_sizes(inverse: Array, tolerance: Array, slope: float) -> Array:
+    """How many points the patch of each pixel has.
+
+    inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; tolerance: (H, W) float32, difference that noise may
+    explain, 1/m, the larger of two counts; slope: difference allowed besides for each pixel of distance, 1/m.
+
+    Returns (H, W) int32, 0 where there is no point.
+    """
+    return _patch_sizes(  # type: ignore[no-any-return]
+        np.ascontiguousarray(inverse), np.ascontiguousarray(tolerance), float(slope)
+    )
+
+
+@numba.njit(nogil=True, cache=True)
+def _linked(inverse, tolerance, slope, row, col, up, left):  # type: ignore[no-untyped-def]
+    """Flat index of the next point upwards or leftwards if it is linked to this one, else -1."""
+    width = inverse.shape[1]
+    for gap in range(1, _GAP + 1):
+        r, c = row - gap * up, col - gap * left
+        if r < 0 or c < 0:
+            return -1
+        if inverse[r, c] > 0.0:
+            allowed = max(tolerance[row, col], tolerance[r, c]) + slope * gap
+            return r * width + c if abs(inverse[r, c] - inverse[row, col]) <= allowed else -1
+    return -1
+
+
+@numba.njit(nogil=True, cache=True)
+def _root(parent, i):  # type: ignore[no-untyped-def]
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@numba.njit(nogil=True, cache=True)
+def _patch_sizes(inverse, tolerance, slope):  # type: ignore[no-untyped-def]
+    height, width = inverse.shape
+    parent = np.empty(height * width, np.int32)
+    sizes = np.zeros(height * width, np.int32)
+    for row in range(height):
+        for col in range(width):
+            i = row * width + col
+            parent[i] = i
+            if not inverse[row, col] > 0.0:
+                continue
+            left = _linked(inverse, tolerance, slope, row, col, 0, 1)
+            above = _linked(inverse, tolerance, slope, row, col, 1, 0)
+            if left >= 0:
+                parent[i] = _root(parent, left)
+            if above >= 0:
+                one, other = parent[i], _root(parent, above)
+                parent[max(one, other)] = min(one, other)
+    # Parents come before their children, so one pass in order reaches every root.
+    for i in range(height * width):
+        parent[i] = parent[parent[i]]
+        sizes[parent[i]] += 1
+    for i in range(height * width):
+        sizes[i] = sizes[parent[i]] if inverse[i // width, i % width] > 0.0 else 0
+    return sizes.reshape(height, width)
+
+
+def patch_sizes_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
+    """The same as `patch_sizes`: scipy's connected components of the graph of links."""
+    present = inverse > 0
+    index = np.arange(inverse.size).reshape(inverse.shape)
+    links = []
+    for axis in (0, 1):
+        lines, numbers = (np.moveaxis(a, axis, 1) for a in (inverse, index))
+        allowed = np.moveaxis(tolerance, axis, 1)
+        for line, number, noise in zip(lines, numbers, allowed, strict=True):
+            at = np.flatnonzero(line > 0)
+            near, far = at[:-1], at[1:]
+            limit = np.maximum(noise[near], noise[far]) + slope * (far - near)
+            linked = (far - near <= _GAP) & (np.abs(line[near] - line[far]) <= limit)
+            links.append(np.stack([number[near[linked]], number[far[linked]]]))
+    one, other = np.concatenate(links, axis=1)
+    graph = coo_array((np.ones(len(one)), (one, other)), shape=(inverse.size, inverse.size))
+    label = connected_components(graph, directed=False)[1].reshape(inverse.shape)
+    return np.where(present, np.bincount(label.ravel())[label], 0).astype(np.int32)

@@ -1,0 +1,98 @@
+"""A small stereo log with lopsided pictures, and ways to write the same messages as another kind of MCAP file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from scipy.spatial.transform import Rotation
+
+from recordings.ros2 import Ros2Writer, camera_info, image, imu, odometry, transform_message
+from stages.data import CameraModel, Pose, Transform
+
+WIDTH, HEIGHT = 24, 16
+BASELINE = 0.25
+FRAMES = 5
+PERIOD = 100_000_000
+START = 1_700_000_000_000_000_000
+LEFT, RIGHT, TILT = "/stereo/left/image_rect", "/stereo/right/image_rect", "/imu/data"
+
+
+def data_folder(name: str) -> Path:
+    """A folder of the real data, or a skip that says where to put it."""
+    folder = Path(os.environ.get("ROVERFLOW_DATA", "")) / name
+    if "ROVERFLOW_DATA" not in os.environ or not folder.exists():
+        pytest.skip(f"needs the real data: set ROVERFLOW_DATA to the folder that holds {name}")
+    return folder
+
+
+def model(side: str = "left", **changes: Any) -> CameraModel:
+    """The calibration of one camera of the sample."""
+    k = np.array([[20.0, 0, 11.5], [0, 20.0, 7.5], [0, 0, 1]])
+    p = np.hstack([k, [[-20.0 * BASELINE if side == "right" else 0.0], [0], [0]]])
+    fields = {"width": WIDTH, "height": HEIGHT, "k": k, "d": np.zeros(5), "r": np.eye(3), "p": p, **changes}
+    return CameraModel(**fields)
+
+
+def picture(seed: int) -> np.ndarray:
+    """An RGB picture that no flip, transposition or exchange of channels leaves alone."""
+    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+def tilt_quaternion(number: int) -> np.ndarray:
+    """The attitude at frame `number`."""
+    return Rotation.from_euler("ZYX", [90, 3 + number, -5], degrees=True).as_quat()
+
+
+TRANSFORMS = (
+    Transform("base_link", "left_optical", np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.5, 0.1, 0.9]),
+    Transform("base_link", "imu_link", Rotation.from_euler("z", 90, degrees=True).as_matrix(), [0, 0, 0.4]),
+)
+
+Edit = Callable[[str, int, Any], Any]
+
+
+def write_sample(
+    path: Path, edit: Edit = lambda topic, number, message: message, names: tuple[str, str] = (LEFT, RIGHT)
+) -> Path:
+    """Write the log. edit: replaces a message (by topic and frame number), or leaves it out by returning None."""
+    with Ros2Writer(path) as writer:
+
+        def write(topic: str, number: int, message: Any, stamp: int) -> None:
+            message = edit(topic, number, message)
+            if message is not None:
+                writer.write(topic, message, stamp)
+
+        write("/tf_static", 0, transform_message([(transform, START) for transform in TRANSFORMS]), START)
+        for number in range(FRAMES):
+            stamp = START + number * PERIOD
+            write(TILT, number, imu(stamp, "imu_link", tilt_quaternion(number)), stamp)
+            for side, topic in zip(("left", "right"), names, strict=True):
+                info = topic.rpartition("/")[0] + "/camera_info"
+                write(info, number, camera_info(stamp, f"{side}_optical", model(side)), stamp)
+                pixels = picture(2 * number + (side == "right"))
+                write(topic, number, image(stamp, f"{side}_optical", pixels), stamp + 1000)
+            pose = Pose(stamp, [number, 2.0, 3.0], tilt_quaternion(number), "odom", "base_link", np.eye(6) * 0.01)
+            write("/odom", number, odometry(pose), stamp + 2000)
+    return path
+
+
+def rewritten(path: Path, out: Path, **options: Any) -> Path:
+    """The same messages as another kind of MCAP file; options as of mcap.writer.Writer."""
+    with path.open("rb") as source, out.open("wb") as target:
+        writer = Writer(target, **options)
+        writer.start(profile="ros2", library="test")
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return out

@@ -1,0 +1,176 @@
+"""The PNG pictures show what was published, the right way round."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recordings import paint
+from recordings.errors import LogError
+from recordings.pictures import MARGIN, disparity_picture, draw, elevation_picture, navigation_picture
+from recordings.ros2 import Ros2Writer, disparity_image, grid_map, occupancy_grid
+from stages.data import LEVEL_FRAME, Array, Cell, Disparity, ElevationMap, NavigationMap
+
+START, STEP = 1_000_000_000, 500_000_000
+FREE, HAZARD, UNKNOWN = (paint.CELLS[cell][1] for cell in (Cell.FREE, Cell.HAZARD, Cell.UNKNOWN))
+ROWS, COLS = 6, 9
+
+
+def navigation(stamp: int = START) -> NavigationMap:
+    """Free, but for a hazard at the far left corner and unknown cells along the right edge."""
+    cells = np.zeros((ROWS, COLS), np.int8)
+    cells[-1, -1] = Cell.HAZARD  # largest y: left; largest x: ahead
+    cells[0, :] = Cell.UNKNOWN
+    return NavigationMap(stamp, cells, np.zeros(cells.shape, np.uint8), 0.5, (0.0, -1.5), LEVEL_FRAME)
+
+
+def terrain(stamp: int = START) -> ElevationMap:
+    """Rises ahead, with a hole in its middle."""
+    elevation = np.tile(np.linspace(0.0, 2.0, COLS, dtype=np.float32), (ROWS, 1))
+    elevation[3, 4] = np.nan
+    return ElevationMap(stamp, {"elevation": elevation}, 0.5, (0.0, -1.5), LEVEL_FRAME)
+
+
+def disparity(stamp: int = START) -> Disparity:
+    """Far at the top, near at the bottom, unknown at the left."""
+    pixels = np.tile(np.linspace(2.0, 60.0, 48, dtype=np.float32)[:, None], (1, 64))
+    pixels[:, :8] = np.nan
+    return Disparity(stamp, pixels, np.isfinite(pixels).astype(np.uint8), np.ones_like(pixels))
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    """A result log of five frames; the second has no maps."""
+    path = tmp_path / "result.mcap"
+    with Ros2Writer(path) as log:
+        for n in range(5):
+            stamp = START + n * STEP
+            log.write("/nav/disparity", disparity_image(disparity(stamp)), stamp)
+            if n != 1:
+                log.write("/nav/elevation_map", grid_map(terrain(stamp)), stamp)
+                log.write("/nav/navigation_map", occupancy_grid(navigation(stamp)), stamp)
+    return path
+
+
+def cells_of(page: Array) -> Array:
+    """The colours at the middles of the cells of a painted map, (COLS, ROWS, 3): x downwards, y to the left."""
+    zoom = (page.shape[0] - 2 * MARGIN) // COLS
+    return page[MARGIN + zoom // 2 :: zoom, MARGIN + zoom // 2 :: zoom][:COLS, :ROWS]
+
+
+def test_ahead_is_up_and_left_is_left() -> None:
+    picture = cells_of(navigation_picture(navigation()))
+    expected = np.full((COLS, ROWS, 3), FREE)
+    expected[0, 0] = HAZARD
+    expected[:, -1] = UNKNOWN
+    expected[-1, 3] = picture[-1, 3]  # the rover's marker reaches into its cell
+    expected[-1, 2] = picture[-1, 2]
+    np.testing.assert_array_equal(picture, expected)
+
+
+def test_terrain_brightens_with_height_and_holes_stay_holes() -> None:
+    picture = cells_of(elevation_picture(terrain())).astype(int)
+    assert tuple(picture[COLS - 1 - 4, ROWS - 1 - 3]) == paint.UNKNOWN_RGB
+    green = picture[1:-1, 0, 1]  # viridis is greener the higher; the ramp rises ahead, which is up
+    assert (np.diff(green) < 0).all()
+
+
+def test_near_is_red_far_is_blue_unknown_is_neither() -> None:
+    picture = disparity_picture(disparity().pixels)[MARGIN:, MARGIN:]
+    near, far = picture[46, 40].astype(int), picture[8, 40].astype(int)
+    assert near[0] > near[2]
+    assert far[2] > far[0]
+    assert tuple(picture[20, 4]) == paint.UNKNOWN_RGB
+
+
+def test_the_log_gives_the_first_middle_and_last_frame(result: Path, tmp_path: Path) -> None:
+    written = draw(result, tmp_path / "pictures")
+    assert [path.name for path in written] == [
+        f"frame-{n:04d}-{name}.png" for n in (0, 2, 4) for name in ("disparity", "elevation", "navigation")
+    ]
+
+
+def test_frames_can_be_chosen_also_from_the_end(result: Path, tmp_path: Path) -> None:
+    written = draw(result, tmp_path / "pictures", frames=[1, -1])
+    assert [path.name for path in written] == [
+        "frame-0001-disparity.png", "frame-0004-disparity.png", "frame-0004-elevation.png",
+        "frame-0004-navigation.png",
+    ]  # fmt: skip
+
+
+def test_a_picture_from_the_log_is_the_picture_of_the_data(result: Path, tmp_path: Path) -> None:
+    """Through GridMap and OccupancyGrid, whose cells run in other directions, nothing is turned round."""
+    files = {path.name: cv2.imread(str(path)) for path in draw(result, tmp_path, frames=[0])}
+    pictures = {
+        "disparity": disparity_picture(disparity().pixels), "elevation": elevation_picture(terrain()),
+        "navigation": navigation_picture(navigation()),
+    }  # fmt: skip
+    for name, picture in pictures.items():
+        file = files[f"frame-0000-{name}.png"]
+        assert file is not None
+        np.testing.assert_array_equal(file[..., ::-1], picture)
+
+
+def test_a_frame_that_is_not_there_is_named(result: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no frame 5: the log holds frames 0 to 4"):
+        draw(result, tmp_path, frames=[5])
+
+
+def test_a_log_without_results_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "raw.mcap"
+    with Ros2Writer(path) as log:
+        log.write("/elsewhere", grid_map(terrain()), START)
+    with pytest.raises(LogError, match=r"raw\.mcap holds none of /nav/disparity"):
+        draw(path, tmp_path)
+
+
+def test_nothing_known_is_still_a_picture() -> None:
+    nothing = np.full((ROWS, COLS), np.nan, np.float32)
+    page = elevation_picture(ElevationMap(START, {"elevation": nothing}, 0.5, (0.0, -1.5), LEVEL_FRAME))
+    assert (cells_of(page)[:-1] == paint.UNKNOWN_RGB).all()
+    assert (disparity_picture(nothing)[MARGIN : MARGIN + ROWS, MARGIN : MARGIN + COLS] == paint.UNKNOWN_RGB).all()
+
+
+def test_light_comes_from_ahead_on_the_left() -> None:
+    x, y = np.meshgrid(np.arange(20), np.arange(20))
+    towards, level, away = (
+        paint.hillshade((share * (x + y)).astype(np.float32), 1.0)[10, 10] for share in (-0.3, 0.0, 0.3)
+    )
+    assert towards > level > away
+
+
+@given(rise_x=st.floats(-2, 2), rise_y=st.floats(-2, 2), hole=st.tuples(st.integers(2, 5), st.integers(2, 5)))
+def test_a_hole_does_not_change_the_shade_of_a_plane(rise_x: float, rise_y: float, hole: tuple[int, int]) -> None:
+    x, y = np.meshgrid(np.arange(8), np.arange(8))
+    plane = rise_x * x + rise_y * y
+    shade = paint.hillshade(plane, 1.0)
+    np.testing.assert_allclose(shade, shade[0, 0], atol=1e-9)
+    plane[hole] = np.nan
+    known = np.isfinite(plane)
+    np.testing.assert_allclose(paint.hillshade(plane, 1.0)[known], shade[0, 0], atol=1e-9)
+
+
+@given(st.integers(2, 9), st.integers(2, 9), st.integers(0, 2**32 - 1))
+def test_every_triangle_of_a_surface_joins_three_known_neighbours(rows: int, cols: int, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    elevation = random.normal(size=(rows, cols)).astype(np.float32)
+    elevation[random.random((rows, cols)) < 0.3] = np.nan
+    grid = ElevationMap(START, {"elevation": elevation}, 1.0, (0.0, 0.0), LEVEL_FRAME)
+    vertices, triangles = paint.surface(grid)
+    np.testing.assert_array_equal(vertices[:, 2], elevation[np.isfinite(elevation)])
+    corners = vertices[triangles]
+    edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0]
+    np.testing.assert_allclose(area, 1.0)  # half a cell, seen from above anticlockwise
+
+
+def test_sixteen_bit_images_keep_their_contrast() -> None:
+    """A 12 bit camera fills a quarter of a 16 bit range's bits, and must not come out black."""
+    twelve = np.linspace(0, 4095, 256).astype(np.uint16).reshape(16, 16)
+    eight = paint.eight_bit(twelve)
+    assert (eight.min(), eight.max()) == (0, 255)

@@ -1,0 +1,293 @@
+"""Our data as ROS 2 messages: what others read from them is what we meant."""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys import Stores, get_typestore
+
+from recordings.errors import LogError
+from recordings.ros2 import (
+    TYPES,
+    Ros2Writer,
+    camera_info,
+    diagnostics,
+    disparity_image,
+    grid_map,
+    image,
+    imu,
+    iter_messages,
+    make,
+    occupancy_grid,
+    odometry,
+    point_cloud,
+    read_disparity,
+    read_grid_map,
+    read_occupancy_grid,
+    stamp_of,
+    transform_message,
+)  # fmt: skip
+from recordings.ros2_types import decoder_for
+from stages.data import (
+    Disparity,
+    ElevationMap,
+    NavigationMap,
+    PointCloud,
+    Pose,
+    StereoCamera,
+    Transform,
+)  # fmt: skip
+from tests.recordings.sample_log import data_folder, model, write_sample
+
+STAMP = 1_700_000_000_123_456_789
+
+
+def terrain(rows: int = 2, cols: int = 3) -> ElevationMap:
+    elevation = np.arange(rows * cols, dtype=np.float32).reshape(rows, cols)
+    elevation[0, -1] = np.nan
+    return ElevationMap(STAMP, {"elevation": elevation, "count": elevation + 10}, 0.5, (-1.0, 4.0), "level")
+
+
+def cloud() -> PointCloud:
+    points = np.array([[1, 2, 3], [4, 5, 6]], np.float32)
+    colors = np.array([[255, 2, 3], [4, 128, 6]], np.uint8)
+    return PointCloud(STAMP, points, colors, np.array([0.1, 0.2], np.float32), np.array([0, 5], np.int32), "level")
+
+
+def disparity(cx_right: float = 10.0) -> Disparity:
+    pixels = np.array([[1.5, np.nan, 3.25], [4, 5, 6]], np.float32)
+    camera = StereoCamera(100.0, 100.0, 10.0, 5.0, 0.25, 3, 2, cx_right=cx_right, frame_id="left_optical")
+    return Disparity(STAMP, pixels, np.ones((2, 3), np.uint8), np.ones((2, 3), np.float32), camera=camera)
+
+
+def navigation() -> NavigationMap:
+    cells = np.array([[0, 100, -1], [0, 0, 100]], np.int8)
+    return NavigationMap(STAMP, cells, np.zeros((2, 3), np.uint8), 0.05, (-1.0, 4.0), "level")
+
+
+def one_of_each() -> dict[str, Any]:
+    transform = Transform("level", "camera", np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), [1, 2, 3])
+    return {
+        "/image": image(STAMP, "cam", np.arange(24, dtype=np.uint8).reshape(2, 4, 3)),
+        "/info": camera_info(STAMP, "cam", model("right")),
+        "/disparity": disparity_image(disparity()),
+        "/points": point_cloud(cloud()),
+        "/grid": grid_map(terrain()),
+        "/map": occupancy_grid(navigation()),
+        "/tf": transform_message([(transform, STAMP)]),
+        "/imu": imu(STAMP, "imu", np.array([0.1, 0.2, 0.3, 0.927]), np.eye(3) * 0.5),
+        "/odom": odometry(Pose(STAMP, [1, 2, 3], [0, 0, 0.6, 0.8], "odom", "base", np.eye(6))),
+        "/diagnostics": diagnostics(STAMP, [(2, "match", "no texture", {"reason": "failed"})]),
+    }
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    path = tmp_path / "each.mcap"
+    with Ros2Writer(path) as writer:
+        for topic, message in one_of_each().items():
+            writer.write(topic, message, STAMP)
+    return path
+
+
+def plain(value: Any) -> Any:
+    """A message of any library as plain, comparable values."""
+    if isinstance(value, bytes | bytearray | memoryview):
+        return list(value)
+    if isinstance(value, np.ndarray):
+        return [plain(item) for item in value.tolist()]
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return repr(value)
+    names = (
+        [f.name for f in fields(value)]
+        if is_dataclass(value)
+        else [n for n in getattr(value, "__slots__", ()) if n[0] != "_"]
+    )
+    return {name: plain(getattr(value, name)) for name in names} or value
+
+
+def through_rosbags(message: Any) -> Any:
+    """A message as rosbags' own store decodes it (it knows all of ours but grid_map_msgs)."""
+    store, name = get_typestore(Stores.ROS2_JAZZY), message.__msgtype__
+    return (store if name in store.types else TYPES).deserialize_cdr(TYPES.serialize_cdr(message, name), name)
+
+
+def test_another_decoder_reads_the_same_numbers(written: Path) -> None:
+    sent = one_of_each()
+    with written.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        read = {channel.topic: message for _, channel, _, message in reader.iter_decoded_messages()}
+    assert read.keys() == sent.keys()
+    for topic, message in sent.items():
+        if topic != "/diagnostics":  # level is a `byte`, which that decoder returns as bytes
+            assert plain(read[topic]) == plain(through_rosbags(message)), topic
+    assert read["/diagnostics"].status[0].message == "no texture"
+
+
+def test_our_reader_returns_every_message_with_its_topic_and_time(written: Path) -> None:
+    read = {topic: (stamp, message) for topic, stamp, message in iter_messages(written)}
+    for topic, message in one_of_each().items():
+        assert read[topic][0] == STAMP
+        assert plain(read[topic][1]) == plain(through_rosbags(message)), topic
+    assert [topic for topic, _, _ in iter_messages(written, ["/grid"])] == ["/grid"]
+
+
+def test_a_grid_map_starts_at_the_corner_of_largest_x_and_y() -> None:
+    ours = terrain()
+    message = grid_map(ours)
+    assert (message.info.length_x, message.info.length_y) == (1.5, 1.0)
+    assert (message.info.pose.position.x, message.info.pose.position.y) == (-0.25, 4.5)
+    layer = message.data[message.layers.index("count")]
+    assert [(d.label, d.size, d.stride) for d in layer.layout.dim] == [("column_index", 2, 6), ("row_index", 3, 3)]
+    matrix = layer.data.reshape((3, 2), order="F")  # as Eigen reads it: rows along -x, columns along -y
+    for i in range(3):
+        for j in range(2):
+            x = -0.25 + 1.5 / 2 - (i + 0.5) * 0.5  # grid_map_core getPositionFromIndex
+            y = 4.5 + 1.0 / 2 - (j + 0.5) * 0.5
+            col, row = int((x - ours.origin[0]) / 0.5), int((y - ours.origin[1]) / 0.5)
+            np.testing.assert_equal(matrix[i, j], ours.layers["count"][row, col])
+
+
+@given(
+    st.integers(1, 7), st.integers(1, 7), st.floats(0.01, 2.0), st.floats(-50, 50), st.integers(0, 6), st.integers(0, 6)
+)
+def test_a_grid_map_comes_back_as_it_was(rows: int, cols: int, cell: float, x: float, outer: int, inner: int) -> None:
+    layer = np.random.default_rng(rows * 10 + cols).normal(size=(rows, cols)).astype(np.float32)
+    ours = ElevationMap(STAMP, {"elevation": layer}, cell, (x, -x / 3), "odom")
+    message = grid_map(ours)
+    # A map moved in its circular buffer: its cell (0, 0) stands at the start indices.
+    message.outer_start_index, message.inner_start_index = outer % cols, inner % rows
+    matrix = message.data[0].data.reshape((cols, rows), order="F")
+    rolled = np.roll(matrix, (outer % cols, inner % rows), (0, 1))
+    message.data[0].data = np.ascontiguousarray(rolled.T).reshape(-1)
+    back = read_grid_map(message)
+    np.testing.assert_array_equal(back.layers["elevation"], layer)
+    np.testing.assert_allclose(back.origin, ours.origin, atol=1e-9)
+    assert (back.resolution, back.frame_id, back.stamp) == (cell, "odom", STAMP)
+
+
+def test_an_occupancy_grid_starts_at_the_lower_left() -> None:
+    message = occupancy_grid(navigation())
+    assert (message.info.width, message.info.height) == (3, 2)
+    assert (message.info.origin.position.x, message.info.origin.position.y) == (-1.0, 4.0)
+    assert message.data.tolist() == [0, 100, -1, 0, 0, 100]
+    back = read_occupancy_grid(message)
+    np.testing.assert_array_equal(back.cells, navigation().cells)
+    assert (back.resolution, back.origin, back.frame_id) == (0.05, (-1.0, 4.0), "level")
+
+
+def test_disparity_obeys_depth_equals_f_times_t_over_d() -> None:
+    message = disparity_image(disparity(cx_right=12.0))
+    d = read_disparity(message)
+    np.testing.assert_array_equal(d, disparity().pixels + 2)
+    assert np.isnan(d[0, 1])
+    assert (message.f, message.t, message.min_disparity, message.max_disparity) == (100.0, 0.25, 3.5, 8.0)
+    np.testing.assert_array_equal(read_disparity(disparity_image(disparity())), disparity().pixels)
+
+
+def test_a_cloud_packs_colours_as_pcl_does() -> None:
+    message = point_cloud(cloud())
+    assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
+        ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("rgb", 12, 7), ("sigma", 16, 7),
+    ]  # fmt: skip
+    rows = message.data.reshape(2, 20)
+    assert rows[0, 12:16].tolist() == [3, 2, 255, 0]  # little-endian 0x00RRGGBB
+    np.testing.assert_array_equal(rows[:, :12].copy().view("<f4"), cloud().points)
+    np.testing.assert_array_equal(rows[:, 16:].copy().view("<f4")[:, 0], cloud().sigma)
+
+
+def test_a_transform_message_turns_points_like_its_transform() -> None:
+    transform = Transform("level", "camera", np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0.0]]), [1, 2, 3])
+    sent = transform_message([(transform, STAMP)]).transforms[0]
+    assert (sent.header.frame_id, sent.child_frame_id, stamp_of(sent.header)) == ("level", "camera", STAMP)
+    q, v = sent.transform.rotation, np.array([1.0, -2.0, 0.5])
+    u = np.array([q.x, q.y, q.z])
+    turned = v + 2 * np.cross(u, np.cross(u, v) + q.w * v)  # q v q*
+    t = sent.transform.translation
+    np.testing.assert_allclose(turned + np.array([t.x, t.y, t.z]), transform(v), atol=1e-12)
+
+
+def test_equal_calls_make_equal_bytes(tmp_path: Path) -> None:
+    digests = [hashlib.sha256(write_sample(tmp_path / name).read_bytes()).hexdigest() for name in ("a", "b")]
+    assert digests[0] == digests[1]
+
+
+def test_a_log_has_its_name_only_once_it_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    path.write_bytes(b"the log before")
+    with Ros2Writer(path) as writer:
+        writer.write("/image", image(1, "cam", np.zeros((2, 2), np.uint8)), 1)
+        writer.abort()
+    assert path.read_bytes() == b"the log before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"cannot write .*nowhere/out\.mcap: No such file"):
+        Ros2Writer(tmp_path / "nowhere" / "out.mcap")
+
+
+def test_a_full_disk_is_told_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    writer = Ros2Writer(tmp_path / "out.mcap")
+    noise = np.random.default_rng(0).integers(0, 256, (512, 512), dtype=np.uint8)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))
+        writer.write("/image", image(1, "cam", noise), 1)
+        with pytest.raises(LogError, match=r"cannot write .*out\.mcap: File too large"):
+            writer.write("/image", image(2, "cam", noise), 2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    writer.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_codecs_are_built_safely_by_many_threads() -> None:
+    text = "".join(f"float64 field{number}\n" for number in range(20)).encode()
+
+    def decoded(number: int) -> float:
+        decoder = decoder_for(f"vendor_msgs/msg/Kind{number % 4}", "ros2msg", text)
+        return float(decoder(b"\0\1\0\0" + np.arange(20.0).tobytes()).field19)
+
+    with ThreadPoolExecutor(8) as pool:
+        assert set(pool.map(decoded, range(64))) == {19.0}
+
+
+def test_a_schema_may_leave_out_standard_types() -> None:
+    decoder = decoder_for("vendor_msgs/msg/Tilt", "ros2msg", b"std_msgs/Header header\nfloat32 pitch\n")
+    header = make("std_msgs/msg/Header", stamp=make("builtin_interfaces/msg/Time", sec=1, nanosec=2), frame_id="abc")
+    raw = bytes(TYPES.serialize_cdr(header, "std_msgs/msg/Header")) + np.float32(2.5).tobytes()
+    message = decoder(raw)
+    assert (message.header.frame_id, message.pitch) == ("abc", 2.5)
+
+
+@settings(max_examples=30)
+@given(st.binary(max_size=80))
+def test_a_schema_of_nonsense_is_a_log_error(text: bytes) -> None:
+    with suppress(LogError):  # any other exception fails the test
+        decoder_for("vendor_msgs/msg/Odd", "ros2msg", text)
+
+
+def test_messages_of_real_recorders_decode() -> None:
+    folder = data_folder("logs/rosbag2")
+    talker = folder / "rosbag2_py__test__resources__mcap__talker__talker.mcap"
+    assert sum(1 for _ in iter_messages(talker)) == 20
+    cdr = folder / "rosbag2_tests__resources__mcap__cdr_test__cdr_test_0.mcap"
+    assert sum(1 for _ in iter_messages(cdr)) == 7

@@ -1,0 +1,317 @@
+"""The simulator's truth, held against itself and against plain references."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
+
+from recordings import ros2
+from recordings.simulator import Simulation, log, raycast, terrain, traverse
+from stages.data import Cell, Transform
+
+SMALL = Simulation(
+    frames=2, rate=1.0, width=400, height=300, relief_cells=512, abundance=0.12, color=False, noise=0.0,
+    tilt_noise=0.0, frame_offset=0.0, seed=5,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return SMALL.frame(1)
+
+
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "traverse.mcap"
+    SMALL.write(path)
+    messages: dict[str, list] = {}
+    order = []
+    for topic, log_time, message in ros2.iter_messages(path):
+        messages.setdefault(topic, []).append(message)
+        order.append(log_time)
+    return messages, order
+
+
+def world_points(seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Every surface pixel's place in the world by way of the disparity image and the static transforms."""
+    camera = SMALL.camera
+    disparity = log.true_disparity(SMALL, 0, seen).pixels.astype(np.float64)
+    v, u = np.nonzero(np.isfinite(disparity))
+    z = camera.fx * camera.baseline / disparity[v, u]
+    optical = np.column_stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
+    return seen.base.after(SMALL.mounts[0])(optical), v, u
+
+
+def solid(rocks: terrain.Rocks, facets: np.ndarray, index: int, points: np.ndarray, extent: float) -> np.ndarray:
+    """Signed excess of points over a rock's surface in its unit space (plain numpy): 0 on it, negative inside."""
+    offset = points - [*rocks.center[index], rocks.middle[index]]
+    offset[:, :2] = (offset[:, :2] + extent / 2) % extent - extent / 2
+    c, s = np.cos(rocks.yaw[index]), np.sin(rocks.yaw[index])
+    unit = offset @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) / rocks.semi_axes[index]
+    planes = facets[rocks.shape[index]]
+    return np.maximum(np.linalg.norm(unit, axis=1) - 1, (unit @ planes[:, :3].T - planes[:, 3]).max(axis=1))
+
+
+def test_true_disparity_reprojects_onto_the_true_surface_within_a_millimetre(seen):
+    points, v, u = world_points(seen)
+    ground = seen.surface[v, u] == raycast.GROUND
+    height = SMALL.terrain.elevation(points[ground, 0], points[ground, 1])
+    assert ground.sum() > 40_000
+    assert np.abs(height - points[ground, 2]).max() < 1e-3
+    on_rock = seen.surface[v, u]
+    rocks = np.unique(on_rock[on_rock >= 0])
+    assert len(rocks) > 50
+    for rock in rocks:
+        excess = solid(
+            SMALL.terrain.rocks, SMALL.terrain.facets, rock, points[on_rock == rock], SMALL.terrain.extent
+        )  # fmt: skip
+        assert np.abs(excess).max() * SMALL.terrain.rocks.semi_axes[rock].max() < 1e-3
+
+
+def test_nothing_stands_between_the_camera_and_what_it_sees(seen):
+    ground, rocks = SMALL.terrain, SMALL.terrain.rocks
+    points, _, _ = world_points(seen)
+    eye = seen.base.after(SMALL.mounts[0]).translation
+    rng = np.random.default_rng(0)
+    for point in points[rng.choice(len(points), 25, replace=False)]:
+        way = eye + np.linspace(0, 1 - 1e-4, 800)[:, None] * (point - eye)
+        assert (way[:, 2] - ground.elevation(way[:, 0], way[:, 1])).min() > -1e-6
+        for index in np.flatnonzero(rocks.diameter > 0.15):
+            assert solid(rocks, ground.facets, index, way, ground.extent).min() > -1e-4
+
+
+def residual(simulation: Simulation, truth, low: float, high: float, shift: float) -> float:
+    """Mean squared gray level between the left image and the right one, warped by the true disparity plus `shift`."""
+    disparity = log.true_disparity(simulation, 0, truth).pixels
+    left, right = (picture.astype(np.float32) for picture in truth.images)
+    height, width = left.shape
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    ring = (truth.seen == 255) & (truth.depth >= low) & (truth.depth < high) & (u - np.nan_to_num(disparity) > 4)
+    warped = cv2.remap(right, u - disparity - np.float32(shift), v, cv2.INTER_LINEAR)[ring]
+    gain = left[ring] @ warped / (warped @ warped)  # the cameras' gains differ on purpose
+    return float(np.mean((gain * warped - left[ring]) ** 2))
+
+
+@pytest.mark.parametrize("rings", [(0, 3), (3, 5), (5, 8)])
+def test_the_images_agree_at_the_true_disparity_and_nowhere_else(seen, rings):
+    before, at, after = (residual(SMALL, seen, *rings, shift) for shift in (-1, 0, 1))
+    assert at < 0.5 * min(before, after)
+
+
+def test_on_bare_ground_the_images_agree_best_within_a_hundredth_of_a_pixel_of_the_truth():
+    # Without rocks, that is without edges, over which the lens's blur mixes two surfaces.
+    bare = replace(SMALL, abundance=0.0, width=1000, height=750)
+    truth = bare.frame(0)
+    for rings in ((0, 3), (3, 5), (5, 8)):
+        before, at, after = (residual(bare, truth, *rings, shift) for shift in (-0.5, 0.0, 0.5))
+        assert abs(0.25 * (before - after) / (before - 2 * at + after)) < 0.01
+        assert at < 8.0
+
+
+def test_a_pixel_is_occluded_exactly_where_the_right_camera_sees_something_nearer(seen):
+    pose = seen.base.after(SMALL.mounts[1])
+    right = np.full(seen.depth.shape, np.nan)
+    surface, facet = np.empty(right.shape, np.int32), np.empty(right.shape, np.int8)
+    raycast.cast_rows(
+        SMALL.terrain.scene, pose.translation, pose.rotation, SMALL.camera.fx, SMALL.camera.fy, SMALL.camera.cx,
+        SMALL.camera.cy, SMALL.horizon, 0, right, surface, facet,
+    )  # fmt: skip
+    v, u = np.nonzero(np.isfinite(seen.depth))
+    depth, mask = seen.depth[v, u], seen.seen[v, u]
+    column = u - SMALL.camera.fx * SMALL.baseline / depth
+    assert (mask[column < -0.5] == 128).all()
+    inside = column > 0
+    v, mask, depth, column = v[inside], mask[inside], depth[inside], column[inside]
+    low = np.floor(column).astype(int)
+    beside = np.stack([right[v, low], right[v, np.minimum(low + 1, SMALL.width - 1)]])
+    # Half a pixel of disparity is what neighbours of one surface may differ by.
+    gap = SMALL.camera.fx * SMALL.baseline * (1 / beside - 1 / depth)
+    hidden, plain = (gap > 1.5).all(axis=0), (np.abs(gap) < 0.5).all(axis=0)
+    assert hidden.sum() > 200
+    assert (mask[hidden] == 128).mean() > 0.995
+    assert (mask[plain] == 255).mean() > 0.995
+    assert ((seen.seen == 0) == np.isinf(seen.depth)).all()
+
+
+@pytest.mark.parametrize("abundance", [0.05, 0.10, 0.20])
+@pytest.mark.parametrize("smallest", [0.06, 0.2, 0.5, 1.0])
+def test_rock_numbers_are_the_integral_of_golombeks_density(abundance, smallest):
+    q = 1.79 + 0.152 / abundance
+    number, _ = quad(lambda d: abundance * q * np.exp(-q * d) / (np.pi * d**2 / 4), smallest, 20.0, epsrel=1e-9)
+    assert terrain.rocks_per_area(abundance, smallest, 20.0)[1][-1] == pytest.approx(number, rel=1e-4)
+
+
+def test_strewn_rocks_have_the_size_frequency_and_cover_of_the_law():
+    ground = terrain.make_terrain(np.random.default_rng(3), 2048, 0.04, 0.05, 0.1, 0.08, 2.5)
+    area = ground.extent**2
+    for diameter in (0.08, 0.15, 0.3, 0.6, 1.0):
+        expected = terrain.rocks_per_area(0.1, diameter, 2.5)[1][-1] * area
+        assert abs((ground.rocks.diameter >= diameter).sum() - expected) < 4 * np.sqrt(expected)
+    cover = np.pi / 4 * np.sum(ground.rocks.diameter**2) / area
+    lost = terrain.area_fraction(0.1, 2.5)
+    assert cover == pytest.approx(float(terrain.area_fraction(0.1, 0.08) - lost), rel=0.06)
+    ratio = ground.rocks.height / ground.rocks.diameter
+    assert ratio.min() >= 0.3
+    assert ratio.max() <= 0.6
+
+
+def test_a_rock_stands_as_high_and_as_wide_as_the_truth_says():
+    rocks = SMALL.terrain.rocks
+    large = np.flatnonzero(rocks.diameter > 0.3)[:40]
+    shapes = SMALL.terrain.facets
+    for index in large:
+        one = rocks.only(np.arange(len(rocks)) == index)
+        single = terrain.Terrain(np.full((64, 64), one.base[0], np.float32), 0.1, one, shapes)
+        reach = np.linspace(-1.6, 1.6, 161)
+        x, y = np.meshgrid(one.center[0, 0] + reach, one.center[0, 1] + reach)
+        top, surface = raycast.tops_at(single.scene, x.ravel(), y.ravel(), single.scene.ceiling)
+        assert top.max() - one.base[0] == pytest.approx(one.height[0], rel=0.05)
+        width = 2 * np.sqrt((surface >= 0).sum() * 0.02**2 / np.pi)
+        assert width == pytest.approx(one.diameter[0], rel=0.25)
+
+
+@pytest.mark.parametrize("slope", [2.0, 15.0])
+def test_relief_has_the_slope_asked_for_and_no_seam(slope):
+    ground = terrain.relief(np.random.default_rng(1), 512, 0.05, np.radians(slope)).astype(np.float64)
+    rise = [np.roll(ground, 20, axis=axis) - ground for axis in (0, 1)]
+    assert np.degrees(np.arctan(np.sqrt(np.mean(np.square(rise))))) == pytest.approx(slope, rel=1e-3)
+    step = np.abs(np.diff(ground, axis=0))
+    assert np.abs(ground[0] - ground[-1]).mean() < 1.5 * step.mean()
+
+
+def test_the_ground_repeats_without_end():
+    scene, extent = SMALL.terrain.scene, SMALL.terrain.extent
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        x, y = rng.uniform(0, extent, 2)
+        direction = (rng.normal(), rng.normal(), rng.uniform(-0.6, -0.02))
+        here = raycast.first_hit(scene, x, y, 3.0, *direction, 0.0, 300.0)
+        there = raycast.first_hit(scene, x + 2 * extent, y - extent, 3.0, *direction, 0.0, 300.0)
+        assert there[1] == here[1]
+        assert there[0] == pytest.approx(here[0], abs=1e-4)
+
+
+@pytest.mark.parametrize(("east", "north", "heading"), [(0.1, 0.0, 0.0), (-0.05, 0.2, 0.7), (0.0, -0.15, 2.5)])
+def test_on_a_plane_the_body_tilts_with_the_plane(east, north, heading):
+    nodes = np.arange(128) * 0.1
+    plane = (east * nodes[None, :] + north * nodes[:, None]).astype(np.float32)
+    bare = SMALL.terrain.rocks.only(np.zeros(len(SMALL.terrain.rocks), bool))
+    ground = terrain.Terrain(plane, 0.1, bare, SMALL.terrain.facets)
+    route = traverse.Route((6.0, 6.5), heading, 0.0, 9.0, 1.0, 1.0)
+    base = traverse.base_pose(ground, route, 0.0)
+    normal = np.array([-east, -north, 1.0])
+    np.testing.assert_allclose(base.rotation[:, 2], normal / np.linalg.norm(normal), atol=1e-6)
+    np.testing.assert_allclose(base.translation, [6.0, 6.5, 6.0 * east + 6.5 * north], atol=1e-6)
+    assert np.arctan2(base.rotation[1, 0], base.rotation[0, 0]) == pytest.approx(heading)
+    np.testing.assert_allclose(traverse.level_pose(base).rotation[:, 2], [0, 0, 1], atol=1e-12)
+
+
+def test_the_inclinometer_and_its_mount_give_the_true_tilt(logged):
+    messages, _ = logged
+    mount = {t.child_frame_id: t for m in messages["/tf_static"] for t in m.transforms}[traverse.INCLINOMETER_FRAME]
+    base_from_sensor = rotation(mount.transform.rotation)
+    readings = {ros2.stamp_of(m.header): m for m in messages["/imu/inclinometer"]}
+    for truth in messages["/truth/tilt"]:
+        up_sensor = rotation(readings[ros2.stamp_of(truth.header)].orientation)[2]
+        up_base = rotation(truth.quaternion)[2]
+        np.testing.assert_allclose(base_from_sensor @ up_sensor, up_base, atol=1e-7)
+        assert 1e-3 < np.arccos(up_base[2]) < np.radians(25)
+    assert np.degrees(np.arccos(base_from_sensor[2, 2])) > 3  # an ignored mount would show
+
+
+def test_true_elevation_is_where_the_seen_ground_is(seen):
+    elevation, hazards = log.truth_maps(SMALL, 0, seen)
+    points, v, u = world_points(seen)
+    local = seen.level.inverse()(points)
+    kept = (seen.surface[v, u] == raycast.GROUND) & (np.abs(local[:, :2]).max(axis=1) < 8)
+    column, row = np.floor((local[kept, :2] - elevation.origin) / elevation.resolution).astype(int).T
+    clear = hazards.cells[row, column] == Cell.FREE
+    error = np.abs(elevation.layers["elevation"][row, column] - local[kept, 2])[clear]
+    assert np.median(error) < 0.005
+    mirrored = np.abs(elevation.layers["elevation"][::-1][row, column] - local[kept, 2])[clear]
+    assert np.median(mirrored) > 5 * np.median(error)
+    visible = elevation.layers["visible"]
+    assert set(np.unique(visible)) == {0.0, 1.0}
+    assert visible[:, :140].sum() == 0  # nothing behind the rover
+    assert 0.05 < visible.mean() < 0.4
+
+
+def test_high_rocks_are_hazards_and_open_ground_is_free(seen):
+    elevation, hazards = log.truth_maps(SMALL, 0, seen)
+    rocks = log.rocks_in_level(SMALL, seen)
+    high = rocks[(rocks[:, 4] >= 0.2) & (np.abs(rocks[:, :2]).max(axis=1) < 7.9)]
+    assert len(high) > 5
+    column, row = np.floor((high[:, :2] + 8) / 0.05).astype(int).T
+    assert (hazards.cells[row, column] == Cell.HAZARD).all()
+    assert (elevation.layers["elevation"][row, column] - high[:, 2] > 0.08).all()
+    assert (hazards.cells == Cell.HAZARD).mean() < 0.3
+    assert (hazards.cells != Cell.UNKNOWN).all()
+
+
+def test_no_rock_stands_in_the_rovers_way():
+    rocks = SMALL.terrain.rocks
+    for way in np.arange(0, 1.0, 0.1):
+        base = traverse.base_pose(SMALL.terrain, SMALL.route, way)
+        near = np.hypot(*(rocks.center - base.translation[:2]).T) < 0.4 + rocks.semi_axes[:, :2].max(axis=1)
+        assert rocks.height[near].max(initial=0.0) < 0.12
+
+
+def test_a_log_has_everything_a_replay_needs_in_log_time_order(logged):
+    messages, order = logged
+    assert order == sorted(order)
+    per_frame = {topic for topic in messages if topic.startswith(("/stereo", "/truth"))}
+    assert per_frame == {
+        "/stereo/left/image_rect", "/stereo/left/camera_info", "/stereo/right/image_rect", "/stereo/right/camera_info",
+        "/truth/disparity", "/truth/occlusion", "/truth/elevation_map", "/truth/navigation_map", "/truth/rocks",
+        "/truth/tilt",
+    }  # fmt: skip
+    wanted = [SMALL.stamp(index) for index in range(SMALL.frames)]
+    for topic in per_frame:
+        assert [ros2.stamp_of(message.header) for message in messages[topic]] == wanted
+    for topic in ("/imu/inclinometer", "/odometry"):
+        stamps = [ros2.stamp_of(message.header) for message in messages[topic]]
+        assert stamps[0] < wanted[0]
+        assert stamps[-1] > wanted[-1]
+    right = messages["/stereo/right/camera_info"][0]
+    assert -right.p[3] / right.p[0] == pytest.approx(SMALL.baseline)
+    static = {t.child_frame_id for m in messages["/tf_static"] for t in m.transforms}
+    assert static == {"left_camera_optical", "right_camera_optical", "inclinometer_link"}
+
+
+def test_odometry_without_drift_tells_how_far_the_rover_drove():
+    first = SMALL.base_at(SMALL.begin)
+    later = SMALL.stamp(1)
+    pose = traverse.odometry_pose(later, first, SMALL.base_at(later), 1.0, 0.0)
+    moved = Transform("odom", "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
+    odom = traverse.level_pose(first)
+    expected = odom.inverse().after(SMALL.base_at(later))
+    np.testing.assert_allclose(moved.rotation, expected.rotation, atol=1e-12)
+    np.testing.assert_allclose(moved.translation, expected.translation, atol=1e-12)
+    assert np.hypot(*pose.position[:2]) == pytest.approx(0.75, abs=0.01)
+
+
+def test_equal_simulations_write_equal_bytes_whatever_the_threads(tmp_path: Path):
+    written = []
+    for name, threads, seed in (("a", 1, 1), ("b", 3, 1), ("c", 1, 2)):
+        small = Simulation(frames=1, width=96, height=72, relief_cells=256, threads=threads, seed=seed)
+        small.write(tmp_path / name)
+        written.append((tmp_path / name).read_bytes())
+    assert written[0] == written[1]
+    assert written[0] != written[2]
+
+
+def test_an_impossible_simulation_is_refused_with_the_parameters_name():
+    with pytest.raises(ValueError, match="relief_cells must be a power of two"):
+        Simulation(relief_cells=1000)
+    with pytest.raises(ValueError, match="frames must be at least 1"):
+        Simulation(frames=0)
+
+
+def rotation(quaternion) -> np.ndarray:
+    return Rotation.from_quat([quaternion.x, quaternion.y, quaternion.z, quaternion.w]).as_matrix()

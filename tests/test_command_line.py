@@ -1,0 +1,223 @@
+"""The command line on real files: what a user types, what comes out, and what is said when it cannot be done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from flow.cli import main
+from tests.conftest import FRAMES, rewrite
+
+ROOT = Path(__file__).parent.parent
+SMALL = ("--set", "matched.disparities=64")
+RESULTS = {
+    "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/tf", "/nav/diagnostics",
+}  # fmt: skip
+
+
+def roverflow(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The traverse, run through the default pipeline."""
+    out = tmp_path_factory.mktemp("result") / "out.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--summary", out.with_suffix(".json")) == 0
+    return out
+
+
+def raw_messages(path: Path) -> list[tuple[str, int, str]]:
+    with path.open("rb") as stream:
+        return [
+            (channel.topic, message.log_time, hashlib.sha256(message.data).hexdigest())
+            for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages()
+        ]
+
+
+def test_every_frame_leaves_every_result(result):
+    counts = Counter(topic for topic, _, _ in raw_messages(result))
+    assert set(counts) == RESULTS
+    assert all(counts[topic] >= FRAMES for topic in RESULTS)
+    assert not result.with_suffix(".mcap.partial").exists()
+
+
+def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
+    summary = json.loads(result.with_suffix(".json").read_text())
+    assert (summary["verdict"], summary["frames_in"], summary["frames_out"]) == ("COMPLETE", FRAMES, FRAMES)
+    assert summary["drops"] == {}
+    assert summary["seconds"]["matched"] > 0
+    assert set(summary["seconds"]) >= {"rectified", "disparity", "points", "elevation_map", "navigation_map"}
+
+
+def test_the_result_reads_back_with_mcap_ros2_support(result):
+    with result.open("rb") as stream:
+        decoded = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    assert len(decoded) == len(raw_messages(result))
+    grid = next(item.decoded_message for item in decoded if item.channel.topic == "/nav/navigation_map")
+    assert set(np.unique(np.array(grid.data))) <= {-1, 0, 100}
+
+
+def test_the_result_reads_back_with_rosbags(result):
+    with AnyReader([result]) as reader:
+        topics = [
+            (connection.topic, reader.deserialize(data, connection.msgtype))
+            for connection, _, data in reader.messages()
+        ]
+    assert len(topics) == len(raw_messages(result))
+    disparity = next(message for topic, message in topics if topic == "/nav/disparity")
+    assert disparity.image.encoding == "32FC1"
+
+
+def test_the_recording_verifies_and_holds_every_intermediate(result):
+    rrd = result.with_suffix(".rrd")
+    check = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(rrd)], capture_output=True, text=True)
+    assert check.returncode == 0, check.stderr
+    import rerun as rr
+
+    paths = {str(path) for path in rr.chunk.RrdReader(str(rrd)).store().schema().entity_paths()}
+    for stream in ("rectified/left", "rectified/right", "tilt", "matched", "disparity", "points", "elevation_map", "navigation_map"):
+        assert any(f"/{stream}" in path for path in paths), (stream, sorted(paths))
+
+
+@pytest.mark.parametrize("pipeline", ["rover", "paper"])
+def test_results_do_not_depend_on_the_number_of_workers(traverse, tmp_path, pipeline):
+    logs = []
+    for workers in (1, 4):
+        out = tmp_path / f"{workers}.mcap"
+        assert roverflow("run", traverse, "-p", pipeline, *SMALL, "-o", out, "--no-rrd", "--workers", workers) == 0
+        logs.append(raw_messages(out))
+    assert len(logs[0]) >= 6 * FRAMES
+    assert logs[0] == logs[1]
+
+
+def test_the_score_is_that_of_a_working_chain(traverse, result, tmp_path, capsys):
+    assert roverflow("score", result, "--truth", traverse, "--json", tmp_path / "score.json") == 0
+    assert "disparity" in capsys.readouterr().out
+    assert json.loads((tmp_path / "score.json").read_text())["frames"] == FRAMES
+
+
+def test_part_of_a_log(traverse, tmp_path):
+    out = tmp_path / "part.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--start", 0.7, "--end", 1.3) == 0
+    assert len([topic for topic, _, _ in raw_messages(out) if topic == "/nav/points"]) == 1
+
+
+def drop(*parts: str):
+    return lambda topic, index, data: None if any(part in topic for part in parts) else data
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (drop("/imu", "/truth"), "tilt"),
+        (drop("camera_info"), "CameraInfo"),
+        (drop("/right"), "one image topic only"),
+        (drop("/tf_static"), "tf_static"),
+        (drop("/"), "no messages"),
+    ],
+    ids=["no tilt", "no calibration", "one camera", "no mounting", "nothing"],
+)
+def test_a_log_that_lacks_something_is_refused_in_one_sentence(traverse, tmp_path, capsys, change, words):
+    log = rewrite(traverse, tmp_path / "lacking.mcap", change)
+    assert roverflow("run", log, "-o", tmp_path / "out.mcap") == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [log]
+
+
+@pytest.mark.parametrize("content", [b"", b"this is no log\n" * 100, b"\x89MCAP0\r\n"], ids=["empty", "text", "magic"])
+def test_a_file_that_is_no_log_is_refused_in_one_sentence(tmp_path, capsys, content):
+    log = tmp_path / "odd.mcap"
+    log.write_bytes(content)
+    for command in (("run", log), ("info", log)):
+        assert roverflow(*command) == 2
+        said = capsys.readouterr().err
+        assert "odd.mcap" in said
+        assert said.count("\n") == 1
+    assert roverflow("run", tmp_path / "nowhere.mcap") == 2
+
+
+def test_a_damaged_image_costs_its_frame_and_nothing_else(traverse, tmp_path, capsys):
+    def damage(topic, index, data):
+        return data[: len(data) // 2] if topic.endswith("left/image_rect_color") and index == 1 else data
+
+    log = rewrite(traverse, tmp_path / "damaged.mcap", damage)
+    out = tmp_path / "out.mcap"
+    assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd") == 3
+    assert "INCOMPLETE" in capsys.readouterr().out
+    counts = Counter(topic for topic, _, _ in raw_messages(out))
+    assert counts["/nav/navigation_map"] == FRAMES - 1
+
+
+def test_the_log_itself_is_never_overwritten(traverse, capsys):
+    before = traverse.stat()
+    assert roverflow("run", traverse, "-o", traverse) == 2
+    assert "another name" in capsys.readouterr().err
+    assert traverse.stat() == before
+
+
+def test_an_output_that_cannot_be_written_is_said_in_one_sentence(traverse, tmp_path, capsys):
+    assert roverflow("run", traverse, *SMALL, "-o", tmp_path / "nowhere" / "out.mcap", "--no-rrd") in (1, 2)
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+SLOW = """
+source: {use: recordings.McapSource}
+streams:
+  stereo: {use: flow.align.pair, left: left, right: right}
+  late:   {use: tests.slow.Nap, frame: stereo}
+  matched: {use: stages.Match, frame: late, disparities: 64}
+sinks: [{use: recordings.McapSink, results: [matched]}]
+"""
+
+
+def test_an_interrupt_leaves_a_readable_result_and_exits_130(traverse, tmp_path):
+    pipeline, out = tmp_path / "slow.yaml", tmp_path / "out.mcap"
+    pipeline.write_text(SLOW)
+    arguments = ["run", traverse, "-p", pipeline, "-o", out, "--no-rrd", "--workers", "1"]
+    command = [sys.executable, "-m", "flow.cli", *map(str, arguments)]
+    child = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+    until = time.monotonic() + 60
+    while not list(tmp_path.glob("*.partial")) and time.monotonic() < until:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    child.send_signal(signal.SIGINT)
+    _, said = child.communicate(timeout=60)
+    assert child.returncode == 130, said
+    assert b"Traceback" not in said
+    assert 1 <= len(raw_messages(out)) < 2 * FRAMES + 1
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys, flow.cli; flow.cli.parser().format_help(); print(sorted({'numpy', 'cv2'} & set(sys.modules)))"
+    assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "[]"
+
+
+@pytest.mark.parametrize("form", ["text", "mermaid", "svg"])
+def test_graph_draws_every_stream(form, capsys):
+    assert roverflow("graph", "--format", form) == 0
+    drawn = capsys.readouterr().out
+    for stream in ("stereo", "tilt", "matched", "disparity", "points", "elevation_map", "navigation_map"):
+        assert stream in drawn
+
+
+def test_info_says_what_a_log_holds(traverse, capsys):
+    assert roverflow("info", traverse) == 0
+    said = capsys.readouterr().out
+    assert "/stereo/left/image_rect_color" in said
+    assert f"{FRAMES}" in said
