@@ -283,7 +283,11 @@ def simulate(out: Path, **settings: Any) -> None:
     except ValueError as error:
         raise UsageError(str(error)) from None
     with tqdm(total=simulation.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
-        simulation.write(out, lambda done, total: bar.update(done - bar.n) and None)
+
+        def progress(done: int, total: int) -> None:
+            bar.update(done - bar.n)
+
+        simulation.write(out, progress)
     print(f"{out}: {simulation.frames} frames with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
 
 

@@ -189,6 +189,7 @@ def draw_pose(canvas: Canvas, path: str, pose: Pose) -> None:
 @draws(ElevationMap)
 def draw_terrain(canvas: Canvas, path: str, terrain: ElevationMap) -> str:
     """Shaded relief, every layer with its values (hover reads them), and the surface in space."""
+    terrain = paint.terrain_ahead(terrain)
     elevation, where = terrain.layers["elevation"], _frame_suffix(terrain.frame_id)
     low, high = paint.elevation_limits(elevation)
     rgb = paint.paint_elevation(terrain, (low, high))
@@ -215,6 +216,7 @@ def draw_terrain(canvas: Canvas, path: str, terrain: ElevationMap) -> str:
 @draws(NavigationMap)
 def draw_navigation(canvas: Canvas, path: str, navigation: NavigationMap) -> str:
     """The three states of the cells, and their reasons."""
+    navigation = paint.navigation_ahead(navigation)
     cells, where = paint.birds_eye(navigation.cells), _frame_suffix(navigation.frame_id)
     canvas.labels(f"{path}/cells", cells, paint.CELLS, Place(Panel.MAP, f"{path}/cells", f"navigation{where}"))
     _lines_ahead(canvas, f"{path}/cells/lines", navigation.cells.shape, navigation)

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -102,7 +102,7 @@ class Index:
 
 def _check_read(record: Schema | Channel, content: bytes | memoryview) -> None:
     """Raise ValueError if a definition is not what its bytes say: the reader takes a cut string for a short one."""
-    builder = RecordBuilder()
+    builder: Any = RecordBuilder()
     record.write(builder)
     written = builder.end()[RECORD.size :]
     if written != bytes(content[: len(written)]):  # padding may follow

@@ -7,6 +7,7 @@ colour of its own that no value can have, and ranges are rounded, so that neighb
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,6 +15,8 @@ import numpy as np
 from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason, Source
 
 Rgb = tuple[int, int, int]
+
+BEHIND = 1.0  # m behind the rover that a picture shows where the camera has looked ahead only
 
 UNKNOWN_RGB: Rgb = (46, 47, 54)
 SOURCES: Mapping[int, tuple[str, Rgb]] = {
@@ -89,6 +92,28 @@ def segment_edges(labels: Array) -> Array:
 def birds_eye(grid: Array) -> Array:
     """A grid (rows along y, columns along x, ...) as a picture: x forward is up, y left is left."""
     return np.ascontiguousarray(grid.swapaxes(0, 1)[::-1, ::-1])
+
+
+def terrain_ahead(terrain: ElevationMap) -> ElevationMap:
+    """The terrain without the columns farther than `BEHIND` behind its origin, if nothing is known of them."""
+    columns, origin = _behind(terrain, np.isfinite(terrain.layers["elevation"]))
+    return replace(terrain, layers={name: layer[:, columns:] for name, layer in terrain.layers.items()}, origin=origin)
+
+
+def navigation_ahead(navigation: NavigationMap) -> NavigationMap:
+    """The same of a navigation map."""
+    columns, origin = _behind(navigation, navigation.cells != Cell.UNKNOWN)
+    return replace(
+        navigation, cells=navigation.cells[:, columns:], reason=navigation.reason[:, columns:], origin=origin
+    )
+
+
+def _behind(grid: ElevationMap | NavigationMap, known: Array) -> tuple[int, tuple[float, float]]:
+    """How many columns to leave out, and the origin of what is left."""
+    columns = max(0, round((-BEHIND - grid.origin[0]) / grid.resolution))
+    if known[:, :columns].any():
+        columns = 0
+    return columns, (grid.origin[0] + columns * grid.resolution, grid.origin[1])
 
 
 def elevation_limits(elevation: Array) -> tuple[float, float]:

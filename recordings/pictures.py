@@ -55,6 +55,7 @@ def disparity_picture(disparity: Array) -> Array:
 
 def elevation_picture(terrain: ElevationMap) -> Array:
     """Shaded relief of a terrain as an RGB picture with coordinates and a colour bar."""
+    terrain = paint.terrain_ahead(terrain)
     low, high = paint.elevation_limits(terrain.layers["elevation"])
     rgb = paint.paint_elevation(terrain, (low, high))
     page = _map_page(rgb, terrain.resolution, terrain.origin, f"elevation, m ({terrain.frame_id})")
@@ -64,6 +65,7 @@ def elevation_picture(terrain: ElevationMap) -> Array:
 
 def navigation_picture(navigation: NavigationMap) -> Array:
     """A navigation map as an RGB picture with coordinates and a legend."""
+    navigation = paint.navigation_ahead(navigation)
     rgb = paint.paint_navigation(navigation)
     title = f"navigation map ({navigation.frame_id})"
     page = _map_page(rgb, navigation.resolution, navigation.origin, title)

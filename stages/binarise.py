@@ -53,9 +53,12 @@ class Binarise(Stage):
     max_roughness: float = parameter(0.06, "root mean square of heights off their plane", unit="m", low=0.0)
     footprint: float = parameter(1.0, "width of the rover: the window of a local plane", unit="m", low=0.05)
     surroundings: float = parameter(2.5, "width of the window in which an obstacle stands out", unit="m", low=0.05)
-    margin: float = parameter(0.03, "a step this close to max_step counts as reaching it: cells blunt a peak", unit="m",
-                              low=0.0)  # fmt: skip
-    skirt: float = parameter(0.05, "a cell this far off the ground belongs to the obstacle it touches", unit="m", low=0.0)
+    margin: float = parameter(
+        0.03, "a step this close to max_step counts as reaching it: cells blunt a peak", unit="m", low=0.0
+    )
+    skirt: float = parameter(
+        0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.0
+    )
     min_points: int = parameter(1, "points without which a cell is unknown, where the map counts them", low=1)
 
     def __call__(self, elevation: ElevationMap) -> NavigationMap:

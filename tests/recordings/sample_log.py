@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, IndexType, Writer
 from scipy.spatial.transform import Rotation
 
+from recordings import McapSource
 from recordings.ros2 import Ros2Writer, camera_info, image, imu, odometry, transform_message
-from stages.data import CameraModel, Pose, Transform
+from stages.data import CameraImage, CameraModel, Pose, Tilt, Transform
 
 WIDTH, HEIGHT = 24, 16
 BASELINE = 0.25
@@ -54,6 +55,22 @@ TRANSFORMS = (
     Transform("base_link", "left_optical", np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.5, 0.1, 0.9]),
     Transform("base_link", "imu_link", Rotation.from_euler("z", 90, degrees=True).as_matrix(), [0, 0, 0.4]),
 )
+
+LAYOUTS: dict[str, dict[str, Any]] = {
+    "small chunks": {"chunk_size": 500},
+    "lz4": {"compression": CompressionType.LZ4},
+    "no compression": {"compression": CompressionType.NONE, "chunk_size": 4000},
+    "no message index": {"index_types": IndexType.CHUNK},
+    "no index": {
+        "index_types": IndexType.NONE,
+        "repeat_channels": False,
+        "repeat_schemas": False,
+        "use_statistics": False,
+    },
+    "no chunks": {"use_chunking": False, "enable_data_crcs": True},
+    "no crcs": {"enable_crcs": False},
+}
+
 
 Edit = Callable[[str, int, Any], Any]
 
@@ -96,3 +113,26 @@ def rewritten(path: Path, out: Path, **options: Any) -> Path:
             writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
         writer.finish()
     return out
+
+
+def items_of(path: Path, source: McapSource | None = None, **bounds: float) -> list[tuple[int, str, Any]]:
+    with (source or McapSource()).open(path, **bounds) as log:
+        return list(log)
+
+
+def essence(item: Any) -> Any:
+    """An item's whole content, comparable."""
+    if isinstance(item, CameraImage):
+        return (
+            item.stamp,
+            item.pixels.tobytes(),
+            item.pixels.shape,
+            item.model.p.tobytes(),
+            item.frame_id,
+            item.rectified,
+        )
+    if isinstance(item, Tilt):
+        return item.stamp, item.up.tobytes(), item.frame_id
+    if isinstance(item, Pose):
+        return item.stamp, item.position.tobytes(), item.quaternion.tobytes(), item.frame_id, item.child_frame_id
+    return item.stamp, item.camera_from_inclinometer.tobytes()

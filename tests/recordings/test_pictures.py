@@ -174,3 +174,17 @@ def test_sixteen_bit_images_keep_their_contrast() -> None:
     twelve = np.linspace(0, 4095, 256).astype(np.uint16).reshape(16, 16)
     eight = paint.eight_bit(twelve)
     assert (eight.min(), eight.max()) == (0, 255)
+
+
+def test_a_picture_leaves_out_what_lies_behind_the_rover_unless_something_is_known_there():
+    elevation = np.full((4, 80), np.nan, np.float32)
+    elevation[1, 50] = 1.0
+    terrain = ElevationMap(0, {"elevation": elevation}, 0.05, (-2.0, 0.0), "level")
+    ahead = paint.terrain_ahead(terrain)
+    assert (ahead.shape, ahead.origin) == ((4, 60), (-1.0, 0.0))
+    assert ahead.layers["elevation"][1, 30] == 1.0
+    cells = np.where(np.isfinite(elevation), 0, -1).astype(np.int8)
+    navigation = NavigationMap(0, cells, np.zeros_like(cells, np.uint8), 0.05, (-2.0, 0.0), "level")
+    assert paint.navigation_ahead(navigation).cells[1, 30] == 0
+    elevation[1, 3] = 1.0
+    assert paint.terrain_ahead(ElevationMap(0, {"elevation": elevation}, 0.05, (-2.0, 0.0), "level")).shape == (4, 80)

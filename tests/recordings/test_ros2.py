@@ -112,11 +112,8 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if isinstance(value, float):
         return repr(value)
-    names = (
-        [f.name for f in fields(value)]
-        if is_dataclass(value)
-        else [n for n in getattr(value, "__slots__", ()) if n[0] != "_"]
-    )
+    named = [f.name for f in fields(value)] if is_dataclass(value) else getattr(value, "__slots__", ())
+    names = [name for name in named if name.islower() and not name.startswith("_")]  # no constants
     return {name: plain(getattr(value, name)) for name in names} or value
 
 

@@ -1,0 +1,176 @@
+"""Damaged and foreign logs: what can be read is read and true, what cannot is told, nothing is lost silently."""
+
+from __future__ import annotations
+
+import io
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from recordings import McapSource
+from recordings.errors import LogError
+from recordings.inventory import describe, format_description
+from recordings.mcap_index import Lost
+from recordings.mcap_reader import McapFile
+from tests.recordings.sample_log import LAYOUTS, LEFT, data_folder, essence, items_of, rewritten
+
+
+def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]]) -> None:
+    """What comes of a damaged log is what was recorded; what does not come is told of."""
+    told: set[str] = set()
+    events: list[tuple[int, str, Any]] = []
+    try:
+        with McapSource().open(path) as log:
+            told = set(log.missing)
+            events = list(log)
+    except LogError as error:
+        events = [(0, "log", error)]
+    known = {(time, stream, essence(item)) for time, stream, item in whole if stream != "mount"}
+    good = [(time, stream, essence(item)) for time, stream, item in events
+            if stream != "mount" and not isinstance(item, Exception)]  # fmt: skip
+    assert set(good) <= known
+    assert len(set(good)) == len(good)
+    losses = [item for _, _, item in events if isinstance(item, Exception)]
+    assert all(isinstance(item, LogError) for item in losses)
+    absent = {stream for _, stream, _ in known - set(good)}
+    assert losses or absent <= told
+
+
+@pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no compression", "lz4", "no index"])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(share=st.floats(0, 1, exclude_max=True))
+def test_a_log_cut_anywhere_loses_only_what_was_cut(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, share: float
+) -> None:
+    full = tmp_path / "full.mcap"
+    if not full.exists():
+        rewritten(sample, full, **LAYOUTS[layout])
+    content = full.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(content[: int(share * len(content))])
+    check_nothing_is_lost_silently(cut, whole)
+
+
+def test_a_cut_chunk_still_gives_the_messages_before_the_cut(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path
+) -> None:
+    full = rewritten(sample, tmp_path / "full.mcap", compression=CompressionType.NONE)  # one chunk
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(full.read_bytes()[: int(full.stat().st_size * 0.6)])
+    events = items_of(cut)
+    assert "the log is cut or damaged at byte" in str(events[-1][2])
+    assert isinstance(events[-1][2], LogError)
+    assert sum(stream == "left" for _, stream, _ in events[:-1]) == 3
+    assert [essence(i) for _, _, i in events[:-1]] == [essence(i) for _, _, i in whole[: len(events) - 1]]
+
+
+@pytest.mark.parametrize("layout", ["small chunks", "no index", "no compression"])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+def test_a_flipped_bit_anywhere_is_never_taken_for_data(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, share: float, bit: int
+) -> None:
+    full = tmp_path / "full.mcap"
+    if not full.exists():
+        rewritten(sample, full, **LAYOUTS[layout])
+    content = bytearray(full.read_bytes())
+    content[int(share * len(content))] ^= 1 << bit
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    check_nothing_is_lost_silently(damaged, whole)
+
+
+def test_a_broken_chunk_costs_its_own_messages_each_with_its_time(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path
+) -> None:
+    full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500)
+    with full.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+        topics = {number: c.topic for number, c in make_reader(file).get_summary().channels.items()}
+    broken = next(c for c in chunks[3:] if [topics[n] for n in c.message_index_offsets] == [LEFT])
+    content = bytearray(full.read_bytes())
+    content[broken.chunk_start_offset + broken.chunk_length // 2] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    events = items_of(damaged)
+    lost = [(time, stream) for time, stream, item in events if isinstance(item, Exception)]
+    assert lost == [(broken.message_start_time, "left")]
+    assert any(str(item).startswith(f"{LEFT}: the chunk at byte") for _, _, item in events)
+    kept = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
+    assert kept == [essence(item) for time, stream, item in whole if (time, stream) not in lost]
+    assert describe(damaged, McapSource())["damage"]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "is empty"),
+        (b"hello, I am a text file\n", "is not an MCAP log"),
+        (b"#ROSBAG V2.0\n....", "is a ROS 1 bag; convert it"),
+        (b"SQLite format 3\0....", "is a rosbag2 SQLite bag; convert it"),
+        (b"\x89MCAP0\r\n", "holds no messages that can be read: the log is cut"),
+    ],
+)
+def test_what_is_no_log_is_refused_with_what_it_is(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=rf"log\.mcap {said}"):
+        McapSource().open(path)
+
+
+def test_no_file_a_folder_and_no_messages_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"cannot read .*none\.mcap: No such file"):
+        McapSource().open(tmp_path / "none.mcap")
+    with pytest.raises(LogError, match="is a folder; give the"):
+        McapSource().open(tmp_path)
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    writer.finish()
+    (tmp_path / "no.mcap").write_bytes(stream.getvalue())
+    with pytest.raises(LogError, match=r"no\.mcap holds no messages"):
+        McapSource().open(tmp_path / "no.mcap")
+
+
+def test_every_file_of_the_conformance_suite_gives_all_its_messages() -> None:
+    folder, checked = data_folder("logs/conformance"), 0
+    for path in sorted(folder.rglob("*.mcap")):
+        records = json.loads(path.with_suffix(".json").read_text())["records"]
+        wanted = sum(record["type"] == "Message" for record in records)
+        read: list[Any] = []
+        with suppress(LogError), McapFile(path) as log:
+            read = list(log.messages(set(log.index.channels)))
+        assert not [item for item in read if isinstance(item, Lost)], path
+        assert len(read) == wanted, path
+        checked += 1
+    assert checked == 205
+
+
+def test_every_real_log_is_described_or_refused_in_a_sentence() -> None:
+    refused = []
+    paths = [path for path in sorted(data_folder("logs").rglob("*")) if path.suffix in (".mcap", ".bag")]
+    for path in paths:
+        try:
+            text = format_description(json.loads(json.dumps(describe(path, McapSource()))))
+        except LogError as error:
+            refused.append(str(error))
+            continue
+        assert "missing: left" in text
+        assert not [item for _, _, item in items_of(path) if isinstance(item, Exception)], path
+    assert (len(paths), len(refused)) == (232, 22)
+    assert all("holds no messages" in text or "is a ROS 1 bag" in text or "is empty" in text for text in refused)
+
+
+def test_the_field_log_has_its_tilt_at_ten_hertz() -> None:
+    path = data_folder("logs/field") / "SO_bag_0.mcap"
+    tilts = [item for _, stream, item in items_of(path) if stream == "inclinometer"]
+    assert len(tilts) == 161
+    assert all(abs(np.linalg.norm(tilt.up) - 1) < 1e-9 for tilt in tilts)

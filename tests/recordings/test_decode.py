@@ -1,0 +1,92 @@
+"""Messages become data: colours in their order, bytes in theirs, angles as directions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from recordings.decode import pixels_of, up_of
+from recordings.errors import LogError
+from recordings.ros2 import header, image, make
+from tests.recordings.sample_log import HEIGHT, WIDTH, picture
+
+
+@given(st.floats(-60, 60), st.floats(-60, 60), st.floats(-180, 180))
+def test_up_agrees_with_a_rover_that_is_turned(pitch: float, roll: float, yaw: float) -> None:
+    # Euler: nose up is a negative turn about y (left), left side up a positive one about x (forward).
+    attitude = Rotation.from_euler("ZYX", [yaw, -pitch, roll], degrees=True)
+    up = attitude.inv().apply([0, 0, 1])
+    np.testing.assert_allclose(up_of(np.deg2rad(pitch), np.deg2rad(roll), "euler"), up, atol=1e-12)
+    # Axis: the angles that the x and y axes themselves make with the horizon.
+    forward, left = (float(np.arcsin(attitude.apply(axis)[2])) for axis in np.eye(3)[:2])
+    np.testing.assert_allclose(up_of(forward, left, "axis"), up, atol=1e-7)
+    if pitch > 1:
+        assert attitude.apply([1, 0, 0])[2] > 0  # the nose is up
+    if roll > 1:
+        assert attitude.apply([0, 1, 0])[2] > 0  # the left side is up
+
+
+def test_angles_that_no_attitude_has_are_refused() -> None:
+    with pytest.raises(LogError, match="check unit and tilt_model"):
+        up_of(1.2, 1.2, "axis")
+
+
+def raw_image(encoding: str, rows: np.ndarray, width: int, big: bool = False) -> Any:
+    message = image(1, "cam", np.zeros((1, 1), np.uint8))
+    message.encoding, message.height, message.width, message.step = encoding, rows.shape[0], width, rows.shape[1]
+    message.data, message.is_bigendian = rows.reshape(-1).copy(), int(big)
+    return message
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+@pytest.mark.parametrize(
+    ("encoding", "order"),
+    [("rgb8", [0, 1, 2]), ("bgr8", [2, 1, 0]), ("8UC3", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0])],
+)
+def test_colour_comes_as_rgb_from_every_order(encoding: str, order: list[int], padding: int) -> None:
+    rgb = picture(7)
+    rows = np.pad(rgb[:, :, order].reshape(HEIGHT, -1), ((0, 0), (0, padding)), constant_values=99)
+    np.testing.assert_array_equal(pixels_of(raw_image(encoding, rows, WIDTH)), rgb)
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_gray_of_16_bit_is_read_in_its_byte_order(big: bool) -> None:
+    gray = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 257 + 3
+    rows = gray.astype(">u2" if big else "<u2").view(np.uint8)
+    out = pixels_of(raw_image("mono16", rows, WIDTH, big))
+    np.testing.assert_array_equal(out, gray)
+    assert out.dtype == np.uint16
+    np.testing.assert_array_equal(pixels_of(raw_image("mono8", picture(1)[:, :, 0], WIDTH)), picture(1)[:, :, 0])
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_a_bayer_mosaic_of_one_colour_is_that_colour(pattern: str) -> None:
+    colour = {"r": 200, "g": 90, "b": 30}
+    tile = np.array([colour[letter] for letter in pattern], np.uint8).reshape(2, 2)
+    out = pixels_of(raw_image(f"bayer_{pattern}8", np.tile(tile, (8, 12)), 24))
+    np.testing.assert_array_equal(out, np.broadcast_to([200, 90, 30], (16, 24, 3)))
+
+
+def compressed(data: bytes, kind: str) -> Any:
+    content = np.frombuffer(data, np.uint8)
+    return make("sensor_msgs/msg/CompressedImage", header=header(1, "cam"), format=kind, data=content)
+
+
+def test_compressed_images_are_decoded_to_rgb_and_cut_ones_refused() -> None:
+    rgb = picture(3)
+    png = cv2.imencode(".png", rgb[:, :, ::-1])[1].tobytes()
+    np.testing.assert_array_equal(pixels_of(compressed(png, "rgb8; png compressed bgr8")), rgb)
+    flat = np.full((16, 24, 3), (200, 90, 30), np.uint8)
+    jpeg = cv2.imencode(".jpg", flat[:, :, ::-1])[1].tobytes()
+    np.testing.assert_allclose(pixels_of(compressed(jpeg, "jpeg")).astype(int), flat, atol=3)
+    for data, kind in ((png, "png"), (jpeg, "jpeg")):
+        with pytest.raises(LogError, match="the compressed image is cut"):
+            pixels_of(compressed(data[:-20], kind))
+    with pytest.raises(LogError, match="cannot be decoded"):
+        pixels_of(compressed(b"nonsense", "jpeg"))

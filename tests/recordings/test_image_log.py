@@ -1,0 +1,156 @@
+"""Image files become a log that any reader of rover logs understands, with the camera where it was said to be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from recordings import McapSource
+from recordings.errors import LogError
+from recordings.image_log import import_images, pair_images
+from tests.recordings.sample_log import data_folder, picture
+
+CALIBRATION = {"fx": 20.0, "cx": 11.5, "cy": 7.5, "baseline": 0.25}
+
+
+def save(path: Path, pixels: np.ndarray) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    assert cv2.imwrite(str(path), pixels[:, :, ::-1] if pixels.ndim == 3 else pixels)
+    return path
+
+
+def make_pairs(folder: Path, count: int = 3) -> tuple[list[Path], list[Path]]:
+    left = [save(folder / f"{number}-left.png", picture(2 * number)) for number in range(count)]
+    right = [save(folder / f"{number}-right.png", picture(2 * number + 1)) for number in range(count)]
+    return left, right
+
+
+def events(path: Path) -> list[tuple[int, str, Any]]:
+    with McapSource().open(path) as log:
+        assert set(log.missing) == {"odometry"}
+        return list(log)
+
+
+def test_the_images_come_back_bit_for_bit_in_pairs_at_the_rate(tmp_path: Path) -> None:
+    left, right = make_pairs(tmp_path)
+    out = tmp_path / "out.mcap"
+    assert import_images(left, right, CALIBRATION, out, pitch_down=15, height=0.9, rate=4) == 3
+    read = events(out)
+    images = {side: [item for _, stream, item in read if stream == side] for side in ("left", "right")}
+    for number in range(3):
+        np.testing.assert_array_equal(images["left"][number].pixels, picture(2 * number))
+        np.testing.assert_array_equal(images["right"][number].pixels, picture(2 * number + 1))
+        frame = images["left"][number].pair_with(images["right"][number])
+        assert frame.camera.baseline == pytest.approx(0.25)
+        assert frame.camera.raw is None
+    stamps = [item.stamp for item in images["left"]]
+    assert np.diff(stamps).tolist() == [250_000_000] * 2
+    tilts = [item.stamp for _, stream, item in read if stream == "inclinometer"]
+    for stamp in stamps:
+        assert stamp in tilts
+        assert min(tilts) < stamp < max(tilts)
+
+
+@pytest.mark.parametrize(("pitch_down", "roll"), [(0, 0), (14.5, 0), (20, 10), (5, -30)])
+def test_the_camera_looks_where_it_was_said_to(tmp_path: Path, pitch_down: float, roll: float) -> None:
+    left, right = make_pairs(tmp_path, 1)
+    out = tmp_path / "out.mcap"
+    import_images(left, right, CALIBRATION, out, pitch_down=pitch_down, roll=roll, height=0.88)
+    read = events(out)
+    mount = next(item for _, stream, item in read if stream == "mount")
+    tilt = next(item for _, stream, item in read if stream == "inclinometer")
+    up = mount.camera_from_inclinometer @ tilt.up  # in camera axes: x right, y down, z forward
+    assert np.degrees(np.arcsin(up[2])) == pytest.approx(-pitch_down)  # the line of sight is below the horizon
+    assert np.degrees(np.arctan2(up[0], -up[1])) == pytest.approx(
+        -roll, abs=1e-9
+    )  # x, to the right, is below for roll > 0
+    np.testing.assert_allclose(mount.base_from_camera.translation, [0, 0, 0.88])
+    forward = mount.base_from_camera.rotation @ [0, 0, 1]
+    np.testing.assert_allclose(
+        forward, [np.cos(np.radians(pitch_down)), 0, -np.sin(np.radians(pitch_down))], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "left"),
+    [
+        (["a-left.png", "a-right.png", "b-left.png", "b-right.png"], ["a-left.png", "b-left.png"]),
+        (["left/10.png", "left/9.png", "right/10.png", "right/9.png"], ["left/9.png", "left/10.png"]),
+        (["im0.png", "im1.png", "mask0nocc.png"], ["im0.png"]),
+        (["img_cam0_9m.png", "img_cam1_9m.png"], ["img_cam0_9m.png"]),
+    ],
+)
+def test_pairs_are_found_by_name_in_order(tmp_path: Path, names: list[str], left: list[str]) -> None:
+    for name in names:
+        save(tmp_path / name, picture(0))
+    found = pair_images(tmp_path)
+    assert [path.relative_to(tmp_path).as_posix() for path in found[0]] == left
+    assert len(found[1]) == len(left)
+    assert not set(found[0]) & set(found[1])
+
+
+def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
+    for name in ("a-left.png", "a-right.png", "b-left.png"):
+        save(tmp_path / name, picture(0))
+    with pytest.raises(LogError, match=r"b-left\.png has no right partner"):
+        pair_images(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(LogError, match="holds no image pairs"):
+        pair_images(tmp_path / "empty")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"baseline": None}, "lacks 'baseline'"),
+        ({"focal": 3.0}, "has the unknown 'focal'"),
+        ({"fx": "wide"}, "'fx' must be a number, not 'wide'"),
+        ({"baseline": -0.2}, "'baseline' must be positive"),
+        ({"width": 640}, "is 24x16, the calibration is for 640x16"),
+    ],
+)
+def test_a_calibration_that_does_not_fit_is_refused_and_leaves_no_file(
+    tmp_path: Path, change: dict[str, Any], said: str
+) -> None:
+    left, right = make_pairs(tmp_path, 1)
+    calibration = {k: v for k, v in {**CALIBRATION, "height": 16, **change}.items() if v is not None}
+    with pytest.raises(LogError, match=said):
+        import_images(left, right, calibration, tmp_path / "out.mcap", pitch_down=0, height=1)
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_the_calibration_may_be_a_file(tmp_path: Path) -> None:
+    left, right = make_pairs(tmp_path, 1)
+    file = tmp_path / "camera.yaml"
+    file.write_text("fx: 20\nfy: 21.5\ncx: 11\ncy: 7\ncx_right: 13\nbaseline: 0.25\n")
+    import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
+    images = {stream: item for _, stream, item in events(tmp_path / "out.mcap") if stream in ("left", "right")}
+    camera = images["left"].pair_with(images["right"]).camera
+    assert (camera.fy, camera.cx, camera.cx_right) == (21.5, 11.0, 13.0)
+    file.write_text("fx: [")
+    with pytest.raises(LogError, match="cannot read the calibration"):
+        import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
+
+
+def test_pictures_of_two_sizes_and_files_that_are_no_pictures_are_refused(tmp_path: Path) -> None:
+    left, right = make_pairs(tmp_path, 1)
+    save(right[0], picture(0)[:8])
+    with pytest.raises(LogError, match="differ in size or kind"):
+        import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1)
+    right[0].write_bytes(b"no picture")
+    with pytest.raises(LogError, match=r"0-right\.png is not an image"):
+        import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1)
+
+
+def test_the_devon_pairs_become_a_log(tmp_path: Path) -> None:
+    left, right = pair_images(data_folder("devon"))
+    calibration = {"fx": 968.999694824, "cx": 635.139038086, "cy": 463.537109375, "baseline": 0.239977002}
+    import_images(left, right, calibration, tmp_path / "devon.mcap", pitch_down=14.5, height=0.88)
+    images = [item for _, stream, item in events(tmp_path / "devon.mcap") if stream == "left"]
+    assert [image.pixels.shape for image in images] == [(960, 1280, 3)] * 2
+    expected = cv2.imread(str(left[0]))[:, :, ::-1]
+    np.testing.assert_array_equal(images[0].pixels, expected)

@@ -1,0 +1,82 @@
+"""What `roverflow info` says of a log is what is in it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recordings import McapSource
+from recordings.inventory import describe, format_description
+from tests.recordings.sample_log import BASELINE, FRAMES, LEFT, PERIOD, RIGHT, TILT, rewritten, write_sample
+
+
+@pytest.fixture(scope="module")
+def description(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    path = write_sample(tmp_path_factory.mktemp("log") / "sample.mcap")
+    described: dict[str, Any] = json.loads(json.dumps(describe(path, McapSource())))
+    return described
+
+
+def test_rates_and_gaps_are_those_of_the_log(description: dict[str, Any]) -> None:
+    topics = {topic["topic"]: topic for topic in description["topics"]}
+    assert topics[LEFT]["messages"] == FRAMES
+    assert topics[LEFT]["hz"] == pytest.approx(1e9 / PERIOD)
+    assert topics[LEFT]["largest_gap_s"] == pytest.approx(PERIOD / 1e9)
+    assert topics["/tf_static"]["hz"] is None
+    assert description["indexed"]
+    assert description["missing"] == {}
+
+
+def test_calibration_transforms_and_pairs_are_told(description: dict[str, Any]) -> None:
+    assert description["calibration"]["baseline"] == BASELINE
+    assert description["calibration"]["rectified"] is True
+    assert description["transforms"] == ["base_link <- imu_link", "base_link <- left_optical"]
+    assert description["mount"]["position"] == [0.5, 0.1, 0.9]
+    frames = description["frames"]
+    assert (frames["left"], frames["right"], frames["pairs"], frames["with_tilt"]) == (FRAMES,) * 4
+
+
+def test_the_text_names_every_topic_its_stream_and_what_is_missing(tmp_path: Path) -> None:
+    path = write_sample(tmp_path / "log.mcap", lambda topic, number, m: None if topic == "/odom" else m)
+    text = format_description(describe(path, McapSource()))
+    line = next(line for line in text.splitlines() if line.startswith(LEFT))
+    assert line.split() == [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100", "s", "left"]
+    assert "missing: odometry: the log has no nav_msgs/Odometry" in text
+    assert "frames: 5 pairs within 5 ms of 5 left and 5 right images; 5 with a tilt around them" in text
+
+
+def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == RIGHT and number in (1, 2):
+            message.header.stamp.nanosec += 6_000_000 if number == 1 else 4_000_000
+        if topic == TILT and number in (1, 2, 3):
+            return None
+        return message
+
+    frames = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())["frames"]
+    assert frames["pairs"] == FRAMES - 1
+    assert frames["with_tilt"] == 2  # the first and the last frame, which have a tilt of their own
+
+
+def test_damage_is_told(tmp_path: Path) -> None:
+    path = rewritten(write_sample(tmp_path / "sample.mcap"), tmp_path / "log.mcap", chunk_size=500)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    description = describe(path, McapSource())
+    assert not description["indexed"]
+    assert "the log is cut or damaged at byte" in description["damage"][0]
+    assert "damaged: the log is cut" in format_description(description)
+
+
+def test_an_imu_without_orientation_is_not_taken_for_an_inclinometer(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == TILT:
+            message.orientation_covariance = np.full(9, -1.0)
+        return message
+
+    description = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())
+    assert "holds no orientation" in description["missing"]["inclinometer"]
+    assert description["frames"]["with_tilt"] == 0

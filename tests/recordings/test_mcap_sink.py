@@ -1,0 +1,152 @@
+"""Writing results: what a frame made is in the log, under its stamp, whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from recordings import McapSink
+from recordings.errors import LogError
+from recordings.ros2 import iter_messages, read_disparity, read_grid_map, read_occupancy_grid, stamp_of
+from stages.data import (
+    CameraImage,
+    Disparity,
+    ElevationMap,
+    NavigationMap,
+    PointCloud,
+    StereoCamera,
+    Transform,
+)  # fmt: skip
+
+START = 1_700_000_000_000_000_000
+STREAMS = {"disparity": Disparity, "points": PointCloud, "elevation_map": ElevationMap, "navigation_map": NavigationMap}
+ABOUT = {"pipeline": "rover", "numpy": "2"}
+
+
+@dataclass
+class Entry:
+    stream: str
+    stamp: int
+    stage: str = "match"
+    reason: str = "failed"
+    detail: str = "no texture"
+
+
+@dataclass
+class Record:
+    stamp: int
+    items: dict[str, Any]
+    entries: tuple[Entry, ...] = ()
+    seconds: dict[str, float] = field(default_factory=lambda: {"match": 0.123})
+    queues: dict[str, int] = field(default_factory=lambda: {"match": 3})
+
+
+def items(stamp: int) -> dict[str, Any]:
+    rng = np.random.default_rng(stamp % 1000)
+    pixels = rng.uniform(1, 60, (6, 8)).astype(np.float32)
+    pixels[0, 0] = np.nan
+    camera = StereoCamera(20.0, 20.0, 4.0, 3.0, 0.25, 8, 6, frame_id="left_optical")
+    sensor = Transform("level", "left_optical", np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.5, 0, 0.9])
+    return {
+        "disparity": Disparity(stamp, pixels, np.ones((6, 8), np.uint8), np.ones((6, 8), np.float32), camera=camera),
+        "points": PointCloud(
+            stamp, rng.normal(size=(5, 3)).astype(np.float32), rng.integers(0, 255, (5, 3), dtype=np.uint8),
+            np.ones(5, np.float32), np.arange(5, dtype=np.int32), "level", sensor=sensor,
+        ),
+        "elevation_map": ElevationMap(stamp, {"elevation": pixels[:3]}, 0.05, (-1.0, 2.0), "level"),
+        "navigation_map": NavigationMap(
+            stamp, np.array([[0, 100, -1]], np.int8), np.zeros((1, 3), np.uint8), 0.05, (0.0, 0.0), "level"
+        ),
+    }  # fmt: skip
+
+
+SUMMARY = {
+    "verdict": "INCOMPLETE", "frames_in": 2, "frames_out": 1, "drops": {"failed": 1}, "messages": {"left": 2},
+    "wall_seconds": 1.5, "entries": [Entry("left", START + 9, "source", "unreadable", "the log is cut")],
+}  # fmt: skip
+
+
+def write(path: Path, seconds: float = 0.1) -> Path:
+    sink = McapSink()
+    sink.open(path, STREAMS, ABOUT)
+    sink.write(Record(START, items(START), seconds={"match": seconds}))
+    lost = (Entry("elevation_map", START + 100),)
+    kept = {name: item for name, item in items(START + 100).items() if name != "elevation_map"}
+    sink.write(Record(START + 100, kept, lost, queues={"match": int(seconds * 10)}))
+    sink.close({**SUMMARY, "wall_seconds": seconds})
+    return path
+
+
+def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path: Path) -> None:
+    read = list(iter_messages(write(tmp_path / "out.mcap")))
+    topics = [(topic, stamp - START) for topic, stamp, _ in read]
+    frame = ["/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/tf", "/nav/diagnostics"]
+    second = [topic for topic in frame if topic != "/nav/elevation_map"]
+    assert topics == [(t, 0) for t in frame] + [(t, 100) for t in second] + [("/nav/diagnostics", 100)]
+    first = {topic: message for topic, stamp, message in read if stamp == START}
+    sent = items(START)
+    np.testing.assert_array_equal(read_disparity(first["/nav/disparity"]), sent["disparity"].pixels)
+    elevation = read_grid_map(first["/nav/elevation_map"]).layers["elevation"]
+    np.testing.assert_array_equal(elevation, sent["elevation_map"].layers["elevation"])
+    np.testing.assert_array_equal(
+        read_occupancy_grid(first["/nav/navigation_map"]).cells, sent["navigation_map"].cells
+    )  # fmt: skip
+    moved = first["/tf"].transforms[0]
+    assert (moved.header.frame_id, moved.child_frame_id, moved.transform.translation.z) == (
+        "level",
+        "left_optical",
+        0.9,
+    )
+    assert stamp_of(moved.header) == START
+
+
+def test_losses_are_in_the_diagnostics_of_their_frame_and_the_late_ones_at_the_end(tmp_path: Path) -> None:
+    path = write(tmp_path / "out.mcap")
+    whole, lost, late = [message.status for topic, _, message in iter_messages(path) if topic == "/nav/diagnostics"]
+    assert [(s.level, s.message) for s in whole] == [(0, "nothing lost")]
+    assert [(s.level, s.name, s.message) for s in lost] == [(2, "match/elevation_map", "no texture")]
+    assert {v.key: v.value for v in lost[0].values}["reason"] == "failed"
+    assert late[0].message == "the log is cut"
+
+
+def test_the_log_says_what_it_was_made_from_and_how_the_run_ended(tmp_path: Path) -> None:
+    with write(tmp_path / "out.mcap").open("rb") as file:
+        records = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+    assert records["roverflow"] == ABOUT
+    assert records["roverflow.run"] == {
+        "verdict": "INCOMPLETE", "frames_in": "2", "frames_out": "1", "drops.failed": "1", "messages.left": "2",
+    }  # fmt: skip
+
+
+def test_runs_that_differ_in_their_timing_only_give_the_same_bytes(tmp_path: Path) -> None:
+    one, other = write(tmp_path / "a.mcap", 0.1), write(tmp_path / "b.mcap", 2.7)
+    assert hashlib.sha256(one.read_bytes()).digest() == hashlib.sha256(other.read_bytes()).digest()
+
+
+def test_a_run_without_frames_leaves_a_readable_log(tmp_path: Path) -> None:
+    sink = McapSink()
+    sink.open(tmp_path / "out.mcap", {}, {})
+    assert not (tmp_path / "out.mcap").exists()
+    sink.close({"verdict": "COMPLETE"})
+    with (tmp_path / "out.mcap").open("rb") as file:
+        assert make_reader(file).get_summary().statistics.message_count == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["out.mcap"]
+
+
+def test_only_what_was_asked_for_is_wanted() -> None:
+    sink = McapSink(results=("disparity",))
+    assert sink.wants("disparity", Disparity)
+    assert not sink.wants("points", PointCloud)
+    with pytest.raises(LogError, match="cannot write 'disparity', a CameraImage"):
+        sink.wants("disparity", CameraImage)
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"cannot write .*gone/out\.mcap: No such file"):
+        McapSink().open(tmp_path / "gone" / "out.mcap", {}, {})
