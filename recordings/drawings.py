@@ -271,7 +271,7 @@ def _lines_ahead(canvas: Canvas, path: str, shape: tuple[int, int], grid: Elevat
     width = float(shape[0])
     far, left = (start + count * grid.resolution for start, count in zip(grid.origin, shape[::-1], strict=True))
     first, last = np.ceil(grid.origin[0] / LINE_SPACING), np.floor(far / LINE_SPACING)
-    ahead = LINE_SPACING * np.arange(first, last + 1)
+    ahead = LINE_SPACING * np.arange(first, last + 1) + 0.0  # no minus zero
     depths = (far - ahead) / grid.resolution
     lines = [[(0.0, depth), (width, depth)] for depth in depths]
     thin = rr.Radius.ui_points(0.6)
