@@ -16,7 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from flow.errors import RoverflowError, UsageError
+from flow.errors import RoverflowError, SinkError, UsageError
 
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -165,12 +165,23 @@ def _version() -> str:
 def _run(options: argparse.Namespace) -> int:
     out = options.out or options.log.with_name(f"{options.log.stem}-nav.mcap")
     rrd = None if options.no_rrd else options.rrd or out.with_suffix(".rrd")
-    summary = replay(
-        options.log, options.pipeline, out, rrd,
-        overrides=options.set, workers=options.workers, start=options.start, end=options.end,
-    )  # fmt: skip
-    if options.summary:
-        options.summary.write_text(json.dumps(summary, indent=2) + "\n")
+    for path in filter(None, (out, rrd, options.summary)):
+        if not path.parent.is_dir():
+            raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
+
+    def keep(summary: dict[str, Any]) -> None:
+        if options.summary:
+            options.summary.write_text(json.dumps(summary, indent=2) + "\n")
+
+    try:
+        summary = replay(
+            options.log, options.pipeline, out, rrd,
+            overrides=options.set, workers=options.workers, start=options.start, end=options.end,
+        )  # fmt: skip
+    except SinkError as error:
+        keep(_as_json(error.summary))
+        raise
+    keep(summary)
     _report(summary, [out, *([rrd] if rrd else [])])
     return _exit_code_of(summary)
 
@@ -229,7 +240,12 @@ def replay(
 
             with interrupts(stop, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)):
                 summary = run(graph, opened, outputs, workers=workers, about=about, stop=stop, on_frame=on_frame)
-    return {name: value for name, value in summary.items() if name != "entries"}  # those stand in "ledger", as JSON
+    return _as_json(summary)
+
+
+def _as_json(summary: dict[str, Any]) -> dict[str, Any]:
+    """A run's summary without the ledger's entry objects; "ledger" has them as plain values."""
+    return {name: value for name, value in summary.items() if name != "entries"}
 
 
 def _report(summary: dict[str, Any], outputs: Sequence[Path]) -> None:

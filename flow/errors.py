@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class RoverflowError(Exception):
     """Base of the family; `exit_code` is what the command line leaves with."""
@@ -22,4 +24,8 @@ class PipelineError(RoverflowError):
 
 
 class SinkError(RoverflowError):
-    """An output could not be written; the run was stopped and the outputs closed."""
+    """An output could not be written; the run was stopped and the outputs closed. `summary` tells how far it came."""
+
+    def __init__(self, sentence: str, summary: dict[str, Any]) -> None:
+        super().__init__(sentence)
+        self.summary = summary

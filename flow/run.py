@@ -115,7 +115,8 @@ def run(
                 errors.append((use, error))
     if errors:
         use, cause = errors[0]
-        raise SinkError(f"{use.rpartition('.')[2]} could not write {outputs[use]}: {cause}") from cause
+        sentence = f"{use.rpartition('.')[2]} could not write {outputs[use]}: {cause}"
+        raise SinkError(sentence, summary | {"verdict": str(Verdict.INCOMPLETE), "failure": sentence}) from cause
     return summary
 
 

@@ -171,9 +171,17 @@ def test_the_log_itself_is_never_overwritten(traverse, capsys):
     assert traverse.stat() == before
 
 
-def test_an_output_that_cannot_be_written_is_said_in_one_sentence(traverse, tmp_path, capsys):
-    assert roverflow("run", traverse, *SMALL, "-o", tmp_path / "nowhere" / "out.mcap", "--no-rrd") in (1, 2)
+def test_an_output_without_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys):
+    assert roverflow("run", traverse, *SMALL, "-o", tmp_path / "nowhere" / "out.mcap", "--no-rrd") == 2
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_an_output_that_fails_is_said_in_one_sentence_and_the_summary_is_still_there(traverse, tmp_path, capsys):
+    (tmp_path / "out.mcap").mkdir()
+    files = ("-o", tmp_path / "out.mcap", "--summary", tmp_path / "summary.json")
+    assert roverflow("run", traverse, *SMALL, *files, "--no-rrd") == 1
     assert capsys.readouterr().err.count("\n") == 1
+    assert json.loads((tmp_path / "summary.json").read_text())["verdict"] == "INCOMPLETE"
 
 
 SLOW = """

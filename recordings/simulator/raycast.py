@@ -17,7 +17,8 @@ from numba import njit
 from stages.data import Array
 
 # One bucket of rocks spans 2**BUCKET_LEVEL ground cells.
-BUCKET_LEVEL = 3
+BUCKET_LEVEL = 1
+SPAN = 16  # px of a row that one beam covers
 SKY = -2
 GROUND = -1
 # Blocks are looked up this far (m) past their border, so that a ray on a border enters the next block.
@@ -38,8 +39,6 @@ class Scene(NamedTuple):
     resolution: float
     tops: Array
     levels: Array
-    rock_tops: Array
-    rock_levels: Array
     rocks: Array
     shapes: Array
     facets: Array
@@ -63,16 +62,19 @@ def scene(
     bucket_start: Array, bucket_rocks: Array,
 ) -> Scene:  # fmt: skip
     """The scene of a ground tile (n, n), the maxima of its patches and of its rock buckets, and its rocks."""
-    tops, levels = pyramid_of(patch_tops)
-    rock_tops, rock_levels = pyramid_of(bucket_tops)
+    half = len(ground) // 2
+    buckets = np.maximum(bucket_tops, patch_tops.reshape(half, 2, half, 2).max(axis=(1, 3)))
+    tops, levels = pyramid_of(buckets)
+    tops = np.concatenate([patch_tops.ravel(), tops])
+    levels = np.concatenate([[0], levels + patch_tops.size])
     return Scene(
-        np.ascontiguousarray(ground, dtype=np.float32), float(resolution), tops, levels, rock_tops, rock_levels,
+        np.ascontiguousarray(ground, dtype=np.float32), float(resolution), tops, levels,
         np.ascontiguousarray(rocks, dtype=np.float64), shapes, np.ascontiguousarray(facets, dtype=np.float64),
-        bucket_start, bucket_rocks, float(max(tops[-1], rock_tops[-1])) + 1.0,
+        bucket_start, bucket_rocks, float(tops[-1]) + 1.0,
     )  # fmt: skip
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def height_at(ground: Any, resolution: float, x: float, y: float) -> float:
     """Bilinear ground elevation at one point."""
     mask = ground.shape[0] - 1
@@ -84,7 +86,7 @@ def height_at(ground: Any, resolution: float, x: float, y: float) -> float:
     return float(low * (1 - v) + (ground[i1, j] * (1 - u) + ground[i1, j1] * u) * v)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def heights_at(ground: Any, resolution: float, x: Any, y: Any) -> Any:
     """Bilinear ground elevation (N,) float64 at points x, y (N,)."""
     out = np.empty(x.shape[0])
@@ -93,13 +95,13 @@ def heights_at(ground: Any, resolution: float, x: Any, y: Any) -> Any:
     return out
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def nearest_repetition(value: float, near: float, extent: float) -> float:
     """The one of value + k * extent that lies nearest to `near`."""
     return value + extent * floor((near - value) / extent + 0.5)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _exit(position: float, inverse: float, index: int, size: float) -> float:
     """Distance at which a ray leaves block `index` along one axis."""
     if inverse == inf or inverse == -inf:
@@ -107,7 +109,7 @@ def _exit(position: float, inverse: float, index: int, size: float) -> float:
     return ((index + 1) * size - position) * inverse if inverse > 0 else (index * size - position) * inverse
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _patch_hit(
     scn: Any, ix: int, iy: int, u: float, v: float, z: float, gx: float, gy: float, dz: float, length: float
 ) -> float:
@@ -137,42 +139,7 @@ def _patch_hit(
     return root if 0 <= root <= length else inf
 
 
-@njit(nogil=True, cache=True)
-def _ground_hit(
-    scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, start: float, far: float
-) -> float:
-    """Distance to the first ground in (start, far), inf if none."""
-    n, step, inverse_step = scn.ground.shape[0], scn.resolution, 1 / scn.resolution
-    highest = scn.levels.shape[0] - 2
-    inverse_x = 1 / dx if dx != 0 else inf
-    inverse_y = 1 / dy if dy != 0 else inf
-    t, level = start, min(3, highest)
-    ceiling = scn.tops[scn.levels[highest]]
-    while t < far:
-        if dz >= 0 and pz + dz * t > ceiling:
-            return inf
-        size, per_metre = step * (1 << level), inverse_step / (1 << level)
-        ix = floor((px + dx * (t + NUDGE)) * per_metre)
-        iy = floor((py + dy * (t + NUDGE)) * per_metre)
-        leave = max(min(_exit(px, inverse_x, ix, size), _exit(py, inverse_y, iy, size), far), t + NUDGE)
-        width = n >> level
-        top = scn.tops[scn.levels[level] + (iy & (width - 1)) * width + (ix & (width - 1))]
-        if pz + dz * (leave if dz < 0 else t) > top:
-            t = leave
-            level = min(level + 1, highest)
-        elif level > 0:
-            level -= 1
-        else:
-            x, y = (px + dx * t) / step - ix, (py + dy * t) / step - iy
-            hit = _patch_hit(scn, ix, iy, x, y, pz + dz * t, dx / step, dy / step, dz, leave - t)
-            if hit < inf:
-                return t + hit
-            t = leave
-            level = 1
-    return inf
-
-
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _rock_hit(
     scn: Any, rock: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, int]:
@@ -209,70 +176,111 @@ def _rock_hit(
     return (enter, facet) if enter > 0 else (inf, ROUNDED)
 
 
-@njit(nogil=True, cache=True)
-def _rocks_hit(
-    scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, start: float, far: float
-) -> tuple[float, int, int]:
-    """Distance, index and facet of the first rock in (start, far); inf if none."""
-    n = scn.ground.shape[0] >> BUCKET_LEVEL
-    step, highest = scn.resolution * (1 << BUCKET_LEVEL), scn.rock_levels.shape[0] - 2
-    extent, inverse_step = n * step, 1 / step
-    inverse_x = 1 / dx if dx != 0 else inf
-    inverse_y = 1 / dy if dy != 0 else inf
+@njit(nogil=True, cache=True, error_model="numpy")
+def _bucket_hit(
+    scn: Any, bucket: int, x: float, y: float, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
+    start: float, far: float,
+) -> tuple[float, int, int]:  # fmt: skip
+    """Distance, index and facet of the first hit in (start, far) of a rock of the bucket about (x, y); SKY if none."""
+    extent = scn.ground.shape[0] * scn.resolution
     best, best_rock, best_facet = far, SKY, ROUNDED
-    t, level = start, 0
-    ceiling = scn.rock_tops[scn.rock_levels[highest]]
-    while t < best:
-        if dz >= 0 and pz + dz * t > ceiling:
-            break
-        size, per_metre = step * (1 << level), inverse_step / (1 << level)
-        ix = floor((px + dx * (t + NUDGE)) * per_metre)
-        iy = floor((py + dy * (t + NUDGE)) * per_metre)
-        leave = max(min(_exit(px, inverse_x, ix, size), _exit(py, inverse_y, iy, size), far), t + NUDGE)
-        width = n >> level
-        block = (iy & (width - 1)) * width + (ix & (width - 1))
-        if pz + dz * (leave if dz < 0 else t) > scn.rock_tops[scn.rock_levels[level] + block]:
-            t = leave
-            level = min(level + 1, highest)
-        elif level > 0:
-            level -= 1
-        else:
-            for k in range(scn.bucket_start[block], scn.bucket_start[block + 1]):
-                rock = scn.bucket_rocks[k]
-                cx = nearest_repetition(scn.rocks[rock, 0], (ix + 0.5) * step, extent)
-                cy = nearest_repetition(scn.rocks[rock, 1], (iy + 0.5) * step, extent)
-                hit, facet = _rock_hit(scn, rock, px - cx, py - cy, pz - scn.rocks[rock, 2], dx, dy, dz)
-                if start < hit < best:
-                    best, best_rock, best_facet = hit, rock, facet
-            t = leave
-    if best_rock == SKY:
-        return inf, SKY, ROUNDED
+    for k in range(scn.bucket_start[bucket], scn.bucket_start[bucket + 1]):
+        rock = scn.bucket_rocks[k]
+        cx = nearest_repetition(scn.rocks[rock, 0], x, extent)
+        cy = nearest_repetition(scn.rocks[rock, 1], y, extent)
+        hit, facet = _rock_hit(scn, rock, px - cx, py - cy, pz - scn.rocks[rock, 2], dx, dy, dz)
+        if start < hit < best:
+            best, best_rock, best_facet = hit, rock, facet
     return best, best_rock, best_facet
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def first_hit(
     scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, start: float, far: float
 ) -> tuple[float, int, int]:
     """Distance (in lengths of the direction), surface (GROUND, SKY or a rock's index) and facet of the first hit."""
-    ground = _ground_hit(scn, px, py, pz, dx, dy, dz, start, far)
-    rock_t, rock, facet = _rocks_hit(scn, px, py, pz, dx, dy, dz, start, min(ground, far))
-    if rock != SKY:
-        return rock_t, rock, facet
-    return ground, (GROUND if ground < inf else SKY), ROUNDED
+    n, step, inverse_step = scn.ground.shape[0], scn.resolution, 1 / scn.resolution
+    highest = scn.levels.shape[0] - 2
+    inverse_x = 1 / dx if dx != 0 else inf
+    inverse_y = 1 / dy if dy != 0 else inf
+    best, surface, facet = far, SKY, ROUNDED
+    t, level, tested = start, BUCKET_LEVEL, -1
+    while t < best:
+        if dz >= 0 and pz + dz * t > scn.ceiling:
+            break
+        size, per_metre = step * (1 << level), inverse_step / (1 << level)
+        ix = floor((px + dx * (t + NUDGE)) * per_metre)
+        iy = floor((py + dy * (t + NUDGE)) * per_metre)
+        leave = max(min(_exit(px, inverse_x, ix, size), _exit(py, inverse_y, iy, size), best), t + NUDGE)
+        width = n >> level
+        block = (iy & (width - 1)) * width + (ix & (width - 1))
+        if pz + dz * (leave if dz < 0 else t) > scn.tops[scn.levels[level] + block]:
+            t = leave
+            level = min(level + 1, highest)
+        elif level > BUCKET_LEVEL:
+            level -= 1
+        elif level == BUCKET_LEVEL:
+            if block != tested and scn.bucket_start[block] < scn.bucket_start[block + 1]:
+                hit, rock, side = _bucket_hit(
+                    scn, block, (ix + 0.5) * size, (iy + 0.5) * size, px, py, pz, dx, dy, dz, start, best
+                )  # fmt: skip
+                if rock != SKY:
+                    best, surface, facet = hit, rock, side
+            tested = block
+            level = 0
+        else:
+            x, y = (px + dx * t) * inverse_step - ix, (py + dy * t) * inverse_step - iy
+            hit = _patch_hit(scn, ix, iy, x, y, pz + dz * t, dx * inverse_step, dy * inverse_step, dz, leave - t)
+            if t + hit < best:
+                best, surface, facet = t + hit, GROUND, ROUNDED
+                break
+            t = leave
+            level = BUCKET_LEVEL
+    return (best if surface != SKY else inf), surface, facet
 
 
-@njit(nogil=True, cache=True)
-def is_hidden(
-    scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, start: float, far: float
-) -> bool:
-    """Whether anything lies on the ray between the distances `start` and `far`."""
-    if _ground_hit(scn, px, py, pz, dx, dy, dz, start, far) < inf:
-        return True
-    return bool(_rocks_hit(scn, px, py, pz, dx, dy, dz, start, far)[1] != SKY)
+@njit(nogil=True, cache=True, error_model="numpy")
+def clear_until(
+    scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, ex: float, ey: float, ez: float,
+    start: float, far: float,
+) -> float:  # fmt: skip
+    """A distance from `start` on up to which no ray of a beam, directions (dx, dy, dz) +- (ex, ey, ez), hits anything.
+
+    It is `far` if none of them ever does.
+    """
+    n, step = scn.ground.shape[0], scn.resolution
+    highest = scn.levels.shape[0] - 2
+    pace = 1 / max(abs(dx), abs(dy), 0.05)
+    lowest = dz - ez
+    t, level = start, 4
+    while t < far:
+        if lowest >= 0 and pz + lowest * t > scn.ceiling:
+            return far
+        size = step * (1 << level)
+        leave = min(t + size * pace, far)
+        x0, x1, y0, y1 = px + dx * t, px + dx * leave, py + dy * t, py + dy * leave
+        i0, i1 = floor((min(y0, y1) - ey * leave) / size), floor((max(y0, y1) + ey * leave) / size)
+        j0, j1 = floor((min(x0, x1) - ex * leave) / size), floor((max(x0, x1) + ex * leave) / size)
+        low = pz + lowest * (leave if lowest < 0 else t)
+        clear = i1 - i0 < 4 and j1 - j0 < 4
+        if not clear:
+            return t
+        width = n >> level
+        for i in range(i0, i1 + 1):
+            first = scn.levels[level] + (i & (width - 1)) * width
+            for j in range(j0, j1 + 1):
+                clear = clear and low > scn.tops[first + (j & (width - 1))]
+        if clear:
+            t = leave
+            level = min(level + 1, highest)
+        elif level > BUCKET_LEVEL:
+            level -= 1
+        else:
+            return t
+    return far
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def normal_at(scn: Any, surface: int, facet: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Unit normal, towards the outside, of the surface at a point that a ray has hit.
 
@@ -300,7 +308,7 @@ def normal_at(scn: Any, surface: int, facet: int, x: float, y: float, z: float) 
     return nx / length, ny / length, nz / length
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def tops_at(scn: Any, x: Any, y: Any, ceiling: float) -> Any:
     """What one meets from above at points x, y (N,): elevation (N,) float64, m, and surface (N,) int32.
 
@@ -308,14 +316,24 @@ def tops_at(scn: Any, x: Any, y: Any, ceiling: float) -> Any:
     """
     z, surface = np.empty(x.shape[0]), np.empty(x.shape[0], np.int32)
     for k in range(x.shape[0]):
-        ground = height_at(scn.ground, scn.resolution, x[k], y[k])
-        t, rock, _ = _rocks_hit(scn, x[k], y[k], ceiling, 0.0, 0.0, -1.0, 0.0, ceiling - ground)
-        z[k] = ground if rock == SKY else ceiling - t
-        surface[k] = GROUND if rock == SKY else rock
+        t, surface[k], _ = first_hit(scn, x[k], y[k], ceiling, 0.0, 0.0, -1.0, 0.0, 1e6)
+        z[k] = ceiling - t
     return z, surface
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
+def _row_clear(
+    scn: Any, origin: Any, rotation: Any, a: float, b: float, reach: float, start: float, far: float
+) -> float:
+    """`clear_until` of the rays of one row whose columns lie within `reach` (in tangents) of `a`."""
+    dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2]
+    dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2]
+    dz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2]
+    ex, ey, ez = abs(rotation[0, 0]) * reach, abs(rotation[1, 0]) * reach, abs(rotation[2, 0]) * reach
+    return clear_until(scn, origin[0], origin[1], origin[2], dx, dy, dz, ex, ey, ez, start, far)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def cast_rows(
     scn: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float, far: float, first: int,
     depth: Any, surface: Any, facet: Any,
@@ -327,16 +345,20 @@ def cast_rows(
     """
     for row in range(depth.shape[0]):
         b = (first + row - cy) / fy
+        start = 0.0
         for column in range(depth.shape[1]):
+            if column % SPAN == 0:
+                a = (column + (SPAN - 1) / 2 - cx) / fx
+                start = _row_clear(scn, origin, rotation, a, b, SPAN / 2 / fx, 0.0, far)
             a = (column - cx) / fx
             dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2]
             dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2]
             dz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2]
-            t, what, side = first_hit(scn, origin[0], origin[1], origin[2], dx, dy, dz, 0.0, far)
+            t, what, side = first_hit(scn, origin[0], origin[1], origin[2], dx, dy, dz, start, far)
             depth[row, column], surface[row, column], facet[row, column] = t, what, side
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def seen_rows(
     scn: Any, left: Any, right: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float, first: int,
     depth: Any, seen: Any,
@@ -347,21 +369,28 @@ def seen_rows(
     """
     baseline = sqrt((right[0] - left[0]) ** 2 + (right[1] - left[1]) ** 2 + (right[2] - left[2]) ** 2)
     width = depth.shape[1]
+    clear = np.empty(width // SPAN + 1)
     for row in range(depth.shape[0]):
         b = (first + row - cy) / fy
+        clear[:] = -1.0
         for column in range(width):
             t = depth[row, column]
             if t == inf:
                 seen[row, column] = 0
                 continue
             seen[row, column] = 128
-            if column - fx * baseline / t < -0.5:
+            place = column - fx * baseline / t + 0.5
+            if place < 0:
                 continue
+            span, end = int(place) // SPAN, t * (1 - 1e-5) - 1e-5
+            if clear[span] < 0:
+                a = (span * SPAN + (SPAN - 1) / 2 - cx) / fx
+                clear[span] = _row_clear(scn, right, rotation, a, b, SPAN / 2 / fx, 0.0, 1e3)
             a = (column - cx) / fx
             # From the right camera, at unit speed along the optical axis, the point is met at t:
             # what is met sooner hides it.
             dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] - (right[0] - left[0]) / t
             dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] - (right[1] - left[1]) / t
             dz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] - (right[2] - left[2]) / t
-            if not is_hidden(scn, right[0], right[1], right[2], dx, dy, dz, 0.0, t * (1 - 1e-5) - 1e-5):
+            if first_hit(scn, right[0], right[1], right[2], dx, dy, dz, clear[span], end)[1] == SKY:
                 seen[row, column] = 255

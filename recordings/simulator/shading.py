@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from recordings.simulator.raycast import GROUND, is_hidden, normal_at, pyramid_of
+from recordings.simulator.raycast import GROUND, SKY, first_hit, normal_at, pyramid_of
 from stages.data import Array
 
 TILE = 1024
@@ -62,7 +62,7 @@ def _band(rng: np.random.Generator, fall: float, shortest: float, longest: float
     return np.asarray(picture / picture.std())
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
     """Periodic bilinear sample at (x, y) px of the square tile of `size` that begins at `start`."""
     ix, iy = floor(x), floor(y)
@@ -73,7 +73,7 @@ def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
     return float(low * (1 - v) + (tiles[i1 + j] * (1 - u) + tiles[i1 + j1] * u) * v)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def sample(tiles: Any, levels: Any, period: float, x: float, y: float, width: float) -> float:
     """The tile laid with `period`, m, at (x, y), m, averaged over about `width`, m: linear between pyramid levels."""
     cell = period / TILE
@@ -87,7 +87,7 @@ def sample(tiles: Any, levels: Any, period: float, x: float, y: float, width: fl
     return value
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _ground_albedo(
     texture: Any, x: float, y: float, width: float, length: float, ux: float, uy: float
 ) -> tuple[float, float]:
@@ -106,7 +106,7 @@ def _ground_albedo(
     return 1 + contrast * (grit / taps - 1), (1 + 0.07 * cloud - 0.04 * broad) * (0.92 + 0.16 * sand)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _rock_albedo(
     texture: Any, rock: int, x: float, y: float, z: float, nx: float, ny: float, nz: float, width: float
 ) -> float:
@@ -122,7 +122,7 @@ def _rock_albedo(
     return max(0.3, (1 + 0.16 * grain + 0.45 * (pits - 1)) * (0.72 + 0.5 * ((rock * 61) % 89) / 89))
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def shade_rows(
     scn: Any, texture: Any, sun: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float,
     first: int, depth: Any, surface: Any, facet: Any, radiance: Any,
@@ -159,7 +159,7 @@ def shade_rows(
             if toward > 0:
                 lift = 0.001 + 1e-4 * t
                 sx, sy, sz = x + lift * nx, y + lift * ny, z + lift * nz
-                if not is_hidden(scn, sx, sy, sz, sun[0], sun[1], sun[2], 0.0, 80.0):
+                if first_hit(scn, sx, sy, sz, sun[0], sun[1], sun[2], 0.0, 80.0)[1] == SKY:
                     # Half Lambert, half Lommel-Seeliger, as dusty surfaces scatter (McEwen 1991).
                     light = SUNLIGHT * grit * (0.5 * toward + toward / (toward + facing))
             light += SKYLIGHT * (0.5 + 0.5 * nz) * (1 + 0.4 * (grit - 1))
