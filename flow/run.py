@@ -78,7 +78,7 @@ def run(
     except PipelineError as error:
         raise UsageError(str(error)) from None
     stop = stop or Stop()
-    ledger, started = Ledger(), time.perf_counter()
+    ledger, started = Ledger(), (time.perf_counter(), time.process_time())
     feeder = Feeder(graph, ledger)
     streams = graph.frame_streams
     sinks = {
@@ -107,7 +107,8 @@ def run(
             if engine.failure:
                 errors.append(engine.failure)
     finally:
-        summary = _summary(graph, feeder, engine, ledger, stop, time.perf_counter() - started)
+        wall, cpu = time.perf_counter() - started[0], time.process_time() - started[1]
+        summary = _summary(graph, feeder, engine, ledger, stop, wall, cpu)
         for use in opened:
             try:
                 sinks[use][0].close(summary)
@@ -155,7 +156,7 @@ def _peak_memory_mb() -> float:
 
 
 def _summary(
-    graph: Graph, feeder: Feeder, engine: Engine | None, ledger: Ledger, stop: Stop, seconds: float
+    graph: Graph, feeder: Feeder, engine: Engine | None, ledger: Ledger, stop: Stop, wall: float, cpu: float
 ) -> dict[str, Any]:
     frames_in = engine.admitted if engine else 0
     frames_out = engine.whole if engine else 0
@@ -169,8 +170,9 @@ def _summary(
         "drops": ledger.counts(),
         "messages": dict(sorted(feeder.messages.items())),
         "seconds": {name: round(value, 6) for name, value in (engine.seconds if engine else {}).items()},
-        "wall_seconds": round(seconds, 6),
-        "frames_per_second": round(frames_out / seconds, 4) if seconds > 0 else 0.0,
+        "wall_seconds": round(wall, 6),
+        "cpu_seconds": round(cpu, 6),
+        "frames_per_second": round(frames_out / wall, 4) if wall > 0 else 0.0,
         "peak_memory_mb": _peak_memory_mb(),
         "ledger": [entry.as_dict() for entry in ledger.entries],
         "entries": feeder.late_entries,

@@ -131,15 +131,20 @@ def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[E
 
 def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Array:
     """(count, count) float32: 1 where a pixel that both cameras see hits the cell within the region, else 0."""
-    camera = simulation.camera
-    v, u = np.nonzero((truth.seen == 255) & (truth.depth <= simulation.region))
-    z = truth.depth[v, u]
-    optical = np.column_stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
-    optical = optical[np.einsum("ij,ij->i", optical, optical) <= simulation.region**2]
-    points = truth.level.inverse().after(truth.base.after(simulation.mounts[0]))(optical)
-    column, row = np.floor((points[:, :2] + simulation.map_half_width) / simulation.map_resolution).astype(np.int64).T
-    inside = (column >= 0) & (column < count) & (row >= 0) & (row < count)
-    hits = np.bincount(row[inside] * count + column[inside], minlength=count * count)
+    camera, shape = simulation.camera, truth.depth.shape
+    mount = truth.level.inverse().after(truth.base.after(simulation.mounts[0]))
+    a, b = (np.arange(shape[1]) - camera.cx) / camera.fx, ((np.arange(shape[0]) - camera.cy) / camera.fy)[:, None]
+    known = (truth.seen == 255) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
+    depth, places = np.where(known, truth.depth, 0.0), []
+    for axis in (1, 0):
+        right, down, ahead = mount.rotation[axis]
+        place = depth * (right * a + (down * b + ahead))
+        place += mount.translation[axis] + simulation.map_half_width
+        place /= simulation.map_resolution
+        known &= (place >= 0) & (place < count)
+        places.append(place)
+    row, column = (place[known].astype(np.int64) for place in places)
+    hits = np.bincount(row * count + column, minlength=count * count)
     return (hits > 0).astype(np.float32).reshape(count, count)
 
 

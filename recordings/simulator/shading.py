@@ -12,20 +12,20 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
-from recordings.simulator.raycast import GROUND, SKY, first_hit, normal_at, pyramid_of
+from recordings.simulator.raycast import GROUND, SKY, compiled, first_hit, normal_at, pyramid_of
 from stages.data import Array
 
 TILE = 1024
 # Period of the tile laid at three scales, m. Their ratios are no round numbers, so the sum does not visibly repeat.
 FINE, MIDDLE, BROAD = 2.56, 13.7, 97.0
-MOST_TAPS = 6
+MOST_TAPS = 4
 VISIBILITY = 300.0  # m, at which haze leaves 1/e of the contrast
 SUNLIGHT, SKYLIGHT = 0.86, 0.24
 EXPOSURE, GAMMA = 0.80, 1 / 1.5
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 BLUR = 0.55  # px, standard deviation of the optics' point spread
+STRIP = 32  # rows that are exposed at a time, so that they stay in the processor's cache
 
 
 class Texture(NamedTuple):
@@ -62,7 +62,7 @@ def _band(rng: np.random.Generator, fall: float, shortest: float, longest: float
     return np.asarray(picture / picture.std())
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
     """Periodic bilinear sample at (x, y) px of the square tile of `size` that begins at `start`."""
     ix, iy = floor(x), floor(y)
@@ -73,40 +73,48 @@ def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
     return float(low * (1 - v) + (tiles[i1 + j] * (1 - u) + tiles[i1 + j1] * u) * v)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def sample(tiles: Any, levels: Any, period: float, x: float, y: float, width: float) -> float:
-    """The tile laid with `period`, m, at (x, y), m, averaged over about `width`, m: linear between pyramid levels."""
+@compiled
+def _sample(
+    tiles: Any, levels: Any, period: float, x: float, y: float, width: float, taps: int, ux: float, uy: float
+) -> float:
+    """The tile laid with `period`, m, averaged over about `width`, m: linear between pyramid levels.
+
+    It is the mean of `taps` samples, (ux, uy) m apart, the middle one at (x, y), m.
+    """
     cell = period / TILE
     level = min(max(log2(max(width, 1e-9) / cell), 0.0), levels.shape[0] - 2.001)
     lower = int(level)
     share, size = level - lower, TILE >> lower
-    px, py = x / period * size - 0.5, y / period * size - 0.5
-    value = _bilinear(tiles, levels[lower], size, px, py)
-    if share > 0:
-        value += share * (_bilinear(tiles, levels[lower + 1], size >> 1, px / 2 - 0.25, py / 2 - 0.25) - value)
-    return value
+    fine, coarse = levels[lower], levels[lower + 1]
+    per_metre, middle = size / period, 0.5 * (taps - 1)
+    px, py = (x - middle * ux) * per_metre - 0.5, (y - middle * uy) * per_metre - 0.5
+    total = 0.0
+    for k in range(taps):
+        qx, qy = px + k * ux * per_metre, py + k * uy * per_metre
+        value = _bilinear(tiles, fine, size, qx, qy)
+        if share > 0:
+            value += share * (_bilinear(tiles, coarse, size >> 1, qx / 2 - 0.25, qy / 2 - 0.25) - value)
+        total += value
+    return total / taps
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _ground_albedo(
     texture: Any, x: float, y: float, width: float, length: float, ux: float, uy: float
 ) -> tuple[float, float]:
     """Grit and albedo of the ground under a footprint of width x length, m, whose long side runs along (ux, uy)."""
     taps = min(max(ceil(length / width), 1), MOST_TAPS)
-    blur = max(width, length / taps)
-    grit = 0.0
-    for k in range(taps):
-        along = ((k + 0.5) / taps - 0.5) * length
-        grit += sample(texture.grit, texture.levels, FINE, x + along * ux, y + along * uy, blur)
-    cloud = sample(texture.noise, texture.levels, MIDDLE, x, y, length)
-    broad = sample(texture.noise, texture.levels, BROAD, x + 31.0, y + 7.0, length)
+    apart = length / taps
+    grit = _sample(texture.grit, texture.levels, FINE, x, y, max(width, apart), taps, apart * ux, apart * uy)
+    cloud = _sample(texture.noise, texture.levels, MIDDLE, x, y, length, 1, 0.0, 0.0)
+    broad = _sample(texture.noise, texture.levels, BROAD, x + 31.0, y + 7.0, length, 1, 0.0, 0.0)
     # Where the broad pattern is high lies drifted sand, smooth and bright; elsewhere gravel.
     sand = min(max(0.5 + 1.4 * (broad + 0.35 * cloud - 0.55), 0.0), 1.0)
     contrast = 1.0 - 0.72 * sand
-    return 1 + contrast * (grit / taps - 1), (1 + 0.07 * cloud - 0.04 * broad) * (0.92 + 0.16 * sand)
+    return 1 + contrast * (grit - 1), (1 + 0.07 * cloud - 0.04 * broad) * (0.92 + 0.16 * sand)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _rock_albedo(
     texture: Any, rock: int, x: float, y: float, z: float, nx: float, ny: float, nz: float, width: float
 ) -> float:
@@ -117,17 +125,29 @@ def _rock_albedo(
     elif abs(ny) > abs(nz):
         a, b = x, z
     shift = 0.377 * (rock % 97)
-    grain = sample(texture.noise, texture.levels, 0.9, a + shift, b - shift, width)
-    pits = sample(texture.grit, texture.levels, 1.1, a - shift, b + shift, width)
+    grain = _sample(texture.noise, texture.levels, 0.9, a + shift, b - shift, width, 1, 0.0, 0.0)
+    pits = _sample(texture.grit, texture.levels, 1.1, a - shift, b + shift, width, 1, 0.0, 0.0)
     return max(0.3, (1 + 0.16 * grain + 0.45 * (pits - 1)) * (0.72 + 0.5 * ((rock * 61) % 89) / 89))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
+def _is_lit(scn: Any, clear: Any, sun: Any, x: float, y: float, z: float) -> bool:
+    """Whether the sun shines on a point; clear: its `sunlight.lit_above`."""
+    mask = clear.shape[0] - 1
+    if z > clear[floor(y / scn.resolution) & mask, floor(x / scn.resolution) & mask]:
+        return True
+    return bool(first_hit(scn, x, y, z, sun[0], sun[1], sun[2], 0.0, 80.0)[1] == SKY)
+
+
+@compiled
 def shade_rows(
-    scn: Any, texture: Any, sun: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float,
-    first: int, depth: Any, surface: Any, facet: Any, radiance: Any,
+    scn: Any, texture: Any, clear: Any, sun: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float,
+    cy: float, first: int, depth: Any, surface: Any, facet: Any, radiance: Any,
 ) -> None:  # fmt: skip
-    """Light that reaches the pixels of `cast_rows` (same arguments): radiance (rows, W, 3) float32, about 0 to 1."""
+    """Light that reaches the pixels of `cast_rows` (same arguments): radiance (rows, W, 3) float32, about 0 to 1.
+
+    sun: (3,) towards it; clear: its `sunlight.lit_above`.
+    """
     for row in range(depth.shape[0]):
         b = (first + row - cy) / fy
         for column in range(depth.shape[1]):
@@ -156,17 +176,15 @@ def shade_rows(
                 red, green, blue = 0.60 * albedo, 0.46 * albedo, 0.37 * albedo
             toward = nx * sun[0] + ny * sun[1] + nz * sun[2]
             light = 0.0
-            if toward > 0:
-                lift = 0.001 + 1e-4 * t
-                sx, sy, sz = x + lift * nx, y + lift * ny, z + lift * nz
-                if first_hit(scn, sx, sy, sz, sun[0], sun[1], sun[2], 0.0, 80.0)[1] == SKY:
-                    # Half Lambert, half Lommel-Seeliger, as dusty surfaces scatter (McEwen 1991).
-                    light = SUNLIGHT * grit * (0.5 * toward + toward / (toward + facing))
+            lift = 0.001 + 1e-4 * t
+            if toward > 0 and _is_lit(scn, clear, sun, x + lift * nx, y + lift * ny, z + lift * nz):
+                # Half Lambert, half Lommel-Seeliger, as dusty surfaces scatter (McEwen 1991).
+                light = SUNLIGHT * grit * (0.5 * toward + toward / (toward + facing))
             light += SKYLIGHT * (0.5 + 0.5 * nz) * (1 + 0.4 * (grit - 1))
-            clear = exp(-t * speed / VISIBILITY)
-            radiance[row, column, 0] = red * light * clear + sky0 * (1 - clear)
-            radiance[row, column, 1] = green * light * clear + sky1 * (1 - clear)
-            radiance[row, column, 2] = blue * light * clear + sky2 * (1 - clear)
+            through = exp(-t * speed / VISIBILITY)
+            radiance[row, column, 0] = red * light * through + sky0 * (1 - through)
+            radiance[row, column, 1] = green * light * through + sky1 * (1 - through)
+            radiance[row, column, 2] = blue * light * through + sky2 * (1 - through)
 
 
 def expose(radiance: Array, gain: float, noise: float, rng: np.random.Generator, color: bool) -> Array:
@@ -174,11 +192,19 @@ def expose(radiance: Array, gain: float, noise: float, rng: np.random.Generator,
 
     noise: standard deviation at half the full scale, as a share of the full scale.
     """
-    light = cv2.GaussianBlur(radiance if color else radiance @ LUMA, (0, 0), BLUR)
+    light = np.asarray(cv2.GaussianBlur(radiance if color else radiance @ LUMA, (0, 0), BLUR))
     height, width = light.shape[:2]
     y, x = np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     falloff = (gain * EXPOSURE * (1 - 0.07 * (x**2 + y**2))).astype(np.float32)
-    light = np.clip(light * (falloff[..., None] if color else falloff), 0, 1) ** np.float32(GAMMA)
-    spread = np.float32(noise) * np.sqrt(0.2 + np.float32(1.6) * light)
-    light += spread * rng.standard_normal(light.shape, dtype=np.float32)
-    return np.asarray(np.clip(light * 255 + 0.5, 0, 255).astype(np.uint8))
+    picture = np.empty(light.shape, np.uint8)
+    for first in range(0, height, STRIP):
+        rows = slice(first, first + STRIP)
+        strip = light[rows] * (falloff[rows, :, None] if color else falloff[rows])
+        np.power(np.clip(strip, 0, 1, out=strip), np.float32(GAMMA), out=strip)
+        grain = rng.standard_normal(strip.shape, dtype=np.float32)
+        grain *= np.sqrt(np.float32(0.2 * (255 * noise) ** 2) + np.float32(1.6 * (255 * noise) ** 2) * strip)
+        strip *= np.float32(255)
+        strip += grain
+        strip += np.float32(0.5)
+        picture[rows] = np.clip(strip, 0, 255, out=strip)
+    return picture

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from recordings import ros2
-from recordings.simulator import log, raycast, shading, traverse
+from recordings.simulator import log, raycast, shading, sunlight, traverse
 from recordings.simulator.terrain import Terrain, make_terrain
 from stages.data import Array, StereoCamera, Transform
 
@@ -134,6 +134,11 @@ class Simulation:
         return np.array([flat * np.cos(self.sun_azimuth), flat * np.sin(self.sun_azimuth), np.sin(self.sun_elevation)])
 
     @cached_property
+    def lit_above(self) -> Array:
+        """Per ground cell the elevation, m, above which this sun surely shines."""
+        return sunlight.lit_above(self.terrain.scene, self.sun)
+
+    @cached_property
     def texture(self) -> shading.Texture:
         """The look of the ground under this sun."""
         return shading.make_texture(self._rng(1), self.sun)
@@ -164,6 +169,7 @@ class Simulation:
         """Images and exact geometry of one frame."""
         base = self.base_at(self.stamp(index))
         left, right = (base.after(mount) for mount in self.mounts[:2])
+        gain = 1 + 0.01 * float(self._rng(2).uniform(0.5, 1.0))
         with ThreadPoolExecutor(self.threads) as pool:
             depth, surface, radiance = self._render(left, pool)
             seen = np.empty(depth.shape, np.uint8)
@@ -175,12 +181,14 @@ class Simulation:
                 ),
             )  # fmt: skip
             _, _, other = self._render(right, pool)
-        gain = 1 + 0.01 * float(self._rng(2).uniform(0.5, 1.0))
-        pictures = [
-            shading.expose(light, factor, self.noise, self._rng(3, index, side), self.color)
-            for side, (light, factor) in enumerate(((radiance, 1.0), (other, gain)))
-        ]
-        return FrameTruth(base, traverse.level_pose(base), depth, surface, seen, (pictures[0], pictures[1]))
+            pictures = pool.map(
+                lambda side, light, factor: shading.expose(
+                    light, factor, self.noise, self._rng(3, index, side), self.color
+                ),
+                (0, 1), (radiance, other), (1.0, gain),
+            )  # fmt: skip
+            images = next(pictures), next(pictures)
+        return FrameTruth(base, traverse.level_pose(base), depth, surface, seen, images)
 
     def write(self, out: Path, progress: Callable[[int, int], None] | None = None) -> None:
         """Write the log. progress: called with (frames written, frames) after each frame."""
@@ -218,7 +226,7 @@ class Simulation:
             hits = depth[rows], surface[rows], facet[rows]
             raycast.cast_rows(self.terrain.scene, *view, self.horizon, rows.start, *hits)
             shading.shade_rows(
-                self.terrain.scene, self.texture, self.sun, *view, rows.start, *hits, radiance[rows]
+                self.terrain.scene, self.texture, self.lit_above, self.sun, *view, rows.start, *hits, radiance[rows]
             )  # fmt: skip
 
         self._by_rows(pool, render)

@@ -7,10 +7,12 @@ cut by planes: their facets look like broken stone, and a ray meets them in clos
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import fft
 
 from recordings.simulator.raycast import BUCKET_LEVEL, Scene, heights_at, scene
 from stages.data import Array
@@ -74,17 +76,18 @@ class Terrain:
     """Ground and rocks, repeating every `extent` metres along x and y.
 
     ground: (n, n) float32 elevations, m, of the nodes at y = row * resolution, x = column * resolution, bilinear
-    between them; n a power of two. scene: the same in the form that the ray caster reads.
+    between them; n a power of two.
     """
 
     ground: Array
     resolution: float
     rocks: Rocks
     facets: Array
-    scene: Scene = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "scene", _scene(self.ground, self.resolution, self.rocks, self.facets))
+    @cached_property
+    def scene(self) -> Scene:
+        """Ground and rocks in the form that the ray caster reads."""
+        return _scene(self.ground, self.resolution, self.rocks, self.facets)
 
     @property
     def extent(self) -> float:
@@ -105,12 +108,14 @@ class Terrain:
     def cleared(self, path: Array, half_width: float, height: float) -> Terrain:
         """This terrain without the rocks of at least `height` within `half_width` of the points `path` (N, 2)."""
         rocks, extent = self.rocks, self.extent
-        nearest = np.full(len(rocks), np.inf)
+        high = np.flatnonzero(rocks.height >= height)
+        nearest = np.full(len(high), np.inf)
         for point in path:
-            offset = (rocks.center - point + extent / 2) % extent - extent / 2
+            offset = (rocks.center[high] - point + extent / 2) % extent - extent / 2
             np.minimum(nearest, np.hypot(offset[:, 0], offset[:, 1]), out=nearest)
-        in_the_way = (nearest < half_width + rocks.semi_axes[:, :2].max(axis=1)) & (rocks.height >= height)
-        return Terrain(self.ground, self.resolution, rocks.only(~in_the_way), self.facets)
+        kept = np.ones(len(rocks), bool)
+        kept[high[nearest < half_width + rocks.semi_axes[high, :2].max(axis=1)]] = False
+        return Terrain(self.ground, self.resolution, rocks.only(kept), self.facets)
 
 
 def elevation(ground: Array, resolution: float, x: ArrayLike, y: ArrayLike) -> Array:
@@ -141,15 +146,16 @@ def make_terrain(
 
 def relief(rng: np.random.Generator, cells: int, resolution: float, slope: float) -> Array:
     """Fractional Brownian elevations, (cells, cells) float32, whose RMS slope over 1 m is `slope`, rad."""
-    frequency = np.hypot(np.fft.fftfreq(cells, resolution)[:, None], np.fft.rfftfreq(cells, resolution)[None, :])
-    frequency[0, 0] = np.inf
-    amplitude = frequency ** -(HURST + 1) * np.exp(-((frequency * SHORTEST_WAVE) ** 4))
-    spectrum = np.fft.rfft2(rng.standard_normal((cells, cells)))
-    shape = np.fft.irfft2(spectrum * amplitude, (cells, cells))
+    noise = rng.standard_normal((cells, cells)).astype(np.float32)
+    y, x = np.fft.fftfreq(cells, resolution)[:, None], np.fft.rfftfreq(cells, resolution)[None, :]
+    square = (y**2 + x**2).astype(np.float32)
+    square[0, 0] = np.inf
+    amplitude = square ** np.float32(-(HURST + 1) / 2) * np.exp(-((square * np.float32(SHORTEST_WAVE**2)) ** 2))
+    shape = fft.irfft2(fft.rfft2(noise) * amplitude, (cells, cells))
     metre = max(1, round(1.0 / resolution))
     rises = [np.roll(shape, metre, axis=axis) - shape for axis in (0, 1)]
     rms = float(np.sqrt(np.mean(np.square(rises)))) / (metre * resolution)
-    return np.asarray(shape * (np.tan(slope) / rms), dtype=np.float32)
+    return np.asarray(shape * np.float32(np.tan(slope) / rms))
 
 
 def _shapes(rng: np.random.Generator) -> tuple[Array, Array]:
@@ -198,29 +204,36 @@ def _strew(
 
 
 def _scene(ground: Array, resolution: float, rocks: Rocks, facets: Array) -> Scene:
-    """Max pyramids of ground and rocks, and the list of the rocks that touch each bucket of ground."""
+    """Max pyramid of ground and rocks, and the list of the rocks that touch each bucket of ground."""
     patch = np.maximum(ground, np.roll(ground, -1, axis=0))
     patch = np.maximum(patch, np.roll(patch, -1, axis=1))
     buckets = len(ground) >> BUCKET_LEVEL
-    bucket, rock = _touched(rocks, buckets, resolution * (1 << BUCKET_LEVEL))
-    order = np.lexsort((rock, bucket))
-    start = np.searchsorted(bucket[order], np.arange(buckets**2 + 1)).astype(np.int32)
-    top = np.full(buckets**2, -np.inf, np.float32)
-    np.maximum.at(top, bucket, (rocks.middle + rocks.semi_axes[:, 2]).astype(np.float32)[rock] + np.float32(1e-4))
+    bucket, rock, top = _touched(rocks, buckets, resolution * (1 << BUCKET_LEVEL))
+    order = np.argsort(bucket, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(bucket, minlength=buckets**2))]).astype(np.int32)
+    tops = np.full(buckets**2, -np.inf, np.float32)
+    np.maximum.at(tops, bucket, top.astype(np.float32) + np.float32(1e-4))
     solid = np.column_stack([rocks.center, rocks.middle, 1 / rocks.semi_axes, np.cos(rocks.yaw), np.sin(rocks.yaw)])
     return scene(
-        ground, resolution, patch, top.reshape(buckets, buckets), solid, rocks.shape.astype(np.int32), facets,
+        ground, resolution, patch, tops.reshape(buckets, buckets), solid, rocks.shape.astype(np.int32), facets,
         start, rock[order].astype(np.int32),
     )  # fmt: skip
 
 
-def _touched(rocks: Rocks, buckets: int, size: float) -> tuple[Array, Array]:
-    """Pairs (bucket index, rock index) of every bucket that a rock's bounding square touches."""
-    reach = rocks.semi_axes[:, :2].max(axis=1, initial=0.0)[:, None]
-    low = np.floor((rocks.center - reach) / size).astype(np.int64)
-    span = np.floor((rocks.center + reach) / size).astype(np.int64) - low + 1
-    rock = np.repeat(np.arange(len(rocks)), span.prod(axis=1))
-    nth = np.arange(len(rock)) - np.repeat(np.cumsum(span.prod(axis=1)) - span.prod(axis=1), span.prod(axis=1))
-    column = (low[rock, 0] + nth % span[rock, 0]) % buckets
-    row = (low[rock, 1] + nth // span[rock, 0]) % buckets
-    return row * buckets + column, rock
+def _touched(rocks: Rocks, buckets: int, size: float) -> tuple[Array, Array, Array]:
+    """Bucket index, rock index and a bound of the rock's elevation there, for every bucket that a rock touches."""
+    longest, c, s = rocks.semi_axes[:, :2].max(axis=1, initial=0.0), np.cos(rocks.yaw), np.sin(rocks.yaw)
+    reach = np.hypot(np.stack([c, s]) * rocks.semi_axes[:, 0], np.stack([s, c]) * rocks.semi_axes[:, 1]).T
+    low = np.floor((rocks.center - reach) / size).astype(np.int32)
+    span = np.floor((rocks.center + reach) / size).astype(np.int32) - low + 1
+    count = span.prod(axis=1)
+    rock = np.repeat(np.arange(len(rocks), dtype=np.int32), count)
+    nth = np.arange(len(rock), dtype=np.int32) - np.repeat((np.cumsum(count) - count).astype(np.int32), count)
+    place = low[rock] + np.column_stack([nth % span[rock, 0], nth // span[rock, 0]])
+    # Away from its middle an ellipsoid is at most as high as the sphere of its longest axis, squeezed to its height.
+    gap = np.abs((place + 0.5) * size - rocks.center[rock]) - size / 2
+    away = np.square(np.maximum(gap, 0.0)).sum(axis=1) / longest[rock] ** 2
+    top = rocks.middle[rock] + rocks.semi_axes[rock, 2] * np.sqrt(np.maximum(1 - away, 0.0))
+    place %= buckets
+    met = away < 1
+    return (place[:, 1] * buckets + place[:, 0])[met], rock[met], top[met]
