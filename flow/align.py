@@ -11,11 +11,11 @@ moved on by `patience` since it arrived, whichever comes first.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, get_type_hints
 
-from flow.ledger import Absent, Entry, Reason
+from flow.ledger import Absent, Entry, Reason, failure
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,9 @@ class Token:
     stamp: int
     value: Any
 
+
+# How long, ns of log time, samples are kept for messages that are logged later than they are stamped.
+HISTORY = 10_000_000_000
 
 Answer = Token | Entry
 Answers = Iterable[Answer]
@@ -42,7 +45,8 @@ def _ms(nanoseconds: int) -> str:
 class Pair:
     """Joins two streams of the same rate into one new stream through the left item's `pair_with(right)`.
 
-    Partners are the first two not yet paired whose stamps differ by at most `slop`; the pair carries the left's stamp.
+    Partners are the first two not yet paired whose stamps differ by at most `slop`, which must be below half the period
+    of the streams; the pair carries the left's stamp.
     """
 
     slop: int = _parameter(5_000_000, "largest difference between the two stamps")
@@ -102,6 +106,11 @@ class PairState:
             while queue:
                 yield self._unmatched(port, "the log ended before its partner came")
 
+    def held(self) -> Iterator[tuple[str, int]]:
+        """(stream, stamp) of every message that still waits."""
+        for port, queue in self.waiting.items():
+            yield from ((self.inputs[port], token.stamp) for _, token in queue)
+
     def _unmatched(self, port: str, why: str) -> Entry:
         _, token = self.waiting[port].popleft()
         return Entry(self.inputs[port], token.stamp, self.name, Reason.UNMATCHED, why)
@@ -113,6 +122,7 @@ class _Sampler:
 
     ports = ("stream", "at")
     clock = "at"
+    patience: int
 
     @staticmethod
     def output(kinds: dict[str, type]) -> type:
@@ -122,16 +132,6 @@ class _Sampler:
     def start(self, name: str, inputs: dict[str, str]) -> SamplerState:
         """A running aligner; `inputs` maps ports to stream names."""
         return SamplerState(self, name, inputs)
-
-    @property
-    def reach(self) -> int:
-        """How far (ns) before a stamp a sample may still be of use, besides the last one."""
-        raise NotImplementedError
-
-    @property
-    def wait(self) -> int:
-        """How long (ns of log time) a stamp waits for the stream to catch up."""
-        raise NotImplementedError
 
     def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
         """The value at `stamp`, or a sentence (str) why there is none, or None to wait (never when `final`)."""
@@ -151,14 +151,6 @@ class Interpolate(_Sampler):
         if not hasattr(kinds["stream"], "interpolated"):
             raise TypeError(f"a {kinds['stream'].__name__} cannot be interpolated")
         return kinds["stream"]
-
-    @property
-    def reach(self) -> int:
-        return self.max_gap
-
-    @property
-    def wait(self) -> int:
-        return self.patience
 
     def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
         before, after = _neighbours(samples, stamp)
@@ -180,14 +172,6 @@ class Nearest(_Sampler):
     slop: int = _parameter(50_000_000, "largest distance from the stamp")
     patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for a nearer sample")
 
-    @property
-    def reach(self) -> int:
-        return self.slop
-
-    @property
-    def wait(self) -> int:
-        return self.patience
-
     def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
         before, after = _neighbours(samples, stamp)
         if after is None and not final and not (before is not None and before.stamp == stamp):
@@ -204,14 +188,6 @@ class Latest(_Sampler):
 
     max_age: int | None = _parameter(None, "oldest sample that still counts; none: any age")
     patience: int = _parameter(0, "how long on the log's clock to wait for samples that are logged late")
-
-    @property
-    def reach(self) -> int:
-        return 0
-
-    @property
-    def wait(self) -> int:
-        return self.patience
 
     def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
         before, after = _neighbours(samples, stamp)
@@ -232,6 +208,7 @@ class SamplerState:
         self.wanted: deque[tuple[int, Token]] = deque()
         self.samples: deque[Token] = deque()
         self.arrivals: deque[int] = deque()
+        self.passed: int | None = None  # the last stamp that has had its answer
 
     def push(self, port: str, log_time: int, token: Token) -> Answers:
         """A message of `port` has arrived."""
@@ -255,23 +232,25 @@ class SamplerState:
     def _answer(self, log_time: int | None) -> Answers:
         while self.wanted:
             arrived, token = self.wanted[0]
-            final = log_time is None or arrived + self.rule.wait < log_time
+            final = log_time is None or arrived + self.rule.patience < log_time
             value = self.rule.choose(self.stream, token.stamp, self.samples, final)
             if value is None:
                 return
             self.wanted.popleft()
+            self.passed = token.stamp
             if isinstance(value, str):
                 value = Absent(Entry(self.name, token.stamp, self.name, Reason.UNALIGNED, value))
             yield Token(token.stamp, value)
 
+    def held(self) -> Iterator[tuple[str, int]]:
+        """Nothing: the frames that wait here are told by the stream they come from, and samples are no frames."""
+        return iter(())
+
     def _forget(self, log_time: int) -> None:
-        """Drop samples that no stamp can want any more; the last one before every stamp to come stays."""
-        useful = self.rule.reach + self.rule.wait
-        oldest = self.wanted[0][1].stamp if self.wanted else None
-        while (
-            len(self.samples) > 1
-            and self.arrivals[1] + useful < log_time
-            and (oldest is None or self.samples[1].stamp <= oldest)
+        """Drop the samples before the last one at or before every stamp to come, and those beyond `HISTORY`."""
+        while len(self.samples) > 1 and (
+            (self.passed is not None and self.samples[1].stamp <= self.passed)
+            or (not self.wanted and self.arrivals[1] + HISTORY < log_time)
         ):
             self.samples.popleft(), self.arrivals.popleft()
 
@@ -296,8 +275,8 @@ def joined(
             return token.value
     try:
         return join(first.value, second.value, at)
-    except ValueError as error:
-        return Absent(Entry(name, at, name, Reason.FAILED, str(error)))
+    except Exception as error:
+        return Absent(Entry(name, at, name, Reason.FAILED, failure(error)))
 
 
 pair, interpolate, nearest, latest = Pair, Interpolate, Nearest, Latest

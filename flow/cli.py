@@ -31,14 +31,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("roverflow: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
     except Exception as error:
         if options.debug:
             raise
         print(f"roverflow: {_sentence(error)}", file=sys.stderr)
         return _exit_code(error)
+
+
+def _say(text: str) -> None:
+    """Print to stdout; a reader that has left does not stop the work."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _sentence(error: Exception) -> str:
@@ -75,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
 
     demo = command("demo", _demo, "simulate a short traverse, run it and score it against the truth")
     demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder for the results (demo)")
-    demo.add_argument("--frames", type=int, default=8, metavar="N", help="frames to simulate (8)")
+    demo.add_argument("--frames", type=_count, default=8, metavar="N", help="frames to simulate (8)")
 
     run = command("run", _run, "replay a log through a pipeline")
     run.add_argument("log", type=Path, metavar="LOG.mcap")
@@ -84,8 +89,8 @@ def parser() -> argparse.ArgumentParser:
     recording = run.add_mutually_exclusive_group()
     recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
     recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
-    run.add_argument("--start", type=float, metavar="T", help="begin T seconds after the log's first message")
-    run.add_argument("--end", type=float, metavar="T", help="stop T seconds after the log's first message")
+    run.add_argument("--start", type=_seconds, metavar="T", help="begin T seconds after the log's first message")
+    run.add_argument("--end", type=_seconds, metavar="T", help="stop T seconds after the log's first message")
     run.add_argument("--workers", type=_count, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
     run.add_argument("--summary", type=Path, metavar="OUT.json", help="counts, drops, times and verdict as JSON")
 
@@ -148,6 +153,16 @@ def _count(text: str) -> int:
     return value
 
 
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be seconds after the log's first message, not '{text}'")
+    return value
+
+
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     if not (width.isdigit() and height.isdigit()):
@@ -168,6 +183,8 @@ def _run(options: argparse.Namespace) -> int:
     for path in filter(None, (out, rrd, options.summary)):
         if not path.parent.is_dir():
             raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
+        if path.is_dir():
+            raise UsageError(f"{path} is a folder; give the name of a file")
 
     def keep(summary: dict[str, Any]) -> None:
         if options.summary:
@@ -250,12 +267,12 @@ def _as_json(summary: dict[str, Any]) -> dict[str, Any]:
 
 def _report(summary: dict[str, Any], outputs: Sequence[Path]) -> None:
     rate = f"{summary['frames_per_second']:.2f} frames/s"
-    print(f"{summary['verdict']}: {summary['frames_out']} of {summary['frames_in']} frames whole, {rate}")
+    _say(f"{summary['verdict']}: {summary['frames_out']} of {summary['frames_in']} frames whole, {rate}")
     for reason, count in summary["drops"].items():
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
-        print(f"  {count} {reason}, first: {first['stream']} at {first['stamp']}: {first['detail']}")
+        _say(f"  {count} {reason}, first: {first['stream']} at {first['stamp']}: {first['detail']}")
     for path in outputs:
-        print(f"  {path} ({path.stat().st_size / 1e6:.1f} MB)")
+        _say(f"  {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
 
 def _info(options: argparse.Namespace) -> int:
@@ -263,7 +280,7 @@ def _info(options: argparse.Namespace) -> int:
     from recordings.inventory import describe, format_description
 
     description = describe(options.log, McapSource())
-    print(json.dumps(description, indent=2) if options.json else format_description(description))
+    _say(json.dumps(description, indent=2) if options.json else format_description(description))
     return COMPLETE
 
 
@@ -271,7 +288,7 @@ def _graph(options: argparse.Namespace) -> int:
     from flow.draw import draw
     from flow.pipeline import load
 
-    print(draw(load(options.pipeline, options.set), options.format))
+    _say(draw(load(options.pipeline, options.set), options.format))
     return COMPLETE
 
 
@@ -304,7 +321,7 @@ def simulate(out: Path, **settings: Any) -> None:
             bar.update(done - bar.n)
 
         simulation.write(out, progress)
-    print(f"{out}: {simulation.frames} frames with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
+    _say(f"{out}: {simulation.frames} frames with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
 
 
 def _import(options: argparse.Namespace) -> int:
@@ -315,7 +332,7 @@ def _import(options: argparse.Namespace) -> int:
         left, right, options.calibration, options.out,
         pitch_down=options.pitch_down, roll=options.roll, height=options.height, rate=options.rate,
     )  # fmt: skip
-    print(f"{options.out}: {frames} stereo frames ({options.out.stat().st_size / 1e6:.1f} MB)")
+    _say(f"{options.out}: {frames} stereo frames ({options.out.stat().st_size / 1e6:.1f} MB)")
     return COMPLETE
 
 
@@ -325,7 +342,7 @@ def _score(options: argparse.Namespace) -> int:
     result = score(options.result, options.truth or options.result)
     if options.json:
         options.json.write_text(result.to_json() + "\n")
-    print(format_score(result))
+    _say(format_score(result))
     return COMPLETE
 
 
@@ -336,15 +353,15 @@ def _demo(options: argparse.Namespace) -> int:
     folder = options.out
     folder.mkdir(parents=True, exist_ok=True)
     log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
-    print("Simulating a traverse ...", flush=True)
+    _say("Simulating a traverse ...")
     simulate(log, frames=options.frames)
-    print("Replaying it through the pipeline 'rover' ...", flush=True)
+    _say("Replaying it through the pipeline 'rover' ...")
     summary = replay(log, "rover", out, rrd, workers=os.cpu_count() or 1)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     _report(summary, [out, rrd])
-    print(f"\n{format_score(score(out, log))}")
+    _say(f"\n{format_score(score(out, log))}")
     pictures = draw(out, folder / "pictures")
-    print(f"\n{len(pictures)} pictures in {folder / 'pictures'}; the timeline: rerun {rrd}")
+    _say(f"\n{len(pictures)} pictures in {folder / 'pictures'}; the timeline: rerun {rrd}")
     return _exit_code_of(summary)
 
 

@@ -15,12 +15,13 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 from flow.graph import Node, Sink
-from flow.ledger import Absent, Entry, Ledger, Reason
+from flow.ledger import Absent, Entry, Ledger, Reason, failure
 
 log = logging.getLogger(__name__)
 
@@ -49,8 +50,8 @@ class _Frame:
     values: dict[str, Any]
     entries: list[Entry]
     seconds: dict[str, float] = field(default_factory=dict)
-    begun: set[str] = field(default_factory=set)
-    done: set[str] = field(default_factory=set)
+    begun: set[_Work] = field(default_factory=set)
+    done: set[_Work] = field(default_factory=set)
 
 
 @dataclass(eq=False)
@@ -86,12 +87,12 @@ class Engine:
         self._condition = threading.Condition()
         self._frames: deque[_Frame] = deque()
         self._work = [self._stage_work(node) for node in stages]
-        self._sinks = [self._sink_work(name, sink, streams) for name, (sink, streams) in sinks.items()]
-        self._work += self._sinks
+        self._work += [self._sink_work(name, sink, streams) for name, (sink, streams) in sinks.items()]
         for work in self._work:
             work.consumers = [other for other in self._work if work.output in other.inputs]
-        self._streams = [node.name for node in stages]
         self._closed = False
+        self._writing = 0  # workers inside a sink
+        self._telling = threading.Lock()
         self.failure: tuple[str, BaseException] | None = None
         self.admitted = self.whole = 0
         self.seconds = dict.fromkeys((work.name for work in self._work), 0.0)
@@ -125,17 +126,24 @@ class Engine:
             return True
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait until every frame is through (or the engine failed, or `stop()`), then end the workers."""
+        """Wait until every frame is through (or the engine failed, or `stop()`), then end the workers.
+
+        After `stop()` only those are waited for that are inside a sink; what the others still do is lost.
+        """
         with self._condition:
             while self._frames and not self.failure and not stop():
                 self._condition.wait(0.1)
             self._closed = True
             self._condition.notify_all()
+            while self._writing:
+                self._condition.wait(0.1)
         for thread in self._threads:
-            thread.join()
-        for frame in self._frames:
-            detail = "the run ended before it was through"
-            self._ledger.add(Entry("frame", frame.stamp, "engine", Reason.ABANDONED, detail))
+            while thread.is_alive() and not stop():
+                thread.join(0.1)
+        with self._condition:
+            for frame in self._frames:
+                detail = "the run ended before it was through"
+                self._ledger.add(Entry("frame", frame.stamp, "engine", Reason.ABANDONED, detail))
 
     # -- scheduling: everything below, up to the work itself, runs under the lock --------------------------------
 
@@ -157,10 +165,22 @@ class Engine:
                 value = error
             seconds = time.perf_counter() - seconds
             with self._condition:
-                frame.seconds[work.name] = seconds
-                self.seconds[work.name] += seconds
-                self._deliver(work, frame, value)
+                retired: list[bool] = []
+                try:
+                    self._writing -= work.output is None
+                    frame.seconds[work.name] = seconds
+                    self.seconds[work.name] += seconds
+                    retired = self._deliver(work, frame, value)
+                except BaseException as error:  # a worker must not die unheard
+                    self.failure = self.failure or (work.name, error)
                 self._condition.notify_all()
+            self._tell(retired)
+
+    def _tell(self, retired: list[bool]) -> None:
+        """Report progress, outside the lock; a progress display that fails is not worth a run."""
+        for whole in retired:
+            with self._telling, suppress(Exception):
+                self._on_frame(whole)
 
     def _next_task(self) -> tuple[_Work, _Frame] | None:
         """The most downstream work that is ready and has room for its result; of one node, the oldest frame's."""
@@ -168,13 +188,15 @@ class Engine:
             return None
         for work in reversed(self._work):
             for frame in self._frames:
-                if work.name in frame.begun or not self._ready(work, frame):
+                if work in frame.begun or not self._ready(work, frame):
                     continue
                 if self._has_room(work.consumers, frame):
-                    frame.begun.add(work.name)
+                    frame.begun.add(work)
                     work.inbox.discard(frame.index)
                     if work.output:
                         self._expect(frame, work.output)
+                    else:
+                        self._writing += 1
                     return work, frame
         return None
 
@@ -196,48 +218,49 @@ class Engine:
     def _expect(self, frame: _Frame, coming: str = "") -> None:
         """Note `frame` in the inbox of every node whose inputs are all there, counting `coming` as there."""
         for work in self._work:
-            if work.name not in frame.begun and all(s in frame.values or s == coming for s in work.inputs):
+            if work not in frame.begun and all(s in frame.values or s == coming for s in work.inputs):
                 work.inbox.add(frame.index)
 
-    def _deliver(self, work: _Work, frame: _Frame, value: Any) -> None:
+    def _deliver(self, work: _Work, frame: _Frame, value: Any) -> list[bool]:
+        """Put a result in its place; for each frame that is now through, whether it is whole."""
         if isinstance(value, BaseException):
             if work.output is None:
                 self.failure = self.failure or (work.name, value)
-            detail = f"{type(value).__name__}: {value}" if not isinstance(value, ValueError) else str(value)
-            entry = self._ledger.add(Entry(work.output or "frame", frame.stamp, work.name, Reason.FAILED, detail))
+            stream = work.output or "frame"
+            entry = self._ledger.add(Entry(stream, frame.stamp, work.name, Reason.FAILED, failure(value)))
             frame.entries.append(entry)
             value = Absent(entry)
         if work.output:
             frame.values[work.output] = value
         self._complete(work, frame)
         self._pass_absence(frame)
-        self._retire()
+        return list(self._retire())
 
     def _complete(self, work: _Work, frame: _Frame) -> None:
-        frame.done.add(work.name)
-        while work.ordered and any(f.index == work.next and work.name in f.done for f in self._frames):
+        frame.done.add(work)
+        while work.ordered and any(f.index == work.next and work in f.done for f in self._frames):
             work.next += 1
 
     def _pass_absence(self, frame: _Frame) -> None:
         """Give every stage whose inputs are there but not whole its absent output (stages are in topological order)."""
         for work in self._work:
-            if work.output is None or work.name in frame.begun:
+            if work.output is None or work in frame.begun:
                 continue
             lost = [frame.values[s] for s in work.inputs if isinstance(frame.values.get(s), Absent)]
             if lost:
-                frame.begun.add(work.name)
+                frame.begun.add(work)
                 work.inbox.discard(frame.index)
                 frame.values[work.output] = lost[0]
                 self._complete(work, frame)
         self._expect(frame)
 
-    def _retire(self) -> None:
+    def _retire(self) -> Iterator[bool]:
         """Let go of the frames, oldest first, that are through."""
         while self._frames and len(self._frames[0].done) == len(self._work):
             frame = self._frames.popleft()
             whole = not self.failure and not any(isinstance(value, Absent) for value in frame.values.values())
             self.whole += whole
-            self._on_frame(whole)
+            yield whole
 
     # -- the work itself, outside the lock -------------------------------------------------------------------
 

@@ -17,6 +17,9 @@ from flow.ledger import Absent, Entry, Ledger, Reason
 
 Event = tuple[int, str, Any]
 
+# ns; a stamp that runs ahead of the log's clock by this much more than the one before it is taken for damaged
+JUMP = 10_000_000_000
+
 
 @dataclass(frozen=True)
 class ReadyFrame:
@@ -38,10 +41,12 @@ class Feeder:
             for port, stream in node.inputs.items():
                 self._ports.setdefault(stream, []).append((node.name, port))
         self._wanted = graph.source_streams
+        self._clock = graph.clock
         made = {node.name for node in graph.stages}
         self._entry_streams = [stream for stream in graph.frame_streams if stream not in made]
         self._waiting: dict[str, deque[Token]] = {stream: deque() for stream in self._entry_streams}
-        self._last_stamp: dict[str, int] = {}
+        self._last: dict[str, tuple[int, int]] = {}  # stamp, and how far it ran ahead of the log's clock
+        self._suspect: dict[str, int] = {}
         self._entries: list[Entry] = []
         self.messages: Counter[str] = Counter()
 
@@ -57,7 +62,7 @@ class Feeder:
                 self._lose(Entry(stream, log_time, "source", Reason.UNREADABLE, str(item)))
             elif stream in self._wanted:
                 self.messages[stream] += 1
-                if self._in_order(stream, item.stamp):
+                if self._in_order(stream, item.stamp, log_time):
                     self._take(stream, log_time, Token(item.stamp, item))
             yield from self._ready()
         for name, aligner in self._aligners.items():
@@ -69,14 +74,37 @@ class Feeder:
         """Losses noticed after the last frame."""
         return self._entries
 
-    def _in_order(self, stream: str, stamp: int) -> bool:
-        last = self._last_stamp.get(stream)
-        if last is not None and stamp <= last:
-            detail = f"its stamp is {(last - stamp) / 1e6:.1f} ms before the {stream} message read before it"
-            self._lose(Entry(stream, stamp, "source", Reason.OUT_OF_ORDER, detail))
-            return False
-        self._last_stamp[stream] = stamp
-        return True
+    def give_back(self, frame: ReadyFrame) -> None:
+        """Take back a frame that was not admitted, to be abandoned with the others."""
+        for stream, value in frame.values.items():
+            self._waiting[stream].appendleft(Token(frame.stamp, value))
+        self._entries = [*frame.entries, *self._entries]
+
+    def abandon(self, why: str) -> None:
+        """Enter into the ledger every message that still waits here, because the run ends before the log."""
+        held = [(self._clock, token.stamp) for token in self._waiting[self._clock]]
+        held += [place for aligner in self._aligners.values() for place in aligner.held()]
+        for stream, stamp in held:
+            self._lose(Entry(stream, stamp, "engine", Reason.ABANDONED, why))
+
+    def _in_order(self, stream: str, stamp: int, log_time: int) -> bool:
+        """Whether a stamp may follow the one before it; the ledger says why not."""
+        ahead = stamp - log_time
+        last, last_ahead = self._last.get(stream, (stamp - 1, ahead))
+        jumps = ahead - last_ahead > JUMP
+        # One damaged stamp must not shut out all that follow; two that agree are a clock that was set.
+        if jumps and abs(self._suspect.get(stream, log_time) - ahead) > JUMP:
+            self._suspect[stream] = ahead
+            detail = f"its stamp jumps {(ahead - last_ahead) / 1e9:.1f} s ahead of the log's clock"
+        elif stamp == last:
+            detail = f"it repeats the stamp of the {stream} message before it"
+        elif stamp < last:
+            detail = f"its stamp is {(last - stamp) / 1e6:.1f} ms before that of the {stream} message read before it"
+        else:
+            self._last[stream] = (stamp, ahead)
+            return True
+        self._lose(Entry(stream, stamp, "source", Reason.OUT_OF_ORDER, detail))
+        return False
 
     def _take(self, stream: str, log_time: int, token: Token) -> None:
         """Give a token to the aligners that read its stream, and to the frame it belongs to."""

@@ -8,7 +8,8 @@ graph share one clock; joining others is the aligners' work.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from inspect import Parameter, signature
 from types import UnionType
 from typing import Any, Protocol, Union, get_args, get_origin, get_type_hints
 
@@ -112,19 +113,23 @@ class Graph:
     def without(self, missing: Mapping[str, str]) -> Graph:
         """The graph without the optional nodes that need a stream in `missing` (stream -> why it is missing).
 
-        Raises PipelineError with that sentence where a node that is not optional needs one.
+        A port that may stay unconnected is left so. Raises PipelineError with that sentence where a node that is not
+        optional needs the stream, or no stage is left.
         """
         gone = dict(missing)
         kept = []
         for node in self.nodes:
-            why = next((gone[stream] for stream in node.inputs.values() if stream in gone), None)
-            if why is None:
-                kept.append(node)
+            lost = {port: gone[stream] for port, stream in node.inputs.items() if stream in gone}
+            needed = [why for port, why in lost.items() if port not in ports_of(type(node.actor))[1]]
+            if not needed:
+                kept.append(replace(node, inputs={p: s for p, s in node.inputs.items() if p not in lost}))
             elif node.optional:
-                gone[node.name] = why
+                gone[node.name] = needed[0]
             else:
-                raise PipelineError(why)
-        return Graph(self.name, self.text, self.source, self.source_use, tuple(kept), self.sinks, self.kinds)
+                raise PipelineError(needed[0])
+        if all(node.aligns for node in kept):
+            raise PipelineError(f"nothing of the pipeline {self.name} is left to do: {next(iter(gone.values()))}")
+        return replace(self, nodes=tuple(kept))
 
 
 def is_aligner(kind: type) -> bool:
@@ -132,15 +137,20 @@ def is_aligner(kind: type) -> bool:
     return hasattr(kind, "start") and hasattr(kind, "ports")
 
 
-def ports_of(kind: type) -> tuple[dict[str, type], set[str]]:
-    """Input ports of a stage or aligner class (name -> type), and which of them may stay unconnected."""
+def ports_of(kind: type) -> tuple[dict[str, Any], set[str]]:
+    """Input ports of a stage or aligner class (name -> type), and which of them may stay unconnected.
+
+    Raises TypeError for a stage that does not say the type of an input.
+    """
     if is_aligner(kind):
         return dict.fromkeys(kind.ports, object), set()  # type: ignore[attr-defined]
     hints = get_type_hints(kind.__call__)
-    hints.pop("return", None)
-    defaults = kind.__call__.__defaults__ or ()
-    names = list(hints)
-    return hints, set(names[len(names) - len(defaults) :])
+    parameters = list(signature(kind.__call__).parameters.values())[1:]
+    for parameter in parameters:
+        if parameter.name not in hints:
+            raise TypeError(f"{kind.__name__}.__call__ does not say the type of its input '{parameter.name}'")
+    unneeded = {parameter.name for parameter in parameters if parameter.default is not Parameter.empty}
+    return {parameter.name: hints[parameter.name] for parameter in parameters}, unneeded
 
 
 def accepts(wanted: Any, given: type) -> bool:

@@ -51,6 +51,11 @@ class Absent:
     cause: Entry
 
 
+def failure(error: BaseException) -> str:
+    """What the ledger says of an exception: a ValueError speaks for itself, others need their name."""
+    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+
+
 class Ledger:
     """The entries of one run, in the order they were made; safe to share between threads."""
 

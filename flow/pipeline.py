@@ -195,7 +195,10 @@ class _Builder:
     def _inputs(self, name: str, item: _Value, streams: list[str]) -> dict[str, str]:
         """Port -> stream, as the entry of stream `name` wires them."""
         kind = self._class(item, f"stream '{name}'")
-        ports, unneeded = ports_of(kind)
+        try:
+            ports, unneeded = ports_of(kind)
+        except (TypeError, NameError) as error:
+            raise item.place.error(str(error)) from error
         parameters = _parameters(kind)
         inputs = {}
         for key, value in item.value.items():

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -16,15 +17,16 @@ from typing import Any
 from flow.engine import Engine
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.feeder import Event, Feeder
-from flow.graph import Graph
-from flow.ledger import Entry, Ledger, Reason, Verdict
+from flow.graph import Graph, Sink
+from flow.ledger import Ledger, Verdict
 
 
 class Stop:
-    """What an interrupt asks for: the first one to finish the frames in flight, the second to abandon them too."""
+    """What interrupts ask for: the first to finish the frames in flight, the second to abandon them too."""
 
     def __init__(self) -> None:
         self._finish, self._abandon = threading.Event(), threading.Event()
+        self.reading = False  # whether the log is being read, where an exception does no harm
 
     def request(self) -> None:
         """One more interrupt."""
@@ -46,6 +48,8 @@ def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
     def request(number: int, frame: FrameType | None) -> None:
         stop.request()
         tell("abandoning the frames in flight" if stop.abandoning() else "interrupted: finishing the frames in flight")
+        if stop.abandoning() and stop.reading:
+            raise KeyboardInterrupt  # out of a source that does not answer
 
     signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     before = {number: signal.signal(number, request) for number in signals}
@@ -54,6 +58,39 @@ def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@dataclass
+class _Outputs:
+    """The sinks of a run, each with its path and the streams it is given; and what went wrong with them."""
+
+    sinks: dict[str, tuple[Sink, list[str]]]
+    paths: Mapping[str, Path]
+    opened: list[str] = field(default_factory=list)
+    errors: list[tuple[str, BaseException]] = field(default_factory=list)
+
+    def open(self, kinds: Mapping[str, type], about: Mapping[str, str]) -> bool:
+        """Open all; False if one could not be."""
+        for use, (sink, streams) in self.sinks.items():
+            try:
+                sink.open(self.paths[use], {stream: kinds[stream] for stream in streams}, about)
+            except Exception as error:
+                self.errors.append((use, error))
+                return False
+            self.opened.append(use)
+        return True
+
+    def close(self, summary: dict[str, Any]) -> None:
+        """Close what is open; raises SinkError if anything went wrong with any sink."""
+        for use in self.opened:
+            try:
+                self.sinks[use][0].close(summary)
+            except Exception as error:
+                self.errors.append((use, error))
+        if self.errors:
+            use, cause = self.errors[0]
+            sentence = f"{use.rpartition('.')[2]} could not write {self.paths[use]}: {cause}"
+            raise SinkError(sentence, summary | {"verdict": str(Verdict.INCOMPLETE), "failure": sentence}) from cause
 
 
 def run(
@@ -77,47 +114,31 @@ def run(
         graph = graph.without(log.missing)
     except PipelineError as error:
         raise UsageError(str(error)) from None
-    stop = stop or Stop()
-    ledger, started = Ledger(), (time.perf_counter(), time.process_time())
-    feeder = Feeder(graph, ledger)
+    stop, ledger = stop or Stop(), Ledger()
+    wall, cpu = time.perf_counter(), time.process_time()
     streams = graph.frame_streams
-    sinks = {
-        use: (sink, [stream for stream, kind in streams.items() if sink.wants(stream, kind)])
-        for use, sink in graph.sinks
-        if use in outputs
-    }
-    opened: list[str] = []
-    engine: Engine | None = None
-    summary: dict[str, Any] = {}
-    errors: list[tuple[str, BaseException]] = []
+    used = {use: sink for use, sink in graph.sinks if use in outputs}
+    wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
+    sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
+    feeder, engine, finished = Feeder(graph, ledger), None, False
     try:
-        for use, (sink, wanted) in sinks.items():
+        if sinks.open(streams, dict(about or {})):
+            engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
             try:
-                sink.open(outputs[use], {stream: streams[stream] for stream in wanted}, dict(about or {}))
-            except Exception as error:
-                errors.append((use, error))
-                break
-            opened.append(use)
-        else:
-            engine = Engine(graph.stages, sinks, ledger, workers=workers, on_frame=on_frame)
-            try:
-                _feed(feeder, log, engine, stop, ledger)
+                finished = _feed(feeder, log, engine, stop)
             finally:
+                if not finished:
+                    feeder.abandon("the run ended before the log")
                 engine.finish(stop.abandoning)
-            if engine.failure:
-                errors.append(engine.failure)
+            sinks.errors += [engine.failure] if engine.failure else []
     finally:
-        wall, cpu = time.perf_counter() - started[0], time.process_time() - started[1]
-        summary = _summary(graph, feeder, engine, ledger, stop, wall, cpu)
-        for use in opened:
-            try:
-                sinks[use][0].close(summary)
-            except Exception as error:
-                errors.append((use, error))
-    if errors:
-        use, cause = errors[0]
-        sentence = f"{use.rpartition('.')[2]} could not write {outputs[use]}: {cause}"
-        raise SinkError(sentence, summary | {"verdict": str(Verdict.INCOMPLETE), "failure": sentence}) from cause
+        times = {"wall_seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+        whole = finished and not sinks.errors and not stop.finishing() and not len(ledger)
+        summary = _summary(graph, feeder, engine, ledger, times) | {
+            "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
+            "interrupted": stop.finishing(),
+        }
+        sinks.close(summary)
     return summary
 
 
@@ -125,28 +146,37 @@ class _StoppedError(Exception):
     """Leaves the log in the middle; the aligners then draw no conclusion from its end."""
 
 
-def _feed(feeder: Feeder, log: Any, engine: Engine, stop: Stop, ledger: Ledger) -> None:
-    """Admit the frames of the log until it ends, the run is stopped, or an output fails."""
-
-    def events() -> Iterator[Event]:
-        log_time = 0
-        try:
-            for event in log:
-                if stop.finishing():
-                    raise _StoppedError
-                log_time = event[0]
-                yield event
-        except Exception as error:  # the rest of the log is lost, what was read of it is not
-            if isinstance(error, _StoppedError):
-                raise
-            yield log_time, "log", error
-
+def _feed(feeder: Feeder, log: Any, engine: Engine, stop: Stop) -> bool:
+    """Admit the frames of the log; False if it was stopped, or an output failed, before the log's end."""
     with suppress(_StoppedError):
-        for frame in feeder.frames(events()):
+        for frame in feeder.frames(_events(log, stop)):
             if not engine.admit(frame.stamp, frame.values, frame.entries, stop.finishing):
-                if engine.failure:
-                    ledger.add(Entry("frame", frame.stamp, "engine", Reason.ABANDONED, "an output failed before it"))
-                return
+                feeder.give_back(frame)
+                return False
+        return True
+    return False
+
+
+def _events(log: Any, stop: Stop) -> Iterator[Event]:
+    """The events of `log`; a source that breaks down ends the log with its exception, and a stop in the middle."""
+    log_time, source = 0, iter(log)
+    while True:
+        try:
+            stop.reading = True
+            event = next(source)
+        except StopIteration:
+            return
+        except KeyboardInterrupt:
+            raise _StoppedError from None
+        except Exception as error:  # the rest of the log is lost, what was read of it is not
+            yield log_time, "log", error
+            return
+        finally:
+            stop.reading = False
+        if stop.finishing():
+            raise _StoppedError
+        log_time = event[0]
+        yield event
 
 
 def _peak_memory_mb() -> float:
@@ -156,23 +186,20 @@ def _peak_memory_mb() -> float:
 
 
 def _summary(
-    graph: Graph, feeder: Feeder, engine: Engine | None, ledger: Ledger, stop: Stop, wall: float, cpu: float
+    graph: Graph, feeder: Feeder, engine: Engine | None, ledger: Ledger, times: dict[str, float]
 ) -> dict[str, Any]:
-    frames_in = engine.admitted if engine else 0
     frames_out = engine.whole if engine else 0
-    whole = engine is not None and not engine.failure and not stop.finishing() and not len(ledger)
     return {
-        "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
-        "interrupted": stop.finishing(),
+        "verdict": "",
+        "interrupted": False,
         "pipeline": graph.name,
-        "frames_in": frames_in,
+        "frames_in": engine.admitted if engine else 0,
         "frames_out": frames_out,
         "drops": ledger.counts(),
         "messages": dict(sorted(feeder.messages.items())),
         "seconds": {name: round(value, 6) for name, value in (engine.seconds if engine else {}).items()},
-        "wall_seconds": round(wall, 6),
-        "cpu_seconds": round(cpu, 6),
-        "frames_per_second": round(frames_out / wall, 4) if wall > 0 else 0.0,
+        **{name: round(value, 6) for name, value in times.items()},
+        "frames_per_second": round(frames_out / times["wall_seconds"], 4),
         "peak_memory_mb": _peak_memory_mb(),
         "ledger": [entry.as_dict() for entry in ledger.entries],
         "entries": feeder.late_entries,

@@ -176,12 +176,25 @@ def test_an_output_without_a_folder_is_refused_before_anything_runs(traverse, tm
     assert "nowhere" in capsys.readouterr().err
 
 
-def test_an_output_that_fails_is_said_in_one_sentence_and_the_summary_is_still_there(traverse, tmp_path, capsys):
-    (tmp_path / "out.mcap").mkdir()
-    files = ("-o", tmp_path / "out.mcap", "--summary", tmp_path / "summary.json")
-    assert roverflow("run", traverse, *SMALL, *files, "--no-rrd") == 1
-    assert capsys.readouterr().err.count("\n") == 1
-    assert json.loads((tmp_path / "summary.json").read_text())["verdict"] == "INCOMPLETE"
+@pytest.mark.parametrize("option", ["-o", "--rrd", "--summary"])
+def test_an_output_that_is_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys, option):
+    (tmp_path / "taken").mkdir()
+    assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, tmp_path / "taken") == 2
+    assert "taken is a folder" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+@pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "soon"])
+def test_an_odd_start_is_refused(traverse, seconds, capsys):
+    with pytest.raises(SystemExit) as caught:
+        roverflow("run", traverse, f"--start={seconds}")
+    assert caught.value.code == 2
+    assert "seconds after the log's first message" in capsys.readouterr().err
+
+
+def test_a_reader_that_leaves_does_not_change_the_exit_code(traverse):
+    command = f"{sys.executable} -m flow.cli info {traverse} | true; exit ${{PIPESTATUS[0]}}"
+    assert subprocess.run(["bash", "-c", command], cwd=ROOT, stderr=subprocess.PIPE).returncode == 0
 
 
 SLOW = """

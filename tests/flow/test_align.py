@@ -132,8 +132,36 @@ def test_every_wanted_stamp_gets_exactly_one_answer_in_order(stamps, gap):
     assert all(value == pytest.approx(stamp) for stamp, value in values(answers))
 
 
-def test_old_samples_are_forgotten():
+def fed_at_100_hz(rule, latency, images_every=100 * MS, seconds=30):
+    """Samples at 100 Hz, stamps wanted every 100 ms and logged `latency` late; the aligner and its answers."""
+    aligner = rule.start("tilt", {"stream": "level", "at": "stereo"})
+    messages = [(stamp, "stream", stamp) for stamp in range(0, seconds * 1000 * MS, 10 * MS)]
+    messages += [(stamp + latency, "at", stamp) for stamp in range(MS, seconds * 1000 * MS - latency, images_every)]
+    answers = []
+    for log_time, port, stamp in sorted(messages):
+        answers += aligner.tick(log_time)
+        answers += aligner.push(port, log_time, Token(stamp, Number(stamp, stamp / 1e9)))
+    return aligner, answers
+
+
+@pytest.mark.parametrize("rule", [Latest(), Interpolate(), Nearest()], ids=lambda rule: type(rule).__name__)
+@pytest.mark.parametrize("latency", [0, 80 * MS, 1500 * MS])
+def test_images_logged_later_than_their_stamp_still_find_their_sample(rule, latency):
+    aligner, answers = fed_at_100_hz(rule, latency)
+    found = values(answers)
+    assert len(found) >= 280
+    assert all(abs(value - stamp / 1e9) <= 0.010 for stamp, value in found)
+    assert reasons(answers) == []
+    assert len(aligner.samples) < 100 + 2 * latency / (10 * MS)
+
+
+def test_old_samples_are_forgotten_even_if_nobody_asks():
+    aligner, _ = fed_at_100_hz(Interpolate(), 0, images_every=10**18)
+    assert len(aligner.samples) < 1100
+
+
+def test_absence_passes_through_chained_aligners_with_one_entry():
     aligner = Interpolate().start("tilt", {"stream": "level", "at": "stereo"})
-    for stamp in range(0, 100_000 * MS, 10 * MS):
-        list(aligner.push("stream", stamp, Token(stamp, Number(stamp, 0.0))))
-    assert len(aligner.samples) < 200
+    lost = Absent(Entry("level", 5, "level", Reason.FAILED, "broken"))
+    answers = [*aligner.push("stream", 5, Token(5, lost)), *aligner.push("at", 5, Token(5, None)), *aligner.end()]
+    assert reasons(answers) == [Reason.UNALIGNED]

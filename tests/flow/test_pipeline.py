@@ -70,6 +70,7 @@ def test_a_setting_from_the_command_line_replaces_one_in_the_file(tmp_path):
         ("stream: level, at: both", "stream: level, at: right", 6, ["different clocks", "align them first"]),
         ("toys.Scale", "toys.Scael", 5, ["no 'Scael'", "did you mean 'Scale'"]),
         ("flow.toys.Scale", "flaw.toys.Scale", 5, ["cannot import 'tests.flaw.toys'"]),
+        ("toys.Add, a: twice, b: height", "toys.Mute, a: twice", 6, ["does not say the type of its input 'a'"]),
         ("toys.Scale", "toys.Keep", 5, ["Keep is no stage"]),
         ("gain: 2.5", "gian: 2.5", 1, ["no parameter 'gian'", "did you mean 'gain'"]),
         ("sinks:", "sinkz:", 7, ["no 'sinkz'", "did you mean 'sinks'"]),

@@ -82,6 +82,22 @@ class Total:
 
 
 @dataclass(frozen=True)
+class Either:
+    """Adds what may be missing."""
+
+    def __call__(self, a: Couple, b: Number | None = None) -> Couple:
+        return Couple(a.stamp, a.value + (b.value if b else 0.0))
+
+
+@dataclass(frozen=True)
+class Mute:
+    """Does not say what it takes."""
+
+    def __call__(self, a) -> Couple:  # type: ignore[no-untyped-def]
+        return Couple(0, 0.0)
+
+
+@dataclass(frozen=True)
 class Liar:
     def __call__(self, couple: Couple) -> Couple:
         return Text(couple.stamp, "not a couple")  # type: ignore[return-value]
@@ -133,7 +149,7 @@ class Keep:
 
 
 class Log:
-    """A log of given events; `endless` logs repeat a frame every second for ever."""
+    """A log of given events."""
 
     def __init__(self, events: list[tuple[int, str, Any]], missing: dict[str, str] | None = None) -> None:
         self.events, self.missing = events, missing or {}
