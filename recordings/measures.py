@@ -1,12 +1,13 @@
 """Error measures over arrays: disparity, elevation, hazards, rocks, tilt. Pure functions, no files.
 
+What is summed over frames comes in two steps: `..._counts` of one frame, which add up, and `..._measures` of the sum,
+so that a log of any length takes the memory of one frame and every pixel or cell, not every frame, counts the same.
 NaN is "unknown" and never takes part in an error; shares of an empty set are NaN, because there is nothing to say.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import SupportsFloat
+from typing import Any, SupportsFloat
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,9 @@ from stages.data import Array, Cell
 BAD_THRESHOLDS = (0.5, 1.0, 2.0)  # px
 CLOSE = 0.05  # m, the height error that the Lunar Autonomy Challenge accepts
 NMAD_SCALE = 1.4826  # makes the median deviation of a normal distribution its standard deviation
+NMAD_BIN = 1e-5  # m, to which errors are rounded for their median
+NMAD_REACH = 1.0  # m, beyond which errors are one bin
+ROCK_OUTLINE = 1.25  # a rock reaches this many mean radii from its centre: rocks are longer than they are wide
 
 
 def share(part: SupportsFloat, whole: SupportsFloat) -> float:
@@ -23,56 +27,153 @@ def share(part: SupportsFloat, whole: SupportsFloat) -> float:
     return float(part) / float(whole) if float(whole) else float("nan")
 
 
-def disparity_measures(estimate: Array, truth: Array, counted: Array) -> dict[str, float]:
-    """Disparity errors over the pixels of the mask `counted` (H, W) that have a true value.
+def added(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:
+    """The counts of two sets of frames as those of one; an empty dict counts nothing."""
+    return {name: first.get(name, 0.0) + second.get(name, 0.0) for name in first | second}
 
-    estimate, truth: (H, W) px, NaN = unknown. Returns pixels (how many were counted), density (share of them known),
-    bad_T (share in error by more than T px, an unknown pixel being bad), bad_T_known (of the known ones), mae and rmse
-    (px, of the known ones).
+
+def in_ring(radius: Array, low: float, high: float) -> Array:
+    """Mask of the radii in [low, high): a cell on the border of two rings belongs to the outer one only."""
+    return np.asarray((radius >= low) & (radius < high))
+
+
+def disparity_counts(estimate: Array, truth: Array, both: Array, one: Array) -> dict[str, float]:
+    """Sums for `disparity_measures` over one frame.
+
+    estimate, truth: (H, W) px, NaN = unknown; both, one: (H, W) bool, pixels seen by both cameras and by one only. What
+    is in neither mask, or has no true value, shows no ground.
     """
-    counted = counted & np.isfinite(truth)
-    error = np.abs(np.asarray(estimate, np.float64)[counted] - np.asarray(truth, np.float64)[counted])
-    known = error[np.isfinite(error)]
-    measures = {"pixels": float(error.size), "density": share(known.size, error.size)}
+    both, one = both & np.isfinite(truth), one & ~both & np.isfinite(truth)
+    given = np.isfinite(estimate)
+    error = np.abs(estimate.astype(np.float64) - truth)
+    known, hidden = error[both & given], error[one & given]
+    counts = {
+        "pixels": np.count_nonzero(both),
+        "known": known.size,
+        "absolute": known.sum(),
+        "squares": np.square(known).sum(),
+        "values": np.count_nonzero(given),
+        "occluded": hidden.size,
+        "occluded_over_2": np.count_nonzero(hidden > 2),
+        "sky": np.count_nonzero(given & ~both & ~one),
+    } | {f"over_{limit:g}": np.count_nonzero(known > limit) for limit in BAD_THRESHOLDS}
+    return {name: float(count) for name, count in counts.items()}
+
+
+def disparity_measures(counts: dict[str, float]) -> dict[str, Any]:
+    """Disparity errors of added `disparity_counts`.
+
+    Over the pixels that both cameras see: pixels (how many), density (share of them known), bad_T (share in error by
+    more than T px, an unknown pixel being bad), bad_T_known (of the known ones), mae and rmse (px, of the known ones).
+    Over all values given: values (how many), given_occluded (those at pixels that only one camera sees: pixels, share
+    of all values, bad_2 the share of them in error by more than 2 px), given_sky (those where there is no ground:
+    pixels, share of all values).
+    """
+    pixels, known, values = counts["pixels"], counts["known"], counts["values"]
+    measures: dict[str, Any] = {"pixels": pixels, "density": share(known, pixels)}
     for limit in BAD_THRESHOLDS:
-        over = int(np.count_nonzero(known > limit))
-        measures[f"bad_{limit:g}"] = share(over + error.size - known.size, error.size)
-        measures[f"bad_{limit:g}_known"] = share(over, known.size)
-    measures["mae"] = float(known.mean()) if known.size else float("nan")
-    measures["rmse"] = float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
-    return measures
+        over = counts[f"over_{limit:g}"]
+        measures[f"bad_{limit:g}"] = share(over + pixels - known, pixels)
+        measures[f"bad_{limit:g}_known"] = share(over, known)
+    hidden, sky = counts["occluded"], counts["sky"]
+    return measures | {
+        "mae": share(counts["absolute"], known),
+        "rmse": share(counts["squares"], known) ** 0.5,
+        "values": values,
+        "given_occluded": {
+            "pixels": hidden, "share": share(hidden, values), "bad_2": share(counts["occluded_over_2"], hidden),
+        },
+        "given_sky": {"pixels": sky, "share": share(sky, values)},
+    }  # fmt: skip
 
 
-def pooled_disparity(frames: Sequence[dict[str, float]]) -> dict[str, float]:
-    """`disparity_measures` of several frames as one: every pixel, not every frame, counts the same."""
-    counts = np.array([frame["pixels"] for frame in frames])
-    known = np.array([frame["pixels"] * frame["density"] if frame["pixels"] else 0.0 for frame in frames])
-    pooled = {"pixels": float(counts.sum()), "density": share(known.sum(), counts.sum())}
-    for name in frames[0]:
-        if name in pooled:
-            continue
-        weight = counts if name.startswith("bad_") and not name.endswith("_known") else known
-        power = 2 if name == "rmse" else 1
-        values = np.array([frame[name] for frame in frames])
-        total = np.sum((weight * values**power)[weight > 0])
-        pooled[name] = share(total, weight.sum()) ** (1 / power)
-    return pooled
+class HeightErrors:
+    """Statistics of height errors of any number of cells, in the memory of one histogram.
+
+    All but the NMAD come of exact sums. The NMAD comes of errors rounded to `NMAD_BIN` (0.01 mm), which moves it by
+    0.015 mm at most; it is NaN where a median falls beyond `NMAD_REACH` (1 m).
+    """
+
+    def __init__(self) -> None:
+        self.seen = self.cells = self.close = 0
+        self.total = self.absolute = self.squares = 0.0
+        self.half = round(NMAD_REACH / NMAD_BIN)
+        self.histogram = np.zeros(2 * self.half + 1, np.int64)
+
+    def add(self, error: ArrayLike) -> None:
+        """Count errors of any shape, m; NaN = a cell that is seen and not known."""
+        values = np.asarray(error, np.float64).ravel()
+        self.seen += values.size
+        values = values[np.isfinite(values)]
+        self.cells += values.size
+        self.close += int(np.count_nonzero(np.abs(values) <= CLOSE))
+        self.total += float(values.sum())
+        self.absolute += float(np.abs(values).sum())
+        self.squares += float(np.square(values).sum())
+        bins = np.rint(np.clip(values, -NMAD_REACH, NMAD_REACH) / NMAD_BIN).astype(np.int64) + self.half
+        self.histogram += np.bincount(bins, minlength=self.histogram.size)
+
+    def measures(self) -> dict[str, float]:
+        """cells (known ones), rmse, mae, bias (mean), nmad, m; within_5cm (share)."""
+        return {
+            "cells": float(self.cells),
+            "rmse": share(self.squares, self.cells) ** 0.5,
+            "mae": share(self.absolute, self.cells),
+            "bias": share(self.total, self.cells),
+            "nmad": self._nmad(),
+            "within_5cm": share(self.close, self.cells),
+        }
+
+    def _nmad(self) -> float:
+        """NMAD_SCALE times the median distance from the median, both medians read off histograms."""
+        if not self.cells:
+            return float("nan")
+        low, high = _middles(self.histogram)
+        middle = low + high  # in half bins, since the median may lie between two
+        nearest, farthest = _middles(np.bincount(np.abs(2 * np.arange(2 * self.half + 1) - middle), self.histogram))
+        # An error in an end bin may be any larger one: neither median may be one of those.
+        if low == 0 or high == 2 * self.half or farthest >= 2 * self.half - abs(middle - 2 * self.half):
+            return float("nan")
+        return NMAD_SCALE * NMAD_BIN * (nearest + farthest) / 4
 
 
-def height_measures(error: ArrayLike) -> dict[str, float]:
-    """Statistics of height errors (N,), m, NaN left out: cells, rmse, mae, bias (mean), nmad, within_5cm (share)."""
-    values = np.asarray(error, np.float64).ravel()
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return {"cells": 0.0, **dict.fromkeys(("rmse", "mae", "bias", "nmad", "within_5cm"), float("nan"))}
-    return {
-        "cells": float(values.size),
-        "rmse": float(np.sqrt(np.mean(values**2))),
-        "mae": float(np.abs(values).mean()),
-        "bias": float(values.mean()),
-        "nmad": NMAD_SCALE * float(np.median(np.abs(values - np.median(values)))),
-        "within_5cm": share(np.count_nonzero(np.abs(values) <= CLOSE), values.size),
-    }
+def _middles(counts: Array) -> tuple[int, int]:
+    """The two middle ones of the indices of `counts`, each taken that many times; their mean is the median."""
+    below = np.cumsum(counts)
+    total = int(below[-1])
+    low, high = np.searchsorted(below, [(total - 1) // 2, total // 2], side="right")
+    return int(low), int(high)
+
+
+class RingErrors:
+    """Height errors by distance, raw and levelled (less the best plane of each map), of any number of maps."""
+
+    def __init__(self, rings: tuple[tuple[float, float], ...]) -> None:
+        self.rings = {ring: (HeightErrors(), HeightErrors()) for ring in rings}
+
+    def add(self, x: Array, y: Array, counted: Array, error: Array) -> None:
+        """Count one map. x: (cols,), y: (rows,) cell centres, m; counted, error: (rows, cols), error m, NaN = unknown.
+
+        The plane is that of the errors at the counted cells.
+        """
+        radius, error = np.hypot(x[None, :], y[:, None]), np.where(counted, error, np.nan)
+        levelled = without_plane(x, y, error)
+        for limits, parts in self.rings.items():
+            cells = counted & in_ring(radius, *limits)
+            for errors, values in zip(parts, (error, levelled), strict=True):
+                errors.add(values[cells])
+
+    def measures(self) -> dict[str, Any]:
+        """Ring ("0-4 m") -> seen (cells counted), completeness (share of them known), raw and levelled measures."""
+        return {
+            f"{low:g}-{high:g} m": {
+                "seen": raw.seen,
+                "completeness": share(raw.cells, raw.seen),
+                "raw": raw.measures(),
+                "levelled": levelled.measures(),
+            }
+            for (low, high), (raw, levelled) in self.rings.items()
+        }
 
 
 def without_plane(x: Array, y: Array, error: Array) -> Array:
@@ -90,21 +191,69 @@ def without_plane(x: Array, y: Array, error: Array) -> Array:
     return np.asarray(error - (design @ plane).reshape(error.shape))
 
 
-def hazard_measures(cells: Array, truth: Array, counted: Array) -> dict[str, float]:
-    """How well a map of `Cell` codes finds the hazards, over the cells of the mask `counted`; any one shape.
+def hazard_counts(cells: Array, truth: Array, seen: Array, counted: Array, rock: Array | None) -> dict[str, float]:
+    """Sums for `hazard_measures` over one frame; all (rows, cols).
 
-    Returns cells, unknown (share), recall (of true hazards, called hazard), false_safe (of true hazards, called free),
-    false_alarm (of truly free cells, called hazard).
+    cells, truth: `Cell` codes, any code but free and hazard being unknown; seen: bool, cells that both cameras see;
+    counted: bool, those of them that are near enough to ask for; rock: bool, cells on a high rock (None: not told).
     """
-    told, true = cells[counted], truth[counted]
-    hazard, free = true == Cell.HAZARD, true == Cell.FREE
-    return {
-        "cells": float(told.size),
-        "unknown": share(np.count_nonzero(told == Cell.UNKNOWN), told.size),
-        "recall": share(np.count_nonzero(hazard & (told == Cell.HAZARD)), np.count_nonzero(hazard)),
-        "false_safe": share(np.count_nonzero(hazard & (told == Cell.FREE)), np.count_nonzero(hazard)),
-        "false_alarm": share(np.count_nonzero(free & (told == Cell.HAZARD)), np.count_nonzero(free)),
+    free, told = cells == Cell.FREE, cells == Cell.HAZARD
+    hazard, safe = truth == Cell.HAZARD, truth == Cell.FREE
+    masks = {
+        "cells": counted,
+        "unknown": counted & ~free & ~told,
+        "hazards": counted & hazard,
+        "hazards_told": counted & hazard & told,
+        "hazards_free": counted & hazard & free,
+        "safe": counted & safe,
+        "safe_told": counted & safe & told,
+        "free": free,
+        "free_hazard": free & hazard,
+        "free_unseen": free & ~seen,
+        "free_unseen_hazard": free & ~seen & hazard,
+        "free_asked": free if rock is not None else np.zeros(1),
+        "free_on_rock": free & rock if rock is not None else np.zeros(1),
     }
+    return {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}
+
+
+def hazard_measures(counts: dict[str, float]) -> dict[str, Any]:
+    """How well a map finds the hazards and how far it can be trusted, of added `hazard_counts`.
+
+    Over the counted cells: cells (how many), unknown (share), recall (of true hazards, called hazard), false_safe (of
+    true hazards, called free), false_alarm (of truly free cells, called hazard). Over all cells that the map calls
+    free, wherever they lie: free (how many), free_hazard (share that are true hazards), free_on_rock (share on a high
+    rock), free_unseen (those that the cameras did not both see: cells, share of all free ones, hazards among them).
+    """
+    return {
+        "cells": counts["cells"],
+        "unknown": share(counts["unknown"], counts["cells"]),
+        "recall": share(counts["hazards_told"], counts["hazards"]),
+        "false_safe": share(counts["hazards_free"], counts["hazards"]),
+        "false_alarm": share(counts["safe_told"], counts["safe"]),
+        "free": counts["free"],
+        "free_hazard": share(counts["free_hazard"], counts["free"]),
+        "free_on_rock": share(counts["free_on_rock"], counts["free_asked"]),
+        "free_unseen": {
+            "cells": counts["free_unseen"], "share": share(counts["free_unseen"], counts["free"]),
+            "hazards": counts["free_unseen_hazard"],
+        },
+    }  # fmt: skip
+
+
+def on_rocks(rocks: Array, hazard: Array, x: Array, y: Array) -> Array:
+    """Mask (rows, cols) of the cells on a rock: true hazard cells whose centre is within a rock's outline.
+
+    rocks: (N, 3) x, y, mean diameter, m; hazard: (rows, cols) bool; x, y: (cols,) and (rows,) cell centres, m. The
+    outline is a circle about the longest rocks (`ROCK_OUTLINE`); of it, the true hazards are the rock itself.
+    """
+    mask = np.zeros(hazard.shape, bool)
+    for at_x, at_y, diameter in np.asarray(rocks, np.float64):
+        reach = ROCK_OUTLINE * diameter / 2
+        columns = slice(*np.searchsorted(x, [at_x - reach, at_x + reach]))
+        lines = slice(*np.searchsorted(y, [at_y - reach, at_y + reach]))
+        mask[lines, columns] |= np.hypot(x[None, columns] - at_x, y[lines, None] - at_y) <= reach
+    return mask & hazard
 
 
 def rocks_found(

@@ -1,8 +1,9 @@
 """A run's output log against the truth topics of the log it ran on: one table of errors.
 
 Results under /nav and truth under /truth meet by header stamp. Both logs are read side by side in log time and a frame
-is scored as soon as neither can add to it, so long logs fit in memory. Errors are counted where the truth says that
-both cameras saw the ground; a value given elsewhere is counted as such, not excused.
+is scored, and forgotten but for its sums, as soon as neither can add to it. Errors are counted where both cameras saw
+the ground; values given elsewhere are counted on their own, and a true frame that the run left out is scored as one of
+which it knew nothing, so that neither a guess nor silence passes for knowledge.
 """
 
 from __future__ import annotations
@@ -28,9 +29,11 @@ TRUTHS = (
     "/truth/tilt",
 )  # fmt: skip
 PATIENCE = 5_000_000_000  # ns of log time after which no log adds to a frame any more
-RINGS = ((0.0, 4.0), (4.0, 8.0))  # m from base_link
+RINGS = ((0.0, 4.0), (4.0, 8.0), (0.0, 8.0))  # m from base_link, the outer border not included
+NEAR = 8.0  # m from base_link, within which cells and rocks are asked for
 HIGH_ROCK = 0.2  # m
 SEEN_BY_BOTH = 255
+SEEN_BY_NONE = 0
 
 
 @dataclass(frozen=True)
@@ -38,22 +41,27 @@ class Score:
     """Errors of a run. Shares 0 to 1, lengths m, disparities px, angles rad; NaN where there was nothing to measure.
 
     frames: in the truth; compared: those with at least one result; missing: result topic -> stamps of true frames that
-    it lacks; unmatched: result topic -> messages at stamps without truth; disparity: `measures.disparity_measures`;
-    elevation: "0-4 m", "4-8 m", "0-8 m" -> completeness, raw and levelled `measures.height_measures`; unseen: share of
-    the elevations given in cells that nobody saw; navigation: `measures.hazard_measures`; rocks: seen, found, recall;
-    tilt: frames, mean, max; per_frame: the main figures of each frame.
+    it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without truth;
+    disparity: `measures.disparity_measures`;
+    elevation: "0-4 m", "4-8 m", "0-8 m" (borders belong outside) -> seen (cells that both cameras see), completeness
+    (share of them known), raw and levelled (less the best plane of each frame) `HeightErrors.measures`;
+    unseen: share of all elevations given in cells that the cameras did not both see;
+    navigation: `measures.hazard_measures` within 8 m; rocks: seen, found, recall of those 0.2 m or higher;
+    tilt: frames, mean, max; untilted: why -> frames with a true tilt whose own could not be scored;
+    per_frame: the main figures of each frame. None where the truth has no such topics (tilt: where no frame has both).
     """
 
     frames: int
     compared: int
     missing: dict[str, list[int]]
     unmatched: dict[str, int]
-    disparity: dict[str, float] | None = None
+    disparity: dict[str, Any] | None = None
     elevation: dict[str, Any] | None = None
     unseen: float = math.nan
-    navigation: dict[str, float] | None = None
+    navigation: dict[str, Any] | None = None
     rocks: dict[str, float] | None = None
     tilt: dict[str, float] | None = None
+    untilted: dict[str, int] = field(default_factory=dict)
     per_frame: list[dict[str, float]] = field(default_factory=list)
 
     def to_json(self) -> str:
@@ -94,8 +102,31 @@ def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dic
         yield stamp, waiting.pop(stamp)
 
 
+@dataclass(frozen=True)
+class _Ground:
+    """The true map of a frame; arrays (rows, cols), x and y (cols,) and (rows,) cell centres, m.
+
+    seen: cells that both cameras see; counted: those of them nearer to base_link than `NEAR`.
+    """
+
+    map: ElevationMap
+    x: Array
+    y: Array
+    seen: Array
+    counted: Array
+
+    @classmethod
+    def of(cls, message: Any) -> _Ground:
+        true = ros2.read_grid_map(message)
+        x, y = (
+            (np.arange(n) + 0.5) * true.resolution + at for n, at in zip(true.shape[::-1], true.origin, strict=True)
+        )
+        seen = true.layers["visible"] > 0.5
+        return cls(true, x, y, seen, seen & measures.in_ring(np.hypot(x[None, :], y[:, None]), 0.0, NEAR))
+
+
 class _Tally:
-    """Sums up frames; what needs a median keeps its errors, everything else only counts."""
+    """Sums up frames; of a frame it keeps one row of figures, whatever the size of its images and maps."""
 
     def __init__(self, result: Path, truth: Path) -> None:
         self.result, self.truth = result, truth
@@ -104,15 +135,13 @@ class _Tally:
         self.missing: dict[str, list[int]] = {topic: [] for topic in RESULTS}
         self.unmatched: dict[str, int] = {}
         self.seen_results: set[str] = set()
-        self.disparity: list[dict[str, float]] = []
-        self.raw: list[Array] = []
-        self.levelled: list[Array] = []
-        self.radius: list[Array] = []
+        self.disparity: dict[str, float] = {}
+        self.heights: measures.RingErrors | None = None
         self.values = self.values_unseen = 0
-        self.cells: list[Array] = []
-        self.true_cells: list[Array] = []
-        self.rocks_seen = self.rocks_found = 0
+        self.hazards: dict[str, float] = {}
+        self.rocks: dict[str, float] = {}
         self.tilts: list[float] = []
+        self.untilted: dict[str, int] = {}
         self.per_frame: list[dict[str, float]] = []
 
     def add(self, stamp: int, frame: dict[str, Any]) -> None:
@@ -128,64 +157,77 @@ class _Tally:
             if topic not in frame:
                 self.missing[topic].append(stamp)
         row: dict[str, float] = {"stamp": stamp}
-        if {"/nav/disparity", "/truth/disparity", "/truth/occlusion"} <= frame.keys():
+        if {"/truth/disparity", "/truth/occlusion"} <= frame.keys():
             row |= self._add_disparity(stamp, frame)
         if "/truth/elevation_map" in frame:
-            self._add_maps(stamp, frame, row)
-        if {"/tf", "/truth/tilt"} <= frame.keys():
-            self._add_tilt(frame, row)
+            ground = _Ground.of(frame["/truth/elevation_map"])
+            row |= self._add_elevation(stamp, frame, ground)
+            if "/truth/navigation_map" in frame:
+                row |= self._add_navigation(stamp, frame, ground)
+        if "/truth/tilt" in frame:
+            row |= self._add_tilt(frame)
         self.per_frame.append(row)
 
     def _add_disparity(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
-        estimate, true = (ros2.read_disparity(frame[f"/{place}/disparity"]) for place in ("nav", "truth"))
+        true = ros2.read_disparity(frame["/truth/disparity"])
+        given = frame.get("/nav/disparity")
+        estimate = ros2.read_disparity(given) if given is not None else np.full_like(true, np.nan)
         if estimate.shape != true.shape:
             raise LogError(
                 f"{self.result}: /nav/disparity at {stamp} ns is {estimate.shape[1]}x{estimate.shape[0]}, the truth in "
                 f"{self.truth} is {true.shape[1]}x{true.shape[0]}; score a run of that very log"
             )
         mask = frame["/truth/occlusion"]
-        both = np.asarray(mask.data).reshape(mask.height, mask.step)[:, : mask.width] == SEEN_BY_BOTH
-        found = measures.disparity_measures(estimate, true, both)
-        self.disparity.append(found)
+        cameras = np.asarray(mask.data).reshape(mask.height, mask.step)[:, : mask.width]
+        both, one = cameras == SEEN_BY_BOTH, (cameras != SEEN_BY_BOTH) & (cameras != SEEN_BY_NONE)
+        counts = measures.disparity_counts(estimate, true, both, one)
+        self.disparity = measures.added(self.disparity, counts)
+        found = measures.disparity_measures(counts)
         return {f"disparity_{name}": found[name] for name in ("density", "bad_1", "rmse")}
 
-    def _add_maps(self, stamp: int, frame: dict[str, Any], row: dict[str, float]) -> None:
-        true = ros2.read_grid_map(frame["/truth/elevation_map"])
-        x, y = (
-            (np.arange(n) + 0.5) * true.resolution + at for n, at in zip(true.shape[::-1], true.origin, strict=True)
-        )
-        radius = np.hypot(x[None, :], y[:, None])
-        visible = (true.layers["visible"] > 0.5) & (radius <= RINGS[-1][1])
+    def _add_elevation(self, stamp: int, frame: dict[str, Any], ground: _Ground) -> dict[str, float]:
+        elevation = np.full(ground.map.shape, np.nan, np.float32)
         if "/nav/elevation_map" in frame:
             given = ros2.read_grid_map(frame["/nav/elevation_map"])
-            elevation = self._aligned(stamp, given, given.layers["elevation"], true, np.nan)
-            error = np.where(visible, elevation - true.layers["elevation"], np.float32(np.nan)).astype(np.float64)
-            levelled = measures.without_plane(x, y, error)
-            self.raw.append(error[visible].astype(np.float32))
-            self.levelled.append(levelled[visible].astype(np.float32))
-            self.radius.append(radius[visible].astype(np.float32))
-            known = np.isfinite(elevation)
-            self.values += int(known.sum())
-            self.values_unseen += int((known & ~(true.layers["visible"] > 0.5)).sum())
-            found = measures.height_measures(error)
-            row |= {"elevation_rmse": found["rmse"], "elevation_bias": found["bias"]}
-        if {"/nav/navigation_map", "/truth/navigation_map"} <= frame.keys():
-            told = ros2.read_occupancy_grid(frame["/nav/navigation_map"])
-            cells = self._aligned(stamp, told, told.cells, true, Cell.UNKNOWN)
-            hazards = ros2.read_occupancy_grid(frame["/truth/navigation_map"])
-            true_cells = self._aligned(stamp, hazards, hazards.cells, true, Cell.UNKNOWN)
-            self.cells.append(cells[visible])
-            self.true_cells.append(true_cells[visible])
-            if "/truth/rocks" in frame:
-                seen, found_rocks = measures.rocks_found(
-                    _high_rocks(frame["/truth/rocks"]), cells, visible, x, y, true.resolution
-                )
-                self.rocks_seen += int(seen.sum())
-                self.rocks_found += int(found_rocks.sum())
-                row |= {"rocks_seen": float(seen.sum()), "rocks_found": float(found_rocks.sum())}
+            elevation = self._aligned(self.result, stamp, given, given.layers["elevation"], ground.map, np.nan)
+        known = np.isfinite(elevation)
+        self.values += int(known.sum())
+        self.values_unseen += int((known & ~ground.seen).sum())
+        error = elevation.astype(np.float64) - ground.map.layers["elevation"]
+        self.heights = self.heights or measures.RingErrors(RINGS)
+        self.heights.add(ground.x, ground.y, ground.counted, error)
+        error = error[known & ground.counted]
+        return {
+            "elevation_completeness": measures.share(error.size, ground.counted.sum()),
+            "elevation_rmse": measures.share(np.square(error).sum(), error.size) ** 0.5,
+            "elevation_bias": measures.share(error.sum(), error.size),
+        }
 
-    def _aligned(self, stamp: int, grid: Any, values: Array, onto: ElevationMap, missing: float) -> Array:
-        where = f"{self.result}: {type(grid).__name__} at {stamp} ns"
+    def _add_navigation(self, stamp: int, frame: dict[str, Any], ground: _Ground) -> dict[str, float]:
+        true = self._cells(self.truth, stamp, frame["/truth/navigation_map"], ground)
+        cells = np.full(true.shape, np.int8(Cell.UNKNOWN))
+        if "/nav/navigation_map" in frame:
+            cells = self._cells(self.result, stamp, frame["/nav/navigation_map"], ground)
+        rocks = _high_rocks(frame["/truth/rocks"]) if "/truth/rocks" in frame else None
+        rock = None if rocks is None else measures.on_rocks(rocks, true == Cell.HAZARD, ground.x, ground.y)
+        counts = measures.hazard_counts(cells, true, ground.seen, ground.counted, rock)
+        self.hazards = measures.added(self.hazards, counts)
+        row = {"free": counts["free"], "free_unseen": counts["free_unseen"]}
+        if rocks is not None:
+            near = rocks[measures.in_ring(np.hypot(rocks[:, 0], rocks[:, 1]), 0.0, NEAR)]
+            seen, found = measures.rocks_found(near, cells, ground.counted, ground.x, ground.y, ground.map.resolution)
+            row |= {"rocks_seen": float(seen.sum()), "rocks_found": float(found.sum())}
+            self.rocks = measures.added(self.rocks, {name: row[f"rocks_{name}"] for name in ("seen", "found")})
+        return row
+
+    def _cells(self, log: Path, stamp: int, message: Any, ground: _Ground) -> Array:
+        grid = ros2.read_occupancy_grid(message)
+        return self._aligned(log, stamp, grid, grid.cells, ground.map, Cell.UNKNOWN)
+
+    def _aligned(
+        self, log: Path, stamp: int, grid: Any, values: Array, onto: ElevationMap, missing: float
+    ) -> Array:  # fmt: skip
+        where = f"{log}: {type(grid).__name__} at {stamp} ns"
         if abs(grid.resolution - onto.resolution) > 1e-4 * onto.resolution:
             raise LogError(
                 f"{where} has cells of {grid.resolution} m, the truth has {onto.resolution} m; run with that resolution"
@@ -197,19 +239,21 @@ class _Tally:
         except ValueError as error:
             raise LogError(f"{where}: {error}; run with whole cells about base_link") from error
 
-    def _add_tilt(self, frame: dict[str, Any], row: dict[str, float]) -> None:
-        item = frame["/tf"]
-        mount = self.mounts.get(item.child_frame_id)
-        if mount is None:
-            return
-        level_from_base, base_from_camera = (
-            _rotation(frame["/truth/tilt"].quaternion),
-            _rotation(mount.transform.rotation),
-        )
-        # Gravity's opposite in camera axes: heading does not enter.
-        true_up = (level_from_base @ base_from_camera)[2]
-        row["tilt"] = measures.angle_between(_rotation(item.transform.rotation)[2], true_up)
-        self.tilts.append(row["tilt"])
+    def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:
+        item, true = frame.get("/tf"), frame["/truth/tilt"]
+        mount = None if item is None else self.mounts.get(item.child_frame_id)
+        if item is None:
+            why = f"the result has no /tf from '{LEVEL_FRAME}' at their stamps"
+        elif mount is None or mount.header.frame_id != true.header.frame_id:
+            why = f"the truth has no mount of '{item.child_frame_id}' on '{true.header.frame_id}'"
+        else:
+            base_from_camera = _rotation(mount.transform.rotation)
+            # Gravity's opposite in camera axes: heading does not enter.
+            true_up = (_rotation(true.quaternion) @ base_from_camera)[2]
+            self.tilts.append(measures.angle_between(_rotation(item.transform.rotation)[2], true_up))
+            return {"tilt": self.tilts[-1]}
+        self.untilted[why] = self.untilted.get(why, 0) + 1
+        return {}
 
     def score(self) -> Score:
         """The tally as a score; LogError if there was nothing to compare."""
@@ -219,90 +263,115 @@ class _Tally:
             raise LogError(f"{self.result} has no results ({', '.join(RESULTS)}); give the log that a run wrote")
         if not self.compared:
             raise LogError(f"no result of {self.result} has the stamp of a true frame of {self.truth}; is it its run?")
+        tilts = self.tilts
         return Score(
             self.frames, self.compared,
             missing={topic: stamps for topic, stamps in self.missing.items() if stamps},
             unmatched=self.unmatched,
-            disparity=measures.pooled_disparity(self.disparity) if self.disparity else None,
-            elevation=self._elevation() if self.raw else None,
+            disparity=measures.disparity_measures(self.disparity) if self.disparity else None,
+            elevation=self.heights.measures() if self.heights else None,
             unseen=measures.share(self.values_unseen, self.values),
-            navigation=self._navigation(),
-            rocks={
-                "seen": self.rocks_seen, "found": self.rocks_found,
-                "recall": measures.share(self.rocks_found, self.rocks_seen),
-            } if self.cells else None,
-            tilt={
-                "frames": len(self.tilts), "mean": float(np.mean(self.tilts)), "max": float(np.max(self.tilts))
-            } if self.tilts else None,
+            navigation=measures.hazard_measures(self.hazards) if self.hazards else None,
+            rocks=self.rocks | {"recall": measures.share(self.rocks["found"], self.rocks["seen"])}
+            if self.rocks else None,
+            tilt={"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)} if tilts else None,
+            untilted=self.untilted,
             per_frame=self.per_frame,
         )  # fmt: skip
 
-    def _elevation(self) -> dict[str, Any]:
-        raw, levelled, radius = (np.concatenate(parts) for parts in (self.raw, self.levelled, self.radius))
-        rings = {}
-        for low, high in (*RINGS, (RINGS[0][0], RINGS[-1][1])):
-            ring = (radius >= low) & (radius <= high)
-            rings[f"{low:g}-{high:g} m"] = {
-                "completeness": measures.share(np.count_nonzero(np.isfinite(raw[ring])), np.count_nonzero(ring)),
-                "raw": measures.height_measures(raw[ring]),
-                "levelled": measures.height_measures(levelled[ring]),
-            }
-        return rings
-
-    def _navigation(self) -> dict[str, float] | None:
-        if not self.cells:
-            return None
-        told, true = np.concatenate(self.cells), np.concatenate(self.true_cells)
-        return measures.hazard_measures(told, true, np.ones(told.shape, bool))
-
 
 def format_score(found: Score) -> str:
-    """The score as a table for a terminal."""
-    lines = [f"frames       {found.compared} of {found.frames} compared"]
-    lines += [
-        f"missing      {topic}: {len(stamps)} of {found.frames} frames" for topic, stamps in found.missing.items()
-    ]
-    lines += [
-        f"unmatched    {topic}: {count} messages at stamps without truth" for topic, count in found.unmatched.items()
-    ]
-    if (d := found.disparity) is not None:
-        lines += [
-            "",
-            f"disparity    {d['pixels']:.0f} pixels seen by both cameras, {_percent(d['density'])} known",
-            f"             {_bad(d, '')}  (unknown is bad)",
-            f"             {_bad(d, '_known')}  of the known; mean {d['mae']:.3f} px, RMS {d['rmse']:.3f} px",
-        ]
+    """The score as a table for a terminal, at most 100 columns wide."""
+    parts = [_frame_lines(found)]
+    if found.disparity is not None:
+        parts.append(_disparity_lines(found.disparity))
     if found.elevation is not None:
-        lines += ["", "elevation                 cells  complete   RMSE    MAE   bias   NMAD  (cm)  within 5 cm"]
-        for ring, row in found.elevation.items():
-            for kind, title in (("raw", ring), ("levelled", f"{ring}, plane removed")):
-                h = row[kind]
-                errors = "".join(f"{100 * h[name]:7.2f}" for name in ("rmse", "mae", "bias", "nmad"))
-                complete, close = _percent(row["completeness"]), _percent(h["within_5cm"])
-                lines.append(f"  {title:<22} {h['cells']:6.0f}   {complete} {errors}       {close}")
-        lines.append(f"  {_percent(found.unseen)} of all elevations lie in cells that the cameras did not both see")
-    if (n := found.navigation) is not None:
-        lines += [
-            "",
-            f"navigation   hazard cells: found {_percent(n['recall'])}, called free {_percent(n['false_safe'])}",
-            f"             free cells called hazard {_percent(n['false_alarm'])}; unknown {_percent(n['unknown'])}",
-        ]
-    if (r := found.rocks) is not None:
-        lines.append(
-            f"rocks        {r['found']:.0f} of {r['seen']:.0f} seen, 0.2 m or higher, found ({_percent(r['recall'])})"
-        )
+        parts.append(_elevation_lines(found.elevation, found.unseen))
+    if found.navigation is not None:
+        parts.append(_navigation_lines(found.navigation, found.rocks))
+    parts.append(_tilt_lines(found))
+    return "\n\n".join("\n".join(lines) for lines in parts if lines)
+
+
+def _frame_lines(found: Score) -> list[str]:
+    lines = [f"frames       {found.compared} of {found.frames} have results"]
+    for topic, stamps in found.missing.items():
+        lines.append(f"missing      {topic}: {len(stamps)} of {found.frames} frames, scored as all unknown")
+    for topic, count in found.unmatched.items():
+        lines.append(f"unmatched    {topic}: {count} messages at stamps without truth, not scored")
+    return lines
+
+
+def _disparity_lines(d: dict[str, Any]) -> list[str]:
+    hidden, sky = d["given_occluded"], d["given_sky"]
+    shares = [
+        (f"{limit:g} px", _percent(d[f"bad_{limit:g}"]), _percent(d[f"bad_{limit:g}_known"]))
+        for limit in measures.BAD_THRESHOLDS
+    ]
+    limits, off, known = ("".join(f"{cell:>10}" for cell in cells) for cells in zip(*shares, strict=True))
+    occluded = f"{_percent(hidden['share']):>7} of all values, {_percent(hidden['bad_2'])} of these off by over 2 px"
+    return [
+        f"disparity    at the {d['pixels']:.0f} pixels that both cameras see, {_percent(d['density'])} of them known",
+        f"               off by over           {limits}",
+        f"               of all, unknown is off{off}",
+        f"               of the known          {known}",
+        f"               error of the known: mean {_number(d['mae'], 3)} px, RMS {_number(d['rmse'], 3)} px",
+        "             values given where stereo cannot measure",
+        f"               only one camera sees  {occluded}",
+        f"               no ground (sky)       {_percent(sky['share']):>7} of all values",
+    ]
+
+
+def _elevation_lines(rings: dict[str, Any], unseen: float) -> list[str]:
+    lines = [
+        "elevation    in cells that both cameras see, by distance from base_link; errors of the known in cm",
+        "               distance      cells    known |   RMSE    MAE   bias   NMAD  within 5 cm",
+    ]
+    levelled = ["               the same with the best plane of each frame's errors removed"]
+    for kind, title in (("raw", []), ("levelled", levelled)):
+        lines += title
+        for name, ring in rings.items():
+            h = ring[kind]
+            errors = "".join(f"{_number(100 * h[key], 2):>7}" for key in ("rmse", "mae", "bias", "nmad"))
+            known, close = _percent(measures.share(h["cells"], ring["seen"])), _percent(h["within_5cm"])
+            lines.append(f"               {name:<8} {ring['seen']:10d} {known:>8} |{errors} {close:>12}")
+    return [*lines, f"             {_percent(unseen)} of all elevations given lie in cells that not both cameras see"]
+
+
+def _navigation_lines(n: dict[str, Any], rocks: dict[str, float] | None) -> list[str]:
+    unseen, high = n["free_unseen"], f"{HIGH_ROCK:g} m or higher"
+    told = f"not both cameras see ({unseen['cells']:.0f} cells, {unseen['hazards']:.0f} of them true hazards)"
+    lines = [
+        f"navigation   in the {n['cells']:.0f} cells within {NEAR:g} m that both cameras see",
+        f"               {_percent(n['recall']):>7} of true hazard cells found",
+        f"               {_percent(n['false_safe']):>7} of true hazard cells called free",
+        f"               {_percent(n['false_alarm']):>7} of truly free cells called hazard",
+        f"               {_percent(n['unknown']):>7} of all cells left unknown",
+        f"             of the {n['free']:.0f} cells called free anywhere on the map",
+        f"               {_percent(n['free_on_rock']):>7} lie on a rock {high}",
+        f"               {_percent(n['free_hazard']):>7} are true hazards, by rock or slope",
+        f"               {_percent(unseen['share']):>7} lie where {told}",
+    ]
+    if rocks is not None:
+        counts = f"{rocks['found']:.0f} of {rocks['seen']:.0f} ({_percent(rocks['recall'])})"
+        lines.append(f"             rocks {high} seen within {NEAR:g} m: {counts} found")
+    return lines
+
+
+def _tilt_lines(found: Score) -> list[str]:
+    lines = [f"tilt         not scored in {count} frames: {why}" for why, count in found.untilted.items()]
     if (t := found.tilt) is not None:
         mean, worst = (math.degrees(t[name]) for name in ("mean", "max"))
-        lines += ["", f"tilt         mean error {mean:.3f} deg, largest {worst:.3f} deg, over {t['frames']:.0f} frames"]
-    return "\n".join(lines)
-
-
-def _bad(found: dict[str, float], kind: str) -> str:
-    return "  ".join(f"bad {t:g} px {_percent(found[f'bad_{t:g}{kind}'])}" for t in measures.BAD_THRESHOLDS)
+        lines = [f"tilt         mean error {mean:.3f} deg, largest {worst:.3f} deg, in {t['frames']} frames", *lines]
+    return lines
 
 
 def _percent(value: float) -> str:
-    return "      -" if math.isnan(value) else f"{100 * value:6.2f}%"
+    return "-" if math.isnan(value) else f"{100 * value:.2f}%"
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"  # never -0.00
 
 
 def _rotation(quaternion: Any) -> Array:
@@ -311,15 +380,14 @@ def _rotation(quaternion: Any) -> Array:
 
 
 def _high_rocks(message: Any) -> Array:
-    """x, y, diameter (N, 3) of the hazardous rocks of /truth/rocks within the outer ring."""
+    """x, y, diameter (N, 3) m of the rocks of /truth/rocks (all within 10 m of base_link) that are hazards."""
     offsets = {item.name: item.offset for item in message.fields}
     rows = np.ascontiguousarray(message.data).reshape(message.width, message.point_step)
     x, y, diameter, height = (
         np.ascontiguousarray(rows[:, offsets[name] : offsets[name] + 4]).view("<f4")[:, 0]
         for name in ("x", "y", "diameter", "height")
     )
-    high, near = height >= HIGH_ROCK, np.hypot(x, y) <= RINGS[-1][1]
-    return np.asarray(np.column_stack([x, y, diameter])[high & near])
+    return np.asarray(np.column_stack([x, y, diameter])[height >= np.float32(HIGH_ROCK)])
 
 
 def _without_nan(value: Any) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,11 +14,25 @@ from recordings import measures
 NAN = float("nan")
 
 
+def disparity(estimate, truth, both, one=None):
+    """The measures of one frame."""
+    one = np.zeros_like(both) if one is None else one
+    return measures.disparity_measures(measures.disparity_counts(estimate, truth, both, one))
+
+
+def heights(*parts):
+    """The measures of errors added in parts."""
+    errors = measures.HeightErrors()
+    for part in parts:
+        errors.add(part)
+    return errors.measures()
+
+
 def test_disparity_errors_of_four_counted_pixels():
     truth = np.array([[10.0, 20.0, 30.0, 40.0, 50.0, NAN]], np.float32)
     estimate = np.array([[10.25, 20.75, NAN, 43.0, 99.0, 1.0]], np.float32)
-    counted = np.array([[True, True, True, True, False, True]])
-    found = measures.disparity_measures(estimate, truth, counted)
+    both = np.array([[True, True, True, True, False, True]])
+    found = disparity(estimate, truth, both)
     assert found["pixels"] == 4
     assert found["density"] == 0.75
     assert (found["bad_0.5"], found["bad_1"], found["bad_2"]) == (0.75, 0.5, 0.5)  # the unknown one is always bad
@@ -26,36 +42,45 @@ def test_disparity_errors_of_four_counted_pixels():
     assert found["rmse"] == pytest.approx(np.sqrt((0.0625 + 0.5625 + 9) / 3))
 
 
+def test_values_where_stereo_cannot_measure_are_counted_on_their_own():
+    truth = np.array([[10.0, 20.0, 30.0, 40.0, 50.0, NAN, NAN, 60.0]])
+    estimate = np.array([[10.0, 22.5, 32.0, NAN, 51.0, 7.0, NAN, 60.0]])
+    both = np.array([[True, False, False, False, False, False, False, False]])
+    one = np.array([[False, True, True, True, True, False, False, False]])
+    found = disparity(estimate, truth, both, one)
+    assert (found["pixels"], found["density"], found["values"]) == (1, 1, 6)
+    assert found["given_occluded"] == {"pixels": 3, "share": 0.5, "bad_2": pytest.approx(1 / 3)}  # 2.0 is not over 2
+    assert found["given_sky"] == {"pixels": 2, "share": pytest.approx(1 / 3)}
+
+
 def test_an_error_of_exactly_the_threshold_is_not_bad():
-    found = measures.disparity_measures(np.array([[11.0]]), np.array([[10.0]]), np.array([[True]]))
+    found = disparity(np.array([[11.0]]), np.array([[10.0]]), np.array([[True]]))
     assert found["bad_1"] == 0
     assert found["bad_0.5"] == 1
 
 
 def test_an_estimate_that_knows_nothing_is_all_bad_and_has_no_error():
-    found = measures.disparity_measures(np.full((2, 2), NAN), np.ones((2, 2)), np.ones((2, 2), bool))
+    found = disparity(np.full((2, 2), NAN), np.ones((2, 2)), np.ones((2, 2), bool))
     assert found["bad_2"] == 1
-    assert found["density"] == 0
-    assert np.isnan(found["rmse"])
-    assert np.isnan(found["bad_2_known"])
+    assert found["density"] == found["values"] == 0
+    assert np.isnan([found["rmse"], found["bad_2_known"], found["given_occluded"]["share"]]).all()
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 29))
-def test_pooling_frames_gives_what_one_large_frame_would(seed, cut):
+def test_added_frames_count_as_one_large_frame(seed, cut):
     rng = np.random.default_rng(seed)
     truth = rng.uniform(1, 100, (30, 4))
     estimate = np.where(rng.random((30, 4)) < 0.3, NAN, truth + rng.normal(0, 1.5, (30, 4)))
-    counted = rng.random((30, 4)) < 0.7
-    whole = measures.disparity_measures(estimate, truth, counted)
-    parts = [measures.disparity_measures(*(a[rows] for a in (estimate, truth, counted)))
-             for rows in (slice(0, cut), slice(cut, 30))]  # fmt: skip
-    pooled = measures.pooled_disparity(parts)
-    assert pooled.keys() == whole.keys()
-    assert [pooled[name] for name in whole] == pytest.approx(list(whole.values()), nan_ok=True)
+    both, one = rng.random((30, 4)) < 0.7, rng.random((30, 4)) < 0.5
+    whole = measures.disparity_counts(estimate, truth, both, one)
+    total: dict[str, float] = {}
+    for rows in (slice(0, cut), slice(cut, 30)):
+        total = measures.added(total, measures.disparity_counts(*(a[rows] for a in (estimate, truth, both, one))))
+    assert total == pytest.approx(whole)
 
 
 def test_height_errors_by_hand():
-    found = measures.height_measures([0.01, -0.03, 0.05, 0.09, NAN])
+    found = heights([0.01, -0.03], [[0.05, NAN], [NAN, 0.09]])
     assert found["cells"] == 4
     assert found["bias"] == pytest.approx(0.03)
     assert found["mae"] == pytest.approx(0.045)
@@ -65,7 +90,48 @@ def test_height_errors_by_hand():
 
 
 def test_no_heights_have_no_error():
-    assert np.isnan(measures.height_measures([NAN])["rmse"])
+    found = heights([NAN])
+    assert found.pop("cells") == 0
+    assert np.isnan(list(found.values())).all()
+
+
+@given(st.lists(st.floats(-0.4, 0.4), min_size=1, max_size=60))
+def test_the_nmad_of_a_histogram_is_that_of_the_errors_to_a_hundredth_of_a_millimetre(errors):
+    exact = 1.4826 * np.median(np.abs(np.array(errors) - np.median(errors)))
+    assert heights(errors)["nmad"] == pytest.approx(exact, abs=1.5e-5)
+
+
+def test_errors_beyond_the_histogram_count_but_no_median_is_made_up_of_them():
+    found = heights([0.01, 0.02, 0.03, 5.0])
+    assert found["nmad"] == pytest.approx(1.4826 * 0.01)  # median 0.025, deviations .015 .005 .005 and a large one
+    assert found["rmse"] == pytest.approx(np.sqrt((0.0001 + 0.0004 + 0.0009 + 25) / 4))
+    assert np.isnan(heights([0.01, 3.0, 4.0])["nmad"])
+    assert np.isnan(heights([0.9, 3.0])["nmad"])
+    assert np.isnan(heights([0.0, 0.9, 3.0, -3.0])["nmad"])  # the median is known, the distances from it are not
+
+
+def test_height_errors_take_no_more_memory_for_more_frames():
+    errors = measures.HeightErrors()
+    errors.add(np.zeros(1000))
+    before = len(pickle.dumps(errors))
+    for _ in range(20):
+        errors.add(np.full(100_000, 0.02))
+    assert len(pickle.dumps(errors)) < before + 100
+    assert errors.measures()["cells"] == 2_001_000
+
+
+def test_a_cell_on_the_border_of_two_rings_is_in_the_outer_one_only():
+    radius = np.array([0.0, 3.999, 4.0, 7.999, 8.0])
+    assert measures.in_ring(radius, 0.0, 4.0).tolist() == [True, True, False, False, False]
+    assert measures.in_ring(radius, 4.0, 8.0).tolist() == [False, False, True, True, False]
+    rings = measures.RingErrors(((0.0, 4.0), (4.0, 8.0), (0.0, 8.0)))
+    error = np.array([[0.01, 0.02, NAN, 0.04, 0.05]])
+    rings.add(radius, np.zeros(1), np.array([[True, True, True, True, False]]), error)
+    found = rings.measures()
+    assert [found[name]["seen"] for name in ("0-4 m", "4-8 m", "0-8 m")] == [2, 2, 4]
+    assert [found[name]["completeness"] for name in ("0-4 m", "4-8 m", "0-8 m")] == [1, 0.5, 0.75]
+    assert found["4-8 m"]["raw"]["bias"] == pytest.approx(0.04)
+    assert found["0-8 m"]["levelled"]["cells"] == 0  # no plane through the three known cells
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-2, 2))
@@ -86,10 +152,33 @@ def test_a_plane_through_three_cells_proves_nothing():
 
 def test_hazard_shares_by_hand():
     truth = np.array([100, 100, 100, 100, 0, 0, 0, 0, 0, 100], np.int8)
-    cells = np.array([100, 0, 0, -1, 100, 0, 0, -1, 0, 100], np.int8)
-    counted = np.array([True] * 9 + [False])
-    found = measures.hazard_measures(cells, truth, counted)
-    assert found == {"cells": 9, "unknown": 2 / 9, "recall": 0.25, "false_safe": 0.5, "false_alarm": 0.2}
+    cells = np.array([100, 0, 0, -1, 100, 0, 0, 55, 0, 0], np.int8)  # 55 is neither free nor a hazard
+    seen = np.array([True] * 9 + [False])
+    rock = np.array([False, True] + [False] * 8)
+    counted = seen & (np.arange(10) != 8)
+    found = measures.hazard_measures(measures.hazard_counts(cells, truth, seen, counted, rock))
+    assert found == {
+        "cells": 8,
+        "unknown": 2 / 8,
+        "recall": 0.25,
+        "false_safe": 0.5,
+        "false_alarm": 0.25,
+        "free": 6,
+        "free_hazard": 0.5,
+        "free_on_rock": pytest.approx(1 / 6),
+        "free_unseen": {"cells": 1, "share": pytest.approx(1 / 6), "hazards": 1},
+    }
+    untold = measures.hazard_measures(measures.hazard_counts(cells, truth, seen, counted, None))
+    assert np.isnan(untold["free_on_rock"])
+    assert untold["free_hazard"] == 0.5
+
+
+def test_cells_on_a_rock_are_the_hazards_within_its_outline():
+    x = y = (np.arange(10) + 0.5) * 0.1
+    hazard = np.zeros((10, 10), bool)
+    hazard[2, [2, 4, 5, 9]] = True  # 0.0, 0.2, 0.3 and 0.7 m from the rock's centre
+    rock = measures.on_rocks(np.array([[0.25, 0.25, 0.4]]), hazard, x, y)  # reaches 1.25 x 0.2 = 0.25 m
+    assert np.argwhere(rock).tolist() == [[2, 2], [2, 4]]
 
 
 def test_a_rock_counts_only_if_it_can_be_seen_and_is_found_within_a_cell_of_its_rim():

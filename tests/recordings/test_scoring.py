@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from recordings import ros2, scoring
 from recordings.errors import LogError
 from recordings.simulator import Simulation, log
-from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Transform
+from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
 
 SMALL = Simulation(
     frames=2, rate=1.0, width=320, height=240, relief_cells=512, abundance=0.2, color=False, seed=11
@@ -45,7 +45,9 @@ class Run:
     resolution: float = 0.05
     skipped: tuple[int, ...] = ()
     shift: dict[int, int] = field(default_factory=dict)
-    only: tuple[str, ...] = field(default=scoring.RESULTS)
+    only: tuple[str, ...] = field(default=(*scoring.RESULTS, "/tf"))
+    camera: str = "left_camera_optical"
+    blind: tuple[int, ...] = ()  # frames that say unknown everywhere
 
     def write(self, path: Path, frames) -> Path:
         with ros2.Ros2Writer(path) as writer:
@@ -53,8 +55,9 @@ class Run:
                 if index in self.skipped:
                     continue
                 stamp = SMALL.stamp(index) + self.shift.get(index, 0)
-                for topic, message in self.messages(stamp, frame).items():
-                    if topic in self.only or topic == "/tf":
+                run = replace(self, **BLIND) if index in self.blind else self
+                for topic, message in run.messages(stamp, frame).items():
+                    if topic in self.only:
                         writer.write(topic, message, stamp)
         return path
 
@@ -70,9 +73,7 @@ class Run:
         origin = (-8 + self.crop * 0.05, -8 + self.crop * 0.05)
         level_from_camera = frame.level.inverse().after(frame.base.after(SMALL.mounts[0]))
         off = Rotation.from_rotvec([0.6 * self.tilt_error, 0.8 * self.tilt_error, 0]).as_matrix()
-        found = Transform(
-            "level", "left_camera_optical", off @ level_from_camera.rotation, level_from_camera.translation
-        )
+        found = Transform("level", self.camera, off @ level_from_camera.rotation, level_from_camera.translation)
         reason = np.zeros(cells.shape, np.uint8)
         return {
             "/nav/disparity": ros2.disparity_image(disparity),
@@ -84,6 +85,13 @@ class Run:
             ),
             "/tf": ros2.transform_message([(found, stamp)]),
         }
+
+
+BLIND = {
+    "disparity": lambda pixels: np.full_like(pixels, np.nan),
+    "elevation": lambda layer: np.full_like(layer, np.nan),
+    "cells": lambda cells: np.full_like(cells, Cell.UNKNOWN),
+}
 
 
 def scored(tmp_path, truth, frames, **changes) -> scoring.Score:
@@ -99,12 +107,15 @@ def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
         assert found.elevation[ring]["raw"]["rmse"] == 0
         assert found.elevation[ring]["completeness"] == found.elevation[ring]["raw"]["within_5cm"] == 1
     assert found.elevation["0-8 m"]["raw"]["cells"] > 5000
+    assert found.elevation["0-8 m"]["seen"] == found.elevation["0-4 m"]["seen"] + found.elevation["4-8 m"]["seen"]
     assert found.navigation["recall"] == 1
     assert found.navigation["false_safe"] == found.navigation["false_alarm"] == found.navigation["unknown"] == 0
+    assert found.navigation["free_hazard"] == found.navigation["free_on_rock"] == 0
     assert found.rocks["seen"] > 5
     assert found.rocks["recall"] == 1
     assert found.tilt["frames"] == 2
     assert found.tilt["max"] < 1e-6
+    assert found.untilted == {}
 
 
 def test_disparity_errors_are_told_apart_from_missing_disparity(tmp_path, truth, frames):
@@ -164,6 +175,86 @@ def test_a_map_that_calls_everything_free_finds_no_rock(tmp_path, truth, frames)
     assert blind.rocks["recall"] == 0
 
 
+def test_cells_called_free_on_rocks_are_a_share_of_all_free_cells(tmp_path, truth, frames):
+    found = scored(tmp_path, truth, frames, cells=np.zeros_like).navigation
+    reasons = np.stack([log.truth_maps(SMALL, 0, frame)[1].reason for frame in frames])
+    assert found["free"] == reasons.size
+    assert found["free_hazard"] == np.mean(reasons != Reason.CLEAR)
+    # The truth lists rocks within 10 m; their cells farther off, in the map's corners, are hazards only.
+    x = (np.arange(320) + 0.5) * 0.05 - 8
+    within = np.hypot(x[None, :], x[:, None]) < 9
+    assert found["free_on_rock"] > 0.99 * np.sum((reasons == Reason.STEP) & within) / reasons.size
+    assert found["free_on_rock"] <= np.mean(reasons != Reason.CLEAR)
+
+
+def test_calling_unseen_cells_free_is_told(tmp_path, truth, frames):
+    maps = [log.truth_maps(SMALL, 0, frame) for frame in frames]
+    seen = np.stack([terrain.layers["visible"] > 0.5 for terrain, _ in maps])
+    cells = np.stack([navigation.cells for _, navigation in maps])
+
+    def guess(value):
+        """The true cells where something was seen, `value` elsewhere."""
+        turn = iter(np.where(seen, cells, np.int8(value)))
+        return scored(tmp_path, truth, frames, cells=lambda _: next(turn)).navigation
+
+    honest, bold = guess(Cell.UNKNOWN), guess(Cell.FREE)
+    told = {"recall", "false_safe", "false_alarm", "unknown", "cells"}
+    assert {name: honest[name] for name in told} == {name: bold[name] for name in told}
+    assert honest["free_unseen"] == {"cells": 0, "share": 0, "hazards": 0}
+    assert honest["free_hazard"] == 0
+    free = np.sum(seen & (cells == Cell.FREE)) + np.sum(~seen)
+    assert bold["free"] == free
+    assert bold["free_unseen"] == {
+        "cells": np.sum(~seen), "share": np.sum(~seen) / free, "hazards": np.sum(~seen & (cells == Cell.HAZARD)),
+    }  # fmt: skip
+    assert bold["free_unseen"]["hazards"] > 1000
+
+
+def test_disparities_where_one_camera_sees_are_told(tmp_path, truth, frames):
+    seen = np.stack([frame.seen for frame in frames])
+
+    def guess(error):
+        """The truth where both cameras see, the truth plus `error` px where one does; sky stays unknown."""
+        turn = iter(np.where(seen == 128, np.float32(error), np.float32(0)))
+        return scored(tmp_path, truth, frames, disparity=lambda pixels: pixels + next(turn)).disparity
+
+    honest, bold = guess(np.nan), guess(3)
+    assert honest["density"] == bold["density"] == 1
+    assert honest["given_occluded"]["pixels"] == 0
+    share = np.sum(seen == 128) / np.sum(seen > 0)
+    assert bold["given_occluded"] == {"pixels": np.sum(seen == 128), "share": share, "bad_2": 1}
+    assert guess(1.5)["given_occluded"]["bad_2"] == 0
+    painted = scored(tmp_path, truth, frames, disparity=lambda pixels: np.nan_to_num(pixels, nan=9.0)).disparity
+    assert painted["given_sky"] == {"pixels": np.sum(seen == 0), "share": np.mean(seen == 0)}
+
+
+def test_leaving_out_a_bad_frame_scores_as_saying_unknown(tmp_path, truth, frames):
+    silent = scored(tmp_path, truth, frames, skipped=(1,))
+    honest = scored(tmp_path, truth, frames, blind=(1,))
+    assert (silent.disparity, silent.elevation, silent.navigation, silent.rocks, silent.unseen) == (
+        honest.disparity, honest.elevation, honest.navigation, honest.rocks, honest.unseen
+    )  # fmt: skip
+    known, seen = np.sum(frames[0].seen == 255), sum(np.sum(frame.seen == 255) for frame in frames)
+    assert silent.disparity["density"] == known / seen
+    assert silent.disparity["bad_2"] == pytest.approx(1 - known / seen)
+    assert 0.3 < silent.elevation["0-8 m"]["completeness"] < 0.7
+    assert silent.navigation["unknown"] == pytest.approx(1 - silent.elevation["0-8 m"]["completeness"])
+    assert 0 < silent.rocks["found"] < silent.rocks["seen"]
+    assert silent.missing == {topic: [SMALL.stamp(1)] for topic in scoring.RESULTS}
+    assert honest.missing == {}
+
+
+def test_a_tilt_that_cannot_be_scored_says_why(tmp_path, truth, frames):
+    found = scored(tmp_path, truth, frames, only=scoring.RESULTS)
+    assert found.tilt is None
+    assert found.untilted == {"the result has no /tf from 'level' at their stamps": 2}
+    assert "not scored in 2 frames: the result has no /tf from 'level'" in scoring.format_score(found)
+    other = scored(tmp_path, truth, frames, camera="mast_camera")
+    assert other.untilted == {"the truth has no mount of 'mast_camera' on 'base_link'": 2}
+    partly = scored(tmp_path, truth, frames, skipped=(0,))
+    assert (partly.tilt["frames"], sum(partly.untilted.values())) == (1, 1)
+
+
 def test_the_tilt_error_is_the_angle_between_the_two_ups(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, tilt_error=0.01)
     assert (found.tilt["mean"], found.tilt["max"]) == pytest.approx((0.01, 0.01), abs=1e-6)
@@ -175,8 +266,8 @@ def test_a_frame_without_results_is_missing_by_its_stamp(tmp_path, truth, frames
     assert found.missing == {topic: [SMALL.stamp(0)] for topic in scoring.RESULTS}
     partial = scored(tmp_path, truth, frames, only=("/nav/disparity",))
     assert partial.missing.keys() == {"/nav/elevation_map", "/nav/navigation_map"}
-    assert partial.elevation is None
-    assert partial.navigation is None
+    assert partial.elevation["0-8 m"]["completeness"] == partial.navigation["recall"] == partial.rocks["found"] == 0
+    assert partial.navigation["unknown"] == partial.disparity["density"] == 1
 
 
 def test_results_at_stamps_without_truth_are_reported_and_never_compared(tmp_path, truth, frames):
@@ -201,13 +292,16 @@ def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
 def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, skipped=(1,), elevation=lambda layer: layer + np.float32(0.02))
     table = scoring.format_score(found)
-    assert "1 of 2 compared" in table
-    assert "/nav/disparity: 1 of 2 frames" in table
-    assert table.count("plane removed") == 3
-    assert "2.00" in table
+    assert "1 of 2 have results" in table
+    assert "/nav/disparity: 1 of 2 frames, scored as all unknown" in table
+    assert [line.split()[4:9] for line in table.splitlines() if line.strip().startswith("0-4 m")] == [
+        ["|", "2.00", "2.00", "2.00", "0.00"], ["|", "0.00", "0.00", "0.00", "0.00"]
+    ]  # fmt: skip
+    assert max(map(len, table.splitlines())) <= 100
     read = json.loads(found.to_json())
     assert read["elevation"]["0-4 m"]["raw"]["bias"] == pytest.approx(0.02, abs=1e-6)
     assert read["per_frame"][0]["stamp"] == SMALL.stamp(0)
     empty = scored(tmp_path, truth, frames, elevation=lambda layer: np.full_like(layer, np.nan))
     assert json.loads(empty.to_json())["elevation"]["0-4 m"]["raw"]["rmse"] is None
-    assert "nan" in scoring.format_score(empty)
+    assert "nan" not in scoring.format_score(empty)
+    assert " 0.00% |      -      -      -      -            -" in scoring.format_score(empty)
