@@ -135,7 +135,9 @@ def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Arra
     mount = truth.level.inverse().after(truth.base.after(simulation.mounts[0]))
     a, b = (np.arange(shape[1]) - camera.cx) / camera.fx, ((np.arange(shape[0]) - camera.cy) / camera.fy)[:, None]
     known = (truth.seen == 255) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
-    depth, places = np.where(known, truth.depth, 0.0), []
+    rows = slice(int(known.any(axis=1).argmax()), None)  # sky and far ground above them
+    known, b, places = known[rows], b[rows], []
+    depth = np.where(known, truth.depth[rows], 0.0)
     for axis in (1, 0):
         right, down, ahead = mount.rotation[axis]
         place = depth * (right * a + (down * b + ahead))

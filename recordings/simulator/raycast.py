@@ -1,15 +1,16 @@
 """Rays against the simulator's terrain: exact first hits with bilinear ground and with cut ellipsoids.
 
-Both are walked through a pyramid of maxima (Tevs et al. 2008): a ray that stays above the highest point of a block
-crosses it in one step, however large the block; in the last block the hit is a quadratic's root, so no step size limits
-the accuracy. All coordinates are world metres; the terrain repeats without end.
+Rays walk through a pyramid of maxima (Tevs et al. 2008): one that stays above the highest point of a block crosses it
+in one step, however large the block; in the last block the hit is a quadratic's root, so no step size limits the
+accuracy. A stretch of a pixel row first walks as one beam, and its rays start where that may first meet something.
+All coordinates are world metres; the terrain repeats without end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from math import floor, inf, sqrt
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numba import njit
@@ -21,20 +22,26 @@ BUCKET_LEVEL = 1
 SPAN = 16  # px of a row that one beam covers
 SKY = -2
 GROUND = -1
-# Blocks are looked up this far (m) past their border, so that a ray on a border enters the next block.
-NUDGE = 1e-7
 ROUNDED = -1
-# The loops only borrow the caller's arrays: counting references to them would cost a third of the time.
-compiled = njit(nogil=True, cache=True, error_model="numpy", _nrt=False)
+Loop = TypeVar("Loop", bound=Callable[..., Any])
+
+
+def borrowing(loop: Loop) -> Loop:
+    """`njit` for loops that allocate nothing: they only borrow the caller's arrays.
+
+    Counting references to those, as numba does unless told otherwise, would cost a third of the time.
+    """
+    compiled: Any = njit
+    return cast(Loop, compiled(nogil=True, cache=True, error_model="numpy", _nrt=False)(loop))
 
 
 class Scene(NamedTuple):
     """Terrain as the compiled loops read it.
 
-    ground: (n, n) float32 nodes, m; resolution: m; tops, levels: flat pyramid of block maxima of the ground and where
-    each level begins; rock_tops, rock_levels: the same over buckets of rocks; rocks: (N, 8) centre, inverse semi-axes,
-    cosine and sine of yaw; shapes: (N,) int32; facets: (S, F, 4) planes in the rock's unit space; bucket_start,
-    bucket_rocks: int32, the rocks of each bucket; ceiling: m, above everything.
+    ground: (n, n) float32 nodes, m; resolution: m; tops, levels: flat pyramid of the highest points, rocks included, of
+    blocks of cells and where each level begins; rocks: (N, 8) centre in the tile, inverse semi-axes, cosine and sine
+    of yaw; shapes: (N,) int32; facets: (S, F, 4) planes in the rock's unit space; bucket_start, bucket_rocks: int32,
+    the rocks of each bucket; ceiling: m, above everything.
     """
 
     ground: Array
@@ -73,7 +80,7 @@ def scene(
     )  # fmt: skip
 
 
-@compiled
+@borrowing
 def height_at(ground: Any, resolution: float, x: float, y: float) -> float:
     """Bilinear ground elevation at one point."""
     mask = ground.shape[0] - 1
@@ -94,13 +101,7 @@ def heights_at(ground: Any, resolution: float, x: Any, y: Any) -> Any:
     return out
 
 
-@compiled
-def nearest_repetition(value: float, near: float, extent: float) -> float:
-    """The one of value + k * extent that lies nearest to `near`."""
-    return value + extent * floor((near - value) / extent + 0.5)
-
-
-@compiled
+@borrowing
 def _patch_hit(
     scn: Any, ix: int, iy: int, u: float, v: float, z: float, gx: float, gy: float, dz: float, length: float
 ) -> float:
@@ -130,7 +131,7 @@ def _patch_hit(
     return root if 0 <= root <= length else inf
 
 
-@compiled
+@borrowing
 def _rock_hit(
     scn: Any, rock: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, int]:
@@ -156,36 +157,38 @@ def _rock_hit(
         along = planes[k, 0] * ex + planes[k, 1] * ey + planes[k, 2] * ez
         room = planes[k, 3] - (planes[k, 0] * qx + planes[k, 1] * qy + planes[k, 2] * qz)
         if along < 0:
-            if room / along > enter:
+            if room < enter * along:
                 enter, facet = room / along, k
-        elif along > 0:
-            leave = min(leave, room / along)
-        elif room < 0:
+        elif room < leave * along:
+            leave = room / along
+        elif along == 0 and room < 0:
             return inf, ROUNDED
         if enter >= leave:
             return inf, ROUNDED
     return (enter, facet) if enter > 0 else (inf, ROUNDED)
 
 
-@compiled
+@borrowing
 def _bucket_hit(
     scn: Any, bucket: int, x: float, y: float, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
     start: float, far: float,
 ) -> tuple[float, int, int]:  # fmt: skip
     """Distance, index and facet of the first hit in (start, far) of a rock of the bucket about (x, y); SKY if none."""
     extent = scn.ground.shape[0] * scn.resolution
+    tile_x, tile_y, half = extent * floor(x / extent), extent * floor(y / extent), extent / 2
     best, best_rock, best_facet = far, SKY, ROUNDED
     for k in range(scn.bucket_start[bucket], scn.bucket_start[bucket + 1]):
         rock = scn.bucket_rocks[k]
-        cx = nearest_repetition(scn.rocks[rock, 0], x, extent)
-        cy = nearest_repetition(scn.rocks[rock, 1], y, extent)
+        cx, cy = scn.rocks[rock, 0] + tile_x, scn.rocks[rock, 1] + tile_y
+        cx += extent if cx < x - half else (-extent if cx > x + half else 0.0)
+        cy += extent if cy < y - half else (-extent if cy > y + half else 0.0)
         hit, facet = _rock_hit(scn, rock, px - cx, py - cy, pz - scn.rocks[rock, 2], dx, dy, dz)
         if start < hit < best:
             best, best_rock, best_facet = hit, rock, facet
     return best, best_rock, best_facet
 
 
-@compiled
+@borrowing
 def first_hit(
     scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, start: float, far: float
 ) -> tuple[float, int, int]:
@@ -193,7 +196,8 @@ def first_hit(
     n, step = scn.ground.shape[0], scn.resolution
     highest = scn.levels.shape[0] - 2
     # In cells, as all that follows but z.
-    gx, gy, ux, uy = px / step, py / step, dx / step, dy / step
+    per_metre = 1 / step
+    gx, gy, ux, uy = px * per_metre, py * per_metre, dx * per_metre, dy * per_metre
     inverse_x, inverse_y = 1 / ux, 1 / uy
     ahead_x, ahead_y = (1 if ux >= 0 else 0), (1 if uy >= 0 else 0)
     if ux == 0:
@@ -202,7 +206,7 @@ def first_hit(
         inverse_y = inf
     best, surface, facet = far, SKY, ROUNDED
     t, level, tested = start, 0, -1
-    ix, iy = int(floor(gx + ux * t)), int(floor(gy + uy * t))
+    ix, iy = floor(gx + ux * t), floor(gy + uy * t)
     while t < best:
         if dz >= 0 and pz + dz * t > scn.ceiling:
             break
@@ -232,31 +236,34 @@ def first_hit(
         t = max(t, leave)
         if leave_x < leave_y:
             ix = border_x - 1 + ahead_x
-            iy = min(max(int(floor(gy + uy * t)), by << level), ((by + 1) << level) - 1)
+            iy = min(max(floor(gy + uy * t), by << level), ((by + 1) << level) - 1)
             if (bx & 1) == ahead_x and level < highest:
                 level += 1
         else:
             iy = border_y - 1 + ahead_y
-            ix = min(max(int(floor(gx + ux * t)), bx << level), ((bx + 1) << level) - 1)
+            ix = min(max(floor(gx + ux * t), bx << level), ((bx + 1) << level) - 1)
             if (by & 1) == ahead_y and level < highest:
                 level += 1
     return (best if surface != SKY else inf), surface, facet
 
 
-@compiled
+@borrowing
 def clear_until(
-    scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, ex: float, ey: float, ez: float,
-    start: float, far: float,
+    scn: Any, origin: Any, rotation: Any, a: float, b: float, reach: float, far: float
 ) -> float:  # fmt: skip
-    """A distance from `start` on up to which no ray of a beam, directions (dx, dy, dz) +- (ex, ey, ez), hits anything.
+    """Depth up to which no ray of a camera through a stretch of a row hits anything; `far` if none ever does.
 
-    It is `far` if none of them ever does.
+    origin, rotation: as in `cast_rows`; a, b: tangents of the stretch's middle; reach: of a from there to its ends.
     """
     n, step = scn.ground.shape[0], scn.resolution
     highest = scn.levels.shape[0] - 2
+    px, py, pz = origin[0], origin[1], origin[2]
+    dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2]
+    dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2]
+    ex, ey = abs(rotation[0, 0]) * reach, abs(rotation[1, 0]) * reach
+    lowest = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] - abs(rotation[2, 0]) * reach
     pace = 1 / max(abs(dx), abs(dy), 0.05)
-    lowest = dz - ez
-    t, level = start, 4
+    t, level = 0.0, 4
     while t < far:
         if lowest >= 0 and pz + lowest * t > scn.ceiling:
             return far
@@ -265,11 +272,9 @@ def clear_until(
         x0, x1, y0, y1 = px + dx * t, px + dx * leave, py + dy * t, py + dy * leave
         i0, i1 = floor((min(y0, y1) - ey * leave) / size), floor((max(y0, y1) + ey * leave) / size)
         j0, j1 = floor((min(x0, x1) - ex * leave) / size), floor((max(x0, x1) + ex * leave) / size)
-        low = pz + lowest * (leave if lowest < 0 else t)
-        clear = i1 - i0 < 4 and j1 - j0 < 4
-        if not clear:
-            return t
-        width = n >> level
+        if i1 - i0 > 3 or j1 - j0 > 3:
+            return t  # the stretch has become too wide for such small blocks
+        low, width, clear = pz + lowest * (leave if lowest < 0 else t), n >> level, True
         for i in range(i0, i1 + 1):
             first = scn.levels[level] + (i & (width - 1)) * width
             for j in range(j0, j1 + 1):
@@ -282,48 +287,6 @@ def clear_until(
         else:
             return t
     return far
-
-
-@compiled
-def _upward(ground: Any, resolution: float, x: float, y: float) -> tuple[float, float, float]:
-    """Normal, of no particular length, of the ground smoothed over neighbouring patches: differences over two cells."""
-    mask = ground.shape[0] - 1
-    gx, gy = x / resolution, y / resolution
-    ix, iy = floor(gx), floor(gy)
-    u, v = gx - ix, gy - iy
-    i0, i1, i2, i3 = (iy - 1) & mask, iy & mask, (iy + 1) & mask, (iy + 2) & mask
-    j0, j1, j2, j3 = (ix - 1) & mask, ix & mask, (ix + 1) & mask, (ix + 2) & mask
-    h11, h12, h21, h22 = ground[i1, j1], ground[i1, j2], ground[i2, j1], ground[i2, j2]
-    west = ((h12 - ground[i1, j0]) * (1 - v) + (h22 - ground[i2, j0]) * v) * (1 - u)
-    east = ((ground[i1, j3] - h11) * (1 - v) + (ground[i2, j3] - h21) * v) * u
-    south = ((h21 - ground[i0, j1]) * (1 - u) + (h22 - ground[i0, j2]) * u) * (1 - v)
-    north = ((ground[i3, j1] - h11) * (1 - u) + (ground[i3, j2] - h12) * u) * v
-    return -(west + east), -(south + north), 2 * resolution
-
-
-@compiled
-def normal_at(scn: Any, surface: int, facet: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Unit normal, towards the outside, of the surface at a point that a ray has hit.
-
-    The ground's is smoothed over neighbouring patches, so that bilinear seams do not show in the light.
-    """
-    if surface == GROUND:
-        nx, ny, nz = _upward(scn.ground, scn.resolution, x, y)
-    else:
-        solid = scn.rocks[surface]
-        c, s = solid[6], solid[7]
-        if facet == ROUNDED:
-            extent = scn.ground.shape[0] * scn.resolution
-            ox = x - nearest_repetition(solid[0], x, extent)
-            oy = y - nearest_repetition(solid[1], y, extent)
-            qx, qy, qz = (c * ox + s * oy) * solid[3], (c * oy - s * ox) * solid[4], (z - solid[2]) * solid[5]
-        else:
-            plane = scn.facets[scn.shapes[surface], facet]
-            qx, qy, qz = plane[0], plane[1], plane[2]
-        ex, ey = qx * solid[3], qy * solid[4]
-        nx, ny, nz = c * ex - s * ey, s * ex + c * ey, qz * solid[5]
-    length = sqrt(nx * nx + ny * ny + nz * nz)
-    return nx / length, ny / length, nz / length
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -339,19 +302,7 @@ def tops_at(scn: Any, x: Any, y: Any, ceiling: float) -> Any:
     return z, surface
 
 
-@compiled
-def _row_clear(
-    scn: Any, origin: Any, rotation: Any, a: float, b: float, reach: float, start: float, far: float
-) -> float:
-    """`clear_until` of the rays of one row whose columns lie within `reach` (in tangents) of `a`."""
-    dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2]
-    dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2]
-    dz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2]
-    ex, ey, ez = abs(rotation[0, 0]) * reach, abs(rotation[1, 0]) * reach, abs(rotation[2, 0]) * reach
-    return clear_until(scn, origin[0], origin[1], origin[2], dx, dy, dz, ex, ey, ez, start, far)
-
-
-@compiled
+@borrowing
 def cast_rows(
     scn: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float, far: float, first: int,
     depth: Any, surface: Any, facet: Any,
@@ -367,7 +318,7 @@ def cast_rows(
         for column in range(depth.shape[1]):
             if column % SPAN == 0:
                 a = (column + (SPAN - 1) / 2 - cx) / fx
-                start = _row_clear(scn, origin, rotation, a, b, SPAN / 2 / fx, 0.0, far)
+                start = clear_until(scn, origin, rotation, a, b, SPAN / 2 / fx, far)
             a = (column - cx) / fx
             dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2]
             dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2]
@@ -376,7 +327,7 @@ def cast_rows(
             depth[row, column], surface[row, column], facet[row, column] = t, what, side
 
 
-@compiled
+@borrowing
 def seen_rows(
     scn: Any, left: Any, right: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float, first: int,
     depth: Any, seen: Any,
@@ -402,12 +353,13 @@ def seen_rows(
             span, end = int(place) // SPAN, t * (1 - 1e-5) - 1e-5
             if span != known:
                 a = (span * SPAN + (SPAN - 1) / 2 - cx) / fx
-                known, clear = span, _row_clear(scn, right, rotation, a, b, SPAN / 2 / fx, 0.0, 1e3)
+                known, clear = span, clear_until(scn, right, rotation, a, b, SPAN / 2 / fx, 1e3)
             a = (column - cx) / fx
             # From the right camera, at unit speed along the optical axis, the point is met at t:
             # what is met sooner hides it.
-            dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] - (right[0] - left[0]) / t
-            dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] - (right[1] - left[1]) / t
-            dz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] - (right[2] - left[2]) / t
+            nearness = 1 / t
+            dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] - (right[0] - left[0]) * nearness
+            dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] - (right[1] - left[1]) * nearness
+            dz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] - (right[2] - left[2]) * nearness
             if first_hit(scn, right[0], right[1], right[2], dx, dy, dz, clear, end)[1] == SKY:
                 seen[row, column] = 255

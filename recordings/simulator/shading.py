@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from recordings.simulator.raycast import GROUND, SKY, compiled, first_hit, normal_at, pyramid_of
+from recordings.simulator.raycast import GROUND, ROUNDED, SKY, borrowing, first_hit, pyramid_of
 from stages.data import Array
 
 TILE = 1024
 # Period of the tile laid at three scales, m. Their ratios are no round numbers, so the sum does not visibly repeat.
 FINE, MIDDLE, BROAD = 2.56, 13.7, 97.0
-MOST_TAPS = 4
+MOST_TAPS = 6
 VISIBILITY = 300.0  # m, at which haze leaves 1/e of the contrast
 SUNLIGHT, SKYLIGHT = 0.86, 0.24
 EXPOSURE, GAMMA = 0.80, 1 / 1.5
@@ -62,7 +62,7 @@ def _band(rng: np.random.Generator, fall: float, shortest: float, longest: float
     return np.asarray(picture / picture.std())
 
 
-@compiled
+@borrowing
 def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
     """Periodic bilinear sample at (x, y) px of the square tile of `size` that begins at `start`."""
     ix, iy = floor(x), floor(y)
@@ -73,7 +73,7 @@ def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
     return float(low * (1 - v) + (tiles[i1 + j] * (1 - u) + tiles[i1 + j1] * u) * v)
 
 
-@compiled
+@borrowing
 def _sample(
     tiles: Any, levels: Any, period: float, x: float, y: float, width: float, taps: int, ux: float, uy: float
 ) -> float:
@@ -98,7 +98,7 @@ def _sample(
     return total / taps
 
 
-@compiled
+@borrowing
 def _ground_albedo(
     texture: Any, x: float, y: float, width: float, length: float, ux: float, uy: float
 ) -> tuple[float, float]:
@@ -114,7 +114,7 @@ def _ground_albedo(
     return 1 + contrast * (grit - 1), (1 + 0.07 * cloud - 0.04 * broad) * (0.92 + 0.16 * sand)
 
 
-@compiled
+@borrowing
 def _rock_albedo(
     texture: Any, rock: int, x: float, y: float, z: float, nx: float, ny: float, nz: float, width: float
 ) -> float:
@@ -130,16 +130,55 @@ def _rock_albedo(
     return max(0.3, (1 + 0.16 * grain + 0.45 * (pits - 1)) * (0.72 + 0.5 * ((rock * 61) % 89) / 89))
 
 
-@compiled
-def _is_lit(scn: Any, clear: Any, sun: Any, x: float, y: float, z: float) -> bool:
-    """Whether the sun shines on a point; clear: its `sunlight.lit_above`."""
-    mask = clear.shape[0] - 1
-    if z > clear[floor(y / scn.resolution) & mask, floor(x / scn.resolution) & mask]:
-        return True
-    return bool(first_hit(scn, x, y, z, sun[0], sun[1], sun[2], 0.0, 80.0)[1] == SKY)
+@borrowing
+def _upward(ground: Any, resolution: float, x: float, y: float) -> tuple[float, float, float]:
+    """Normal, of no particular length, of the ground smoothed over neighbouring patches: differences over two cells."""
+    mask = ground.shape[0] - 1
+    gx, gy = x / resolution, y / resolution
+    ix, iy = floor(gx), floor(gy)
+    u, v = gx - ix, gy - iy
+    i0, i1, i2, i3 = (iy - 1) & mask, iy & mask, (iy + 1) & mask, (iy + 2) & mask
+    j0, j1, j2, j3 = (ix - 1) & mask, ix & mask, (ix + 1) & mask, (ix + 2) & mask
+    h11, h12, h21, h22 = ground[i1, j1], ground[i1, j2], ground[i2, j1], ground[i2, j2]
+    west = ((h12 - ground[i1, j0]) * (1 - v) + (h22 - ground[i2, j0]) * v) * (1 - u)
+    east = ((ground[i1, j3] - h11) * (1 - v) + (ground[i2, j3] - h21) * v) * u
+    south = ((h21 - ground[i0, j1]) * (1 - u) + (h22 - ground[i0, j2]) * u) * (1 - v)
+    north = ((ground[i3, j1] - h11) * (1 - u) + (ground[i3, j2] - h12) * u) * v
+    return -(west + east), -(south + north), 2 * resolution
 
 
-@compiled
+@borrowing
+def _nearest_repetition(value: float, near: float, extent: float) -> float:
+    """The one of value + k * extent that lies nearest to `near`."""
+    return value + extent * floor((near - value) / extent + 0.5)
+
+
+@borrowing
+def _normal_at(scn: Any, surface: int, facet: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Unit normal, towards the outside, of the surface at a point that a ray has hit.
+
+    The ground's is smoothed over neighbouring patches, so that bilinear seams do not show in the light.
+    """
+    if surface == GROUND:
+        nx, ny, nz = _upward(scn.ground, scn.resolution, x, y)
+    else:
+        solid = scn.rocks[surface]
+        c, s = solid[6], solid[7]
+        if facet == ROUNDED:
+            extent = scn.ground.shape[0] * scn.resolution
+            ox = x - _nearest_repetition(solid[0], x, extent)
+            oy = y - _nearest_repetition(solid[1], y, extent)
+            qx, qy, qz = (c * ox + s * oy) * solid[3], (c * oy - s * ox) * solid[4], (z - solid[2]) * solid[5]
+        else:
+            plane = scn.facets[scn.shapes[surface], facet]
+            qx, qy, qz = plane[0], plane[1], plane[2]
+        ex, ey = qx * solid[3], qy * solid[4]
+        nx, ny, nz = c * ex - s * ey, s * ex + c * ey, qz * solid[5]
+    length = sqrt(nx * nx + ny * ny + nz * nz)
+    return nx / length, ny / length, nz / length
+
+
+@borrowing
 def shade_rows(
     scn: Any, texture: Any, clear: Any, sun: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float,
     cy: float, first: int, depth: Any, surface: Any, facet: Any, radiance: Any,
@@ -148,6 +187,7 @@ def shade_rows(
 
     sun: (3,) towards it; clear: its `sunlight.lit_above`.
     """
+    mask = clear.shape[0] - 1
     for row in range(depth.shape[0]):
         b = (first + row - cy) / fy
         for column in range(depth.shape[1]):
@@ -163,7 +203,7 @@ def shade_rows(
                 radiance[row, column, 0], radiance[row, column, 1], radiance[row, column, 2] = sky0, sky1, sky2
                 continue
             x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
-            nx, ny, nz = normal_at(scn, what, facet[row, column], x, y, z)
+            nx, ny, nz = _normal_at(scn, what, facet[row, column], x, y, z)
             facing = max(-(nx * dx + ny * dy + nz * dz) / speed, 0.03)
             width = t / fx
             if what == GROUND:
@@ -176,10 +216,13 @@ def shade_rows(
                 red, green, blue = 0.60 * albedo, 0.46 * albedo, 0.37 * albedo
             toward = nx * sun[0] + ny * sun[1] + nz * sun[2]
             light = 0.0
-            lift = 0.001 + 1e-4 * t
-            if toward > 0 and _is_lit(scn, clear, sun, x + lift * nx, y + lift * ny, z + lift * nz):
-                # Half Lambert, half Lommel-Seeliger, as dusty surfaces scatter (McEwen 1991).
-                light = SUNLIGHT * grit * (0.5 * toward + toward / (toward + facing))
+            if toward > 0:
+                lift = 0.001 + 1e-4 * t
+                x, y, z = x + lift * nx, y + lift * ny, z + lift * nz
+                sure = z > clear[floor(y / scn.resolution) & mask, floor(x / scn.resolution) & mask]
+                if sure or first_hit(scn, x, y, z, sun[0], sun[1], sun[2], 0.0, 80.0)[1] == SKY:
+                    # Half Lambert, half Lommel-Seeliger, as dusty surfaces scatter (McEwen 1991).
+                    light = SUNLIGHT * grit * (0.5 * toward + toward / (toward + facing))
             light += SKYLIGHT * (0.5 + 0.5 * nz) * (1 + 0.4 * (grit - 1))
             through = exp(-t * speed / VISIBILITY)
             radiance[row, column, 0] = red * light * through + sky0 * (1 - through)

@@ -208,20 +208,42 @@ def _scene(ground: Array, resolution: float, rocks: Rocks, facets: Array) -> Sce
     patch = np.maximum(ground, np.roll(ground, -1, axis=0))
     patch = np.maximum(patch, np.roll(patch, -1, axis=1))
     buckets = len(ground) >> BUCKET_LEVEL
-    bucket, rock, top = _touched(rocks, buckets, resolution * (1 << BUCKET_LEVEL))
+    bucket, rock, top = _touched(rocks, _tops(facets)[rocks.shape], buckets, resolution * (1 << BUCKET_LEVEL))
     order = np.argsort(bucket, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(bucket, minlength=buckets**2))]).astype(np.int32)
     tops = np.full(buckets**2, -np.inf, np.float32)
     np.maximum.at(tops, bucket, top.astype(np.float32) + np.float32(1e-4))
-    solid = np.column_stack([rocks.center, rocks.middle, 1 / rocks.semi_axes, np.cos(rocks.yaw), np.sin(rocks.yaw)])
+    solid = np.column_stack([
+        rocks.center % (len(ground) * resolution), rocks.middle, 1 / rocks.semi_axes, np.cos(rocks.yaw),
+        np.sin(rocks.yaw),
+    ])  # fmt: skip
     return scene(
         ground, resolution, patch, tops.reshape(buckets, buckets), solid, rocks.shape.astype(np.int32), facets,
         start, rock[order].astype(np.int32),
     )  # fmt: skip
 
 
-def _touched(rocks: Rocks, buckets: int, size: float) -> tuple[Array, Array, Array]:
-    """Bucket index, rock index and a bound of the rock's elevation there, for every bucket that a rock touches."""
+def _tops(facets: Array, steps: int = 150) -> Array:
+    """Upper bounds, close ones, of how far the cut spheres `facets` (S, F, 4) reach upwards: (S,).
+
+    With weights w >= 0 of the planes n . p <= d, every point has z <= w . d + |up - sum w n|; the weights go downhill.
+    """
+    normals, distance = facets[..., :3], facets[..., 3]
+    weights, least = np.zeros(distance.shape), np.ones(len(facets))
+    for step in range(steps):
+        rest = np.array([0.0, 0.0, 1.0]) - np.einsum("sf,sfk->sk", weights, normals)
+        length = np.linalg.norm(rest, axis=1)
+        np.minimum(least, np.einsum("sf,sf->s", weights, distance) + length, out=least)
+        ahead = np.einsum("sfk,sk->sf", normals, rest / np.maximum(length, 1e-9)[:, None]) - distance
+        weights = np.maximum(weights + 0.3 / np.sqrt(step + 1) * ahead, 0.0)
+    return least
+
+
+def _touched(rocks: Rocks, reach_up: Array, buckets: int, size: float) -> tuple[Array, Array, Array]:
+    """Bucket index, rock index and a bound of the rock's elevation there, for every bucket that a rock touches.
+
+    reach_up: (N,) bounds of the rocks' tops above their middles, as shares of the semi-axis.
+    """
     longest, c, s = rocks.semi_axes[:, :2].max(axis=1, initial=0.0), np.cos(rocks.yaw), np.sin(rocks.yaw)
     reach = np.hypot(np.stack([c, s]) * rocks.semi_axes[:, 0], np.stack([s, c]) * rocks.semi_axes[:, 1]).T
     low = np.floor((rocks.center - reach) / size).astype(np.int32)
@@ -233,7 +255,7 @@ def _touched(rocks: Rocks, buckets: int, size: float) -> tuple[Array, Array, Arr
     # Away from its middle an ellipsoid is at most as high as the sphere of its longest axis, squeezed to its height.
     gap = np.abs((place + 0.5) * size - rocks.center[rock]) - size / 2
     away = np.square(np.maximum(gap, 0.0)).sum(axis=1) / longest[rock] ** 2
-    top = rocks.middle[rock] + rocks.semi_axes[rock, 2] * np.sqrt(np.maximum(1 - away, 0.0))
+    top = rocks.middle[rock] + rocks.semi_axes[rock, 2] * np.minimum(np.sqrt(np.maximum(1 - away, 0.0)), reach_up[rock])
     place %= buckets
     met = away < 1
     return (place[:, 1] * buckets + place[:, 0])[met], rock[met], top[met]

@@ -197,6 +197,54 @@ def test_the_ground_repeats_without_end():
         assert there[0] == pytest.approx(here[0], abs=1e-4)
 
 
+@pytest.mark.parametrize(("elevation", "azimuth"), [(38, 140), (20, -100), (9, 45), (55, 0), (30, 270), (90, 0)])
+def test_what_is_surely_lit_has_nothing_before_the_sun(elevation, azimuth):
+    here = replace(
+        SMALL, slope=float(np.radians(12)), sun_elevation=float(np.radians(elevation)),
+        sun_azimuth=float(np.radians(azimuth)),
+    )  # fmt: skip
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(-here.terrain.extent, here.terrain.extent, (2, 3000))
+    z = here.terrain.elevation(x, y) + 1e-3
+    row, column = (np.floor(place / here.relief_resolution).astype(int) % here.relief_cells for place in (y, x))
+    sure = z > here.lit_above[row, column]
+    lit = [
+        raycast.first_hit(here.terrain.scene, *point, *here.sun, 0.0, 200.0)[1] == raycast.SKY
+        for point in zip(x, y, z, strict=True)
+    ]
+    assert np.all(np.asarray(lit)[sure])
+    assert sure.sum() > 0.25 * np.sum(lit)
+
+
+def test_nothing_is_met_before_the_depth_up_to_which_a_stretch_of_a_row_is_clear():
+    scene, camera = SMALL.terrain.scene, SMALL.camera
+    pose = SMALL.base_at(SMALL.begin).after(SMALL.mounts[0])
+    rng, closest = np.random.default_rng(4), []
+    for _ in range(300):
+        a, b = rng.uniform(0, 400) - camera.cx, rng.uniform(40, 300) - camera.cy
+        clear = raycast.clear_until(
+            scene, pose.translation, pose.rotation, a / camera.fx, b / camera.fy, 8 / camera.fx, 300.0
+        )  # fmt: skip
+        hits = []
+        for column in a + np.linspace(-8, 8, 33):
+            direction = pose.rotation @ [column / camera.fx, b / camera.fy, 1.0]
+            hits.append(raycast.first_hit(scene, *pose.translation, *direction, 0.0, 300.0))
+            assert raycast.first_hit(scene, *pose.translation, *direction, clear, 300.0)[1:] == hits[-1][1:]
+        closest.append((clear, min(hit[0] for hit in hits)))
+    clear, hit = np.array(closest).T
+    assert (clear < hit).all()
+    assert np.median(clear[hit < 5] / hit[hit < 5]) > 0.9
+
+
+def test_no_surface_stands_above_the_top_of_its_cell():
+    rng, scene = np.random.default_rng(6), SMALL.terrain.scene
+    x, y = rng.uniform(0, SMALL.terrain.extent, (2, 200_000))
+    z, surface = raycast.tops_at(scene, x, y, scene.ceiling)
+    cell = np.floor(y / SMALL.relief_resolution) * SMALL.relief_cells + np.floor(x / SMALL.relief_resolution)
+    assert (surface >= 0).sum() > 10_000
+    assert (scene.tops[cell.astype(int)] - z).min() > -1e-6
+
+
 @pytest.mark.parametrize(("east", "north", "heading"), [(0.1, 0.0, 0.0), (-0.05, 0.2, 0.7), (0.0, -0.15, 2.5)])
 def test_on_a_plane_the_body_tilts_with_the_plane(east, north, heading):
     nodes = np.arange(128) * 0.1
