@@ -40,11 +40,14 @@ class Binarise(Stage):
       does: off the ground by `skirt` and joined to such a cell by others like it;
     - SLOPE: lies on ground steeper than `max_slope` over the rover's footprint;
     - ROUGHNESS: has heights about it whose root mean square off their plane exceeds `max_roughness`.
-    A cell without points, or with so few cells about it that the ground is not determined, is unknown (UNOBSERVED),
-    unless it is a hazard on its own showing. Ground wider than `surroundings` is terrain, not an obstacle: its edge is
-    a hazard, its top is judged on its own.
+    A cell is unknown (UNOBSERVED), unless it is a hazard on its own showing, where it has no points, where so few cells
+    lie about it that the ground is not determined, and where the layer `variance`, if the map has it, does not say that
+    the height is known to `max_sigma`: what could be a step is not free.
 
-    method "absolute", the paper's: a hazard is a cell whose elevation exceeds `max_step` (ELEVATION).
+    Ground wider than `surroundings` is terrain, not an obstacle: its edge is a hazard, its top is judged on its own.
+
+    method "absolute", the paper's: a hazard is a cell whose elevation exceeds `max_step` (ELEVATION); all others with
+    points are free, however little is known of their height.
     """
 
     method: str = parameter("footprint", "hazard rule", choices=("footprint", "absolute"))
@@ -57,7 +60,10 @@ class Binarise(Stage):
         0.03, "a step this close to max_step counts as reaching it: cells blunt a peak", unit="m", low=0.0
     )
     skirt: float = parameter(
-        0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.0
+        0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.01
+    )
+    max_sigma: float = parameter(
+        0.067, "standard deviation of a cell's height beyond which it is not free (3 are a step)", unit="m", low=0.0
     )
     min_points: int = parameter(1, "points without which a cell is unknown, where the map counts them", low=1)
 
@@ -88,7 +94,7 @@ class Binarise(Stage):
         roughness = fit_planes(height, passable, radius, _LEVERAGE)[3]
 
         reason = np.full(height.shape, Reason.UNOBSERVED)
-        reason[passable & known & np.isfinite(roughness)] = Reason.CLEAR
+        reason[passable & known & np.isfinite(roughness) & self._sure(elevation)] = Reason.CLEAR
         reason[passable & (roughness > self.max_roughness)] = Reason.ROUGHNESS
         reason[passable & known & (slope > self.max_slope + _SLOPE_ROUNDING)] = Reason.SLOPE
         reason[step] = Reason.STEP
@@ -115,6 +121,12 @@ class Binarise(Stage):
         slope = np.arctan(np.hypot(local[1], local[2]) / resolution)
         return np.where(known, local[0], around[0]), slope, known
 
+    def _sure(self, elevation: ElevationMap) -> Array:
+        """Cells whose height is known well enough to be called free, (rows, cols) bool."""
+        if "variance" not in elevation.layers:
+            return np.ones(elevation.shape, bool)
+        return elevation.layers["variance"] <= self.max_sigma**2
+
     def _step(self, elevation: ElevationMap, height: Array, level: Array) -> Array:
         """Cells that reach `max_step` from the ground. Heights compare false where the ground is not known.
 
@@ -122,8 +134,7 @@ class Binarise(Stage):
         off the ground.
         """
         limit = self.max_step - self.margin
-        top = elevation.layers.get("maximum", elevation.layers["elevation"]).astype(np.float64)
-        bottom = elevation.layers.get("minimum", elevation.layers["elevation"]).astype(np.float64)
+        top, bottom = (_finite(elevation.layers.get(extreme), height) for extreme in ("maximum", "minimum"))
         above = (top - level >= limit) & (height - level >= limit / 4)
         below = (level - bottom >= limit) & (level - height >= limit / 4)
         within = (top - bottom >= limit) & (height - bottom >= limit / 4) & (top - height >= limit / 4)
@@ -136,6 +147,11 @@ def _whole_obstacles(peaks: Array, raised: Array) -> Array:
     dangerous = np.bincount(obstacles[peaks], minlength=obstacles.max() + 1) > 0
     dangerous[0] = False
     return dangerous[obstacles]  # type: ignore[no-any-return]
+
+
+def _finite(layer: Array | None, height: Array) -> Array:
+    """A layer of heights as float64, with `height` where it is missing or not finite."""
+    return height if layer is None else np.where(np.isfinite(layer), layer, height)
 
 
 def _cells(width: float, resolution: float) -> int:

@@ -16,7 +16,9 @@ from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from stages.publish import check_rotation, publish, publish_image, publish_vector, read_only
 
 Array = NDArray[Any]
 
@@ -24,7 +26,11 @@ LEVEL_FRAME = "level"
 
 
 class Source(IntEnum):
-    """Where a disparity comes from, the codes of `Disparity.source`."""
+    """Where a disparity comes from, the codes of `Disparity.source`.
+
+    MEASURED: matched at this pixel; PLANE: the surface that the matches about it agree on, be there no match at this
+    pixel or one that disagrees; FILLED: guessed from beside.
+    """
 
     UNKNOWN = 0
     MEASURED = 1
@@ -51,37 +57,6 @@ class Reason(IntEnum):
     ROUGHNESS = 5
 
 
-def _published(owner: object, name: str, shape: tuple[int | None, ...], dtype: DTypeLike) -> None:
-    """Check the field `name` of a frozen dataclass and replace it by a read-only view.
-
-    `None` in `shape` stands for any extent. Raises ValueError with the field's name.
-    """
-    array = np.asarray(getattr(owner, name))
-    where = f"{type(owner).__name__}.{name}"
-    if array.dtype != np.dtype(dtype):
-        raise ValueError(f"{where} must be {np.dtype(dtype)}, not {array.dtype}")
-    if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
-        wanted = ", ".join("n" if extent is None else str(extent) for extent in shape)
-        raise ValueError(f"{where} must have shape ({wanted}), not {array.shape}")
-    view = array.view()
-    view.flags.writeable = False
-    object.__setattr__(owner, name, view)
-
-
-def _check_image(owner: object, name: str) -> None:
-    """Check that the field `name` holds a gray (H, W) or RGB (H, W, 3) image of 8 or 16 bit; make it read-only."""
-    pixels = np.asarray(getattr(owner, name))
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{type(owner).__name__}.{name} must be uint8 or uint16, not {pixels.dtype}")
-    _published(owner, name, (None, None) if pixels.ndim == 2 else (None, None, 3), pixels.dtype)
-
-
-def _vector(owner: object, name: str, shape: tuple[int, ...]) -> None:
-    """Publish a small float64 array given as any array-like."""
-    object.__setattr__(owner, name, np.array(getattr(owner, name), dtype=np.float64))
-    _published(owner, name, shape, np.float64)
-
-
 @dataclass(frozen=True, eq=False)
 class Transform:
     """A rigid transform: a point p of frame `child` is `rotation @ p + translation` in frame `parent`.
@@ -95,10 +70,9 @@ class Transform:
     translation: Array
 
     def __post_init__(self) -> None:
-        _vector(self, "rotation", (3, 3))
-        _vector(self, "translation", (3,))
-        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(self.rotation) < 0:
-            raise ValueError(f"Transform {self.parent} <- {self.child}: rotation is not a rotation matrix")
+        publish_vector(self, "rotation", (3, 3))
+        publish_vector(self, "translation", (3,))
+        check_rotation(self.rotation, f"Transform {self.parent} <- {self.child}: rotation")
 
     def __call__(self, points: ArrayLike) -> Array:
         """Points (N, 3) of `child`, expressed in `parent`."""
@@ -132,7 +106,7 @@ class CameraModel:
 
     def __post_init__(self) -> None:
         for name, shape in (("k", (3, 3)), ("d", (np.size(self.d),)), ("r", (3, 3)), ("p", (3, 4))):
-            _vector(self, name, shape)
+            publish_vector(self, name, shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +162,7 @@ class CameraImage:
     rectified: bool
 
     def __post_init__(self) -> None:
-        _check_image(self, "pixels")
+        publish_image(self, "pixels")
 
     def pair_with(self, right: CameraImage) -> StereoFrame:
         """The stereo frame of this (left) image and its right partner; it carries the left image's stamp."""
@@ -208,8 +182,8 @@ class StereoFrame:
     camera: StereoCamera
 
     def __post_init__(self) -> None:
-        _check_image(self, "left")
-        _check_image(self, "right")
+        publish_image(self, "left")
+        publish_image(self, "right")
         if self.left.shape != self.right.shape:
             raise ValueError(f"StereoFrame: left is {self.left.shape}, right is {self.right.shape}")
         if self.left.shape[:2] != (self.camera.height, self.camera.width):
@@ -228,7 +202,7 @@ class Tilt:
     frame_id: str = "inclinometer"
 
     def __post_init__(self) -> None:
-        _vector(self, "up", (3,))
+        publish_vector(self, "up", (3,))
         if not abs(float(np.linalg.norm(self.up)) - 1.0) < 1e-6:
             raise ValueError(f"Tilt.up must be a unit vector, not {self.up.tolist()}")
 
@@ -253,10 +227,10 @@ class Pose:
     covariance: Array | None = None
 
     def __post_init__(self) -> None:
-        _vector(self, "position", (3,))
-        _vector(self, "quaternion", (4,))
+        publish_vector(self, "position", (3,))
+        publish_vector(self, "quaternion", (4,))
         if self.covariance is not None:
-            _vector(self, "covariance", (6, 6))
+            publish_vector(self, "covariance", (6, 6), finite=False)
         if not abs(float(np.linalg.norm(self.quaternion)) - 1.0) < 1e-3:
             raise ValueError(f"Pose.quaternion must be a unit quaternion, not {self.quaternion.tolist()}")
 
@@ -281,7 +255,8 @@ class Mount:
     base_from_camera: Transform | None = None
 
     def __post_init__(self) -> None:
-        _vector(self, "camera_from_inclinometer", (3, 3))
+        publish_vector(self, "camera_from_inclinometer", (3, 3))
+        check_rotation(self.camera_from_inclinometer, "Mount.camera_from_inclinometer")
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,11 +276,11 @@ class Disparity:
     camera: StereoCamera | None = None
 
     def __post_init__(self) -> None:
-        _published(self, "pixels", (None, None), np.float32)
-        _published(self, "source", self.pixels.shape, np.uint8)
-        _published(self, "confidence", self.pixels.shape, np.float32)
+        publish(self, "pixels", (None, None), np.float32)
+        publish(self, "source", self.pixels.shape, np.uint8)
+        publish(self, "confidence", self.pixels.shape, np.float32)
         if self.segments is not None:
-            _published(self, "segments", self.pixels.shape, np.int32)
+            publish(self, "segments", self.pixels.shape, np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,11 +302,11 @@ class PointCloud:
     sensor: Transform | None = None
 
     def __post_init__(self) -> None:
-        _published(self, "points", (None, 3), np.float32)
+        publish(self, "points", (None, 3), np.float32)
         n = len(self.points)
-        _published(self, "colors", (n, 3), np.uint8)
-        _published(self, "sigma", (n,), np.float32)
-        _published(self, "pixel", (n,), np.int32)
+        publish(self, "colors", (n, 3), np.uint8)
+        publish(self, "sigma", (n,), np.float32)
+        publish(self, "pixel", (n,), np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,17 +325,16 @@ class ElevationMap:
     shape: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
-        layers = {name: np.asarray(layer).view() for name, layer in self.layers.items()}
+        layers = {name: np.asarray(layer) for name, layer in self.layers.items()}
         if "elevation" not in layers:
             raise ValueError("ElevationMap has no layer 'elevation'")
         rows, cols = layers["elevation"].shape
         for name, layer in layers.items():
             if layer.shape != (rows, cols) or layer.dtype != np.float32:
                 raise ValueError(f"ElevationMap layer '{name}' must be float32 ({rows}, {cols})")
-            layer.flags.writeable = False
         if not self.resolution > 0:
             raise ValueError(f"ElevationMap.resolution must be positive, not {self.resolution}")
-        object.__setattr__(self, "layers", MappingProxyType(layers))
+        object.__setattr__(self, "layers", MappingProxyType({n: read_only(layer) for n, layer in layers.items()}))
         object.__setattr__(self, "shape", (rows, cols))
 
 
@@ -377,8 +351,8 @@ class NavigationMap:
     frame_id: str
 
     def __post_init__(self) -> None:
-        _published(self, "cells", (None, None), np.int8)
-        _published(self, "reason", self.cells.shape, np.uint8)
+        publish(self, "cells", (None, None), np.int8)
+        publish(self, "reason", self.cells.shape, np.uint8)
 
 
 def _share(first: int, last: int, stamp: int) -> float:

@@ -27,10 +27,20 @@ class Level(Stage):
         1.0, "height of the left camera above the origin, where base_link is not known", unit="m", low=0.0
     )
 
-    def __call__(self, cloud: PointCloud, tilt: Tilt, mount: Mount) -> PointCloud:
-        """The cloud in frame `level`, with `sensor` telling where the camera is in it."""
+    def __call__(self, cloud: PointCloud, tilt: Tilt, mount: Mount | None = None) -> PointCloud:
+        """The cloud in frame `level`, with `sensor` telling where the camera is in it.
+
+        Without `mount` the tilt must be given in the cloud's own frame: how an inclinometer sits is never guessed.
+        """
         if cloud.sensor is not None:
             raise ValueError(f"Level: the cloud is in frame '{cloud.frame_id}', not its camera's; level it only once")
+        if mount is None:
+            if tilt.frame_id != cloud.frame_id:
+                raise ValueError(
+                    f"Level: the tilt is in frame '{tilt.frame_id}', the cloud in '{cloud.frame_id}', and nothing says "
+                    "how one sits in the other; connect the port 'mount'"
+                )
+            mount = Mount(tilt.stamp, np.eye(3))
         sensor = level_transform(tilt, mount, cloud.frame_id, self.camera_height)
         points = transform_points(cloud.points, sensor.rotation, sensor.translation)
         return replace(cloud, points=points, frame_id=LEVEL_FRAME, sensor=sensor)
@@ -44,8 +54,6 @@ def level_transform(tilt: Tilt, mount: Mount, camera_frame: str, camera_height: 
     heading is so close to vertical that it points nowhere.
     """
     up = mount.camera_from_inclinometer @ tilt.up
-    if not abs(float(np.linalg.norm(up)) - 1.0) < 1e-3:
-        raise ValueError("Mount.camera_from_inclinometer is not a rotation; check the inclinometer's static transform")
     up = up / np.linalg.norm(up)
     forward, origin = _heading_and_origin(mount, up, camera_height)
     level = forward - (forward @ up) * up

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from stages.data import Array, Disparity, Source, StereoFrame
+from stages.intensity import eight_bit, gray
 from stages.stage import Stage, parameter
 
 F32 = np.float32
@@ -98,21 +99,6 @@ class Match(Stage):
         partner = np.arange(width, dtype=np.float32) - pixels
         pixels[(sixteenths < 16 * self.minimum) | (partner < 0) | (partner > width - 1)] = np.nan
         return pixels
-
-
-def eight_bit(*images: Array) -> tuple[Array, ...]:
-    """uint8 copies of images of one exposure; 16-bit ones are stretched jointly, 0.1th to 99.9th percentile."""
-    if all(image.dtype == np.uint8 for image in images):
-        return images
-    low, high = np.percentile(np.concatenate([image.ravel() for image in images]), (0.1, 99.9))
-    scale = 255 / max(high - low, 1.0)
-    return tuple(np.clip((image - low) * scale + 0.5, 0, 255).astype(np.uint8) for image in images)
-
-
-def gray(image: Array) -> Array:
-    """A gray or RGB uint8 image as gray (H, W) uint8."""
-    luma: Array = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    return luma
 
 
 def _texture(image: Array, block: int) -> Array:

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 
 from stages.data import Array, Disparity, Source, StereoFrame
+from stages.intensity import eight_bit, gray
 from stages.kernels.background import fill_background
 from stages.kernels.bilateral import joint_bilateral
 from stages.kernels.planes import Planes, fit_planes, render_planes
 from stages.kernels.slic import superpixels
 from stages.kernels.smoother import smooth
-from stages.match import eight_bit, gray
 from stages.stage import Stage, parameter
 
 F32 = np.float32
@@ -29,9 +29,11 @@ FILL_TRUST = 0.25  # the same of a pixel filled from beside
 class Refine(Stage):
     """A denser and smoother disparity image, with the superpixels it was made with.
 
-    Matches keep their confidence; a pixel from a plane has at most 0.5, a filled one at most 0.25. With `fill` wls a
-    hole is filled from all around by the confidence-weighted smoother; with background from the farther of its ends
-    in the row.
+    Only MEASURED pixels are matches; all others count as holes. What moves by at most `inlier_distance` stays MEASURED
+    and keeps its confidence. A match that moves farther has been replaced by what lies about it: it becomes PLANE, as a
+    hole that its superpixel's plane fills, and its confidence at most 0.5; a filled pixel has at most 0.25. With `fill`
+    wls a hole is filled from all around by the confidence-weighted smoother; with background from the farther of its
+    ends in the row.
     """
 
     trusted: float = parameter(0.1, "confidence below which a match is treated as unknown", low=0, high=1)
@@ -65,28 +67,36 @@ class Refine(Stage):
             raise ValueError(f"Refine: disparity is {disparity.pixels.shape}, the image is {frame.left.shape[:2]}")
         image = eight_bit(frame.left)[0]
         guide = gray(image)
-        matches = self._trusted_matches(disparity)
+        measured = self._trusted_matches(disparity)
+        matches = self._median(measured)
         labels, count = superpixels(image, self.superpixels, self.compactness)
         planes = fit_planes(matches, labels, count, self.inlier_distance, self.hypotheses, disparity.stamp)
         pixels = self._pulled_to_planes(matches, self._accepted(planes), labels)
         plane_confidence = F32(PLANE_TRUST) * planes.inlier_share[labels]
         confidence = np.where(np.isfinite(matches), disparity.confidence, plane_confidence)
         filled, support = self._filled(pixels, confidence, guide)
-        source = _sources(matches, pixels, filled)
+        refined = self._bilateral(filled, guide)
+        source = _sources(np.abs(refined - measured) <= self.inlier_distance, pixels, refined)
+        replaced = (source == Source.PLANE) & np.isfinite(measured)
+        confidence[replaced] = np.minimum(confidence, plane_confidence)[replaced]
         confidence[source == Source.FILLED] = F32(FILL_TRUST) * support[source == Source.FILLED]
         confidence[source == Source.UNKNOWN] = 0
-        return Disparity(frame.stamp, self._bilateral(filled, guide), source, confidence, labels, frame.camera)
+        return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
 
     def _trusted_matches(self, disparity: Disparity) -> Array:
-        """The matches that are trusted, median-filtered among themselves; (H, W) float32, NaN elsewhere."""
-        matches = np.where(disparity.confidence >= self.trusted, disparity.pixels, F32(np.nan))
+        """The matches that are trusted, (H, W) float32, NaN elsewhere."""
+        trusted = (disparity.source == Source.MEASURED) & (disparity.confidence >= self.trusted)
+        return np.where(trusted & np.isfinite(disparity.pixels), disparity.pixels, F32(np.nan))
+
+    def _median(self, matches: Array) -> Array:
+        """The matches, each moved to the median of those around it where that is near; (H, W) float32.
+
+        The median filter knows no NaN, so a hole counts as farther than all: holes are of the background, as a rule.
+        A match with fewer neighbours than holes about it has no median and stays.
+        """
         if not self.median:
             return matches
-        # The median filter knows no NaN: holes lend it their background, and are holes again afterwards.
-        dense = fill_background(matches, np.inf)
-        if np.isnan(dense).any():  # rows without any match
-            dense = np.nan_to_num(dense, nan=np.nanmin(matches) if np.isfinite(matches).any() else 0.0)
-        median = cv2.medianBlur(dense, self.median)
+        median = cv2.medianBlur(np.where(np.isnan(matches), F32(-np.inf), matches), self.median)
         return np.where(np.abs(median - matches) <= self.near, median, matches)
 
     def _accepted(self, planes: Planes) -> Array:
@@ -125,9 +135,10 @@ class Refine(Stage):
         )
 
 
-def _sources(matches: Array, with_planes: Array, filled: Array) -> Array:
+def _sources(as_measured: Array, with_planes: Array, refined: Array) -> Array:
     """Where each disparity comes from, codes of `Source`, (H, W) uint8."""
-    source = np.full(matches.shape, Source.UNKNOWN, np.uint8)
-    for code, pixels in ((Source.FILLED, filled), (Source.PLANE, with_planes), (Source.MEASURED, matches)):
-        source[np.isfinite(pixels)] = code
+    source = np.full(refined.shape, Source.UNKNOWN, np.uint8)
+    source[np.isfinite(refined)] = Source.FILLED
+    source[np.isfinite(with_planes)] = Source.PLANE
+    source[as_measured] = Source.MEASURED
     return source

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from stages.data import Array, Disparity, PointCloud, StereoFrame
+from stages.data import Disparity, PointCloud, StereoFrame
+from stages.intensity import eight_bit
 from stages.kernels.triangulation import triangulate
 from stages.stage import Stage, parameter
 
@@ -39,7 +38,7 @@ class Reproject(Stage):
             )
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> PointCloud:
-        """The cloud of `disparity`, coloured from the frame's left image; it may be empty."""
+        """The cloud of `disparity`, coloured from the left image, stretched to 8 bit; it may be empty."""
         camera = disparity.camera or frame.camera
         if frame.camera.raw is not None:
             raise ValueError("Reproject: the stereo frame is not rectified; put Rectify before it")
@@ -52,7 +51,7 @@ class Reproject(Stage):
             disparity.pixels,
             disparity.source,
             disparity.confidence,
-            _eight_bit(frame.left),
+            eight_bit(frame.left)[0],
             camera,
             self.max_depth,
             self.filled,
@@ -60,7 +59,3 @@ class Reproject(Stage):
         )
         shape = (int(disparity.pixels.shape[0]), int(disparity.pixels.shape[1]))
         return PointCloud(frame.stamp, points, colors, sigma, pixel, camera.frame_id, shape)
-
-
-def _eight_bit(image: Array) -> Array:
-    return (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else image

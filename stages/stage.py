@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -33,6 +35,8 @@ class Stage:
             choices, low, high, unit = (meta.get(key) for key in ("choices", "low", "high", "unit"))
             if choices is not None and value not in choices:
                 raise ValueError(f"{where} must be one of {', '.join(map(str, choices))}, not {value}")
+            if isinstance(value, numbers.Real) and not math.isfinite(value):
+                raise ValueError(f"{where} must be a finite number{f' of {unit}' if unit else ''}, not {value}")
             if (low is not None and not value >= low) or (high is not None and not value <= high):
                 bounds = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
                 raise ValueError(f"{where} must be {bounds}{f' {unit}' if unit else ''}, not {value}")

@@ -9,24 +9,23 @@ from __future__ import annotations
 import os
 import re
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from flow.pipeline import load
 from stages.data import Array, Disparity, StereoCamera, StereoFrame
 from stages.kernels.background import fill_background
 from stages.match import Match
 from stages.refine import Refine
 
-PAPER_MATCH = {
-    "paths": 8, "block": 5, "p1": 4.0, "p2": 38.0, "color": True, "prefilter": 15, "speckle_range": 2,
-}  # fmt: skip
-PAPER_REFINE = {
-    "trusted": 0.0, "inlier_distance": 1.0, "inlier_share": 0.0, "valid_share": 0.2, "slope": 1000.0,
-    "plane_weight": 1.0, "near": 1000.0, "plane_fill": False, "fill": "wls", "fill_support": 0.0,
-    "bilateral_radius": 2, "bilateral_space": 2.0,
-}  # fmt: skip
+
+def paper_stages() -> tuple[Match, Refine]:
+    """Matching and refinement as the pipeline `paper` sets them."""
+    actors = {node.name: node.actor for node in load("paper").nodes}
+    return actors["matched"], actors["disparity"]
 
 
 def load_scene(folder: Path) -> tuple[StereoFrame, Array, Array, int]:
@@ -58,9 +57,10 @@ def errors(pixels: Array, truth: Array, mask: Array, margin: int) -> Array:
 
 def chains(frame: StereoFrame, levels: int) -> dict[str, Array]:
     """Disparity pixels of each way to compute them."""
+    paper_match, paper = paper_stages()
+    rover = Refine()
     matched = Match(disparities=levels)(frame)
-    as_paper = Match(disparities=levels, **PAPER_MATCH)(frame)
-    paper, rover = Refine(**PAPER_REFINE), Refine()
+    as_paper = replace(paper_match, disparities=levels)(frame)
     results: dict[str, Disparity | Array] = {
         "rover match, filled": fill_background(matched.pixels, np.inf),
         "rover match + rover refine": rover(frame, matched),

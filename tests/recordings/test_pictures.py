@@ -186,5 +186,5 @@ def test_a_picture_leaves_out_what_lies_behind_the_rover_unless_something_is_kno
     cells = np.where(np.isfinite(elevation), 0, -1).astype(np.int8)
     navigation = NavigationMap(0, cells, np.zeros_like(cells, np.uint8), 0.05, (-2.0, 0.0), "level")
     assert paint.navigation_ahead(navigation).cells[1, 30] == 0
-    elevation[1, 3] = 1.0
-    assert paint.terrain_ahead(ElevationMap(0, {"elevation": elevation}, 0.05, (-2.0, 0.0), "level")).shape == (4, 80)
+    behind = np.where(np.arange(80) == 3, np.float32(1.0), elevation)
+    assert paint.terrain_ahead(ElevationMap(0, {"elevation": behind}, 0.05, (-2.0, 0.0), "level")).shape == (4, 80)

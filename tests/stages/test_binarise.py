@@ -131,6 +131,50 @@ def test_noise_of_two_centimetres_is_no_hazard() -> None:
         assert (Binarise()(map_of(noise, maximum=noise + 0.02, minimum=noise - 0.02)).cells == Cell.FREE).all()
 
 
+def test_the_low_back_of_a_rock_belongs_to_it_and_bumps_apart_from_it_do_not() -> None:
+    """A wide rock, 0.22 m high in front, whose back runs down to the ground over 0.8 m."""
+    x, y = grid()
+    rock = (x > 1.5) & (x < 2.3) & (np.abs(y - 2) < 0.5)
+    height = np.where(rock, 0.22 * (1 - (x - 1.5) / 0.8), 0.0)
+    far = np.hypot(x - 3.4, y - 0.6) < 0.12
+    touching = ~rock & (np.abs(x - 1.9) < 0.1) & (y > 2.4) & (y < 2.7)
+    scene = map_of(height + 0.08 * far + 0.04 * touching)
+    back = rock & (height > 0.1) & (height < 0.15)
+    whole, peaks_only = Binarise()(scene), Binarise(skirt=1.0)(scene)
+    assert (whole.reason[back] == Reason.STEP).all()
+    assert (whole.cells[~rock] == Cell.FREE).all()  # the high bump far off, and the low one that touches the rock
+    assert (whole.cells[rock & (height < 0.04)] == Cell.FREE).all()
+    assert (peaks_only.cells[back] == Cell.FREE).mean() > 0.9
+    assert (peaks_only.reason[rock & (height > 0.2)] == Reason.STEP).all()
+
+
+def test_a_cell_whose_height_is_not_known_to_a_step_is_not_free_and_a_hazard_stays_one() -> None:
+    flat = np.zeros((80, 80))
+    flat[60:64, 60:64] = 0.4
+    sigma = np.full(flat.shape, 0.02)
+    sigma[10:20, 10:20], sigma[30, 30], sigma[60:64, 60:64] = 0.1, np.nan, 0.1
+    doubtful = ~(sigma <= 0.05) & (flat == 0)
+    result = Binarise()(map_of(flat, variance=sigma**2))
+    assert (result.reason[doubtful] == Reason.UNOBSERVED).all()
+    assert (result.cells[doubtful] == Cell.UNKNOWN).all()
+    assert (result.cells[~doubtful & (flat == 0)] == Cell.FREE).all()
+    assert (result.cells[flat > 0] == Cell.HAZARD).all()
+    assert (Binarise(max_sigma=0.15)(map_of(flat, variance=sigma**2)).cells == Cell.UNKNOWN).sum() == 1
+    assert (Binarise()(map_of(flat)).cells != Cell.UNKNOWN).all()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("method", ["footprint", "absolute"])
+def test_heights_that_are_not_finite_are_unknown_and_extremes_that_are_not_count_for_nothing(method: str) -> None:
+    flat = np.zeros((40, 40))
+    infinite, top, bottom = flat.copy(), flat.copy(), flat.copy()
+    infinite[5, 5], infinite[6, 6] = np.inf, -np.inf
+    top[20, 20], bottom[20, 20], top[21, 21], bottom[5, 5] = np.inf, -np.inf, np.nan, np.inf
+    result = Binarise(method=method)(map_of(infinite, maximum=top, minimum=bottom))
+    assert np.argwhere(result.cells != Cell.FREE).tolist() == [[5, 5], [6, 6]]
+    assert result.cells[5, 5] == result.cells[6, 6] == Cell.UNKNOWN
+
+
 def test_one_stray_point_in_a_cell_is_no_hazard_but_a_point_on_a_rock_is() -> None:
     flat = np.zeros((80, 80))
     top = flat.copy()

@@ -100,10 +100,18 @@ def test_a_nose_up_rover_sees_the_hill_behind_the_horizon() -> None:
     np.testing.assert_allclose(cloud.points[0], [8 * np.cos(a), 0, 8 * np.sin(a)], atol=1e-6)
 
 
+def test_a_tilt_in_the_cameras_own_frame_needs_no_mount_and_any_other_does() -> None:
+    cloud = cloud_of(scattered(), "left_optical")
+    alone = Level()(cloud, Tilt(0, UP, "left_optical"))
+    np.testing.assert_array_equal(alone.points, Level()(cloud, Tilt(0, UP), BARE).points)
+    with pytest.raises(ValueError, match=r"tilt is in frame 'inclinometer', the cloud in 'left_optical'.*port 'mount'"):
+        Level()(cloud, Tilt(0, UP))
+
+
 def test_a_heading_straight_down_a_wrong_mount_and_a_second_levelling_are_refused() -> None:
     with pytest.raises(ValueError, match="nearly vertical"):
         level_transform(Tilt(0, np.array([0, 0, -1.0])), BARE, "camera")
-    with pytest.raises(ValueError, match="not a rotation"):
+    with pytest.raises(ValueError, match=r"Mount\.camera_from_inclinometer is not a rotation"):
         level_transform(Tilt(0, UP), Mount(0, 2 * np.eye(3)), "camera")
     once = Level()(cloud_of(scattered()), Tilt(0, UP), BARE)
     with pytest.raises(ValueError, match="only once"):

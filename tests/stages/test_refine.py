@@ -11,7 +11,7 @@ from stages.data import Disparity, Source, StereoCamera, StereoFrame
 from stages.kernels.background import fill_background
 from stages.match import Match
 from stages.refine import Refine
-from tests.bench.stereo_scores import PAPER_MATCH, PAPER_REFINE, errors, load_scene
+from tests.bench.stereo_scores import errors, load_scene, paper_stages
 
 SHAPE = HEIGHT, WIDTH = 120, 160
 
@@ -51,15 +51,107 @@ def test_noise_falls_and_holes_close_on_the_right_side_of_edges(box, parameters)
 def test_every_pixel_says_where_it_comes_from(box):
     frame, matches, _ = box
     refined = Refine(superpixels=200)(frame, matches)
-    known = np.isfinite(refined.pixels)
-    assert np.array_equal(refined.source == Source.MEASURED, matches.source == Source.MEASURED)
+    known, matched = np.isfinite(refined.pixels), np.isfinite(matches.pixels)
+    near = np.abs(refined.pixels - matches.pixels) <= 0.5
+    assert near[matched].mean() > 0.9
+    assert np.array_equal(refined.source == Source.MEASURED, near)
+    assert (refined.source[matched & ~near] == Source.PLANE).all()
     assert np.array_equal(refined.source == Source.UNKNOWN, ~known)
     confidence = {code: refined.confidence[refined.source == code] for code in Source}
     assert (confidence[Source.MEASURED] == np.float32(0.8)).all()
-    assert 0.3 < confidence[Source.PLANE].min() <= confidence[Source.PLANE].max() <= 0.5
+    assert refined.confidence[(refined.source == Source.PLANE) & ~matched].min() > 0.3
+    assert confidence[Source.PLANE].max() <= 0.5
     assert 0 < confidence[Source.FILLED].min() <= confidence[Source.FILLED].max() <= 0.25
     assert (confidence[Source.UNKNOWN] == 0).all()
     assert all(part.size for part in confidence.values())
+
+
+@pytest.mark.parametrize("code", [Source.UNKNOWN, Source.PLANE, Source.FILLED])
+def test_what_was_not_measured_is_no_match_whatever_its_pixels_say(box, code):
+    frame, matches, _ = box
+    nowhere = Refine()(frame, replace(matches, source=np.full(SHAPE, code, np.uint8)))
+    assert (nowhere.source == Source.UNKNOWN).all()
+    assert np.isnan(nowhere.pixels).all()
+    source, pixels, confidence = matches.source.copy(), matches.pixels.copy(), matches.confidence.copy()
+    source[10:40, 20:60], pixels[10:40, 20:60], confidence[10:40, 20:60] = code, 35, 1
+    holed = replace(matches, pixels=np.where(source == code, np.nan, pixels).astype(np.float32), source=source)
+    given, wanted = (Refine()(frame, d) for d in (replace(holed, pixels=pixels, confidence=confidence), holed))
+    assert np.array_equal(given.pixels, wanted.pixels, equal_nan=True)
+    assert np.array_equal(given.source, wanted.source)
+
+
+def flat_scene(level=8.0):
+    """A frame of one gray, all of it matched at `level` with full confidence: (frame, pixels, source, confidence)."""
+    image = np.full(SHAPE, 100, np.uint8)
+    frame = StereoFrame(5, image, image, StereoCamera(300, 300, 80, 60, 0.1, WIDTH, HEIGHT))
+    return frame, np.full(SHAPE, level, np.float32), np.ones(SHAPE, np.uint8), np.ones(SHAPE, np.float32)
+
+
+@pytest.mark.parametrize("median", [0, 5])
+def test_a_match_that_is_replaced_is_called_plane_and_loses_its_confidence(median):
+    frame, pixels, source, confidence = flat_scene()
+    pixels[60, 80] = 30
+    matches = Disparity(5, pixels, source, confidence)
+    replaced = Refine(near=1000, plane_weight=1, inlier_share=0, median=median)(frame, matches)
+    assert replaced.pixels[60, 80] == pytest.approx(8, abs=0.01)
+    assert replaced.source[60, 80] == Source.PLANE
+    assert replaced.confidence[60, 80] <= 0.5
+    assert (replaced.source == Source.MEASURED).sum() == HEIGHT * WIDTH - 1
+    kept = Refine(median=median, bilateral_radius=0)(frame, matches)
+    assert (kept.pixels[60, 80], kept.source[60, 80], kept.confidence[60, 80]) == (30, Source.MEASURED, 1)
+
+
+def test_a_lone_match_has_no_median_and_stays():
+    frame, pixels, source, confidence = flat_scene(5.0)
+    pixels[50:70, 60:100], source[50:70, 60:100] = np.nan, 0
+    pixels[60, 80], source[60, 80] = 20, 1
+    refine = Refine(near=1000, fill="none", plane_fill=False, superpixels=1, inlier_share=1)
+    refined = refine(frame, Disparity(5, pixels, source, confidence))
+    assert refined.pixels[60, 80] == pytest.approx(20, abs=0.01)
+
+
+def test_a_match_of_little_confidence_counts_as_unknown():
+    frame, pixels, source, confidence = flat_scene()
+    pixels[30:60, 40:80], confidence[30:60, 40:80] = 40, 0.3
+    matches = Disparity(5, pixels, source, confidence)
+    bare = {"fill": "none", "plane_fill": False}
+    doubted = Refine(trusted=0.31, **bare)(frame, matches)
+    assert np.array_equal(np.isnan(doubted.pixels), confidence < 0.31)
+    assert np.isfinite(Refine(trusted=0.3, **bare)(frame, matches).pixels).all()
+
+
+def test_a_plane_steeper_than_allowed_fills_nothing():
+    frame, pixels, source, confidence = flat_scene()
+    pixels += 0.4 * np.arange(WIDTH, dtype=np.float32)
+    hole = np.s_[50:55, 70:75]
+    pixels[hole], source[hole] = np.nan, 0
+    matches = Disparity(5, pixels, source, confidence)
+    filled = Refine(superpixels=60, fill="none", slope=0.45)(frame, matches)
+    assert (filled.source[hole] == Source.PLANE).all()
+    assert np.abs(filled.pixels[hole] - (8 + 0.4 * np.arange(70, 75))).max() < 0.1
+    assert np.isnan(Refine(superpixels=60, fill="none", slope=0.35)(frame, matches).pixels[hole]).all()
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_plane_is_not_followed_beyond_the_range_of_all_matches(side):
+    frame, pixels, source, confidence = flat_scene(100.0)
+    pixels += side * 0.4 * np.arange(WIDTH, dtype=np.float32)
+    pixels[:, 150:], source[:, 150:] = np.nan, 0
+    matches = Disparity(5, pixels, source, confidence)
+    # One superpixel: its plane would go on to the image's right border.
+    filled = Refine(superpixels=1, fill="none", median=0)(frame, matches)
+    assert np.isfinite(filled.pixels[:, :149]).all()
+    assert np.isnan(filled.pixels[:, 151:]).all()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("bad", [np.inf, -np.inf])
+def test_an_infinite_disparity_is_no_match(box, bad):
+    frame, matches, _ = box
+    pixels, holed = matches.pixels.copy(), matches.pixels.copy()
+    pixels[100:104, 100:104], holed[100:104, 100:104] = bad, np.nan
+    refined, wanted = (Refine()(frame, replace(matches, pixels=given)) for given in (pixels, holed))
+    assert np.array_equal(refined.pixels, wanted.pixels, equal_nan=True)
 
 
 def test_nothing_is_invented_outside_the_right_image(box):
@@ -69,10 +161,10 @@ def test_nothing_is_invented_outside_the_right_image(box):
 
 def test_a_match_far_from_its_plane_is_not_overwritten(box):
     frame, matches, truth = box
-    pixels, confidence = matches.pixels.copy(), matches.confidence.copy()
+    pixels, source, confidence = (np.copy(a) for a in (matches.pixels, matches.source, matches.confidence))
     stone = np.s_[100:106, 120:126]
-    pixels[stone], confidence[stone] = truth[stone] + 6, 0.8
-    refined = Refine(superpixels=60)(frame, replace(matches, pixels=pixels, confidence=confidence))
+    pixels[stone], source[stone], confidence[stone] = truth[stone] + 6, Source.MEASURED, 0.8
+    refined = Refine(superpixels=60)(frame, replace(matches, pixels=pixels, source=source, confidence=confidence))
     assert np.abs(refined.pixels[101:105, 121:125] - truth[101:105, 121:125] - 6).max() < 1
 
 
@@ -85,9 +177,7 @@ def test_the_stamp_decides_every_bit(box):
     assert (runs[0].stamp, runs[0].camera) == (5, frame.camera)
 
 
-@pytest.mark.parametrize(
-    "refine", [Refine(), Refine(**PAPER_REFINE), Refine(fill="none", bilateral_radius=0, median=0)]
-)
+@pytest.mark.parametrize("refine", [Refine(), paper_stages()[1], Refine(fill="none", bilateral_radius=0, median=0)])
 def test_no_match_at_all_stays_no_disparity(box, refine):
     frame, matches, _ = box
     empty = np.full(SHAPE, np.nan, np.float32)
@@ -112,7 +202,8 @@ def test_rover_beats_matching_and_paper_on_real_scenes():
     for name in ("Adirondack", "Motorcycle", "PlaytableP", "Teddy"):
         frame, truth, mask, levels = load_scene(folder / name)
         matches = Match(disparities=levels)(frame)
-        paper = Refine(**PAPER_REFINE)(frame, Match(disparities=levels, **PAPER_MATCH)(frame))
+        paper_match, paper_refine = paper_stages()
+        paper = paper_refine(frame, replace(paper_match, disparities=levels)(frame))
         chain = fill_background(matches.pixels, np.inf), paper.pixels, Refine()(frame, matches).pixels
         scores.append([errors(pixels, truth, mask, levels) for pixels in chain])
     matched, paper, rover = np.mean(scores, axis=0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -81,15 +83,33 @@ def test_nothing_beyond_max_depth_and_nothing_at_all_is_a_legal_cloud() -> None:
     assert none.pixel.shape == none.sigma.shape == (0,)
 
 
-def test_colours_come_from_the_left_image_whatever_its_depth() -> None:
-    random = np.random.default_rng(3)
-    left = random.integers(0, 2**16, (12, 16, 3), np.uint16)
+def test_colours_come_from_the_left_image() -> None:
+    left, right = np.random.default_rng(3).integers(0, 256, (2, 12, 16, 3), np.uint8)
     disparity = as_disparity(np.full((12, 16), 5.0), SMALL)
-    deep = Reproject()(StereoFrame(0, left, left, SMALL), disparity)
-    np.testing.assert_array_equal(deep.colors, (left // 256).reshape(-1, 3))
-    gray = (left[..., 0] // 256).astype(np.uint8)
-    flat = Reproject()(StereoFrame(0, gray, gray, SMALL), disparity)
+    cloud = Reproject()(StereoFrame(0, left, right, SMALL), disparity)
+    np.testing.assert_array_equal(cloud.colors, left.reshape(-1, 3))
+    gray = left[..., 0]
+    flat = Reproject()(StereoFrame(0, gray, right[..., 0], SMALL), disparity)
     np.testing.assert_array_equal(flat.colors, np.repeat(gray.reshape(-1, 1), 3, axis=1))
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_a_deep_image_is_as_bright_as_its_eight_bit_twin_however_many_bits_it_uses(bits: int) -> None:
+    camera = StereoCamera(100.0, 100.0, 32.0, 24.0, 0.2, 64, 48)
+    eight = np.random.default_rng(4).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    deep = eight.astype(np.uint16) << (bits - 8)
+    cloud = Reproject()(StereoFrame(0, deep, deep, camera), as_disparity(np.full((48, 64), 5.0), camera))
+    assert np.abs(cloud.colors.astype(int) - eight.reshape(-1, 3)).max() <= 2
+
+
+def test_the_disparitys_own_camera_goes_before_the_frames() -> None:
+    other = replace(SMALL, baseline=0.4, frame_id="other")
+    pixels = np.full((12, 16), 3.5)
+    cloud = Reproject()(blank_frame(SMALL), as_disparity(pixels, other))
+    assert cloud.points[:, 2] == pytest.approx(100.0 * 0.4 / (3.5 + 1.5))
+    assert cloud.frame_id == "other"
+    unsaid = replace(as_disparity(pixels, other), camera=None)
+    assert Reproject()(blank_frame(SMALL), unsaid).points[:, 2] == pytest.approx(100.0 * 0.2 / (3.5 + 1.5))
 
 
 def test_a_disparity_of_another_size_and_an_unrectified_frame_are_refused() -> None:

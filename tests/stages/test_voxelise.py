@@ -43,6 +43,9 @@ def test_every_point_within_the_region_is_counted_once(seed: int, resolution: fl
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_mirrored_cloud_gives_the_mirrored_map(seed: int) -> None:
     points = scattered(seed)
+    # Of two cells a point on their border belongs to the upper one, and mirrored to the lower one.
+    rows = points[:, 1] / 0.05
+    points = points[np.abs(rows - np.round(rows)) > 1e-4]
     plain = Voxelise()(cloud_of(points, sensor=None))
     mirrored = Voxelise()(cloud_of(points * [1, -1, 1], sensor=None))
     for name, layer in plain.layers.items():

@@ -1,0 +1,59 @@
+"""How the data types take in their arrays: checked, and read-only from then on.
+
+An error names the type and its field, for the types are made from logs as well as by stages.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+
+def publish(owner: object, name: str, shape: tuple[int | None, ...], dtype: DTypeLike) -> None:
+    """Check the array field `name` of a frozen dataclass and make it read-only.
+
+    `None` in `shape` stands for any extent. Raises ValueError with the field's name.
+    """
+    array = np.asarray(getattr(owner, name))
+    where = f"{type(owner).__name__}.{name}"
+    if array.dtype != np.dtype(dtype):
+        raise ValueError(f"{where} must be {np.dtype(dtype)}, not {array.dtype}")
+    if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
+        wanted = ", ".join("n" if extent is None else str(extent) for extent in shape)
+        raise ValueError(f"{where} must have shape ({wanted}), not {array.shape}")
+    object.__setattr__(owner, name, read_only(array))
+
+
+def publish_image(owner: object, name: str) -> None:
+    """Check that the field `name` holds a gray (H, W) or RGB (H, W, 3) image of 8 or 16 bit; make it read-only."""
+    pixels = np.asarray(getattr(owner, name))
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{type(owner).__name__}.{name} must be uint8 or uint16, not {pixels.dtype}")
+    publish(owner, name, (None, None) if pixels.ndim == 2 else (None, None, 3), pixels.dtype)
+
+
+def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: bool = True) -> None:
+    """Publish a float64 copy of a small array given as any array-like."""
+    values = np.array(getattr(owner, name), dtype=np.float64)
+    if finite and not np.isfinite(values).all():
+        raise ValueError(f"{type(owner).__name__}.{name} must be finite, not {values.tolist()}")
+    object.__setattr__(owner, name, values)
+    publish(owner, name, shape, np.float64)
+
+
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """A read-only view. An array that owns its memory becomes read-only itself, so that nobody who still holds it can
+    change what was published; one that is a part or a view of another cannot promise as much for that other."""
+    if array.flags.owndata:
+        array.flags.writeable = False
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def check_rotation(rotation: NDArray[Any], where: str) -> None:
+    """Raise ValueError unless a (3, 3) matrix is orthonormal and right-handed."""
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+        raise ValueError(f"{where} is not a rotation matrix")

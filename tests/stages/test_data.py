@@ -1,0 +1,134 @@
+"""The data types take nothing that is not what they say, and nobody changes them afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stages.data import (
+    Array,
+    CameraModel,
+    Disparity,
+    ElevationMap,
+    Mount,
+    NavigationMap,
+    PointCloud,
+    Pose,
+    StereoFrame,
+    Tilt,
+    Transform,
+)
+from stages.match import Match
+from stages.stage import Stage, parameter
+from tests.stages.terrain_scene import CAMERA, blank_frame
+
+F32, U8 = np.float32, np.uint8
+QUATERNION = np.array([0, 0, 0, 1.0])
+FLAT = np.zeros((2, 3), F32)
+MAKERS: list[Callable[[], Any]] = [
+    lambda: blank_frame(),
+    lambda: Disparity(
+        0, np.zeros((2, 3), F32), np.zeros((2, 3), U8), np.zeros((2, 3), F32), np.zeros((2, 3), np.int32)
+    ),
+    lambda: PointCloud(0, np.zeros((4, 3), F32), np.zeros((4, 3), U8), np.zeros(4, F32), np.zeros(4, np.int32), "c"),
+    lambda: NavigationMap(0, np.zeros((2, 3), np.int8), np.zeros((2, 3), U8), 0.1, (0.0, 0.0), "level"),
+    lambda: Tilt(0, np.array([0, 0, 1.0])),
+    lambda: Pose(0, np.zeros(3), QUATERNION, "odom", "base", np.eye(6)),
+    lambda: Mount(0, np.eye(3)),
+    lambda: Transform("a", "b", np.eye(3), np.zeros(3)),
+    lambda: CameraModel(4, 3, np.eye(3), np.zeros(5), np.eye(3), np.eye(3, 4)),
+]
+
+
+@pytest.mark.parametrize("make", MAKERS)
+def test_arrays_are_read_only_once_published(make: Callable[[], Any]) -> None:
+    item = make()
+    arrays = [value for f in fields(item) if isinstance(value := getattr(item, f.name), np.ndarray)]
+    assert arrays
+    for array in arrays:
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+
+
+def test_layers_of_a_map_are_read_only_and_none_can_be_added() -> None:
+    terrain = ElevationMap(0, {"elevation": FLAT.copy()}, 0.1, (0.0, 0.0), "level")
+    with pytest.raises(ValueError, match="read-only"):
+        terrain.layers["elevation"][0, 0] = 1
+    with pytest.raises(TypeError):
+        terrain.layers["other"] = FLAT  # type: ignore[index]
+
+
+def test_whoever_made_an_array_cannot_change_what_was_published_of_it() -> None:
+    pixels, layer = np.full((2, 3), 7, F32), np.zeros((2, 3), F32)
+    Disparity(0, pixels, np.ones((2, 3), U8), np.ones((2, 3), F32))
+    ElevationMap(0, {"elevation": layer}, 0.1, (0.0, 0.0), "level")
+    for array in (pixels, layer):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0, 0] = 1
+
+
+def test_a_published_part_of_an_array_is_read_only_and_the_rest_is_not() -> None:
+    whole = np.zeros((4, 3), F32)
+    part = Disparity(0, whole[:2], np.zeros((2, 3), U8), np.zeros((2, 3), F32))
+    with pytest.raises(ValueError, match="read-only"):
+        part.pixels[0, 0] = 1
+    whole[3] = 1
+
+
+def test_small_arrays_are_copied_so_that_their_givers_keep_theirs() -> None:
+    up = np.array([0, 0, 1.0])
+    tilt = Tilt(0, up)
+    up[2] = 5
+    assert tilt.up.tolist() == [0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda bad: Pose(0, np.array([0, bad, 0]), QUATERNION, "odom", "base"), "Pose.position must be finite"),
+        (lambda bad: Pose(0, np.zeros(3), np.array([0, 0, bad, 1]), "odom", "base"), "Pose.quaternion must be finite"),
+        (lambda bad: Transform("a", "b", np.eye(3), np.array([bad, 0, 0])), "Transform.translation must be finite"),
+        (lambda bad: Tilt(0, np.array([0, 0, bad])), "Tilt.up must be finite"),
+        (lambda bad: Mount(0, np.diag([1, 1, bad])), "Mount.camera_from_inclinometer must be finite"),
+    ],
+)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_is_refused_by_name(make: Callable[[float], Any], message: str, bad: float) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(bad)
+
+
+def test_an_unknown_covariance_may_be_infinite() -> None:
+    pose = Pose(0, np.zeros(3), QUATERNION, "odom", "base", np.full((6, 6), np.inf))
+    assert pose.covariance is not None
+
+
+@pytest.mark.parametrize("matrix", [2 * np.eye(3), np.diag([1.0, 1, -1]), np.ones((3, 3)), np.zeros((3, 3))])
+def test_a_mount_that_is_not_a_rotation_is_refused(matrix: Array) -> None:
+    with pytest.raises(ValueError, match=r"Mount\.camera_from_inclinometer is not a rotation matrix"):
+        Mount(0, matrix)
+
+
+def test_an_image_of_another_size_than_its_calibration_is_refused() -> None:
+    small = np.zeros((10, 10), U8)
+    with pytest.raises(ValueError, match="images are 10x10, the calibration is for 640x480"):
+        StereoFrame(0, small, small, CAMERA)
+
+
+@dataclass(frozen=True)
+class Free(Stage):
+    """A stage whose parameter has no range."""
+
+    length: float = parameter(1.0, "any length", unit="m")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, F32("nan")])
+def test_a_parameter_that_is_not_finite_is_refused_with_or_without_a_range(value: float) -> None:
+    with pytest.raises(ValueError, match=r"Free\.length must be a finite number of m, not"):
+        Free(length=value)
+    with pytest.raises(ValueError, match=r"Match\.p2 must be a finite number, not"):
+        Match(p2=value)
