@@ -7,6 +7,7 @@ direction by the model that the pipeline file names.
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -40,6 +41,7 @@ _BAYER = {
     "bayer_gbrg": cv2.COLOR_BayerGBRG2RGB,
     "bayer_grbg": cv2.COLOR_BayerGRBG2RGB,
 }
+_PADDING = 1024  # bytes that may follow the end of a compressed image
 _ENCODINGS = _PLAIN | {f"{name}{bits}": (f"u{bits // 8}", 1, code) for name, code in _BAYER.items() for bits in (8, 16)}
 
 
@@ -51,12 +53,28 @@ def stamp_or(header: Any, log_time: int) -> int:
     return stamp or log_time
 
 
-def pixels_of(message: Any) -> Array:
-    """Gray (H, W) or RGB (H, W, 3) pixels, uint8 or uint16, of a sensor_msgs Image or CompressedImage."""
-    return _raw_pixels(message) if hasattr(message, "encoding") else _compressed_pixels(message)
+def frame_of(message: Any) -> str:
+    """The frame_id of a message's header, empty where it has none."""
+    header = getattr(message, "header", None)
+    return str(header.frame_id).lstrip("/") if header is not None else ""
 
 
-def _raw_pixels(message: Any) -> Array:
+def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
+    """Gray (H, W) or RGB (H, W, 3) pixels, uint8 or uint16, of a sensor_msgs Image or CompressedImage.
+
+    size: (width, height) of the calibration; an image of another one is refused before it is unpacked.
+    """
+    return _raw_pixels(message, size) if hasattr(message, "encoding") else _compressed_pixels(message, size)
+
+
+def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
+    if width == 0 or height == 0:
+        raise LogError(f"the image is empty ({width}x{height})")
+    if size is not None and size != (width, height):
+        raise LogError(f"the image is {width}x{height}, its calibration is for {size[0]}x{size[1]}")
+
+
+def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     if message.encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
         raise LogError(f"image encoding '{message.encoding}' is not one of those that can be read ({known})")
@@ -64,8 +82,7 @@ def _raw_pixels(message: Any) -> Array:
     height, width, data = int(message.height), int(message.width), np.asarray(message.data, np.uint8)
     row = width * channels * int(kind[1])
     step = int(message.step) or row
-    if height == 0 or width == 0:
-        raise LogError(f"the image is empty ({width}x{height})")
+    _check_size(width, height, size)
     if step < row:
         raise LogError(f"the image's step of {step} bytes is shorter than a row of {width} {message.encoding} pixels")
     needed = (height - 1) * step + row  # the last row need not be padded
@@ -78,20 +95,41 @@ def _raw_pixels(message: Any) -> Array:
     return _converted(pixels, conversion)
 
 
-def _compressed_pixels(message: Any) -> Array:
+def _compressed_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     data = np.ascontiguousarray(message.data, np.uint8)
     content = data.tobytes()
-    # OpenCV fills the missing part of a cut picture with gray and says nothing.
-    whole = {b"\xff\xd8": content.rstrip(b"\0").endswith(b"\xff\xd9"), b"\x89P": b"IEND" in content[-64:]}
-    if not whole.get(content[:2], True):
+    # OpenCV fills the missing part of a cut picture with gray and says nothing. Padding may follow the end.
+    end = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(content[:2], b"")
+    if end not in content[-_PADDING:]:
         raise LogError(f"the compressed image is cut after {data.size} bytes")
-    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    stated = _stated_size(content)
+    if stated is not None:
+        _check_size(*stated, size)
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if stated else None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         raise LogError(f"the compressed image (format '{message.format}') cannot be decoded; it should be JPEG or PNG")
     encoding = message.format.split(";")[0].strip()
     if pixels.ndim == 2:
         return _converted(pixels, _BAYER.get(encoding.rstrip("0123456789")))
     return _converted(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
+
+
+def _stated_size(content: bytes) -> tuple[int, int] | None:
+    """(width, height) as the head of a PNG or JPEG file states it, None where it is neither."""
+    if content.startswith(b"\x89PNG") and len(content) >= 24:
+        width, height = struct.unpack_from(">II", content, 16)
+        return width, height
+    position = 2
+    while content.startswith(b"\xff\xd8") and position + 9 <= len(content) and content[position] == 0xFF:
+        kind, length = content[position + 1], struct.unpack_from(">H", content, position + 2)[0]
+        if kind == 0xFF:  # filling before a marker
+            position += 1
+        elif 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):  # a start of frame; those are tables
+            height, width = struct.unpack_from(">HH", content, position + 5)
+            return width, height
+        else:
+            position += 2 + length
+    return None
 
 
 def _converted(pixels: Array, conversion: int | None) -> Array:
@@ -109,11 +147,14 @@ def camera_model(info: Any) -> CameraModel:
 def transform_of(message: Any) -> Transform:
     """The transform of a geometry_msgs/TransformStamped."""
     moved, turned = message.transform.translation, message.transform.rotation
-    rotation = rotation_of(turned, f"the transform {message.header.frame_id} <- {message.child_frame_id}")
-    return Transform(
-        message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/"), rotation.as_matrix(),
-        np.array([moved.x, moved.y, moved.z]),
-    )  # fmt: skip
+    parent, child = frame_of(message), message.child_frame_id.lstrip("/")
+    name = f"the transform '{parent}' <- '{child}'"
+    if not parent or not child:
+        raise LogError(f"{name} lacks the name of a frame")
+    translation = np.array([moved.x, moved.y, moved.z])
+    if not np.isfinite(translation).all():
+        raise LogError(f"the translation of {name} is {translation.tolist()}")
+    return Transform(parent, child, rotation_of(turned, name).as_matrix(), translation)
 
 
 def rotation_of(quaternion: Any, what: str) -> Rotation:
@@ -160,8 +201,7 @@ def tilt_of(message: Any, log_time: int, frame_id: str | None = None) -> Tilt:
 def _tilt(message: Any, log_time: int, frame_id: str | None, up: Array) -> Tilt:
     header = getattr(message, "header", None)
     stamp = stamp_or(header, log_time) if header is not None else log_time
-    frame = frame_id or (header.frame_id.lstrip("/") if header is not None else "") or "inclinometer"
-    return Tilt(stamp, up / np.linalg.norm(up), frame)
+    return Tilt(stamp, up / np.linalg.norm(up), frame_id or frame_of(message) or "inclinometer")
 
 
 @dataclass(frozen=True)

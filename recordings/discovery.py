@@ -1,15 +1,16 @@
 """Finds which topics of a log are the stereo pair, its calibrations, the inclinometer and the pose.
 
 By schema first, then by name: two image topics are a pair where exchanging left and right in one name gives the other.
-It never guesses: where two candidates are equal, or none is there, the answer is a sentence that names them and the
-setting that decides.
+It never guesses: where candidates are equal or of different cameras, or none is there, the answer is a sentence that
+names them and the setting that decides.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from typing import Protocol
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -31,7 +32,8 @@ SIDES = (
     (re.compile(r"(?<!\d)0(?!\d)"), "1"),
 )
 _TRANSPORTS = re.compile(r"/(compressed|compressedDepth|ffmpeg|theora)$")
-_NOT_SENSORS = ("/truth/", "/nav/")  # ground truth, and what an earlier run has written; used only where told
+_TRUTH = "/truth/"  # the simulator's ground truth, used only where the settings name some of it
+_RESULTS = "/nav/"  # where an earlier run has written; a pose there is not taken for a sensor's unless told
 _OTHER_IMAGES = re.compile(r"compressedDepth$|(^|[/_])(depth|disparity|mask|truth|confidence|theora)([/_]|$)")
 
 
@@ -70,20 +72,30 @@ class Settings(Protocol):
     def odometry(self) -> str | None: ...
 
 
-def discover(topics: Sequence[Topic], settings: Settings, oriented: Iterable[str], bare_angles: bool) -> Topics:
+def discover(
+    topics: Sequence[Topic],
+    settings: Settings,
+    bare_angles: bool,
+    frame_of: Callable[[str], str],
+    untilted: Callable[[str], str | None],
+) -> Topics:
     """The topics of each role.
 
-    oriented: the Imu topics whose messages do have an orientation; bare_angles: whether the settings say how bare
-    pitch and roll are to be read.
+    bare_angles: whether the settings say how bare pitch and roll are to be read; frame_of: topic -> the frame_id of its
+    messages; untilted: Imu topic -> why it has no orientation, None where it has.
     """
-    told = {settings.left, settings.right, settings.inclinometer, settings.odometry}
-    topics = [topic for topic in topics if topic.name in told or not topic.name.startswith(_NOT_SENSORS)]
+    told = (
+        settings.left, settings.right, settings.left_info, settings.right_info, settings.inclinometer,
+        settings.odometry,
+    )  # fmt: skip
+    if not any(name.startswith(_TRUTH) for name in told if name is not None):
+        topics = [topic for topic in topics if not topic.name.startswith(_TRUTH)]
     found = Topics()
     _find_images(topics, settings, found)
     for side in ("left", "right"):
         if side in found.chosen:
-            _find_info(topics, settings, side, found)
-    _find_tilt(topics, settings, set(oriented), bare_angles, found)
+            _find_info(topics, settings, side, frame_of, found)
+    _find_tilt(topics, settings, bare_angles, untilted, found)
     _find_pose(topics, settings, found)
     return found
 
@@ -106,7 +118,8 @@ def _find_images(topics: Sequence[Topic], settings: Settings, found: Topics) -> 
             found.missing[side] = _not_there(side, given, "image", images)
     if found.missing:
         return
-    candidates = [topic for topic in images if topic.messages and not _OTHER_IMAGES.search(topic.name)]
+    told = settings.left or settings.right  # then only its partner can be the other
+    candidates = [topic for topic in images if topic.messages and (told or not _OTHER_IMAGES.search(topic.name))]
     if settings.left and settings.right:
         found.chosen.update(left=settings.left, right=settings.right)
         return
@@ -129,14 +142,25 @@ def _find_images(topics: Sequence[Topic], settings: Settings, found: Topics) -> 
         remedy = "; set 'left' and 'right' of the source to the topics" if len(candidates) > 1 else ""
         found.missing.update(left=why + remedy, right=why + remedy)
         return
-    best = max(map(_rank, pairs))
-    equal = [pair for pair in pairs if _rank(pair) == best]
+    cameras = dict.fromkeys(map(_camera, pairs))  # topics of two cameras are not better or worse than each other
+    equal = [pair for camera in cameras for pair in _best([pair for pair in pairs if _camera(pair) == camera])]
     if len(equal) > 1:
         listed = ", ".join(f"{left.name} with {right.name}" for left, right in equal)
         why = f"several stereo pairs are equally good ({listed}); set 'left' and 'right' of the source"
         found.missing.update(left=why, right=why)
         return
     found.chosen.update(left=equal[0][0].name, right=equal[0][1].name)
+
+
+def _camera(pair: tuple[Topic, Topic]) -> str:
+    """What names the stereo camera itself: the start that both names share, "/front/" or "/cam"."""
+    shared = takewhile(lambda letters: letters[0] == letters[1], zip(pair[0].name, pair[1].name, strict=False))
+    return "".join(letter for letter, _ in shared)
+
+
+def _best(pairs: Sequence[tuple[Topic, Topic]]) -> list[tuple[Topic, Topic]]:
+    best = max(map(_rank, pairs))
+    return [pair for pair in pairs if _rank(pair) == best]
 
 
 def _rank(pair: tuple[Topic, Topic]) -> tuple[bool, bool, bool]:
@@ -150,7 +174,9 @@ def looks_rectified(topic: str) -> bool:
     return re.search(r"(^|[/_])rect(ified)?([/_]|$)", topic) is not None
 
 
-def _find_info(topics: Sequence[Topic], settings: Settings, side: str, found: Topics) -> None:
+def _find_info(
+    topics: Sequence[Topic], settings: Settings, side: str, frame_of: Callable[[str], str], found: Topics
+) -> None:
     infos = [topic for topic in topics if topic.schema == INFO and topic.messages]
     given = settings.left_info if side == "left" else settings.right_info
     image = found.chosen[side]
@@ -162,13 +188,14 @@ def _find_info(topics: Sequence[Topic], settings: Settings, side: str, found: To
         return
     base = _TRANSPORTS.sub("", image)
     names = {topic.name for topic in infos}
-    for name in (f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info"):
+    for name in (f"{base}/camera_info", f"{base.rpartition('/')[0]}/camera_info"):
         if name in names:
             found.chosen[f"{side}_info"] = name
             return
     pairs = [(left, right) for left in sorted(names) for right in partners(left) if right in names]
-    if len(pairs) == 1:
-        found.chosen[f"{side}_info"] = pairs[0][side == "right"]
+    alike = [pair[side == "right"] for pair in pairs if frame_of(image) == frame_of(pair[side == "right"]) != ""]
+    if len(alike) == 1:
+        found.chosen[f"{side}_info"] = alike[0]
         return
     listed = f"the log's CameraInfo topics are {_listed(infos)}" if infos else "the log has no CameraInfo"
     remedy = f"set '{side}_info' of the source" if infos else "record it, or add it to the log"
@@ -176,7 +203,11 @@ def _find_info(topics: Sequence[Topic], settings: Settings, side: str, found: To
 
 
 def _find_tilt(
-    topics: Sequence[Topic], settings: Settings, oriented: set[str], bare_angles: bool, found: Topics
+    topics: Sequence[Topic],
+    settings: Settings,
+    bare_angles: bool,
+    untilted: Callable[[str], str | None],
+    found: Topics,
 ) -> None:
     given = settings.inclinometer
     if given is not None:
@@ -193,7 +224,8 @@ def _find_tilt(
     candidates = [topic for topic in topics if topic.schema in schemas and topic.messages]
     if bare_angles:
         candidates = [topic for topic in candidates if topic.schema == BARE_TILT]
-    useful = [topic for topic in candidates if topic.schema != IMU or topic.name in oriented]
+    useless = {topic.name: why for topic in candidates if topic.schema == IMU and (why := untilted(topic.name))}
+    useful = [topic for topic in candidates if topic.name not in useless]
     named = [topic for topic in useful if re.search("inclin|tilt", topic.name, re.IGNORECASE)]
     choice = named or useful
     if len(choice) == 1:
@@ -203,7 +235,7 @@ def _find_tilt(
     if len(choice) > 1:
         why = f"several topics could be the inclinometer ({_listed(choice)}); set 'inclinometer' of the source"
     elif candidates:
-        why = f"{_listed(candidates)} holds no orientation (orientation_covariance[0] is -1); record one that does"
+        why = f"{_listed(candidates)} holds no orientation ({next(iter(useless.values()))}); record one that does"
     elif bare and not bare_angles:
         why = _undefined(bare[0])
     else:
@@ -226,14 +258,14 @@ def _find_pose(topics: Sequence[Topic], settings: Settings, found: Topics) -> No
         else:
             found.missing["odometry"] = _not_there("odometry", settings.odometry, "pose", poses)
         return
-    choice = [topic for topic in poses if topic.schema == ODOMETRY]
+    choice = [topic for topic in poses if topic.schema == ODOMETRY and not topic.name.startswith(_RESULTS)]
     if len(choice) == 1:
         found.chosen["odometry"] = choice[0].name
     elif choice:
         found.missing["odometry"] = f"several odometries ({_listed(choice)}); set 'odometry' of the source"
     else:
         other = f" (there is {_listed(poses)}; set 'odometry' of the source to use it)" if poses else ""
-        found.missing["odometry"] = f"the log has no nav_msgs/Odometry{other}"
+        found.missing["odometry"] = f"the log has no nav_msgs/Odometry of a sensor{other}"
 
 
 def _not_there(setting: str, given: str, kind: str, topics: Sequence[Topic]) -> str:

@@ -19,14 +19,16 @@ from scipy.spatial.transform import Rotation
 
 from recordings.discovery import SIDES
 from recordings.errors import LogError
+from recordings.rig import BODY_FROM_OPTICAL
 from recordings.ros2 import Ros2Writer, camera_info, image, imu, transform_message
 from stages.data import Array, CameraModel, Transform
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
 FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
 CAMERAS = {"left": "left_camera_optical", "right": "right_camera_optical"}
-# A camera's axes (x right, y down, z forward) in the rover's (x forward, y left, z up), when it looks straight ahead.
-FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+# Ground truth that data sets put beside their images, as Middlebury's mask0nocc.png.
+_NOT_CAMERAS = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
+_LISTED = 5  # files in a sentence
 _REQUIRED, _OPTIONAL = ("fx", "cx", "cy", "baseline"), ("fy", "cx_right", "width", "height")
 
 
@@ -55,7 +57,7 @@ def import_images(
         )
     if not rate > 0 or not height > 0:
         raise LogError(f"rate ({rate} Hz) and height ({height} m) must be positive")
-    rotation = Rotation.from_euler("YX", [pitch_down, roll], degrees=True).as_matrix() @ FORWARD
+    rotation = Rotation.from_euler("YX", [pitch_down, roll], degrees=True).as_matrix() @ BODY_FROM_OPTICAL
     mounted = Transform("base_link", CAMERAS["left"], rotation, np.array([0.0, 0.0, height]))
     beside = Transform(CAMERAS["left"], CAMERAS["right"], np.eye(3), np.array([values["baseline"], 0.0, 0.0]))
     sensor = Transform("base_link", "imu_link", np.eye(3), np.zeros(3))
@@ -75,23 +77,36 @@ def import_images(
 
 def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
     """The left and the right images of a folder, in order: a-left.png with a-right.png, left/1.png with right/1.png,
-    im0.png with im1.png. Raises LogError where there are none, or one lacks its partner."""
+    im0.png with im1.png. Raises LogError where there are none, or an image has no partner."""
     if not folder.is_dir():
         raise LogError(f"{folder} is not a folder; give the folder that holds the left and right images")
     files = sorted((f for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
-    names = {file.relative_to(folder).as_posix(): file for file in files}
+    named = {file.relative_to(folder).as_posix(): file for file in files}
+    names = {name: file for name, file in named.items() if not _NOT_CAMERAS.search(name)}
     for word, other in SIDES:
-        pairs = [(name, word.sub(other, name)) for name in names if word.search(name)]
-        found = [(one, two) for one, two in pairs if two in names]
-        if not found:
+        partners = {name: word.sub(other, name) for name in names if word.search(name)}
+        pairs = [(one, two) for one, two in partners.items() if two in names and not _counted(one, word, names)]
+        if not pairs:
             continue
-        alone = [one for one, two in pairs if two not in names]
-        if alone and word.pattern.lower() == "left":
-            raise LogError(f"{folder}: {alone[0]} has no right partner; add it, or take the image away")
-        return [names[one] for one, _ in found], [names[two] for _, two in found]
+        paired = {name for pair in pairs for name in pair}
+        if alone := [name for name in names if name not in paired]:
+            more = f" and {len(alone) - _LISTED} more have" if len(alone) > _LISTED else " has"
+            listed = ", ".join(alone[:_LISTED])
+            raise LogError(f"{folder}: {listed}{more} no partner; add it, or take the image away")
+        return [names[one] for one, _ in pairs], [names[two] for _, two in pairs]
     raise LogError(
         f"{folder} holds no image pairs; name them alike but for left/right, l/r or 0/1 ({len(files)} images)"
     )
+
+
+def _counted(name: str, side: re.Pattern[str], names: Mapping[str, Path]) -> bool:
+    """Whether the digit that would be the side of `name` counts images: others have 2, 3, ... in its place."""
+    place = side.search(name)
+    if place is None or not place.group().isdecimal():
+        return False
+    alike = re.compile(re.escape(name[: place.start()]) + r"(\d+)" + re.escape(name[place.end() :]))
+    counts = [int(found.group(1)) for found in map(alike.fullmatch, names) if found is not None]
+    return max(counts) > int(place.group()) + 1
 
 
 def _natural(file: Path, folder: Path) -> list[tuple[int, int, str]]:

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.mcap_index import Lost
-from recordings.mcap_source import CAMERAS, McapLog, McapSource, peek_stamp
+from recordings.mcap_log import McapLog
+from recordings.mcap_opening import CAMERAS, peek_stamp
+from recordings.mcap_source import McapSource
 from stages.data import Tilt
 
 SLOP = 5_000_000  # ns between the two images of a frame
@@ -25,7 +27,7 @@ def describe(path: Path, source: McapSource) -> dict[str, Any]:
     source: how the log's streams are found, as in a pipeline file.
     """
     with source.open(Path(path)) as log:
-        damage = sorted({f"{lost.reason}" for lost in log.file.index.lost})
+        damage = sorted({lost.reason for lost in log.file.index.lost} | {str(problem) for _, problem in log.problems})
         stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
         tilted = _tilted(stamps["left"], _tilts(log, damage))
         return {
@@ -50,7 +52,7 @@ def describe(path: Path, source: McapSource) -> dict[str, Any]:
             "transforms": log.static.listed(),
             "mount": _mount(log),
             "missing": dict(log.missing),
-            "damage": damage,
+            "damage": list(dict.fromkeys(damage)),
         }
 
 
@@ -95,9 +97,9 @@ def format_description(description: dict[str, Any]) -> str:
 
 def _topics(log: McapLog) -> list[dict[str, Any]]:
     index, found = log.file.index, []
-    for channel in sorted(index.channels.values(), key=lambda channel: channel.topic):
+    for channel in sorted(index.channels.values(), key=lambda channel: (channel.topic, channel.id)):
         schema = index.schemas.get(channel.schema_id)
-        times = log.file.times(channel.topic)
+        times = log.file.times({channel.id})
         gaps = np.diff(times)
         span = float(times[-1] - times[0]) / 1e9 if times.size > 1 else 0.0
         found.append(
@@ -118,7 +120,7 @@ def _stamps(log: McapLog, stream: str, damage: list[str]) -> Stamps:
     if stream not in log.topics:
         return np.zeros(0, np.int64)
     topic, stamps = log.topics[stream], []
-    for raw in log.file.messages(log.file.channels_of([topic])):
+    for raw in log.file.messages(log.channels(stream)):
         if not isinstance(raw, Lost):
             stamps.append(peek_stamp(raw.data) or raw.log_time)
         elif raw.channel is not None:

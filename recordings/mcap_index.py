@@ -1,11 +1,11 @@
-"""Finds where the messages of an MCAP file are: from its summary where that is whole, else by walking all of it once.
+"""Finds where the messages of an MCAP file are from its summary, where that is whole (else `mcap_walk` does).
 
-Both ways give the same `Index`, so reading knows one way only. The walk goes on behind a broken chunk, rescues what a
-cut one still holds, and notes each loss.
+Both ways give the same `Index`, so reading knows one way only.
 """
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from array import array
@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
@@ -23,13 +22,12 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
-BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
+BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError, OSError)
 
 RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_CHUNK = struct.Struct("<QQQII")  # start time, end time, size, CRC, length of the compression's name
 _FOOTER_LENGTH = 20
-_PRIVATE = 0x80  # from here on, opcodes are free for private use
+_SECTION = 1 << 30  # bytes; of a longer summary, or header, not all is read
 _TAIL = RECORD.size + _FOOTER_LENGTH + len(MAGIC)
 
 
@@ -78,10 +76,12 @@ class Index:
     counts: tuple[int, int, int] | None = None
     profile: str = ""
     walked: bool = False
+    latest: int = 0  # the last log time seen, ns
 
     def seen(self, channel: int, log_time: int) -> None:
         """Count one message."""
         self.times.setdefault(channel, array("Q")).append(log_time)
+        self.latest = max(self.latest, log_time)
 
     def define(self, opcode: int, content: bytes | memoryview) -> None:
         """Take note of a schema or channel; other records do not matter."""
@@ -96,8 +96,7 @@ class Index:
 
     def lose(self, reason: str, log_time: int | None = None) -> None:
         """Note damage whose messages are not known; without a time, behind all that was seen."""
-        latest = max((max(times) for times in self.times.values()), default=0)
-        self.lost.append(Lost(None, latest if log_time is None else log_time, reason))
+        self.lost.append(Lost(None, self.latest if log_time is None else log_time, reason))
 
 
 def _check_read(record: Schema | Channel, content: bytes | memoryview) -> None:
@@ -125,8 +124,19 @@ def from_summary(file: BinaryIO, size: int) -> Index | None:
         return None
     with suppress(*BROKEN):  # without its header a log can be read as well
         _, length = RECORD.unpack(read(file, len(MAGIC), RECORD.size))
-        index.profile = Header.read(_stream(read(file, len(MAGIC) + RECORD.size, min(length, size)))).profile
+        index.profile = profile_of(read(file, len(MAGIC) + RECORD.size, min(length, _SECTION)))
     return index
+
+
+def own_statistics(file: BinaryIO, size: int) -> dict[int, int]:
+    """How many messages a file's own statistics count by channel; empty where it has none."""
+    index = _summary(file, size)
+    return index.expected if index is not None else {}
+
+
+def profile_of(content: bytes) -> str:
+    """The profile that a header record names."""
+    return str(Header.read(_stream(content)).profile)
 
 
 def _summary(file: BinaryIO, size: int) -> Index | None:
@@ -139,7 +149,10 @@ def _summary(file: BinaryIO, size: int) -> Index | None:
     footer = Footer.read(_stream(tail[RECORD.size : -len(MAGIC)]))
     if not len(MAGIC) < footer.summary_start < size - _TAIL:
         return None
-    section = read(file, footer.summary_start, size - _TAIL - footer.summary_start)
+    length = size - _TAIL - footer.summary_start
+    if length > _SECTION:
+        return None
+    section = read(file, footer.summary_start, length)
     if footer.summary_crc and zlib.crc32(tail[: RECORD.size + 16], zlib.crc32(section)) != footer.summary_crc:
         return None
     index = Index()
@@ -158,98 +171,13 @@ def _summary(file: BinaryIO, size: int) -> Index | None:
     return index
 
 
-def walk(file: BinaryIO, size: int) -> Index:
-    """The index of a file that carries none, or a broken one, from its data section."""
-    index = Index(walked=True)
-    if summary := _summary(file, size):
-        index.expected = summary.expected
-    checksum, position, before = zlib.crc32(MAGIC), len(MAGIC), 0
-    while True:
-        head = read(file, position, RECORD.size)
-        opcode, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
-        content = read(file, position + RECORD.size, min(length, size))
-        if opcode == 0 or len(content) < length:
-            _note_cut(index, opcode, content, position, size)
-            return index
-        if opcode == Opcode.DATA_END and 4 <= length < MESSAGE.size:  # a longer one was once something else
-            if struct.unpack_from("<I", content)[0] not in (0, checksum):
-                index.lose("the CRC of the data section does not match: messages in it were changed, not known which")
-            return index
-        try:
-            _note(index, opcode, content, position, before)
-        except BROKEN as error:
-            index.lose(f"the record at byte {position} is broken ({said(error)})")
-        checksum = zlib.crc32(content, zlib.crc32(head, checksum))
-        position, before = position + RECORD.size + length, opcode
-
-
-def _note(index: Index, opcode: int, content: bytes, position: int, before: int) -> None:
-    """Take note of one record of the data section. before: the opcode of the one before it.
-
-    A record that cannot be where it is was something else before it was damaged, perhaps messages: that raises.
-    """
-    if opcode == Opcode.CHUNK:
-        _note_chunk(index, content, position)
-    elif opcode == Opcode.MESSAGE:
-        channel, _, log_time, _ = MESSAGE.unpack_from(content)
-        start = position + RECORD.size + MESSAGE.size
-        index.loose.append(Loose(channel, log_time, start, len(content) - MESSAGE.size))
-        index.seen(channel, log_time)
-    elif opcode == Opcode.HEADER and before == 0:
-        index.profile = Header.read(_stream(content)).profile
-    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-        index.define(opcode, content)
-    elif opcode == Opcode.MESSAGE_INDEX:
-        (listed,) = struct.unpack_from("<I", content, 2)
-        if before not in (Opcode.CHUNK, Opcode.MESSAGE_INDEX) or listed % 16 or listed > len(content) - 6:
-            raise ValueError("a message index without its chunk")
-    elif opcode not in (Opcode.ATTACHMENT, Opcode.METADATA) and opcode < _PRIVATE:
-        raise ValueError(f"a record of kind {opcode} has no place there")
-
-
-def _note_chunk(index: Index, content: bytes, position: int) -> None:
-    try:
-        inside = list(records(unpacked(content)))
-    except BROKEN as error:
-        start = _CHUNK.unpack_from(content)[0]
-        index.lose(f"the chunk at byte {position} is broken and its messages are lost ({said(error)})", start)
-        return
-    offsets, times = {}, []
-    for opcode, record in inside:
-        if opcode == Opcode.MESSAGE:
-            channel, _, log_time, _ = MESSAGE.unpack_from(record)
-            offsets[channel] = 0
-            times.append(log_time)
-            index.seen(channel, log_time)
-        else:
-            index.define(opcode, record)
-    if times:
-        chunk = ChunkIndex(
-            chunk_length=RECORD.size + len(content), chunk_start_offset=position, compression="", compressed_size=0,
-            message_end_time=max(times), message_index_length=0, message_index_offsets=offsets,
-            message_start_time=min(times), uncompressed_size=0,
-        )  # fmt: skip
-        index.chunks.append(chunk)
-
-
-def _note_cut(index: Index, opcode: int, content: bytes, position: int, size: int) -> None:
-    """Rescue what a cut chunk still holds, and note the cut."""
-    if opcode == Opcode.CHUNK:
-        with suppress(*BROKEN):  # nothing more is to be had then
-            for inner, record in records(_unpacked_start(content), whole=False):
-                if inner == Opcode.MESSAGE:
-                    index.rescued.append(raw(record))
-                    index.seen(index.rescued[-1].channel, index.rescued[-1].log_time)
-                else:
-                    index.define(inner, record)
-    count = sum(map(len, index.times.values()))
-    index.lose(f"the log is cut or damaged at byte {position} of {size}; {count} messages were read before that")
-
-
 def read(file: BinaryIO, offset: int, size: int) -> bytes:
-    """At most `size` bytes from `offset`."""
+    """At most `size` bytes from `offset`; none where the file does not reach so far."""
+    there = os.fstat(file.fileno()).st_size - offset
+    if there <= 0:
+        return b""
     file.seek(offset)
-    return file.read(size)
+    return file.read(min(size, there))
 
 
 def records(section: bytes, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
@@ -270,45 +198,6 @@ def raw(content: memoryview) -> Raw:
     """The message of a message record."""
     channel, _, log_time, _ = MESSAGE.unpack_from(content)
     return Raw(channel, log_time, content[MESSAGE.size :])
-
-
-def unpacked(content: bytes) -> bytes:
-    """The records of a chunk record, decompressed, size and CRC checked."""
-    _, _, size, checksum, _ = _CHUNK.unpack_from(content)
-    compression, packed, length = _packed(content)
-    if len(packed) != length:
-        raise ValueError(f"{len(packed)} of {length} bytes are there")
-    if compression == "zstd":
-        data = zstandard.decompress(packed, size) if size else b""
-    elif compression == "lz4":
-        data = bytes(lz4.frame.decompress(packed))
-    elif not compression:
-        data = bytes(packed)
-    else:
-        raise ValueError(f"compression '{compression}' is not known, only zstd, lz4 and none are")
-    if len(data) != size:
-        raise ValueError(f"it unpacks to {len(data)} bytes, not {size}")
-    if checksum and zlib.crc32(data) != checksum:
-        raise ValueError("its CRC does not match")
-    return data
-
-
-def _unpacked_start(content: bytes) -> bytes:
-    """As much of a cut chunk as can still be decompressed; there is no CRC for a part."""
-    compression, packed, _ = _packed(content)
-    if compression == "zstd":
-        return bytes(zstandard.ZstdDecompressor().decompressobj().decompress(packed))
-    if compression == "lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed))
-    return b"" if compression else bytes(packed)
-
-
-def _packed(content: bytes) -> tuple[str, memoryview, int]:
-    """Compression, the compressed bytes, and how many they should be."""
-    name_end = _CHUNK.size + _CHUNK.unpack_from(content)[-1]
-    (length,) = struct.unpack_from("<Q", content, name_end)
-    view = memoryview(content)
-    return str(view[_CHUNK.size : name_end], "utf-8"), view[name_end + 8 : name_end + 8 + length], length
 
 
 def said(error: BaseException) -> str:

@@ -20,21 +20,9 @@ from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
 from recordings.errors import LogError
-from recordings.mcap_index import (
-    BROKEN,
-    MAGIC,
-    RECORD,
-    Loose,
-    Lost,
-    Raw,
-    from_summary,
-    raw,
-    read,
-    records,
-    said,
-    unpacked,
-    walk,
-)
+from recordings.mcap_chunk import LARGEST, unpacked
+from recordings.mcap_index import BROKEN, MAGIC, RECORD, Loose, Lost, Raw, from_summary, raw, read, records, said
+from recordings.mcap_walk import walk
 from recordings.ros2_types import decoder_for
 
 
@@ -92,9 +80,9 @@ class McapFile:
         if start is None and end is None:
             yield from self._unaccounted(found)
 
-    def times(self, topic: str) -> NDArray[np.int64]:
-        """The log times of a topic's messages, ns, sorted; where the file is indexed, without reading the messages."""
-        channels, found = self.channels_of([topic]), list[int]()
+    def times(self, channels: set[int]) -> NDArray[np.int64]:
+        """The log times of channels' messages, ns, sorted; where the file is indexed, without reading the messages."""
+        found = list[int]()
         if self.index.walked:
             for channel in channels:
                 found.extend(self.index.times.get(channel, ()))
@@ -103,9 +91,9 @@ class McapFile:
                 found.extend(item.log_time for item in self._contents(chunk) if item.channel in channels)
         return np.sort(np.array(found, dtype=np.uint64).astype(np.int64))
 
-    def count(self, topic: str) -> int:
-        """How many messages of a topic the file holds, by its statistics or by the walk."""
-        channels, index = self.channels_of([topic]), self.index
+    def count(self, channels: set[int]) -> int:
+        """How many messages of the channels the file holds, by its statistics or by the walk."""
+        index = self.index
         if index.walked:
             return sum(len(index.times.get(channel, ())) for channel in channels)
         return sum(index.expected.get(channel, 0) for channel in channels)
@@ -155,11 +143,12 @@ class McapFile:
         return lost or [Lost(None, chunk.message_start_time, reason)]
 
     def _chunk_messages(self, chunk: ChunkIndex) -> list[Raw]:
-        record = read(self._file, chunk.chunk_start_offset, min(chunk.chunk_length, self.size))
-        expected = (int(Opcode.CHUNK), chunk.chunk_length - RECORD.size)
-        if len(record) < RECORD.size or RECORD.unpack_from(record) != expected:
+        length = chunk.chunk_length - RECORD.size
+        head = read(self._file, chunk.chunk_start_offset, RECORD.size)
+        if len(head) < RECORD.size or RECORD.unpack(head) != (int(Opcode.CHUNK), length):
             raise ValueError("no chunk is where the index has one")
-        inside = records(unpacked(record[RECORD.size :]))
+        content = read(self._file, chunk.chunk_start_offset + RECORD.size, min(length, LARGEST))
+        inside = records(unpacked(content))
         return [raw(content) for opcode, content in inside if opcode == Opcode.MESSAGE]
 
     def _loose_message(self, loose: Loose) -> Raw:
@@ -177,7 +166,7 @@ class McapFile:
         """(channel, log time) of each message, from the message index behind a chunk; empty where there is none."""
         found: list[tuple[int, int]] = []
         first = chunk.chunk_start_offset + chunk.chunk_length
-        for opcode, content in records(read(self._file, first, min(chunk.message_index_length, self.size))):
+        for opcode, content in records(read(self._file, first, min(chunk.message_index_length, LARGEST))):
             if opcode == Opcode.MESSAGE_INDEX:
                 channel, size = struct.unpack_from("<HI", content)
                 pairs = np.frombuffer(content, "<u8", size // 8, 6)

@@ -1,7 +1,7 @@
 """Writes every intermediate of a run into a rerun recording, for the debugging desk of `recordings.desk`.
 
-The pictures are in `recordings.drawings`; this is their clock, their ledger and their file. The file grows under a
-temporary name and takes its own when it is finished; rerun's errors, by its default mere warnings, are raised.
+The pictures are in `recordings.drawings`; this is their clock, their ledger and their file. rerun's errors, by
+its default mere warnings, are raised.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from recordings.desk import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Pane
 from recordings.drawings import PICTURES, Canvas
 from recordings.errors import LogError
 from recordings.frame_record import FrameRecord, LossEntry
+from recordings.whole_file import give_name, temporary_name, unwritable
 from stages.data import Array, StereoFrame
 
 END = b"RRF2FOOT"  # the last magic number of a whole recording, before a checksum of 4 bytes
@@ -45,6 +46,7 @@ class RerunSink:
             raise ValueError(f"RerunSink.max_points must be at least 1, not {self.max_points}")
         if not 1 <= self.jpeg_quality <= 100:
             raise ValueError(f"RerunSink.jpeg_quality must be 1 to 100, not {self.jpeg_quality}")
+        self._closed = True
 
     def wants(self, stream: str, kind: type) -> bool:
         """Whether there is a picture of items of type `kind`."""
@@ -53,23 +55,33 @@ class RerunSink:
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Begin a recording. streams: name -> type of item, in the pipeline's order; about: what to say of the run."""
         self._path, self._streams, self._about = Path(path), tuple(streams), dict(about)
-        self._partial = self._path.with_name(self._path.name + ".partial")
+        self._partial = temporary_name(self._path)
         self._stamp: int | None = None
-        self._frames, self._hung, self._closed = 0, -1, False
+        self._frames, self._hung = 0, -1
         try:
             self._partial.open("wb").close()
         except OSError as error:
-            raise self._unwritable(error.strerror or str(error)) from error
-        with catch_and_log_exceptions(strict=True):
-            self._recording = rr.RecordingStream(self.application_id)
-            self._recording.set_log_time_enabled(False)
-            self._recording.set_sinks(rr.FileSink(str(self._partial)))
-            self._recording.send_recording_name(self._about.get("log", self._path.stem))
-            self._recording.log(SUMMARY, _document("RUNNING", self._about), static=True)
+            raise unwritable(self._path, error.strerror or str(error)) from error
+        try:
+            with catch_and_log_exceptions(strict=True):
+                self._begin()
+        except BaseException:
+            self._partial.unlink(missing_ok=True)
+            raise
         self._canvas = Canvas(self._recording, self.jpeg_quality, self.max_points)
+        self._closed = False
+
+    def _begin(self) -> None:
+        self._recording = rr.RecordingStream(self.application_id)
+        self._recording.set_log_time_enabled(False)
+        self._recording.set_sinks(rr.FileSink(str(self._partial)))
+        self._recording.send_recording_name(self._about.get("log", self._path.stem))
+        self._recording.log(SUMMARY, _document("RUNNING", self._about), static=True)
 
     def write(self, record: FrameRecord) -> None:
         """Draw one frame. May be called from any thread, one call at a time."""
+        if self._closed:
+            raise LogError("RerunSink is not open")
         with catch_and_log_exceptions(strict=True):
             self._set_clocks(record.stamp, self._frames)
             captions = self._draw(record.items)
@@ -83,7 +95,7 @@ class RerunSink:
         self._frames += 1
 
     def close(self, summary: Mapping[str, Any]) -> None:
-        """End the recording with the run's verdict and give it its name. Closing twice does nothing."""
+        """End the recording with the run's verdict and give it its name. Does nothing where none is open."""
         if self._closed:
             return
         self._closed = True
@@ -103,7 +115,7 @@ class RerunSink:
             self._publish()
         except (OSError, RuntimeError) as error:  # rerun says RuntimeError where its file could not be written
             self._partial.unlink(missing_ok=True)
-            raise self._unwritable(getattr(error, "strerror", None) or str(error)) from error
+            raise unwritable(self._path, getattr(error, "strerror", None) or str(error)) from error
 
     def _publish(self) -> None:
         """Finish the file, and name it if its end is there: of a disk that is full rerun tells late, or nobody."""
@@ -114,7 +126,7 @@ class RerunSink:
             whole = END in file.read()
         if not whole:
             raise OSError("its end is missing, as after a full disk")
-        self._partial.replace(self._path)
+        give_name(self._partial, self._path)
 
     def _set_clocks(self, stamp: int, frame: int) -> None:
         """rerun's clocks belong to the calling thread, so every call from outside sets them first."""
@@ -162,9 +174,6 @@ class RerunSink:
         if len(self._canvas.hung) != self._hung:
             self._hung = len(self._canvas.hung)
             self._recording.send_blueprint(desk(self._canvas.hung.values()))
-
-    def _unwritable(self, reason: str) -> LogError:
-        return LogError(f"cannot write {self._path}: {reason}; choose another place for the output or make room there")
 
 
 def _last(items: Mapping[str, Any], kind: type) -> list[str]:

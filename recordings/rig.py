@@ -15,10 +15,17 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings.decode import camera_model, transform_of
+from recordings.decode import transform_of
 from recordings.discovery import looks_rectified
 from recordings.errors import LogError
 from stages.data import Array, CameraModel, Mount, Transform
+
+# A camera's axes (x right, y down, z forward) in the rover's (x forward, y left, z up), when it looks straight ahead.
+BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+_SAME = 1e-6  # m and matrix elements; two transforms of the same frames that differ by more contradict each other
+_PARALLEL = 1e-3  # rad; cameras turned against each other by less need no rectification: a pixel at 1000 px
+_BESIDE = 0.01  # of the baseline; and so for cameras that are shifted against each other by less in y and z
 
 
 @dataclass
@@ -26,18 +33,27 @@ class Frames:
     """The static transforms of a log, as a graph in which any two connected frames have a transform."""
 
     edges: dict[str, dict[str, Transform]] = field(default_factory=dict)
-    given: set[tuple[str, str]] = field(default_factory=set)
+    parents: dict[str, str] = field(default_factory=dict)
 
     def add(self, message: Any) -> None:
-        """Add the transforms of a tf2_msgs/TFMessage; a later one of the same frames replaces an earlier."""
-        for item in message.transforms:
-            transform = transform_of(item)
-            self.given.add((transform.parent, transform.child))
-            self.edges.setdefault(transform.parent, {})[transform.child] = transform
-            self.edges.setdefault(transform.child, {})[transform.parent] = transform.inverse()
+        """Add a geometry_msgs/TransformStamped. Raises LogError, and keeps what is there, where it contradicts that."""
+        transform = transform_of(message)
+        parent, child = transform.parent, transform.child
+        known = self.between(parent, child)
+        if known is None:
+            if child in self.parents:
+                raise LogError(f"'{child}' has two parents, '{self.parents[child]}' and '{parent}'; the first is used")
+            self.edges.setdefault(parent, {})[child] = transform
+            self.edges.setdefault(child, {})[parent] = transform.inverse()
+            self.parents[child] = parent
+        elif not _same(known, transform):
+            raise LogError(f"the transform '{parent}' <- '{child}' contradicts an earlier one; the earlier one is used")
 
     def between(self, parent: str, child: str) -> Transform | None:
-        """The transform from `child` to `parent`, along the fewest steps; None where nothing connects them."""
+        """The transform from `child` to `parent`, along the fewest steps; None where nothing connects them, or one has
+        no name."""
+        if not parent or not child:
+            return None
         reached = {parent: Transform(parent, parent, np.eye(3), np.zeros(3))}
         queue = deque([parent])
         while queue and child not in reached:
@@ -50,7 +66,13 @@ class Frames:
 
     def listed(self) -> list[str]:
         """Each transform of the log as "parent <- child", sorted."""
-        return sorted(f"{parent} <- {child}" for parent, child in self.given)
+        return sorted(f"{parent} <- {child}" for child, parent in self.parents.items())
+
+
+def _same(one: Transform, other: Transform) -> bool:
+    return np.allclose(one.rotation, other.rotation, rtol=0, atol=_SAME) and np.allclose(
+        one.translation, other.translation, rtol=0, atol=_SAME
+    )
 
 
 @dataclass(frozen=True)
@@ -62,34 +84,41 @@ class Camera:
     frame_id: str
 
 
-def calibrated_pair(left: Any, right: Any, topics: tuple[str, str], frames: Frames) -> tuple[Camera, Camera]:
-    """The two cameras of a stereo pair.
+def calibrated_pair(
+    models: tuple[CameraModel, CameraModel], names: tuple[str, str], topics: tuple[str, str], frames: Frames
+) -> tuple[Camera, Camera]:
+    """The two cameras of a stereo pair, left and right.
 
-    left, right: their CameraInfo; topics: of their images. The baseline is that of the projection matrices, or where
-    these have none (two single calibrations), that of the static transform between the cameras. Raises LogError where
-    the log does not tell it.
+    models: as their CameraInfo tell them; names: of their frames; topics: of their images. The baseline is that of the
+    projection matrices, or where these have none (two single calibrations), that of the static transform between the
+    cameras. Raises LogError where the log does not tell it.
     """
-    models = [_checked(info, topic) for info, topic in zip((left, right), topics, strict=True)]
-    rectified = [looks_rectified(t) or is_ideal(model) for t, model in zip(topics, models, strict=True)]
-    if rectified[0] != rectified[1]:
+    left, right = (_checked(model, topic) for model, topic in zip(models, topics, strict=True))
+    called = [looks_rectified(topic) for topic in topics]
+    states = [name or is_ideal(model) for name, model in zip(called, (left, right), strict=True)]
+    if any(called) and not all(states):
         raise LogError(f"of {topics[0]} and {topics[1]} only one is rectified; set 'left' and 'right' to two alike")
-    names = [info.header.frame_id.lstrip("/") for info in (left, right)]
-    if models[0].p[0, 3] == 0 and models[1].p[0, 3] == 0:
-        placed = frames.between(names[0], names[1])
-        if placed is None or not np.any(placed.translation):
-            raise LogError(
-                "the log does not tell the baseline: P[0,3] of the right CameraInfo is 0 and no static transform "
-                f"joins '{names[0]}' and '{names[1]}'; record the stereo calibration"
-            )
-        models = _joined(models[0], models[1], placed, rectified[0])
-    baseline = models[0].p[0, 3] / models[0].p[0, 0] - models[1].p[0, 3] / models[1].p[0, 0]
+    singles = left.p[0, 3] == 0 and right.p[0, 3] == 0
+    placed = _placed(names, frames) if singles else None
+    rectified = all(states) and (placed is None or _beside(left, right, placed))
+    if any(called) and not rectified:
+        raise LogError(
+            f"{topics[0]} and {topics[1]} are called rectified, but the static transform between them says that "
+            "they are not parallel; record the stereo calibration, or the images before rectification"
+        )
+    if not rectified and min(left.k[0, 0], right.k[0, 0]) <= 0:
+        raise LogError(f"{topics[0]} and {topics[1]} are not rectified, and K of a CameraInfo is 0; calibrate them")
+    if placed is not None:
+        left, right = (_joined if rectified else _rectifying)(left, right, placed)
+    baseline = float(left.p[0, 3]) / float(left.p[0, 0]) - float(right.p[0, 3]) / float(right.p[0, 0])
+    if not np.isfinite(baseline):
+        raise LogError(f"P of the CameraInfo of {topics[0]} or {topics[1]} tells no baseline; calibrate them again")
     if not baseline > 0:
         raise LogError(
             f"the baseline is {baseline:.4g} m, so {topics[0]} is the right camera: exchange 'left' and 'right' "
             "of the source"
         )
-    one, other = (Camera(m, r, n) for m, r, n in zip(models, rectified, names, strict=True))
-    return one, other
+    return Camera(left, rectified, names[0]), Camera(right, rectified, names[1])
 
 
 def is_ideal(model: CameraModel) -> bool:
@@ -97,25 +126,63 @@ def is_ideal(model: CameraModel) -> bool:
     return not np.any(model.d) and np.allclose(model.r, np.eye(3)) and np.allclose(model.k, model.p[:, :3])
 
 
-def _checked(info: Any, topic: str) -> CameraModel:
+def _checked(model: CameraModel, topic: str) -> CameraModel:
     """The calibration; where a single camera left R or P out (zeros), those of a camera that needs no rectification."""
-    if info.k[0] <= 0 and info.p[0] <= 0:
+    whose = f"the CameraInfo of {topic}"
+    if model.k[0, 0] <= 0 and model.p[0, 0] <= 0:
         raise LogError(f"the camera of {topic} is not calibrated (K and P of its CameraInfo are 0); calibrate it")
-    model = camera_model(info)
     if not np.any(model.r):
         model = replace(model, r=np.eye(3))
     if not np.any(model.p):
         model = replace(model, p=np.hstack([model.k, np.zeros((3, 1))]))
+    if model.p[0, 0] <= 0 or model.p[1, 1] <= 0:
+        raise LogError(f"the focal lengths in P of {whose} are not positive; calibrate the camera again")
+    if model.width <= 0 or model.height <= 0:
+        raise LogError(f"{whose} is for images of {model.width}x{model.height}; calibrate the camera again")
     return model
 
 
-def _joined(left: CameraModel, right: CameraModel, placed: Transform, rectified: bool) -> list[CameraModel]:
-    """The pair with the baseline that a transform (right camera in the left's frame) tells."""
-    if rectified:
-        baseline = float(np.copysign(np.linalg.norm(placed.translation), placed.translation[0]))
-        projection = right.p.copy()
-        projection[0, 3] = -projection[0, 0] * baseline
-        return [left, replace(right, p=projection)]
+def _placed(names: tuple[str, str], frames: Frames) -> Transform:
+    """The right camera in the left's frame. Raises LogError where no transform tells, or it is not beside the left."""
+    placed = frames.between(*names)
+    if placed is None or not np.any(placed.translation):
+        raise LogError(
+            "the log does not tell the baseline: P[0,3] of the right CameraInfo is 0 and no static transform "
+            f"joins '{names[0]}' and '{names[1]}'; record the stereo calibration"
+        )
+    if abs(placed.translation[0]) < 0.9 * np.linalg.norm(placed.translation):
+        raise LogError(
+            f"the static transform '{placed.parent}' <- '{placed.child}' has the right camera at "
+            f"{placed.translation.tolist()} m, not beside the left one: these are not optical frames (x right, y down, "
+            "z forward); name such in CameraInfo"
+        )
+    return placed
+
+
+def _beside(left: CameraModel, right: CameraModel, placed: Transform) -> bool:
+    """Whether two cameras, each as its rectified image, look in parallel from two places along x, with alike lenses.
+
+    placed: the right camera in the left's frame.
+    """
+    turned = Rotation.from_matrix(left.r @ placed.rotation @ right.r.T).magnitude()
+    x, y, z = left.r @ placed.translation
+    lenses = ([0, 1, 1], [0, 1, 2])  # fx, fy, cy
+    return bool(
+        turned < _PARALLEL
+        and max(abs(y), abs(z)) < _BESIDE * abs(x)
+        and np.allclose(left.p[lenses], right.p[lenses], rtol=1e-3)
+    )
+
+
+def _joined(left: CameraModel, right: CameraModel, placed: Transform) -> tuple[CameraModel, CameraModel]:
+    """A rectified pair, with the baseline that a transform (right camera in the left's frame) tells."""
+    projection = right.p.copy()
+    projection[0, 3] = -projection[0, 0] * (left.r @ placed.translation)[0]
+    return left, replace(right, p=projection)
+
+
+def _rectifying(left: CameraModel, right: CameraModel, placed: Transform) -> tuple[CameraModel, CameraModel]:
+    """The pair with the R and P that rectify it, where a transform (right camera in the left's frame) places it."""
     inverse = placed.inverse()
     moved = inverse.translation.reshape(3, 1)
     size = (left.width, left.height)
@@ -128,7 +195,7 @@ def _joined(left: CameraModel, right: CameraModel, placed: Transform, rectified:
             left.k, left.d, right.k, right.d, size, inverse.rotation, moved,
             flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
         )  # fmt: skip
-    return [replace(left, r=made[0], p=made[2]), replace(right, r=made[1], p=made[3])]
+    return replace(left, r=made[0], p=made[2]), replace(right, r=made[1], p=made[3])
 
 
 def mounted(

@@ -80,6 +80,7 @@ def full_name(schema_name: str) -> str:
 def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable[[bytes | memoryview], Any]:
     """A function from CDR bytes to a message object, built from a log's schema ("ros2msg" or "ros2idl").
 
+    An empty schema is that of the standard type of its name, else of a type without fields.
     Raises LogError where the schema cannot be understood; the returned function raises whatever the codec does for
     bytes that do not fit it.
     """
@@ -88,11 +89,7 @@ def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable
         raise LogError(
             f"schema '{schema_name}' is in '{schema_encoding}', which is not a ROS 2 schema (ros2msg, ros2idl)"
         )
-    if not text.strip():
-        if name not in TYPES.types:
-            raise LogError(
-                f"schema '{schema_name}' is empty and its type is not a standard one, so it cannot be decoded"
-            )
+    if not text.strip() and name in TYPES.types:
         return lambda data: TYPES.deserialize_cdr(data, name)
     try:
         store = _store_of(name, schema_encoding, text.decode())
@@ -114,16 +111,22 @@ def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
                     store.register(get_types_from_idl(body))
         else:
             store.register(get_types_from_msg(text, name))
-        pending = [name]
-        while pending:
-            for wanted in _references(store.fielddefs[pending.pop()][1]):
-                if wanted not in store.fielddefs:
-                    store.fielddefs[wanted] = TYPES.fielddefs[wanted]
-                    store.types[wanted] = TYPES.types[wanted]
-                    pending.append(wanted)
-                elif wanted not in store.cache:
-                    pending.append(wanted)
+        _complete(store, name, [], set())
     return store
+
+
+def _complete(store: SharedTypestore, name: str, above: list[str], done: set[str]) -> None:
+    """Add the standard types that type `name` refers to, and those refer to. above: the types it is a part of."""
+    if name in above:
+        raise ValueError(f"{name} is a part of itself")
+    if name in done:
+        return
+    if name not in store.fielddefs:
+        store.fielddefs[name] = TYPES.fielddefs[name]
+        store.types[name] = TYPES.types[name]
+    for part in sorted(_references(store.fielddefs[name][1])):
+        _complete(store, part, [*above, name], done)
+    done.add(name)
 
 
 def _references(fields: Any) -> set[str]:

@@ -1,7 +1,7 @@
 """Writes ROS 2 messages into an MCAP log that either is whole or is not there.
 
-The file grows under a temporary name and takes its own when it is finished. Its one trick: a large message is a chunk
-of its own, so whoever wants only the small topics (tilt, calibration, transforms) decompresses no images.
+Its one trick: a large message is a chunk of its own, so whoever wants only the small topics (tilt, calibration,
+transforms) decompresses no images.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from mcap.writer import CompressionType, Writer
 
 from recordings.errors import LogError
 from recordings.ros2_types import TYPES
+from recordings.whole_file import give_name, temporary_name, unwritable
 
 LARGE = 64 * 1024  # bytes; from here a message gets a chunk of its own
+LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are 32 bits, with a sign
 
 
 class Ros2Writer:
@@ -28,7 +30,7 @@ class Ros2Writer:
 
     def __init__(self, path: Path, profile: str = "ros2") -> None:
         self.path = Path(path)
-        self._partial = self.path.with_name(self.path.name + ".partial")
+        self._partial = temporary_name(self.path)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, tuple[int, str]] = {}
         self._counts: dict[str, int] = {}
@@ -47,6 +49,8 @@ class Ros2Writer:
     def write(self, topic: str, message: Any, stamp: int) -> None:
         """Append one message; the topic's channel is registered by its first message and keeps that type."""
         kind = message.__msgtype__
+        if not 0 <= stamp < LAST_STAMP:
+            raise ValueError(f"{kind} for {topic}: a stamp of {stamp} ns cannot be written; give ns since 1970")
         data = TYPES.serialize_cdr(message, kind)
         try:
             channel = self._channel(topic, kind)
@@ -75,7 +79,7 @@ class Ros2Writer:
         try:
             self._writer.finish()
             self._file.close()
-            self._partial.replace(self.path)
+            give_name(self._partial, self.path)
         except OSError as error:
             raise self._unwritable(error) from error
 
@@ -113,5 +117,4 @@ class Ros2Writer:
         """Close and remove what is half there, and say why."""
         if hasattr(self, "_file"):
             self.abort()
-        reason = error.strerror or str(error)
-        return LogError(f"cannot write {self.path}: {reason}; choose another place for the output or make room there")
+        return unwritable(self.path, error.strerror or str(error))

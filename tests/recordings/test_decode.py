@@ -90,3 +90,25 @@ def test_compressed_images_are_decoded_to_rgb_and_cut_ones_refused() -> None:
             pixels_of(compressed(data[:-20], kind))
     with pytest.raises(LogError, match="cannot be decoded"):
         pixels_of(compressed(b"nonsense", "jpeg"))
+
+
+@pytest.mark.parametrize("padding", [b"\0" * 16, b"\xff" * 16, b"\n", b"\xff\xd9" + b" " * 500])
+def test_what_pads_a_compressed_image_does_no_harm(padding: bytes) -> None:
+    pixels = np.full((16, 24, 3), (200, 90, 30), np.uint8)
+    jpeg = cv2.imencode(".jpg", pixels)[1].tobytes()
+    assert pixels_of(compressed(jpeg + padding, "jpeg"), (24, 16)).shape == (16, 24, 3)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("optimize", [0, 1])
+def test_an_image_of_another_size_than_its_calibration_is_refused_before_it_is_unpacked(
+    suffix: str, optimize: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = [cv2.IMWRITE_JPEG_PROGRESSIVE, optimize] if suffix == ".jpg" else []
+    data = cv2.imencode(suffix, picture(1), flags)[1].tobytes()
+    assert pixels_of(compressed(data, suffix), (WIDTH, HEIGHT)).shape == (HEIGHT, WIDTH, 3)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
+    with pytest.raises(LogError, match=f"the image is {WIDTH}x{HEIGHT}, its calibration is for 10x{HEIGHT}"):
+        pixels_of(compressed(data, suffix), (10, HEIGHT))
+    with pytest.raises(LogError, match=f"the image is {WIDTH}x{HEIGHT}, its calibration is for 10x{HEIGHT}"):
+        pixels_of(raw_image("mono8", picture(1)[:, :, 0], WIDTH), (10, HEIGHT))

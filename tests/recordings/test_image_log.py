@@ -93,10 +93,26 @@ def test_pairs_are_found_by_name_in_order(tmp_path: Path, names: list[str], left
     assert not set(found[0]) & set(found[1])
 
 
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["a-left.png", "a-right.png", "b-right.png", "c.png"], r"b-right\.png, c\.png has no partner"),
+        (["a_l.png", "a_r.png", "b_l.png"], r"b_l\.png has no partner"),
+        (["0.png", "1.png", "2.png", "3.png"], r"holds no image pairs; .* \(4 images\)"),
+        (["im0.png", "im1.png", "view5.png"], r"view5\.png has no partner"),
+    ],
+)
+def test_no_image_is_left_out_without_a_word(tmp_path: Path, names: list[str], said: str) -> None:
+    for name in names:
+        save(tmp_path / name, picture(0))
+    with pytest.raises(LogError, match=said):
+        pair_images(tmp_path)
+
+
 def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
     for name in ("a-left.png", "a-right.png", "b-left.png"):
         save(tmp_path / name, picture(0))
-    with pytest.raises(LogError, match=r"b-left\.png has no right partner"):
+    with pytest.raises(LogError, match=r"b-left\.png has no partner"):
         pair_images(tmp_path)
     (tmp_path / "empty").mkdir()
     with pytest.raises(LogError, match="holds no image pairs"):

@@ -363,3 +363,25 @@ def test_the_desk_has_a_view_for_each_picture_and_none_without() -> None:
     places = [Place(Panel.LEFT, "rectified/left", "left"), Place(Panel.DISPARITY, "matched/pixels", "matched")]
     names = [view.name for view in views(desk(places).root_container)]
     assert sorted(names) == ["ledger", "left", "matched", "run"]
+
+
+def test_a_sink_that_is_not_open_writes_nothing_and_closes(tmp_path: Path) -> None:
+    sink = RerunSink()
+    sink.close({"verdict": "COMPLETE"})
+    with pytest.raises(LogError, match="is a folder"):
+        sink.open(tmp_path, STREAMS, {})
+    sink.close({"verdict": "COMPLETE"})
+    with pytest.raises(LogError, match="RerunSink is not open"):
+        sink.write(Record(START, {}))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_two_sinks_on_one_path_do_not_mix(tmp_path: Path) -> None:
+    path, sinks = tmp_path / "run.rrd", [RerunSink(), RerunSink()]
+    for sink in sinks:
+        sink.open(path, STREAMS, {})
+    assert len(list(tmp_path.iterdir())) == 2
+    for sink in sinks:
+        sink.close({"verdict": "COMPLETE"})
+        assert b"RRF2FOOT" in path.read_bytes()[-20:]
+    assert list(tmp_path.iterdir()) == [path]

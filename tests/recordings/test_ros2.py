@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -238,6 +239,46 @@ def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
         Ros2Writer(tmp_path / "nowhere" / "out.mcap")
 
 
+def test_an_output_that_is_a_folder_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "out.mcap").mkdir()
+    with pytest.raises(LogError, match=r"cannot write .*out\.mcap: it is a folder"):
+        Ros2Writer(tmp_path / "out.mcap")
+    writer = Ros2Writer(tmp_path / "late.mcap")
+    (tmp_path / "late.mcap").mkdir()
+    with pytest.raises(LogError, match=r"cannot write .*late\.mcap: Is a directory"):
+        writer.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["late.mcap", "out.mcap"]
+
+
+def test_two_writers_to_one_path_each_write_a_whole_log(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    writers = [Ros2Writer(path), Ros2Writer(path)]
+    for number in range(1, 50):
+        for place, writer in enumerate(writers):
+            writer.write(f"/image{place}", image(number, "cam", np.zeros((200, 200), np.uint8)), number)
+    for place, writer in enumerate(writers):
+        writer.close()
+        assert [topic for topic, _, _ in iter_messages(path)] == [f"/image{place}"] * 49
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_log_takes_its_name_when_the_disk_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    settle, replace = os.fsync, Path.replace
+    monkeypatch.setattr(os, "fsync", lambda number: (order.append("settled"), settle(number))[1])
+    monkeypatch.setattr(Path, "replace", lambda *paths: (order.append("named"), replace(*paths))[1])
+    Ros2Writer(tmp_path / "out.mcap").close()
+    assert order == ["settled", "named", "settled"]
+
+
+@pytest.mark.parametrize("stamp", [-1, 2**31 * 10**9])
+def test_a_stamp_that_ros_cannot_tell_is_refused(tmp_path: Path, stamp: int) -> None:
+    with Ros2Writer(tmp_path / "out.mcap") as writer:
+        with pytest.raises(ValueError, match=f"a stamp of {stamp} ns cannot be written"):
+            writer.write("/image", image(1, "cam", np.zeros((2, 2), np.uint8)), stamp)
+        writer.abort()
+
+
 def test_a_full_disk_is_told_and_leaves_nothing_behind(tmp_path: Path) -> None:
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -273,6 +314,25 @@ def test_a_schema_may_leave_out_standard_types() -> None:
     raw = bytes(TYPES.serialize_cdr(header, "std_msgs/msg/Header")) + np.float32(2.5).tobytes()
     message = decoder(raw)
     assert (message.header.frame_id, message.pitch) == ("abc", 2.5)
+
+
+RECURSIVE = {
+    "itself": b"Odd[] kids\nfloat64 x\n",
+    "by another": b"Other c\n" + b"=" * 80 + b"\nMSG: vendor_msgs/Other\nOdd[] b\n",
+}
+
+
+@pytest.mark.parametrize("text", RECURSIVE.values(), ids=RECURSIVE)
+def test_a_schema_that_is_a_part_of_itself_is_a_log_error(text: bytes) -> None:
+    with pytest.raises(LogError, match="vendor_msgs/msg/Odd is a part of itself"):
+        decoder_for("vendor_msgs/msg/Odd", "ros2msg", text)
+
+
+def test_an_empty_schema_is_that_of_a_type_without_fields() -> None:
+    decoder = decoder_for("test_msgs/msg/Empty", "ros2msg", b"")
+    assert type(decoder(b"\0\1\0\0\0")).__name__.endswith("Empty")
+    with pytest.raises(Exception, match="size mismatch"):
+        decoder(b"\0\1\0\0" + bytes(12))  # there are fields, which are not known
 
 
 @settings(max_examples=30)

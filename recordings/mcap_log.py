@@ -1,0 +1,263 @@
+"""Replays an MCAP log as the streams that a pipeline starts from: two cameras, tilt, mount and pose.
+
+Only what the opening chose is decoded. What is broken is delivered as an exception in its place. Calibrations are read
+along, a little ahead of the images, so that none is delivered with a calibration that was not in force.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from recordings.decode import camera_model, pixels_of, pose_of, stamp_or, tilt_of
+from recordings.errors import LogError
+from recordings.mcap_index import Lost, Raw, said
+from recordings.mcap_opening import CAMERAS, Decoder, Opening, peek_stamp
+from recordings.mcap_reader import McapFile
+from recordings.rig import Camera, Frames
+from stages.data import CameraImage, CameraModel, Mount, Tilt
+
+if TYPE_CHECKING:
+    from recordings.mcap_source import McapSource
+
+LEAD = 1_000_000_000  # ns; tilt and pose are read this much beyond the ends of a range, to interpolate at its frames
+AHEAD = 100_000_000  # ns; so much later a calibration may be logged than the image it is for
+STREAMS = (*CAMERAS, "inclinometer", "mount", "odometry")
+
+
+@dataclass
+class Calibrations:
+    """A camera's calibrations in the order of their stamps, of which only those like the first are of use.
+
+    The mount and the partner's calibration were made for the first.
+    """
+
+    first: CameraModel
+    stamps: list[int] = field(default_factory=list)
+    same: list[bool] = field(default_factory=list)
+
+    def note(self, message: Any, log_time: int) -> None:
+        """Take note of a CameraInfo."""
+        stamp, model = stamp_or(message.header, log_time), camera_model(message)
+        place = bisect_right(self.stamps, stamp)
+        self.stamps.insert(place, stamp)
+        self.same.insert(place, _equal(model, self.first))
+
+    def check(self, stamp: int) -> None:
+        """Raise LogError if another calibration than the first is in force at `stamp`."""
+        place = bisect_right(self.stamps, stamp) - 1
+        if place >= 0 and not self.same[place]:
+            raise LogError(
+                "the calibration has changed since the log began, so the image cannot be used; cut the log in two "
+                f"where it changes ({self._since(place)} ns)"
+            )
+
+    def _since(self, place: int) -> int:
+        """Since when the calibration at `place` is in force."""
+        while place > 0 and not self.same[place - 1]:
+            place -= 1
+        return self.stamps[place]
+
+
+def _equal(one: CameraModel, other: CameraModel) -> bool:
+    numbers = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("k", "d", "r", "p"))
+    return numbers and (one.width, one.height, one.model) == (other.width, other.height, other.model)
+
+
+@dataclass
+class Reading:
+    """One topic as it is read: the stream it makes, its decoders by channel, and what makes an item of a message (of a
+    message at a log time; None makes none)."""
+
+    stream: str
+    topic: str
+    decoders: dict[int, Decoder]
+    item: Callable[[Any, int], Any]
+
+    def __call__(self, raw: Raw) -> Any:
+        """The item of a message, or the LogError of one that is lost."""
+        try:
+            return self.item(self.decoders[raw.channel](raw.data), raw.log_time)
+        except Exception as error:  # foreign bytes may fail a codec in any way; the message is lost, not the log
+            return LogError(f"{self.topic} at {raw.log_time} ns: {said(error)}")
+
+
+@dataclass
+class McapLog:
+    """An opened log; iterating gives (log time in ns, stream, item), an exception as item standing for a loss.
+
+    missing: stream -> why the log does not provide it, and what to do; topics: stream -> topic; frames: left images to
+    come; cameras: the calibrated pair, where both are there; static: the log's static transforms; problems: (stream,
+    loss) that opening it came upon.
+    """
+
+    path: Path
+    source: McapSource
+    start: float | None = None
+    end: float | None = None
+    missing: dict[str, str] = field(init=False)
+    topics: dict[str, str] = field(init=False)
+    cameras: tuple[Camera, Camera] | None = field(init=False)
+    static: Frames = field(init=False)
+    mount: Mount | None = field(init=False)
+    problems: list[tuple[str, LogError]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.file = McapFile(self.path)
+        try:
+            self._check_range()
+            self._opening = opening = Opening(self.file, self.source)
+            self.missing, self.topics, self.problems = opening.missing, opening.topics, opening.problems
+            self.cameras, self.static, self.mount = opening.cameras, opening.static, opening.mount
+        except BaseException:
+            self.file.close()
+            raise
+
+    @property
+    def frames(self) -> int | None:
+        """How many left images are to come; None where the log has none."""
+        if "left" not in self.topics:
+            return None
+        low, high = self._range()
+        if low is None and high is None:
+            return self.file.count(self.channels("left"))
+        times = self.file.times(self.channels("left"))
+        return int(np.sum((times >= (low or 0)) & (times < (high or 1 << 62))))
+
+    def __iter__(self) -> Iterator[tuple[int, str, Any]]:
+        return self.events(STREAMS)
+
+    def events(self, streams: Sequence[str]) -> Iterator[tuple[int, str, Any]]:
+        """Iterates as the log does, over some of its streams."""
+        low, high = self._range()
+        wide_low = None if low is None else max(low - LEAD, 0)
+        wide_high = None if high is None else high + LEAD
+        log_start = self.file.start if wide_low is None else max(wide_low, self.file.start)
+        for stream, problem in self.problems:
+            if stream in (*streams, "log"):
+                yield log_start, stream, problem
+        if self.mount is not None and "mount" in streams:
+            yield log_start, "mount", self.mount
+        calibrations = {side: Calibrations(model) for side, (_, model) in self._opening.infos.items()}
+        infos = self._by_channel(self._info_readings(calibrations, streams))
+        items = self._by_channel(self._item_readings(calibrations, streams))
+        raws = self.file.messages(infos.keys() | items.keys(), wide_low, wide_high)
+        for raw, noted in _ahead(raws, infos):
+            if raw.channel is None:
+                yield raw.log_time, "log", LogError(f"{self.path.name}: {raw.reason}")
+                continue
+            reading = (infos if raw.channel in infos else items)[raw.channel]
+            if isinstance(raw, Lost):
+                yield raw.log_time, reading.stream, LogError(f"{reading.topic}: {raw.reason}")
+            elif reading.stream not in CAMERAS or self._is_within(raw.data, raw.log_time, low, high):
+                item = noted if raw.channel in infos else reading(raw)
+                if item is not None:
+                    yield raw.log_time, reading.stream, item
+
+    def channels(self, stream: str) -> set[int]:
+        """The channels that a stream is read from."""
+        return self._opening.channels_of(self.topics[stream])
+
+    def schema(self, topic: str) -> str:
+        """The schema of a topic, its full ROS 2 name."""
+        return self._opening.schemas[topic]
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+    def __enter__(self) -> McapLog:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _check_range(self) -> None:
+        low, high = self._range()
+        length = (self.file.end - self.file.start) / 1e9
+        if low is not None and low > self.file.end:
+            raise LogError(f"{self.path} is {length:.3f} s long; start {self.start} s is behind its end")
+        if low is not None and high is not None and low >= high:
+            raise LogError(f"start {self.start} s is not before end {self.end} s; give them in that order")
+
+    def _range(self) -> tuple[int | None, int | None]:
+        """The range in log time, ns."""
+        low = None if self.start is None else self.file.start + round(self.start * 1e9)
+        high = None if self.end is None else self.file.start + round(self.end * 1e9)
+        return low, high
+
+    def _is_within(self, data: memoryview, log_time: int, low: int | None, high: int | None) -> bool:
+        """Whether an image belongs to the range. By its stamp, where that is of the log's clock: then both images of a
+        frame are in or out, though they were logged one after the other."""
+        if low is None and high is None:
+            return True
+        stamp = peek_stamp(data) or log_time
+        when = stamp if abs(stamp - log_time) < LEAD else log_time
+        return (low is None or when >= low) and (high is None or when < high)
+
+    def _info_readings(self, calibrations: dict[str, Calibrations], streams: Sequence[str]) -> list[Reading]:
+        return [
+            self._reading(side, topic, calibrations[side].note)
+            for side, (topic, _) in self._opening.infos.items()
+            if side in self.topics and side in streams
+        ]
+
+    def _item_readings(self, calibrations: dict[str, Calibrations], streams: Sequence[str]) -> list[Reading]:
+        tilt, base_frame = self.source.angles() or tilt_of, self.source.base_frame
+        made: dict[str, Callable[[Any, int], Any]] = {
+            "inclinometer": lambda message, log_time: self._of_the_mount(tilt(message, log_time)),
+            "odometry": lambda message, log_time: pose_of(message, log_time, base_frame),
+        }
+        for side, camera in zip(CAMERAS, self.cameras or (), strict=False):
+            made[side] = _Images(camera, calibrations[side])
+        chosen = [(stream, topic) for stream, topic in self.topics.items() if stream in made and stream in streams]
+        return [self._reading(stream, topic, made[stream]) for stream, topic in chosen]
+
+    def _of_the_mount(self, tilt: Tilt) -> Tilt:
+        """The tilt, if its sensor is the one that the mount speaks of."""
+        known = self._opening.tilt_frame
+        if known and tilt.frame_id != known:
+            raise LogError(f"its frame is '{tilt.frame_id}', but the mount was found for '{known}'")
+        return tilt
+
+    def _reading(self, stream: str, topic: str, item: Callable[[Any, int], Any]) -> Reading:
+        decoders = {number: self._opening.decoders[number] for number in self._opening.channels_of(topic)}
+        return Reading(stream, topic, decoders, item)
+
+    @staticmethod
+    def _by_channel(readings: Iterable[Reading]) -> dict[int, Reading]:
+        return {channel: reading for reading in readings for channel in reading.decoders}
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Makes the images of one camera, each only if the calibration that was in force is the one known."""
+
+    camera: Camera
+    calibrations: Calibrations
+
+    def __call__(self, message: Any, log_time: int) -> CameraImage:
+        model, stamp = self.camera.model, stamp_or(message.header, log_time)
+        self.calibrations.check(stamp)
+        frame = self.camera.frame_id or message.header.frame_id.lstrip("/")
+        pixels = pixels_of(message, (model.width, model.height))
+        return CameraImage(stamp, pixels, model, frame, self.camera.rectified)
+
+
+def _ahead(raws: Iterable[Raw | Lost], early: dict[int, Reading]) -> Iterator[tuple[Raw | Lost, Any]]:
+    """The messages in their order, with what became of those that are read `early`: `AHEAD` before they come."""
+    waiting: deque[tuple[Raw | Lost, Any]] = deque()
+    for raw in raws:
+        waiting.append((raw, early[raw.channel](raw) if isinstance(raw, Raw) and raw.channel in early else None))
+        while waiting[0][0].log_time < raw.log_time - AHEAD:
+            yield waiting.popleft()
+    yield from waiting

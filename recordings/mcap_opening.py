@@ -1,0 +1,217 @@
+"""Opens an MCAP log: looks at its topics, its calibration and its static transforms, and says for each stream that the
+log cannot give why not.
+
+A message may have any fields, whatever its type's name: what cannot be made of one is an error of that message, said
+like a broken one's, and never ends the opening.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from itertools import islice
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from mcap.records import Channel
+
+from recordings.decode import camera_model, frame_of, tilt_of
+from recordings.discovery import TRANSFORMS, Topic, Topics, discover
+from recordings.errors import LogError
+from recordings.mcap_index import Lost, said
+from recordings.mcap_reader import McapFile
+from recordings.rig import Camera, Frames, calibrated_pair, mounted
+from recordings.ros2_types import decoder_for, full_name
+from stages.data import CameraModel, Mount
+
+if TYPE_CHECKING:
+    from recordings.mcap_source import McapSource
+
+CAMERAS = ("left", "right")
+_STREAMS = (*CAMERAS, "inclinometer", "odometry")
+_LOOKED_AT = 20  # messages of an Imu; an orientation filter may begin with nonsense
+_LISTED = 5  # topics in a sentence
+
+Decoder = Callable[[bytes | memoryview], Any]
+T = TypeVar("T")
+
+
+class Opening:
+    """What a log offers.
+
+    decoders: by channel; missing: stream -> why the log does not provide it, and what to do; topics: stream -> topic;
+    infos: side -> topic of its calibration, and the first of it; cameras: the calibrated pair, where both are there;
+    static: the log's static transforms; tilt_frame: of the inclinometer's first message; problems: (stream, loss) that
+    came up.
+    """
+
+    def __init__(self, file: McapFile, source: McapSource) -> None:
+        self.file, self.source = file, source
+        self.missing: dict[str, str] = {}
+        self.topics: dict[str, str] = {}
+        self.infos: dict[str, tuple[str, CameraModel]] = {}
+        self.cameras: tuple[Camera, Camera] | None = None
+        self.static = Frames()
+        self.mount: Mount | None = None
+        self.tilt_frame = ""
+        self.problems: list[tuple[str, LogError]] = []
+        self.schemas: dict[str, str] = {}
+        self.decoders: dict[int, Decoder] = {}
+        self._sealed: dict[int, str] = {}  # channel -> why it cannot be decoded
+        self._find_decoders()
+        self._read_static()
+        found = self._discover()
+        self._find_cameras(found)
+        self._find_mount()
+        for stream in self.missing:
+            self.topics.pop(stream, None)
+        self._tell_sealed()
+
+    def channels_of(self, topic: str) -> set[int]:
+        """The channels of a topic that can be decoded."""
+        return self.file.channels_of([topic]) & self.decoders.keys()
+
+    def _find_decoders(self) -> None:
+        for number, channel in self.file.index.channels.items():
+            try:
+                self.decoders[number] = self._decoder(channel)
+            except LogError as error:
+                self._sealed[number] = str(error)
+
+    def _decoder(self, channel: Channel) -> Decoder:
+        schema = self.file.schema(channel)
+        if channel.message_encoding != "cdr":
+            raise LogError(f"its messages are in '{channel.message_encoding}', not in 'cdr' as those of ROS 2")
+        if schema is None:
+            raise LogError("its messages have no schema")
+        decoder = decoder_for(schema.name, schema.encoding, schema.data)
+        self.schemas[channel.topic] = full_name(schema.name)
+        return decoder
+
+    def _read_static(self) -> None:
+        for topic, schema in sorted(self.schemas.items()):
+            if schema == TRANSFORMS and topic.endswith("tf_static"):
+                for transforms in self._made(topic, lambda message: message.transforms):
+                    for item in [transforms] if isinstance(transforms, LogError) else transforms:
+                        added = item if isinstance(item, LogError) else _attempt(self.static.add, item)
+                        if isinstance(added, LogError):
+                            self.problems.append(("log", LogError(f"{topic}: {added}")))
+
+    def _discover(self) -> Topics:
+        topics = [Topic(name, self.schemas[name], self.file.count(self.channels_of(name))) for name in self.schemas]
+        topics.sort(key=lambda topic: topic.name)
+        bare = self.source.angles() is not None
+        found = discover(topics, self.source, bare, self._frame_of, self._untilted)
+        sealed = {self.file.channel(n).topic: why for n, why in self._sealed.items() if self.file.count({n})}
+        listed = [f"{topic}: {why}" for topic, why in sorted(sealed.items()) if topic not in self.schemas]
+        if listed:
+            more = f", and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+            aside = f" (topics that cannot be decoded: {'; '.join(listed[:_LISTED])}{more})"
+            found.missing = {stream: why + aside for stream, why in found.missing.items()}
+        self.missing.update(found.missing)
+        self.topics.update({role: name for role, name in found.chosen.items() if role in _STREAMS})
+        return found
+
+    def _find_cameras(self, found: Topics) -> None:
+        if any(role not in found.chosen for side in CAMERAS for role in (side, f"{side}_info")):
+            return
+        frames = []
+        for side in CAMERAS:
+            topic = found.chosen[f"{side}_info"]
+            info = self._first(topic, lambda message: (camera_model(message), frame_of(message)))
+            if isinstance(info, LogError):
+                self.missing[side] = f"the calibration on {topic} cannot be read: {info}"
+            else:
+                self.infos[side] = topic, info[0]
+                frames.append(info[1])
+        if len(frames) < len(CAMERAS):
+            return
+        topics = (found.chosen["left"], found.chosen["right"])
+        models = (self.infos["left"][1], self.infos["right"][1])
+        cameras = _attempt(calibrated_pair, models, (frames[0], frames[1]), topics, self.static)
+        if isinstance(cameras, LogError):
+            self.missing.update(left=str(cameras), right=str(cameras))
+        else:
+            self.cameras = cameras
+
+    def _find_mount(self) -> None:
+        if self.cameras is None:
+            self.missing["mount"] = (
+                f"without a calibrated left camera there is no mount: {self.missing.get('left', '')}"
+            )
+        elif "inclinometer" in self.missing:
+            self.missing["mount"] = f"without an inclinometer there is no mount: {self.missing['inclinometer']}"
+        else:
+            frame = self._first(self.topics["inclinometer"], frame_of)
+            self.tilt_frame = "" if isinstance(frame, LogError) else frame
+            given, base = self.source.camera_from_inclinometer, self.source.base_frame
+            stamp = min(self.file.start, self._first_stamp(self.topics["left"]))
+            mount = _attempt(mounted, stamp, self.cameras[0], self.tilt_frame, base, self.static, given)
+            if isinstance(mount, LogError):
+                self.missing["mount"] = str(mount)
+            else:
+                self.mount = mount
+
+    def _tell_sealed(self) -> None:
+        """Messages of a chosen topic that came in another encoding, or by another schema, are lost."""
+        streams = {topic: stream for stream, topic in self.topics.items()}
+        streams |= {topic: side for side, (topic, _) in self.infos.items() if side in self.topics}
+        for number, why in sorted(self._sealed.items()):
+            topic, count = self.file.channel(number).topic, self.file.count({number})
+            if topic in streams and count:
+                problem = LogError(f"{topic}: {count} messages of its channel {number} cannot be decoded: {why}")
+                self.problems.append((streams[topic], problem))
+
+    def _frame_of(self, topic: str) -> str:
+        frame = self._first(topic, frame_of)
+        return "" if isinstance(frame, LogError) else frame
+
+    def _untilted(self, topic: str) -> str | None:
+        """Why the first messages of an Imu tell no tilt; None where one does."""
+        why: LogError | None = LogError("it has no messages")
+        for tilt in islice(self._made(topic, lambda message: tilt_of(message, 0)), _LOOKED_AT):
+            if not isinstance(tilt, LogError):
+                return None
+            why = tilt
+        return str(why)
+
+    def _made(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
+        """What `make` makes of each message of a topic; a LogError for one of which it makes nothing."""
+        for raw in self.file.messages(self.channels_of(topic)):
+            if not isinstance(raw, Lost):
+                yield _attempt(lambda data, decoder: make(decoder(data)), raw.data, self.decoders[raw.channel])
+            elif raw.channel is not None:
+                yield LogError(raw.reason)
+
+    def _first(self, topic: str, make: Callable[[Any], T]) -> T | LogError:
+        """What `make` makes of the first message of which it makes anything, else the LogError of the last."""
+        made: T | LogError = LogError(f"{topic} has no messages")
+        for made in self._made(topic, make):
+            if not isinstance(made, LogError):
+                return made
+        return made
+
+    def _first_stamp(self, topic: str) -> int:
+        """The stamp of a topic's first message: it may be before the log's first log time, or of another clock."""
+        raws = self.file.messages(self.channels_of(topic))
+        first = next((raw for raw in raws if not isinstance(raw, Lost)), None)
+        return self.file.start if first is None else max(peek_stamp(first.data) or first.log_time, 0)
+
+
+def _attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:
+    """What `make` returns, or what it raises: foreign messages may fail a codec or a conversion in any way."""
+    try:
+        return make(*arguments)
+    except LogError as error:
+        return error
+    except (AttributeError, TypeError) as error:
+        return LogError(f"it is not what its type's name says ({said(error)})")
+    except Exception as error:
+        return LogError(said(error))
+
+
+def peek_stamp(data: memoryview) -> int:
+    """The stamp, ns, of a CDR message that begins with a std_msgs/Header, without decoding it; 0 if it is too short."""
+    if len(data) < 12:
+        return 0
+    seconds, nanoseconds = struct.unpack_from("<iI" if data[1] else ">iI", data, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)

@@ -1,0 +1,48 @@
+"""Files that are whole or not there: one grows under a temporary name and takes its own when it is finished.
+
+A temporary name belongs to one writer, so two that write to one path at the same time do not mix; the later one wins.
+"""
+
+from __future__ import annotations
+
+import os
+from itertools import count
+from pathlib import Path
+
+from recordings.errors import LogError
+
+_numbers = count()
+
+
+def temporary_name(path: Path) -> Path:
+    """A name beside `path` that no other writer has. Raises LogError where no file can take the name `path`."""
+    if path.is_dir():
+        raise LogError(f"cannot write {path}: it is a folder; give the name of a file in it")
+    return path.with_name(f"{path.name}.{os.getpid()}-{next(_numbers)}.partial")
+
+
+def give_name(temporary: Path, path: Path) -> None:
+    """Give a finished file its name once the disk has its content. Raises OSError; then the temporary file is gone."""
+    try:
+        _settle(temporary)
+        temporary.replace(path)
+        _settle(path.parent)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def unwritable(path: Path, reason: str) -> LogError:
+    """The error of a file that cannot be written."""
+    return LogError(f"cannot write {path}: {reason}; choose another place for the output or make room there")
+
+
+def _settle(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
+    if path.is_dir() and os.name == "nt":
+        return  # a folder cannot be opened there
+    number = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

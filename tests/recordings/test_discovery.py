@@ -1,0 +1,127 @@
+"""The topics of a rover are found by what they are; what two readings of a log would allow is asked, not guessed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recordings import McapSource
+from recordings.ros2 import Ros2Writer, camera_info, image
+from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, model, picture, write_sample
+
+
+def images(path: Path, topics: dict[str, str], infos: dict[str, str]) -> Path:
+    """A log of images and calibrations alone; both: topic -> frame_id."""
+    with Ros2Writer(path) as writer:
+        for number in range(2):
+            stamp = START + number * PERIOD
+            for topic, frame in infos.items():
+                side = "right" if "right" in topic else "left"
+                writer.write(topic, camera_info(stamp, frame, model(side, width=20 + len(topic) % 7)), stamp)
+            for topic, frame in topics.items():
+                writer.write(topic, image(stamp, frame, picture(number)), stamp)
+    return path
+
+
+def test_cameras_of_two_places_are_not_better_or_worse_than_each_other(tmp_path: Path) -> None:
+    sides = ("left", "right")
+    topics = [f"/{place}/{side}/{kind}" for place, kind in (("front", "image_raw"), ("rear", "image_rect"))
+              for side in sides]  # fmt: skip
+    infos = [f"/{place}/{side}/camera_info" for place in ("front", "rear") for side in sides]
+    path = images(tmp_path / "log.mcap", dict.fromkeys(topics, "a"), dict.fromkeys(infos, "a"))
+    with McapSource().open(path) as log:
+        assert "/front/left/image_raw with /front/right/image_raw" in log.missing["left"]
+        assert "/rear/left/image_rect with /rear/right/image_rect" in log.missing["left"]
+    with McapSource(right="/front/right/image_raw").open(path) as log:
+        assert log.topics["left"] == "/front/left/image_raw"
+
+
+@pytest.mark.parametrize("raw", ["/cam/left/image_raw", "/cam/left_raw/image_raw"])
+def test_of_one_camera_the_rectified_images_are_taken(tmp_path: Path, raw: str) -> None:
+    names = [raw, "/cam/left/image_rect"]
+    topics = [*names, *(name.replace("left", "right") for name in names)]
+    path = images(tmp_path / "log.mcap", dict.fromkeys(topics, "a"), {})
+    with McapSource().open(path) as log:
+        assert "no CameraInfo belongs to /cam/left/image_rect" in log.missing["left"]
+        assert "no CameraInfo belongs to /cam/right/image_rect" in log.missing["right"]
+
+
+@pytest.mark.parametrize(("frame", "found"), [("front_left", True), ("rear_left", False), ("", False)])
+def test_a_calibration_from_elsewhere_must_be_of_the_images_frame(tmp_path: Path, frame: str, found: bool) -> None:
+    topics = {f"/front/{side}/image_rect": frame.replace("left", side) for side in ("left", "right")}
+    infos = {f"/calibration/{side}": f"front_{side}" if frame else "" for side in ("left", "right")}
+    with McapSource().open(images(tmp_path / "log.mcap", topics, infos)) as log:
+        assert ("left" not in log.missing) == found
+        if not found:
+            assert "no CameraInfo belongs to /front/left/image_rect" in log.missing["left"]
+
+
+def test_the_calibration_under_the_image_itself_comes_first(tmp_path: Path) -> None:
+    topics = {f"/cam/{side}": side for side in ("left", "right")}
+    infos = {f"/cam/{side}/camera_info": side for side in topics.values()} | {"/cam/camera_info": "other"}
+    with McapSource().open(images(tmp_path / "log.mcap", topics, infos)) as log:
+        assert log.cameras is not None
+        assert [camera.frame_id for camera in log.cameras] == ["left", "right"]
+
+
+def test_a_navigation_camera_is_a_camera(tmp_path: Path) -> None:
+    names = ("/nav/left/image_rect", "/nav/right/image_rect")
+    with McapSource().open(write_sample(tmp_path / "log.mcap", names=names)) as log:
+        assert log.missing == {}
+        assert (log.topics["left"], log.topics["right"]) == names
+
+
+def test_truth_is_used_with_its_partner_where_it_is_told(tmp_path: Path) -> None:
+    names = ("/truth/left/image_rect", "/truth/right/image_rect")
+    path = write_sample(tmp_path / "log.mcap", names=names)
+    with McapSource().open(path) as log:
+        assert "the log has no camera image" in log.missing["left"]
+    with McapSource(left=names[0]).open(path) as log:
+        assert log.missing == {}
+        assert log.topics["right"] == names[1]
+
+
+def test_a_pose_among_results_is_named_but_not_taken(tmp_path: Path) -> None:
+    from recordings.ros2 import odometry
+    from stages.data import Pose
+
+    path = tmp_path / "log.mcap"
+    with Ros2Writer(path) as writer:
+        writer.write("/nav/odometry", odometry(Pose(START, [0, 0, 0], [0, 0, 0, 1], "odom", "base_link")), START)
+    with McapSource().open(path) as log:
+        assert "there is /nav/odometry; set 'odometry' of the source to use it" in log.missing["odometry"]
+    with McapSource(odometry="/nav/odometry").open(path) as log:
+        assert log.topics["odometry"] == "/nav/odometry"
+
+
+@pytest.mark.parametrize("bad", [5, FRAMES])
+def test_an_imu_without_a_single_unit_quaternion_is_no_inclinometer(tmp_path: Path, bad: int) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == TILT and number < bad:
+            for name in "xyzw":
+                setattr(message.orientation, name, 0.0)
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        said = f"{TILT} holds no orientation (the quaternion of the inclinometer is not a rotation: [0.0, 0.0"
+        assert said in log.missing["inclinometer"]
+
+
+def test_an_imu_that_begins_with_nonsense_is_still_an_inclinometer(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == TILT and number == 0:
+            message.orientation_covariance = np.full(9, -1.0)
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert log.missing == {}
+        losses = [(stream, str(item)) for _, stream, item in log if isinstance(item, Exception)]
+    assert [stream for stream, _ in losses] == ["inclinometer"]
+
+
+def test_both_names_of_the_sample_are_its_pair(sample: Path) -> None:
+    with McapSource().open(sample) as log:
+        assert (log.topics["left"], log.topics["right"]) == (LEFT, RIGHT)

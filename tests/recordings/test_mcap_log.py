@@ -1,0 +1,132 @@
+"""What changes in the middle of a log, and what calls itself what it is not, costs its own messages and is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from recordings import McapSource
+from recordings.inventory import describe
+from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, items_of, write_sample
+
+INFO = "/stereo/left/camera_info"
+IMAGE_LAG = 1000  # ns between an image's stamp and its log time in the sample
+
+
+def copied(source: Path, out: Path, encode: Callable[[str, int, bytes], tuple[str, bytes]]) -> Path:
+    """The same messages; `encode` says of a topic, a number in it and a schema: message encoding and schema."""
+    with source.open("rb") as stream, out.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels: dict[Any, int] = {}
+        counts: dict[str, int] = {}
+        for schema, channel, message in make_reader(stream).iter_messages():
+            number = counts[channel.topic] = counts.get(channel.topic, -1) + 1
+            key = (channel.topic, *encode(channel.topic, number, schema.data))
+            if key not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, key[2])
+                channels[key] = writer.register_channel(channel.topic, key[1], known)
+            writer.add_message(channels[key], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return out
+
+
+@pytest.mark.parametrize("lag", [0, 50_000_000])
+def test_no_image_comes_with_a_calibration_that_was_not_in_force(tmp_path: Path, lag: int) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == INFO and number in (2, 3):
+            message.k = message.k * 1.5
+        return message
+
+    plain = write_sample(tmp_path / "plain.mcap", edit)
+    path = tmp_path / "log.mcap"
+    with plain.open("rb") as stream, path.open("wb") as file:  # the calibration logged after its image
+        writer, channels = Writer(file), dict[str, int]()
+        writer.start()
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if channel.topic not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", known)
+            log_time = message.log_time + (lag if channel.topic == INFO else 0)
+            writer.add_message(channels[channel.topic], log_time, message.data, message.publish_time)
+        writer.finish()
+    events = items_of(path)
+    assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
+    lost = [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]
+    assert [(time, stream) for time, stream, _ in lost] == [
+        (START + number * PERIOD + IMAGE_LAG, "left") for number in (2, 3)
+    ]
+    assert all(f"cut the log in two where it changes ({START + 2 * PERIOD} ns)" in said for _, _, said in lost)
+    left = [item.stamp for _, stream, item in events if stream == "left" and not isinstance(item, Exception)]
+    assert left == [START + number * PERIOD for number in (0, 1, 4)]
+    assert sum(stream == "right" for _, stream, _ in events) == FRAMES
+
+
+def test_a_tilt_of_another_sensor_than_the_mounts_is_lost(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == TILT and number == 3:
+            message.header.frame_id = "other_imu"
+        return message
+
+    events = items_of(write_sample(tmp_path / "log.mcap", edit))
+    lost = [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]
+    assert [(time, stream) for time, stream, _ in lost] == [(START + 3 * PERIOD, "inclinometer")]
+    assert "its frame is 'other_imu', but the mount was found for 'imu_link'" in lost[0][2]
+
+
+@pytest.mark.parametrize(("topic", "stream"), [(TILT, "inclinometer"), (LEFT, "left"), (INFO, "left")])
+def test_messages_of_a_topic_in_another_encoding_are_told_with_their_number(
+    sample: Path, tmp_path: Path, topic: str, stream: str
+) -> None:
+    def encode(name: str, number: int, schema: bytes) -> tuple[str, bytes]:
+        return ("json" if name == topic and number >= 3 else "cdr"), schema
+
+    path = copied(sample, tmp_path / "log.mcap", encode)
+    with McapSource().open(path) as log:
+        assert log.missing == {}
+        assert log.frames == (3 if topic == LEFT else FRAMES)
+        losses = [(name, str(item)) for _, name, item in log if isinstance(item, Exception)]
+    assert [name for name, _ in losses] == [stream]
+    assert f"{topic}: 2 messages of its channel" in losses[0][1]
+    assert "in 'json', not in 'cdr'" in losses[0][1]
+    described = describe(path, McapSource())
+    counts = [(item["encoding"], item["messages"]) for item in described["topics"] if item["topic"] == topic]
+    assert sorted(counts) == [("cdr", 3), ("json", 2)]
+    assert described["damage"] == [losses[0][1]]
+
+
+def test_images_that_cannot_be_decoded_are_named_with_the_reason(sample: Path, tmp_path: Path) -> None:
+    def encode(name: str, number: int, schema: bytes) -> tuple[str, bytes]:
+        return ("protobuf" if name in (LEFT, RIGHT) else "cdr"), schema
+
+    with McapSource().open(copied(sample, tmp_path / "log.mcap", encode)) as log:
+        assert log.missing["left"].startswith("the log has no camera image")
+        assert f"cannot be decoded: {LEFT}: its messages are in 'protobuf'" in log.missing["left"]
+
+
+@pytest.mark.parametrize(
+    ("topic", "fields", "stream"),
+    [
+        (TILT, (b"orientation", b"orientatiox"), "inclinometer"),
+        ("/tf_static", (b"transforms", b"transformed"), "mount"),
+        ("/tf_static", (b"child_frame_id", b"child_frame_ix"), "mount"),
+        (INFO, (b"float64[9] k", b"float64[9] q"), "left"),
+        (INFO, (b"float64[12] p", b"float64[4] p\nfloat64[8] q"), "left"),
+    ],
+)
+def test_a_type_with_other_fields_than_its_names_is_said_and_no_failure(
+    sample: Path, tmp_path: Path, topic: str, fields: tuple[bytes, bytes], stream: str
+) -> None:
+    def encode(name: str, number: int, schema: bytes) -> tuple[str, bytes]:
+        return "cdr", schema.replace(*fields) if name == topic else schema
+
+    path = copied(sample, tmp_path / "log.mcap", encode)
+    with McapSource().open(path) as log:
+        assert stream in log.missing
+        list(log)
+    describe(path, McapSource())

@@ -1,0 +1,185 @@
+"""How the rover is built is what its log says, and where the log contradicts itself or says nothing, that is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recordings import McapSource
+from recordings.errors import LogError
+from recordings.rig import Frames
+from recordings.ros2 import transform_message
+from stages.data import Transform
+from tests.recordings.sample_log import LEFT, START, TRANSFORMS, model, write_sample
+
+RAW = ("/left/image_raw", "/right/image_raw")
+RECTIFIED = ("/left/image_rect", "/right/image_rect")
+
+
+def single_calibrations(path: Path, names: tuple[str, str], beside: Transform, fx: float = 20.0) -> Path:
+    """Two cameras calibrated each alone and without distortion; `beside` places the right one in the left's frame."""
+
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == "/tf_static":
+            return transform_message([(transform, START) for transform in (*TRANSFORMS, beside)])
+        if topic.endswith("camera_info"):
+            message.p = np.zeros(12)
+            if topic.startswith("/right"):
+                message.k[[0, 4]] = fx
+        return message
+
+    return write_sample(path, edit, names=names)
+
+
+def turned(axis: str, degrees: float) -> np.ndarray:
+    return np.asarray(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
+
+
+@pytest.mark.parametrize("names", [RAW, RECTIFIED])
+def test_parallel_cameras_beside_each_other_are_rectified_as_they_are(tmp_path: Path, names: tuple[str, str]) -> None:
+    beside = Transform("left_optical", "right_optical", np.eye(3), [0.25, 0.001, 0])
+    with McapSource().open(single_calibrations(tmp_path / "log.mcap", names, beside)) as log:
+        assert log.cameras is not None
+        assert [camera.rectified for camera in log.cameras] == [True, True]
+        assert log.cameras[1].model.p[0, 3] == pytest.approx(-20 * 0.25)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "place", "fx"),
+    [
+        (turned("y", -3), [0.25, 0, 0], 20.0),
+        (turned("z", 5), [0.25, 0, 0], 20.0),
+        (np.eye(3), [0.25, 0.01, 0], 20.0),
+        (np.eye(3), [0.25, 0, 0.1], 20.0),
+        (np.eye(3), [0.25, 0, 0], 22.0),
+    ],
+)
+def test_cameras_that_are_not_parallel_are_rectified_or_refused_where_called_rectified(
+    tmp_path: Path, rotation: np.ndarray, place: list[float], fx: float
+) -> None:
+    beside = Transform("left_optical", "right_optical", rotation, place)
+    with McapSource().open(single_calibrations(tmp_path / "raw.mcap", RAW, beside, fx)) as log:
+        assert log.cameras is not None
+        left, right = log.cameras
+    assert not left.rectified
+    assert -right.model.p[0, 3] / right.model.p[0, 0] == pytest.approx(np.linalg.norm(place))
+    point = np.array([0.3, -0.2, 4.0])
+    rows = []
+    for camera, seen in ((left, point), (right, beside.inverse()(point))):
+        projected = camera.model.p[:, :3] @ camera.model.r @ seen
+        rows.append(projected[1] / projected[2])
+    assert rows[0] == pytest.approx(rows[1], abs=1e-9)
+    with McapSource().open(single_calibrations(tmp_path / "rect.mcap", RECTIFIED, beside, fx)) as log:
+        assert "are called rectified, but the static transform between them says" in log.missing["left"]
+
+
+@pytest.mark.parametrize("place", [[0, -0.25, 0], [0, 0.25, 0], [0.15, 0, 0.2], [0, 0, -0.25]])
+@pytest.mark.parametrize("names", [RAW, RECTIFIED])
+def test_a_right_camera_that_is_not_beside_the_left_is_refused(
+    tmp_path: Path, names: tuple[str, str], place: list[float]
+) -> None:
+    beside = Transform("left_optical", "right_optical", np.eye(3), place)
+    with McapSource().open(single_calibrations(tmp_path / "log.mcap", names, beside)) as log:
+        assert "these are not optical frames" in log.missing["left"]
+
+
+@pytest.mark.parametrize("names", [RAW, RECTIFIED])
+def test_exchanged_cameras_are_named_so(tmp_path: Path, names: tuple[str, str]) -> None:
+    beside = Transform("left_optical", "right_optical", np.eye(3), [-0.25, 0, 0])
+    with McapSource().open(single_calibrations(tmp_path / "log.mcap", names, beside)) as log:
+        assert f"so {names[0]} is the right camera" in log.missing["left"]
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"k": np.full(9, np.nan)}, "must be finite"),
+        ({"d": np.full(5, np.nan)}, "must be finite"),
+        ({"p": np.full(12, np.nan)}, "must be finite"),
+        ({"p": np.hstack([np.diag([0.0, 20, 1]), np.zeros((3, 1))]).reshape(-1)}, "focal lengths in P .* not positive"),
+        ({"width": 0}, "is for images of 0x16"),
+        ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "tells no baseline"),
+    ],
+)
+def test_a_calibration_that_cannot_be_is_told_as_such(tmp_path: Path, values: dict[str, Any], said: str) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == "/stereo/left/camera_info":
+            for name, value in values.items():
+                setattr(message, name, value)
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log, pytest.raises(LogError, match=said):
+        raise LogError(log.missing["left"])
+
+
+def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if hasattr(message, "header"):
+            message.header.frame_id = ""
+        return None if topic == "/tf_static" else message
+
+    assert Frames().between("", "") is None
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert log.mount is None
+        assert "no static transform joins the camera ('') and the inclinometer ('')" in log.missing["mount"]
+
+
+def with_transforms(path: Path, *more: Transform) -> Path:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == "/tf_static":
+            return transform_message([(transform, START) for transform in (*TRANSFORMS, *more)])
+        return message
+
+    return write_sample(path, edit)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (Transform("mast", "imu_link", np.eye(3), [0, 0, 1]), "'imu_link' has two parents, 'base_link' and 'mast'"),
+        (Transform("base_link", "imu_link", turned("z", 90), [0, 0, 0.4001]), "contradicts an earlier one"),
+        (Transform("imu_link", "base_link", np.eye(3), [0, 0, 0]), "contradicts an earlier one"),
+        (Transform("left_optical", "imu_link", np.eye(3), [0, 0, 0]), "contradicts an earlier one"),
+        (Transform("imu_link", "imu_link", np.eye(3), [0, 0, 1]), "contradicts an earlier one"),
+        (Transform("", "imu_link", np.eye(3), [0, 0, 1]), "lacks the name of a frame"),
+    ],
+)
+def test_a_transform_that_cannot_be_is_told_and_the_others_hold(tmp_path: Path, more: Transform, said: str) -> None:
+    with McapSource().open(with_transforms(tmp_path / "log.mcap", more)) as log:
+        assert log.missing == {}
+        assert log.mount is not None
+        np.testing.assert_allclose(
+            log.mount.camera_from_inclinometer, TRANSFORMS[0].rotation.T @ TRANSFORMS[1].rotation, atol=1e-12
+        )
+        told = [(stream, item) for _, stream, item in log if isinstance(item, Exception)]
+    assert [stream for stream, _ in told] == ["log"]
+    with pytest.raises(LogError, match=said):
+        raise told[0][1]
+
+
+def test_a_translation_that_is_not_finite_is_told_and_not_used(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == "/tf_static":
+            message.transforms[0].transform.translation.x = np.nan
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert "no static transform joins the camera" in log.missing["mount"]
+        told = [str(item) for _, _, item in log if isinstance(item, Exception)]
+    assert told == ["/tf_static: the translation of the transform 'base_link' <- 'left_optical' is [nan, 0.1, 0.9]"]
+
+
+def test_a_transform_that_is_told_again_is_no_contradiction(tmp_path: Path) -> None:
+    with McapSource().open(with_transforms(tmp_path / "log.mcap", *TRANSFORMS, TRANSFORMS[0].inverse())) as log:
+        assert not [item for _, _, item in log if isinstance(item, Exception)]
+        assert log.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]
+
+
+def test_the_pair_of_the_sample_is_rectified(sample: Path) -> None:
+    with McapSource(left=LEFT).open(sample) as log:
+        assert log.cameras is not None
+        np.testing.assert_array_equal(log.cameras[1].model.p, model("right").p)
