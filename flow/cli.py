@@ -68,7 +68,12 @@ def _is_log_error(error: Exception) -> bool:
 
 def parser() -> argparse.ArgumentParser:
     """The command line's grammar."""
-    top = argparse.ArgumentParser(prog="roverflow", description="Replay rover traverses into terrain one can trust.")
+    top = argparse.ArgumentParser(
+        prog="roverflow",
+        description="Replay rover traverses into terrain one can trust.",
+        epilog="Exit codes: 0 complete; 1 an output or the program failed; 2 usage, or a log that cannot be used; "
+        "3 finished but incomplete; 130 interrupted, with the outputs closed and readable.",
+    )
     top.add_argument("--version", action="version", version=f"roverflow {_version()}")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
 
@@ -177,14 +182,26 @@ def _version() -> str:
         return "unknown"
 
 
+def _check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path]) -> None:
+    """Refuse outputs that cannot be written, that would replace what is being read, or that are one file twice."""
+    taken: list[Path] = []
+    for path in filter(None, outputs):
+        if not path.parent.is_dir():
+            raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
+        if path.exists() and not path.is_file():
+            raise UsageError(f"{path} is a folder or a device; give the name of a file")
+        for given in inputs:
+            if path.exists() and given.exists() and path.samefile(given):
+                raise UsageError(f"{path} is what is being read; choose another name for the output")
+        if path.resolve() in taken:
+            raise UsageError(f"{path} is given for two outputs; choose another name for one")
+        taken.append(path.resolve())
+
+
 def _run(options: argparse.Namespace) -> int:
     out = options.out or options.log.with_name(f"{options.log.stem}-nav.mcap")
     rrd = None if options.no_rrd else options.rrd or out.with_suffix(".rrd")
-    for path in filter(None, (out, rrd, options.summary)):
-        if not path.parent.is_dir():
-            raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
-        if path.is_dir():
-            raise UsageError(f"{path} is a folder; give the name of a file")
+    _check_outputs([out, rrd, options.summary], [options.log, Path(options.pipeline)])
 
     def keep(summary: dict[str, Any]) -> None:
         if options.summary:
@@ -233,8 +250,6 @@ def replay(
     for use, sink in graph.sinks:
         path = {".mcap": out, ".rrd": rrd}.get(sink.suffix)
         if path is not None:
-            if path.exists() and path.samefile(log):
-                raise UsageError(f"{path} is the log itself; choose another name for the result (-o, --rrd)")
             outputs[use] = path
     cv2.setNumThreads(1)  # frames in flight fill the cores, not threads inside one call
     stop = Stop()
@@ -293,6 +308,7 @@ def _graph(options: argparse.Namespace) -> int:
 
 
 def _simulate(options: argparse.Namespace) -> int:
+    _check_outputs([options.out], [])
     settings = {
         "frames": options.frames,
         "seed": options.seed,
@@ -328,6 +344,7 @@ def _import(options: argparse.Namespace) -> int:
     from recordings.image_log import import_images, pair_images
 
     left, right = pair_images(options.source)
+    _check_outputs([options.out], [options.calibration, *left, *right])
     frames = import_images(
         left, right, options.calibration, options.out,
         pitch_down=options.pitch_down, roll=options.roll, height=options.height, rate=options.rate,
@@ -339,7 +356,9 @@ def _import(options: argparse.Namespace) -> int:
 def _score(options: argparse.Namespace) -> int:
     from recordings.scoring import format_score, score
 
-    result = score(options.result, options.truth or options.result)
+    truth = options.truth or options.result
+    _check_outputs([options.json], [options.result, truth])
+    result = score(options.result, truth)
     if options.json:
         options.json.write_text(result.to_json() + "\n")
     _say(format_score(result))

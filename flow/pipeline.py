@@ -7,6 +7,8 @@ file, the line, and the nearest name that would have been valid.
 from __future__ import annotations
 
 import importlib
+import math
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from difflib import get_close_matches
@@ -50,6 +52,8 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"cannot read the pipeline {path}: {error}") from error
+    if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
+        sys.path.append(str(path.parent.resolve()))  # stages may stand beside the file that uses them
     tree = _parse(text, path.name)
     for setting in overrides:
         _override(tree, setting)
@@ -81,7 +85,10 @@ def _parse(text: str, file: str) -> _Value:
         raise Place(file, 1).error(f"not valid YAML: {error}") from error
     if root is None:
         raise Place(file, 1).error("the file is empty; it needs 'source', 'streams' and 'sinks'")
-    return _located(root, file, yaml.SafeLoader(""))
+    try:
+        return _located(root, file, yaml.SafeLoader(""))
+    except RecursionError:
+        raise Place(file, 1).error("a YAML anchor holds itself") from None
 
 
 def _located(node: yaml.Node, file: str, loader: yaml.SafeLoader) -> _Value:
@@ -249,8 +256,8 @@ class _Builder:
             raise place.error(f"'use: {use}' must be a module and a class, such as stages.Match")
         try:
             module = importlib.import_module(module_name)
-        except ImportError as error:
-            raise place.error(f"cannot import '{module_name}': {error}") from error
+        except Exception as error:  # whatever a module of the user's own may raise
+            raise place.error(f"cannot import '{module_name}': {type(error).__name__}: {error}") from error
         kind = getattr(module, name, None)
         if not (isinstance(kind, type) and is_dataclass(kind)):
             known = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
@@ -288,7 +295,6 @@ def _shown(kind: Any) -> str:
 
 def _coerced(value: Any, kind: Any, parameter: Field[Any]) -> Any:
     """`value` as a parameter of type `kind`; raises ValueError where it is none."""
-    unit = parameter.metadata.get("unit", "")
     if get_origin(kind) in (Union, UnionType):
         options = get_args(kind)
         if value is None and type(None) in options:
@@ -302,13 +308,14 @@ def _coerced(value: Any, kind: Any, parameter: Field[Any]) -> Any:
     if get_origin(kind) is not None or kind is Any:
         return value
     if kind in (int, float):
-        return _number(value, kind, unit)
+        return _number(value, kind, parameter)
     if not isinstance(value, kind):
         raise ValueError(f"expected {kind.__name__}, not {value!r}")
     return value
 
 
-def _number(value: Any, kind: type, unit: str) -> float | int:
+def _number(value: Any, kind: type, parameter: Field[Any]) -> float | int:
+    unit = parameter.metadata.get("unit", "")
     if isinstance(value, str):
         value = quantity(value, unit)
         if kind is int and float(value).is_integer():
@@ -318,6 +325,14 @@ def _number(value: Any, kind: type, unit: str) -> float | int:
     if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
         wanted = {"int": "a whole number", "float": "a number"}[kind.__name__]
         raise ValueError(f"expected {wanted}{f' in {unit}' if unit else ''}, not {value!r}")
+    low, high = parameter.metadata.get("low"), parameter.metadata.get("high")
+    for wrong, wanted in (
+        (not math.isfinite(value), "finite"),
+        (low is not None and value < low, f"at least {low}"),
+        (high is not None and value > high, f"at most {high}"),
+    ):
+        if wrong:
+            raise ValueError(f"must be {wanted}{f' {unit}' if unit else ''}, not {value}")
     return kind(value)  # type: ignore[no-any-return]
 
 

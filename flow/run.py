@@ -43,7 +43,7 @@ class Stop:
 
 @contextmanager
 def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
-    """Send SIGINT and SIGTERM to `stop` instead of raising in the middle of something."""
+    """Send SIGINT, SIGTERM and SIGHUP to `stop` instead of raising in the middle of something."""
 
     def request(number: int, frame: FrameType | None) -> None:
         stop.request()
@@ -51,7 +51,8 @@ def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
         if stop.abandoning() and stop.reading:
             raise KeyboardInterrupt  # out of a source that does not answer
 
-    signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    in_main = threading.current_thread() is threading.main_thread()  # only there can signals be caught
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if in_main else ()
     before = {number: signal.signal(number, request) for number in signals}
     try:
         yield

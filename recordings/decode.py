@@ -244,6 +244,9 @@ class Angles:
 
 def up_of(pitch: float, roll: float, model: Literal["axis", "euler"]) -> Array:
     """The unit vector up, in x forward, y left, z up, of a pitch (nose up) and a roll (left side up), rad."""
+    for name, angle in (("pitch", pitch), ("roll", roll)):
+        if not abs(angle) <= np.pi / 2:
+            raise LogError(f"a {name} of {np.rad2deg(angle):.1f} degrees is no tilt; check the field and its unit")
     if model == "euler":
         return np.array([np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
     forward, left = np.sin(pitch), np.sin(roll)

@@ -80,7 +80,8 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
     im0.png with im1.png. Raises LogError where there are none, or an image has no partner."""
     if not folder.is_dir():
         raise LogError(f"{folder} is not a folder; give the folder that holds the left and right images")
-    files = sorted((f for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
+    near = (f for pattern in ("*", "*/*") for f in folder.glob(pattern) if not f.parent.name.startswith("."))
+    files = sorted((f for f in near if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
     named = {file.relative_to(folder).as_posix(): file for file in files}
     names = {name: file for name, file in named.items() if not _NOT_CAMERAS.search(name)}
     for word, other in SIDES:
@@ -146,16 +147,15 @@ def _write_tilt(writer: Ros2Writer, stamp: int) -> None:
     writer.write("/imu/data", imu(stamp, "imu_link", np.array([0.0, 0.0, 0.0, 1.0])), stamp)
 
 
-def _write_pair(writer: Ros2Writer, stamp: int, pair: tuple[Path, Path], values: Mapping[str, float]) -> None:
+def _write_pair(writer: Ros2Writer, stamp: int, pair: tuple[Path, Path], values: dict[str, float]) -> None:
     images = [_pixels(path) for path in pair]
     height, width = images[0].shape[:2]
     if images[0].shape != images[1].shape or images[0].dtype != images[1].dtype:
         shapes = " and ".join("x".join(map(str, pixels.shape)) for pixels in images)
         raise LogError(f"{pair[0]} and {pair[1]} differ in size or kind ({shapes})")
-    if (values.get("width", width), values.get("height", height)) != (width, height):
-        raise LogError(
-            f"{pair[0]} is {width}x{height}, the calibration is for {values['width']:g}x{values['height']:g}"
-        )
+    if (values.setdefault("width", width), values.setdefault("height", height)) != (width, height):
+        expected = f"{values['width']:g}x{values['height']:g}"
+        raise LogError(f"{pair[0]} is {width}x{height}, the calibration or the first pair is {expected}")
     for side, pixels in zip(("left", "right"), images, strict=True):
         model = _model(side, width, height, values)
         writer.write(f"/stereo/{side}/camera_info", camera_info(stamp, CAMERAS[side], model), stamp)

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from shutil import disk_usage
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from recordings.frame_record import FrameRecord, LossEntry
 from recordings.whole_file import give_name, temporary_name, unwritable
 from stages.data import Array, StereoFrame
 
+RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well
 END = b"RRF2FOOT"  # the last magic number of a whole recording, before a checksum of 4 bytes
 
 
@@ -71,7 +73,13 @@ class RerunSink:
         self._canvas = Canvas(self._recording, self.jpeg_quality, self.max_points)
         self._closed = False
 
+    def _check_room(self) -> None:
+        """Raise LogError before the disk is full: rerun's writer does not return from a full one."""
+        if disk_usage(self._partial.parent).free < RESERVE:
+            raise unwritable(self._path, f"less than {RESERVE >> 20} MB are free")
+
     def _begin(self) -> None:
+        self._check_room()
         self._recording = rr.RecordingStream(self.application_id)
         self._recording.set_log_time_enabled(False)
         self._recording.set_sinks(rr.FileSink(str(self._partial)))
@@ -82,6 +90,7 @@ class RerunSink:
         """Draw one frame. May be called from any thread, one call at a time."""
         if self._closed:
             raise LogError("RerunSink is not open")
+        self._check_room()
         with catch_and_log_exceptions(strict=True):
             self._set_clocks(record.stamp, self._frames)
             captions = self._draw(record.items)

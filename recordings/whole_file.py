@@ -18,6 +18,8 @@ def temporary_name(path: Path) -> Path:
     """A name beside `path` that no other writer has. Raises LogError where no file can take the name `path`."""
     if path.is_dir():
         raise LogError(f"cannot write {path}: it is a folder; give the name of a file in it")
+    if path.exists() and not path.is_file():
+        raise LogError(f"cannot write {path}: it is a device or the like; give the name of a file")
     return path.with_name(f"{path.name}.{os.getpid()}-{next(_numbers)}.partial")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -51,7 +52,7 @@ def test_every_frame_leaves_every_result(result):
     counts = Counter(topic for topic, _, _ in raw_messages(result))
     assert set(counts) == RESULTS
     assert all(counts[topic] >= FRAMES for topic in RESULTS)
-    assert not result.with_suffix(".mcap.partial").exists()
+    assert not list(result.parent.glob("*.partial"))
 
 
 def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
@@ -164,11 +165,35 @@ def test_a_damaged_image_costs_its_frame_and_nothing_else(traverse, tmp_path, ca
     assert counts["/nav/navigation_map"] == FRAMES - 1
 
 
-def test_the_log_itself_is_never_overwritten(traverse, capsys):
+@pytest.mark.parametrize("option", ["-o", "--rrd", "--summary"])
+def test_what_is_read_is_never_overwritten(traverse, tmp_path, capsys, option):
     before = traverse.stat()
-    assert roverflow("run", traverse, "-o", traverse) == 2
-    assert "another name" in capsys.readouterr().err
+    (tmp_path / "link").symlink_to(traverse)
+    for name in (traverse, tmp_path / "link"):
+        assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, name) == 2
+        assert "is what is being read" in capsys.readouterr().err
     assert traverse.stat() == before
+
+
+def test_a_score_never_overwrites_what_it_reads(traverse, result, capsys):
+    before = traverse.stat()
+    assert roverflow("score", result, "--truth", traverse, "--json", traverse) == 2
+    assert traverse.stat() == before
+
+
+@pytest.mark.parametrize("options", [("--rrd", "out.mcap"), ("--summary", "out.mcap")])
+def test_one_file_is_never_two_outputs(traverse, tmp_path, capsys, options):
+    assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", options[0], tmp_path / options[1]) == 2
+    assert "two outputs" in capsys.readouterr().err
+
+
+def test_a_device_is_never_replaced_by_a_file(traverse, tmp_path, capsys):
+    pipe = tmp_path / "pipe.mcap"
+    os.mkfifo(pipe)
+    assert roverflow("run", traverse, "-o", pipe) == 2
+    assert roverflow("simulate", pipe, "--frames", 1) == 2
+    assert "device" in capsys.readouterr().err
+    assert not pipe.is_file()
 
 
 def test_an_output_without_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys):
@@ -180,7 +205,7 @@ def test_an_output_without_a_folder_is_refused_before_anything_runs(traverse, tm
 def test_an_output_that_is_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys, option):
     (tmp_path / "taken").mkdir()
     assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, tmp_path / "taken") == 2
-    assert "taken is a folder" in capsys.readouterr().err
+    assert "taken is a folder or a device" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 

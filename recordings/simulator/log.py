@@ -35,7 +35,6 @@ Logged = tuple[int, str, Any]
 HAZARD_ROCK = 0.2  # m, height above the ground around it
 HAZARD_SLOPE = float(np.radians(20))
 ROCKS_WITHIN = 10.0  # m of base_link
-FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32
 
 
 def static_transforms(simulation: Simulation, log_time: int) -> list[Logged]:
@@ -162,7 +161,7 @@ def rocks_in_level(simulation: Simulation, truth: FrameTruth) -> Array:
 def _rocks_message(simulation: Simulation, stamp: int, truth: FrameTruth) -> Any:
     table = rocks_in_level(simulation, truth)
     fields = [
-        ros2.make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=FLOAT32, count=1)
+        ros2.make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=ros2.FLOAT32, count=1)
         for place, name in enumerate(("x", "y", "z", "diameter", "height"))
     ]
     return ros2.make(

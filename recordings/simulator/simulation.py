@@ -20,7 +20,8 @@ from recordings.simulator.terrain import Terrain, make_terrain
 from stages.data import Array, StereoCamera, Transform
 
 SECOND = 1_000_000_000
-START = 1_700_000_000 * SECOND
+EPOCH = 1_700_000_000 * SECOND
+DAY = 86_400 * SECOND
 MARGIN = SECOND // 2  # the slow sensors run this long before the first frame and after the last
 BLOCK = 32  # rows a thread takes at a time
 # The Devon Island rover's rectified camera (1280 pixels wide).
@@ -90,7 +91,7 @@ class Simulation:
         least = {
             "frames": 1, "rate": 1e-3, "speed": 0, "width": 16, "height": 16, "baseline": 1e-3, "camera_height": 0.1,
             "slope": 0, "relief_resolution": 1e-3, "abundance": 0, "smallest_rock": 0.01, "noise": 0, "tilt_noise": 0,
-            "tilt_rate": 1, "odometry_rate": 1, "map_half_width": 0.5, "map_resolution": 1e-3, "threads": 1,
+            "seed": 0, "tilt_rate": 1, "odometry_rate": 1, "map_half_width": 0.5, "map_resolution": 1e-3, "threads": 1,
         }  # fmt: skip
         for name, low in least.items():
             if not getattr(self, name) >= low:
@@ -148,18 +149,23 @@ class Simulation:
         """base_link <- left camera, <- right camera, <- inclinometer."""
         return traverse.mounts(self.baseline, self.camera_height, self.pitch_down)
 
+    @property
+    def start(self) -> int:
+        """Nominal start of the drive, ns; every seed has its own day, so that no log passes for another's truth."""
+        return EPOCH + self.seed * DAY
+
     def stamp(self, frame: int) -> int:
         """Stamp of a frame, ns."""
-        return START + round((self.frame_offset + frame / self.rate) * SECOND)
+        return self.start + round((self.frame_offset + frame / self.rate) * SECOND)
 
     @property
     def begin(self) -> int:
         """Time of the first sensor sample, ns."""
-        return START - MARGIN
+        return self.start - MARGIN
 
     def way(self, stamp: int) -> float:
         """Metres driven since the nominal start, at a time, ns."""
-        return (stamp - START) / SECOND * self.speed
+        return (stamp - self.start) / SECOND * self.speed
 
     def base_at(self, stamp: int) -> Transform:
         """world <- base_link at a time, ns."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recordings.rig import BODY_FROM_OPTICAL
 from recordings.simulator.terrain import Terrain
 from stages.data import LEVEL_FRAME, Array, Pose, Transform
 
@@ -19,8 +20,6 @@ BODY_LENGTH, BODY_WIDTH = 1.0, 0.8
 LEFT_FRAME, RIGHT_FRAME = "left_camera_optical", "right_camera_optical"
 INCLINOMETER_FRAME = "inclinometer_link"
 MAST_FORWARD = 0.35  # m, of the cameras ahead of the body's centre
-# Optical axes (x right, y down, z forward) in a body frame (x forward, y left, z up).
-BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 @dataclass(frozen=True)

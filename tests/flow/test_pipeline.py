@@ -58,6 +58,8 @@ def test_a_setting_from_the_command_line_replaces_one_in_the_file(tmp_path):
         ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'"]),
         ("25 cm", "-1", 5, ["at least 0 m"]),
         ("25 cm", "true", 5, ["expected a number in m"]),
+        ("5 ms", "-5 ms", 3, ["must be at least 0 ns"]),
+        ("25 cm", ".inf", 5, ["must be finite"]),
         ("5 ms", "5", 3, ["needs a unit"]),
         ("[1, 2.5]", "3", 5, ["expected a list"]),
         ("a: twice", "a: thrice", 6, ["no stream 'thrice'", "did you mean 'twice'"]),
@@ -99,6 +101,24 @@ def test_a_file_that_is_no_pipeline_is_refused(tmp_path, text):
 def test_a_bad_setting_is_named(tmp_path, setting):
     with pytest.raises((PipelineError, UsageError), match="--set"):
         loaded(tmp_path, overrides=[setting])
+
+
+def test_stages_may_stand_beside_the_file_that_uses_them(tmp_path):
+    source = "from tests.flow.toys import Scale\nclass Near(Scale):\n    __call__ = Scale.__call__\n"
+    (tmp_path / "beside.py").write_text(source)
+    text = GOOD.replace("tests.flow.toys.Scale", "beside.Near")
+    assert {node.name: node.use for node in loaded(tmp_path, text).nodes}["twice"] == "beside.Near"
+
+
+def test_a_module_that_does_not_import_is_named_with_its_line(tmp_path):
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    with pytest.raises(PipelineError, match=r"toy.yaml:5: cannot import 'broken': ZeroDivisionError"):
+        loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", "broken.Stage"))
+
+
+def test_an_anchor_that_holds_itself_is_refused(tmp_path):
+    with pytest.raises(PipelineError, match="anchor"):
+        loaded(tmp_path, "a: &a [*a]\n")
 
 
 def test_an_unknown_pipeline_lists_those_that_ship():

@@ -126,7 +126,7 @@ def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
         ({"focal": 3.0}, "has the unknown 'focal'"),
         ({"fx": "wide"}, "'fx' must be a number, not 'wide'"),
         ({"baseline": -0.2}, "'baseline' must be positive"),
-        ({"width": 640}, "is 24x16, the calibration is for 640x16"),
+        ({"width": 640}, "is 24x16, the calibration or the first pair is 640x16"),
     ],
 )
 def test_a_calibration_that_does_not_fit_is_refused_and_leaves_no_file(
