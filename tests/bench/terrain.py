@@ -1,4 +1,4 @@
-"""Disparity, terrain and hazards against the exact truth of simulated traverses: `rover` beside `paper`, seed by seed."""
+"""Disparity, terrain and hazards against the exact truth of simulated traverses: `rover` and `paper`, seed by seed."""
 
 from __future__ import annotations
 
