@@ -82,6 +82,16 @@ def test_the_result_reads_back_with_rosbags(result):
     assert disparity.image.encoding == "32FC1"
 
 
+def test_the_result_reads_back_with_reruns_own_loader(result, tmp_path):
+    import rerun as rr
+
+    rrd = tmp_path / "loaded.rrd"
+    convert = [sys.executable, "-m", "rerun", "mcap", "convert", str(result), "-o", str(rrd)]
+    assert subprocess.run(convert, capture_output=True).returncode == 0
+    paths = {str(path) for path in rr.chunk.RrdReader(str(rrd)).store().schema().entity_paths()}
+    assert paths >= RESULTS
+
+
 def test_the_recording_verifies_and_holds_every_intermediate(result):
     rrd = result.with_suffix(".rrd")
     check = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(rrd)], capture_output=True, text=True)
