@@ -1,77 +1,148 @@
+"""Semi-global aggregation (Hirschmüller, 2008, section 2.3): the cost of the cheapest paths that lead to each pixel.
+
+    L(p, d) = C(p, d) + min(L(q, d), L(q, d - 1) + p1, L(q, d + 1) + p1, p2) - min over d of the sum before it
+
+with q the pixel before p on the path. Paths come from 8 sides: a sweep down the image follows the 4 whose q is to the
+left or above, a sweep up the other 4. p2 falls with the step of brightness from q to p, where surfaces are likely to end.
+
+Three tricks. L has its smallest value subtracted as soon as it is known, so that it never exceeds C + p2 and fits a byte;
+Hirschmüller subtracts the same number one pixel later. The 4 paths of a sweep are added where they stand, in one pass,
+as numbers above their own smallest; sums stop at 255, which no disparity that might win reaches. And a path along a
+diagonal keeps its place in memory: its place is x - y (or x + y), which is the same for p and q, so that one row of costs
+for each direction is enough, read and overwritten in place.
+"""
+
 from __future__ import annotations
+
+import cv2
+import numpy as np
 from numba import njit
-from stages.kernels.vectors import byte, lanes_in, lesser, load, minus, plus_capped, shifted, smallest, spread, store
 
-FAR = 255
+from stages.data import Array
+from stages.kernels.vectors import (
+    Width, byte, either, lanes_in, lesser, load, minus, minus_capped, plus_capped, shifted, smallest, spread, store,
+)  # fmt: skip
 
-@njit(nogil=True, error_model="numpy", cache=True, inline="never")
-def _continued(path, cost, p1, p2, width):
-    near = plus_capped(lesser(shifted(path, FAR, 1), shifted(path, FAR, -1)), p1)
-    return plus_capped(cost, lesser(lesser(near, path), spread(p2, width)))
+BLOCK = 64
+FAR = 255  # beyond either end of the search range
+SIDES = ((0, -1), (-1, -1), (-1, 0), (-1, 1))  # (dy, dx) to q of a sweep down; of a sweep up their opposites
 
-@njit(nogil=True, error_model="numpy", cache=True)
-def aggregate_row(costs, penalties, state, y, step, p1, diagonals, sums, place, total, final, width):
-    """One row"""
+
+def brightness_steps(image: Array) -> Array:
+    """Absolute differences to the four neighbours of `SIDES`.
+
+    image: (H, W) uint8. Returns (4, H + 1, S) uint8 with S >= W + 2: pixel (y, x) is at [:, y, x + 1], differences to
+    pixels outside the image are arbitrary.
+    """
+    height, columns = image.shape
+    stride = -(-(columns + 2) // BLOCK) * BLOCK
+    padded = cv2.copyMakeBorder(image, 1, 1, 2, 1 + stride - columns, cv2.BORDER_REPLICATE)
+    steps = np.empty((len(SIDES), height + 1, stride), np.uint8)
+    _brightness_steps(padded.reshape(-1), padded.shape[1], steps.reshape(-1), height + 1, stride, Width(BLOCK))
+    return steps
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _brightness_steps(image, image_stride, steps, rows, stride, width):  # type: ignore[no-untyped-def]
+    side = 0
+    for dy, dx in SIDES:
+        for y in range(rows):
+            for i in range(0, stride, lanes_in(width)):
+                here = (y + 1) * image_stride + i + 1
+                one, other = load(image, here, width), load(image, here + dy * image_stride + dx, width)
+                step = either(minus_capped(one, other), minus_capped(other, one))
+                store(steps, (side * rows + y) * stride + i, step)
+        side += 1
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def aggregate_row(  # type: ignore[no-untyped-def]
+    costs, steps, table, p1, diagonals, paths, y, step, sums, place, total, final, width
+):
+    """Follow the paths of one sweep from the row before into row y, and add them up.
+
+    costs: (W * n,) uint8, C of the row; steps: of `brightness_steps`; table: (256,) uint8, p2 for each step of
+    brightness; diagonals: whether the sweep follows 4 paths or 2; paths: (3 * W * n,) uint8, L of the row before, all 0
+    at first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where the sums of the row go, from
+    `place` on (W * n); final: instead, add what the other sweep left there, and put the whole into `total`.
+    """
     n = lanes_in(width)
     columns = costs.size // n
-    stride = columns + 2
-    plane = penalties.size // 4
-    below = y + (1 if step < 0 else 0)
-    first = 0 if step > 0 else columns - 1
-    first_p = first + 1
-    level = y * stride + first_p + (1 if step < 0 else 0)
-    falling = plane + below * stride + first_p + (1 if step < 0 else 0)
-    upright = 2 * plane + below * stride + first_p
-    rising = 3 * plane + below * stride + first_p - (1 if step < 0 else 0)
-    p1s = spread(p1, width)
-    nothing = spread(0, width)
+    _, rows, stride = steps.shape
+    steps = steps.reshape(-1)
+    nothing, small_step = spread(0, width), spread(p1, width)
+    first, last = (0, columns - 1) if step > 0 else (columns - 1, 0)
+    upwards = 1 if step < 0 else 0  # the pair (p, q) of a sweep up is the pair (q, p) of a sweep down
+    beside = y * stride + first + 1 + upwards
+    falling = (rows + y + upwards) * stride + first + 1 + upwards
+    upright = (2 * rows + y + upwards) * stride + first + 1
+    rising = (3 * rows + y + upwards) * stride + first + 1 - upwards
+    fall, rise = (first - y) % columns, (first + y) % columns  # places of the diagonals through the first pixel
+    store(paths, fall * n, nothing)  # this path begins here, as does the one at the other end of the row
+    store(paths, (2 * columns + (last + y) % columns) * n, nothing)
     path = nothing
-    a = (first - y) % columns
-    b = (first + y) % columns
-    if diagonals:
-        edge = (0 if step > 0 else columns - 1)
-        store(state, ((edge - y) % columns) * n, nothing)
-        store(state, (2 * columns + ((columns - 1 - edge + y) % columns)) * n, nothing)
     x = first
     for _ in range(columns):
         cost = load(costs, x * n, width)
-        v = _continued(path, cost, p1s, byte(penalties, level), width)
-        path = minus(v, spread(smallest(v), width))
-        s = path
+        path = _continued(path, cost, small_step, byte(table, byte(steps, beside)), width)
+        total_here = path
         at = (columns + x) * n
-        v = _continued(load(state, at, width), cost, p1s, byte(penalties, upright), width)
-        v = minus(v, spread(smallest(v), width))
-        store(state, at, v)
-        s = plus_capped(s, v)
+        moved = _continued(load(paths, at, width), cost, small_step, byte(table, byte(steps, upright)), width)
+        store(paths, at, moved)
+        total_here = plus_capped(total_here, moved)
         if diagonals:
-            at = a * n
-            v = _continued(load(state, at, width), cost, p1s, byte(penalties, falling), width)
-            v = minus(v, spread(smallest(v), width))
-            store(state, at, v)
-            s = plus_capped(s, v)
-            at = (2 * columns + b) * n
-            v = _continued(load(state, at, width), cost, p1s, byte(penalties, rising), width)
-            v = minus(v, spread(smallest(v), width))
-            store(state, at, v)
-            s = plus_capped(s, v)
+            at = fall * n
+            moved = _continued(load(paths, at, width), cost, small_step, byte(table, byte(steps, falling)), width)
+            store(paths, at, moved)
+            total_here = plus_capped(total_here, moved)
+            at = (2 * columns + rise) * n
+            moved = _continued(load(paths, at, width), cost, small_step, byte(table, byte(steps, rising)), width)
+            store(paths, at, moved)
+            total_here = plus_capped(total_here, moved)
+        here = place + x * n
         if final:
-            store(total, x * n, plus_capped(s, load(sums, place + x * n, width)))
+            store(total, x * n, plus_capped(total_here, load(sums, here, width)))
         else:
-            store(sums, place + x * n, s)
-        level += step
-        falling += step
-        upright += step
-        rising += step
-        x += step
-        a += step
-        b += step
-        if a == columns:
-            a = 0
-        if a < 0:
-            a = columns - 1
-        if b == columns:
-            b = 0
-        if b < 0:
-            b = columns - 1
-# x
-# y
+            store(sums, here, total_here)
+        beside, falling, upright, rising, x = beside + step, falling + step, upright + step, rising + step, x + step
+        fall, rise = _around(fall + step, columns), _around(rise + step, columns)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _continued(before, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    """L of the next pixel of a path, above its smallest value."""
+    neighbour = plus_capped(lesser(shifted(before, FAR, 1), shifted(before, FAR, -1)), p1)
+    after = plus_capped(cost, lesser(lesser(neighbour, before), spread(p2, width)))
+    return minus(after, spread(smallest(after), width))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _around(place, columns):  # type: ignore[no-untyped-def]
+    """`place` modulo `columns`, from one step outside at most."""
+    return 0 if place == columns else columns - 1 if place < 0 else place
+
+
+def aggregate_reference(costs: Array, image: Array, table: Array, p1: int, paths: int) -> tuple[Array, Array]:
+    """The sums of the sweep down and of the sweep up in plain numpy.
+
+    costs: (H, W, n) uint8; image: (H, W) uint8; table, p1: as above; paths: 4 or 8. Returns two (H, W, n) uint8.
+    """
+    height, columns, n = costs.shape
+    sums = []
+    for sign in (1, -1):
+        total = np.zeros(costs.shape, np.int64)
+        for dy, dx in SIDES if paths == 8 else SIDES[::2]:
+            dy, dx = sign * dy, sign * dx
+            before = np.zeros((height + 2, columns + 2, n + 2), np.int64)  # of every pixel, a frame of paths that begin
+            before[..., 0] = before[..., -1] = FAR
+            for y in range(height)[::sign]:
+                for x in range(columns)[::sign]:
+                    q = before[y + dy + 1, x + dx + 1]
+                    inside = 0 <= y + dy < height and 0 <= x + dx < columns
+                    step = abs(int(image[y, x]) - int(image[y + dy, x + dx])) if inside else 0
+                    near = np.minimum(np.minimum(q[:-2], q[2:]) + p1, np.minimum(q[1:-1], table[step]))
+                    after = np.minimum(costs[y, x] + near, 255)
+                    before[y + 1, x + 1, 1:-1] = after - after.min()
+            total += before[1:-1, 1:-1, 1:-1]
+        sums.append(np.minimum(total, 255).astype(np.uint8))
+    return sums[0], sums[1]

@@ -23,45 +23,38 @@ OFFSETS = tuple((dy, dx) for dy in range(-2, 3) for dx in range(-2, 3) if (dy, d
 BLOCK = 64  # pixels described at a time
 
 
-def census(image: Array, mirrored: bool = False) -> Array:
-    """The comparisons of each pixel as bytes.
+def census(image: Array, planes: Array, mirrored: bool = False) -> None:
+    """Write the comparisons of each pixel into `planes`.
 
-    image: (H, W) uint8, its own border replicated beyond; mirrored: the image is flipped left to right, and the bits are
-    to be those of the image as it was. Returns (H, 3, W') uint8 with W' = W rounded up to 64 (the rest is arbitrary).
+    image: (H, W) uint8, its own border replicated beyond; planes: (H, 3, >= W rounded up to 64) uint8, of which more
+    than W columns are written; mirrored: the image is flipped left to right, and the bits are to be those it had before.
     """
-    height, width = image.shape
-    padded_width = -(-width // BLOCK) * BLOCK
-    padded = cv2.copyMakeBorder(image, 2, 2, 2, 2 + padded_width - width, cv2.BORDER_REPLICATE)
-    bits = np.empty((height, PLANES, padded_width), np.uint8)
-    _census(padded.reshape(-1), padded.shape[1], -1 if mirrored else 1, bits.reshape(-1), height, padded_width, Width(BLOCK))
-    return bits
+    columns = -(-image.shape[1] // BLOCK) * BLOCK
+    padded = cv2.copyMakeBorder(image, 2, 2, 2, 2 + columns - image.shape[1], cv2.BORDER_REPLICATE)
+    _census(padded, -1 if mirrored else 1, planes, columns, Width(BLOCK))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _census(image, stride, sign, bits, height, columns, width):  # type: ignore[no-untyped-def]
-    nothing = spread(0, width)
-    for y in range(height):
+def _census(image, sign, planes, columns, width):  # type: ignore[no-untyped-def]
+    nothing, stride = spread(0, width), image.shape[1]
+    for y in range(planes.shape[0]):
         for x in range(0, columns, lanes_in(width)):
             at = (y + 2) * stride + x + 2
             centre = load(image, at, width)
-            bit = 0
-            plane = nothing
+            bit, plane = 0, nothing
             for dy in range(-2, 3):
                 for dx in range(-2, 3):
-                    if dy == 0 and dx == 0:
-                        continue
-                    darker = where_less(
-                        load(image, at + dy * stride + sign * dx, width), centre, spread(1 << (bit & 7), width), nothing
-                    )
-                    plane = either(plane, darker)
-                    bit += 1
-                    if bit & 7 == 0:
-                        store(bits, (y * PLANES + (bit >> 3) - 1) * columns + x, plane)
-                        plane = nothing
+                    if dy != 0 or dx != 0:
+                        neighbour = load(image, at + dy * stride + sign * dx, width)
+                        plane = either(plane, where_less(neighbour, centre, spread(1 << (bit & 7), width), nothing))
+                        bit += 1
+                        if bit & 7 == 0:
+                            store(planes[y, (bit >> 3) - 1], x, plane)
+                            plane = nothing
 
 
 def census_reference(image: Array, mirrored: bool = False) -> Array:
-    """`census` in plain numpy, without the arbitrary columns."""
+    """The planes of `census`, (H, 3, W) uint8, in plain numpy."""
     height, width = image.shape
     padded = np.pad(image, 2, mode="edge")
     bits = np.zeros((height, PLANES, width), np.uint8)
@@ -72,22 +65,33 @@ def census_reference(image: Array, mirrored: bool = False) -> Array:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def census_costs(left, right, view, costs, width):  # type: ignore[no-untyped-def]
-    """The costs of one row, all pixels and disparities.
+def census_costs(pair, unseen, y, costs, width):  # type: ignore[no-untyped-def]
+    """The costs of row y, all pixels and disparities: costs (W * n,) uint8, pixel after pixel.
 
-    left: (3, W) uint8, the row's bits; right: (3, W + n) the right row's, backwards, so that pixel x and lane d meet
-    at W - 1 - x + d; view: see `semiglobal.View`; costs: (W * n,) uint8, the result, pixel after pixel.
+    pair: `semiglobal.Pair`, whose right planes run backwards, so that pixel x and lane d meet at W - 1 - x + d; unseen:
+    the cost where the partner is outside the right image.
     """
     n = lanes_in(width)
     columns = costs.size // n
-    left0, left1, left2 = left[0], left[1], left[2]
-    right0, right1, right2 = right[0], right[1], right[2]
+    left, right = pair.left[y], pair.right[y]
     for x in range(columns):
-        i = columns - 1 - x
-        cost = ones(exclusive_or(spread(byte(left0, x), width), load(right0, i, width)))
-        cost = plus(cost, ones(exclusive_or(spread(byte(left1, x), width), load(right1, i, width))))
-        cost = plus(cost, ones(exclusive_or(spread(byte(left2, x), width), load(right2, i, width))))
-        if x < view.whole_from or x >= view.whole_to:
-            outside = load(view.outside, i, width)
-            cost = either(minus_capped(cost, outside), both(outside, spread(view.unseen, width)))
-        store(costs, x * n, cost)
+        bits = differing_bits(left, right, columns, x, width)
+        store(costs, x * n, seen_costs(bits, pair, unseen, columns, x, width))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def differing_bits(left, right, columns, x, width):  # type: ignore[no-untyped-def]
+    """How many of the 24 comparisons differ between pixel x and its partner at each disparity."""
+    i = columns - 1 - x
+    bits = ones(exclusive_or(spread(byte(left[0], x), width), load(right[0], i, width)))
+    bits = plus(bits, ones(exclusive_or(spread(byte(left[1], x), width), load(right[1], i, width))))
+    return plus(bits, ones(exclusive_or(spread(byte(left[2], x), width), load(right[2], i, width))))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def seen_costs(costs, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
+    """`costs` of pixel x, but `unseen` where the partner is outside the right image."""
+    if pair.whole_from <= x < pair.whole_to:
+        return costs
+    outside = load(pair.outside, columns - 1 - x, width)
+    return either(minus_capped(costs, outside), both(outside, spread(unseen, width)))

@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 
 from stages.data import Array
+from stages.kernels.census import differing_bits, seen_costs
 from stages.kernels.vectors import (
-    Width, average, both, byte, either, exclusive_or, greater, lanes_in, lesser, load, minus, minus_capped, ones, plus,
-    plus_capped, spread, store,
+    Width, average, byte, either, lanes_in, lesser, load, minus_capped, plus, plus_capped, spread, store,
 )  # fmt: skip
 
 PLANES = 2
@@ -24,76 +24,93 @@ BLOCK = 64
 LARGEST = 6
 
 
-def gradients(image: Array, mirrored: bool = False) -> Array:
-    """dx, dy (H, 2, W')"""
-    height, width = image.shape
-    padded_width = -(-width // BLOCK) * BLOCK
-    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1 + padded_width - width, cv2.BORDER_REPLICATE)
-    result = np.empty((height, PLANES, padded_width), np.uint8)
-    _gradients(padded.reshape(-1), padded.shape[1], -1 if mirrored else 1, result.reshape(-1), height, padded_width, Width(BLOCK))
-    return result
+def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
+    """Write dx and dy of each pixel (Sobel / 4, gray levels a pixel, plus 128, within 0 to 255) into `planes`.
 
-
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
-def _signed(more, less, width):
-    return minus_capped(plus_capped(spread(128, width), minus_capped(more, less)), minus_capped(less, more))
+    image: (H, W) uint8, its own border replicated beyond; planes: (H, 2, >= W rounded up to 64) uint8, of which more
+    than W columns are written; mirrored: the image is flipped left to right, and dx is to be what it was before.
+    """
+    columns = -(-image.shape[1] // BLOCK) * BLOCK
+    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1 + columns - image.shape[1], cv2.BORDER_REPLICATE)
+    _gradients(padded, -1 if mirrored else 1, planes, columns, Width(BLOCK))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _gradients(image, stride, sign, result, height, columns, width):  # type: ignore[no-untyped-def]
-    for y in range(height):
+def _gradients(image, sign, planes, columns, width):  # type: ignore[no-untyped-def]
+    stride = image.shape[1]
+    for y in range(planes.shape[0]):
+        dx, dy = planes[y, 0], planes[y, 1]
         for x in range(0, columns, lanes_in(width)):
             at = (y + 1) * stride + x + 1
-            nw = load(image, at - stride - sign, width)
-            n = load(image, at - stride, width)
-            ne = load(image, at - stride + sign, width)
-            w = load(image, at - sign, width)
-            e = load(image, at + sign, width)
-            sw = load(image, at + stride - sign, width)
-            s = load(image, at + stride, width)
-            se = load(image, at + stride + sign, width)
-            east = average(average(ne, se), e)
-            west = average(average(nw, sw), w)
-            north = average(average(nw, ne), n)
-            south = average(average(sw, se), s)
-            store(result, 2 * y * columns + x, _signed(east, west, width))
-            store(result, (2 * y + 1) * columns + x, _signed(south, north, width))
+            west, east = _smooth(image, at - sign, stride, width), _smooth(image, at + sign, stride, width)
+            north, south = _smooth(image, at - stride, 1, width), _smooth(image, at + stride, 1, width)
+            store(dx, x, _signed_difference(east, west, width))
+            store(dy, x, _signed_difference(south, north, width))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _raw(left, right, view, columns, x, width):
-    i = columns - 1 - x
-    bits = ones(exclusive_or(spread(byte(left[0], x), width), load(right[0], i, width)))
-    bits = plus(bits, ones(exclusive_or(spread(byte(left[1], x), width), load(right[1], i, width))))
-    bits = plus(bits, ones(exclusive_or(spread(byte(left[2], x), width), load(right[2], i, width))))
-    a, b = spread(byte(left[3], x), width), load(right[3], i, width)
-    dx = either(minus_capped(a, b), minus_capped(b, a))
-    a, b = spread(byte(left[4], x), width), load(right[4], i, width)
-    dy = either(minus_capped(a, b), minus_capped(b, a))
-    step = lesser(plus_capped(dx, dy), spread(LARGEST, width))
-    two = plus(step, step)
-    cost = plus(plus(plus(bits, bits), step), plus(two, two))
-    if x < view.whole_from or x >= view.whole_to:
-        outside = load(view.outside, i, width)
-        cost = either(minus_capped(cost, outside), both(outside, spread(view.unseen, width)))
-    return cost
+def _smooth(image, at, stride, width):  # type: ignore[no-untyped-def]
+    """Mean of three pixels `stride` apart, the middle one, at `at`, twice."""
+    ends = average(load(image, at - stride, width), load(image, at + stride, width))
+    return average(ends, load(image, at, width))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def smoothed_costs(left, right, view, sums, behind, here, make, costs, width):
-    """left right: of the row ahead. sums: (2, W * n): behind, here; behind is replaced by those of the row ahead"""
+def _signed_difference(more, less, width):  # type: ignore[no-untyped-def]
+    above = plus_capped(spread(128, width), minus_capped(more, less))
+    return minus_capped(above, minus_capped(less, more))
+
+
+def gradients_reference(image: Array, mirrored: bool = False) -> Array:
+    """The planes of `gradients`, (H, 2, W) uint8, in plain numpy."""
+    padded = np.pad(image.astype(np.int64), 1, mode="edge")
+    if mirrored:
+        return np.ascontiguousarray(gradients_reference(image[:, ::-1])[:, :, ::-1])
+
+    def mean(one: Array, middle: Array, other: Array) -> Array:
+        return ((one + other + 1) // 2 + middle + 1) // 2
+
+    columns, rows = mean(padded[:-2], padded[1:-1], padded[2:]), mean(padded[:, :-2], padded[:, 1:-1], padded[:, 2:])
+    planes = np.stack([columns[:, 2:] - columns[:, :-2], rows[2:] - rows[:-2]], axis=1)
+    return np.clip(planes + 128, 0, 255).astype(np.uint8)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ignore[no-untyped-def]
+    """The costs of the row before row `ahead` of a sweep, all pixels and disparities: costs (W * n,) uint8.
+
+    pair, unseen: as of `census_costs`; ahead: may be one row outside the image, whose border then counts twice;
+    column_sums: (2, W * n) uint8, those of the two rows before `ahead`; the older are replaced by those of `ahead`.
+    """
     n = lanes_in(width)
     columns = costs.size // n
+    older, newer = column_sums[ahead & 1], column_sums[1 - (ahead & 1)]
+    inside = min(max(ahead, 0), pair.left.shape[0] - 1)
+    left, right = pair.left[inside], pair.right[inside]
     nothing = spread(0, width)
-    behind_row, here_row = sums[behind], sums[here]
-    middle = _raw(left, right, view, columns, 0, width)
-    before = middle
+    here = _raw_costs(left, right, pair, unseen, columns, 0, width)
+    before = here
     for x in range(columns):
-        after = _raw(left, right, view, columns, min(x + 1, columns - 1), width)
-        ahead = plus(plus(before, middle), after)
-        at = x * n
-        cost = average(average(load(behind_row, at, width), ahead), load(here_row, at, width))
-        store(behind_row, at, ahead)
-        store(costs, at, average(average(cost, nothing), nothing))
-        before = middle
-        middle = after
+        after = _raw_costs(left, right, pair, unseen, columns, min(x + 1, columns - 1), width)
+        three = plus(plus(before, here), after)
+        mean = average(average(load(older, x * n, width), three), load(newer, x * n, width))
+        store(older, x * n, three)
+        store(costs, x * n, average(average(mean, nothing), nothing))
+        before, here = here, after
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _raw_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
+    i = columns - 1 - x
+    bits = differing_bits(left, right, columns, x, width)
+    dx = _difference(spread(byte(left[3], x), width), load(right[3], i, width))
+    dy = _difference(spread(byte(left[4], x), width), load(right[4], i, width))
+    step = lesser(plus_capped(dx, dy), spread(LARGEST, width))
+    twice = plus(step, step)
+    cost = plus(plus(plus(bits, bits), step), plus(twice, twice))
+    return seen_costs(cost, pair, unseen, columns, x, width)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _difference(one, other):  # type: ignore[no-untyped-def]
+    return either(minus_capped(one, other), minus_capped(other, one))

@@ -1,58 +1,91 @@
-"""winner"""
+"""Selection: the disparity of each pixel from the sums of its paths, and whether it can be believed.
+
+The smallest sum wins, to a fraction of a pixel by the parabola through it and its neighbours. A winner must beat every
+disparity that is not its neighbour (uniqueness), and the right image's pixel must choose the same from the same sums
+(left-right check). That choice needs all sums of a row along a diagonal; the trick is to keep the best so far of n right
+pixels in the lanes of one vector, which moves by one lane from pixel to pixel, as the partners do.
+"""
+
 from __future__ import annotations
+
 import numpy as np
 from numba import njit
-from stages.kernels.vectors import count_up, either, first_equal, lanes_in, lesser, load, outermost, shifted, smallest, spread, store, where_less, byte
 
-@njit(nogil=True, error_model="numpy", cache=True)
-def find_winners(total, beyond, guard, step, winner, evidence, right, width):
-    n = lanes_in(width)
-    columns = winner.size
-    lanes = count_up(width, right)
-    out = load(beyond, 0, width)
-    best = spread(255, width)
-    index = lanes
+from stages.data import Array
+from stages.kernels.vectors import (
+    byte, count_up, either, first_equal, lanes_in, lesser, load, outermost, shifted, smallest, spread, store, where_less,
+)  # fmt: skip
+
+LARGEST_EVIDENCE = 255
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def find_winners(total, beyond, guard, step, winner, votes, right, width):  # type: ignore[no-untyped-def]
+    """The best disparity of each pixel of a row, left and right; the smallest of equals.
+
+    total: (W * n,) uint8, the sums; beyond: (n,) uint8, 255 for lanes that are no disparities; guard: (2 n,) uint8, 255
+    at n - 1, n, n + 1, else 0; step: direction in which to go through the row, with the same result. Into winner (W,)
+    int16, votes (4, W) uint8: sum of the winner, of its lower and upper neighbour, and the smallest of the others; and
+    right (W + n,) uint8 or uint16: the right image's winners, backwards, of left pixel x and disparity d at W - 1 - x + d.
+    """
+    n, columns = lanes_in(width), winner.size
+    lanes, outside = count_up(width, right), load(beyond, 0, width)
+    best, index = spread(255, width), lanes
     if step > 0:
         for x in range(columns):
-            t = either(load(total, x * n, width), out)
-            _winner(t, total, guard, x, winner, evidence, width)
+            sums = either(load(total, x * n, width), outside)
+            _find_winner(sums, total, guard, x, winner, votes, width)
             best, index = shifted(best, 255, 1), shifted(index, 0, 1)
-            index = where_less(t, best, lanes, index)
-            best = lesser(t, best)
+            index, best = where_less(sums, best, lanes, index), lesser(sums, best)
             right[columns + n - 2 - x] = outermost(index, 1)
         store(right, 0, index)
     else:
-        for back in range(columns):
-            x = columns - 1 - back
-            t = either(load(total, x * n, width), out)
-            _winner(t, total, guard, x, winner, evidence, width)
+        for x in range(columns - 1, -1, -1):
+            sums = either(load(total, x * n, width), outside)
+            _find_winner(sums, total, guard, x, winner, votes, width)
             best, index = shifted(best, 255, -1), shifted(index, 0, -1)
-            index = where_less(best, t, index, lanes)
-            best = lesser(t, best)
+            index, best = where_less(best, sums, index, lanes), lesser(sums, best)
             right[columns - 1 - x] = outermost(index, -1)
         store(right, columns - 1, index)
 
-@njit(nogil=True, error_model="numpy", cache=True)
-def _winner(t, total, guard, x, winner, evidence, width):
-    n = lanes_in(width)
-    low = smallest(t)
-    d = first_equal(t, low)
-    winner[x] = d
-    evidence[0, x] = low
-    evidence[1, x] = byte(total, x * n + max(d - 1, 0))
-    evidence[2, x] = byte(total, x * n + min(d + 1, n - 1))
-    evidence[3, x] = smallest(either(t, load(guard, n - d, width)))
 
-@njit(nogil=True, error_model="numpy", cache=True)
-def fit_row(winner, evidence, right, disparities, minimum, keep, tolerance, pixels, strength):
+@njit(nogil=True, cache=True, error_model="numpy")
+def _find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[no-untyped-def]
+    n = lanes_in(width)
+    low = smallest(sums)
+    d = first_equal(sums, low)
+    winner[x] = d
+    votes[0, x] = low
+    votes[1, x] = byte(total, x * n + max(d - 1, 0))
+    votes[2, x] = byte(total, x * n + min(d + 1, n - 1))
+    votes[3, x] = smallest(either(sums, load(guard, n - d, width)))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def fit_row(winner, votes, right, rule, pixels, evidence):  # type: ignore[no-untyped-def]
+    """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
+
+    winner, votes, right: of `find_winners`; rule: `semiglobal.Rule`; into pixels (W,) float32, px, NaN = unknown, and
+    evidence (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown.
+
+    A winner at an end of the search range, or with a neighbour outside the right image, is none: its parabola would
+    lean on a sum that says nothing, and the smallest may lie beyond.
+    """
     columns = winner.size
     for x in range(columns):
         d = np.int64(winner[x])
-        low, before, after, second = np.int64(evidence[0, x]), np.int64(evidence[1, x]), np.int64(evidence[2, x]), np.int64(evidence[3, x])
-        partner = x - minimum - d
-        e = min(columns - 1 - x + d, right.size - 1)
-        fits = (d > 0) & (d < disparities - 1) & (partner > 0) & (partner < columns - 1)
-        fits &= (second * keep > low * 100) & (abs(np.int64(right[e]) - d) <= tolerance)
-        bend = max(before + after - 2 * low, 1)
-        pixels[x] = np.float32(minimum + d) + np.float32(before - after) / np.float32(2 * bend) if fits else np.float32(np.nan)
-        strength[x] = min(255, (second - low) ) if fits else 0
+        low, second = np.int64(votes[0, x]), np.int64(votes[3, x])
+        before, after = np.int64(votes[1, x]), np.int64(votes[2, x])
+        partner = x - rule.minimum - d
+        agrees = abs(np.int64(right[columns - 1 - x + d]) - d) <= rule.consistency
+        bracketed = 0 < d < rule.disparities - 1 and 0 < partner < columns - 1
+        if bracketed and agrees and second - low > rule.uniqueness:
+            bend = max(before + after - 2 * low, 1)
+            pixels[x] = np.float32(rule.minimum + d) + np.float32(before - after) / np.float32(2 * bend)
+            evidence[x] = second - low
+        else:
+            pixels[x] = np.nan
+            evidence[x] = 0
+
+
+def select_reference(total: Array, rule: object, minimum: int) -> None: ...

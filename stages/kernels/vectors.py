@@ -135,10 +135,10 @@ def _spread(b: Any, kind: Lanes, scalar: Any) -> Any:
     return b.shuffle_vector(first, nothing, _indices([0] * kind.chunk))
 
 
-def _place(context: Any, b: Any, array_type: Any, array: Any, index: Any, offset: int, kind: Any) -> Any:
-    """Pointer to `kind` at element `index + offset` of an array."""
-    data = make_array(array_type)(context, b, array).data
-    index = b.sext(index, _I64) if index.type.width < 64 else index
+def _place(context: Any, b: Any, types_of: Any, args: Any, offset: int, kind: Any) -> Any:
+    """Pointer to `kind` at element `args[1] + offset` of the array args[0]."""
+    data = make_array(types_of[0])(context, b, args[0]).data
+    index = context.cast(b, args[1], types_of[1], types.int64)
     return b.bitcast(b.gep(data, [b.add(index, _I64(offset))]), kind.as_pointer())
 
 
@@ -191,7 +191,7 @@ def load(typing_context: Any, array: Any, index: Any, width: Any) -> Any:
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
         chunks = []
         for i in range(kind.count):
-            place = _place(context, b, array, args[0], args[1], i * kind.chunk, kind.vector)
+            place = _place(context, b, signature.args, args, i * kind.chunk, kind.vector)
             chunks.append(b.load(place, align=1))
         return _joined(b, kind, chunks)
 
@@ -204,7 +204,7 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
         for i, chunk in enumerate(_chunks(b, args[2], value)):
-            place = _place(context, b, array, args[0], args[1], i * value.chunk, value.vector)
+            place = _place(context, b, signature.args, args, i * value.chunk, value.vector)
             b.store(chunk, place, align=1)
         return context.get_dummy_value()
 
@@ -216,7 +216,7 @@ def byte(typing_context: Any, array: Any, index: Any) -> Any:
     """One byte of `array`; like array[index], without numba's test for negative indices."""
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        return b.load(_place(context, b, array, args[0], args[1], 0, ir.IntType(8)))
+        return b.load(_place(context, b, signature.args, args, 0, ir.IntType(8)))
 
     return types.uint8(array, index), generate
 

@@ -1,0 +1,100 @@
+"""Speckle removal: patches of the disparity image that are too small to be believed are dropped.
+
+A patch is a set of pixels joined through neighbours (left, right, above, below) whose disparities differ by no more than
+`step`. The trick: what is joined are not pixels but runs, stretches of a row without such a step, by union-find; a row
+has a hundred times fewer of them, and a patch is dropped run by run.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from stages.data import Array
+
+
+def drop_speckles(disparity: Array, evidence: Array, step: float, largest: int) -> None:
+    """Set patches of at most `largest` pixels to NaN, and their evidence to 0, in place.
+
+    disparity: (H, W) float32, px, NaN = unknown; evidence: (H, W) uint8.
+    """
+    if largest > 0:
+        _drop_speckles(disparity, evidence, np.float32(step), largest)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _drop_speckles(disparity, evidence, step, largest):  # type: ignore[no-untyped-def]
+    height, columns = disparity.shape
+    room = height * ((columns + 1) // 2) + columns
+    start, size, parent = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
+    above, here = np.full(columns, -1, np.int32), np.full(columns, -1, np.int32)
+    count = 0
+    for y in range(height):
+        row = disparity[y]
+        before = np.float32(np.nan)
+        joined = -1  # the run above that the present one was joined with last
+        for x in range(columns):
+            value = row[x]
+            run = -1
+            if value == value:
+                if not abs(value - before) <= step:
+                    if count == start.size:
+                        start, size, parent = _doubled(start), _doubled(size), _doubled(parent)
+                    start[count], size[count], parent[count] = y * columns + x, 0, count
+                    count += 1
+                    joined = -1
+                run = count - 1
+                size[run] += 1
+                over = above[x]
+                if over >= 0 and over != joined and abs(value - disparity[y - 1, x]) <= step:
+                    joined = over
+                    _join(parent, run, over)
+            here[x] = run
+            before = value
+        above, here = here, above
+    area = np.zeros(count, np.int32)
+    for run in range(count):
+        area[_root(parent, run)] += size[run]
+    pixels, strength = disparity.reshape(-1), evidence.reshape(-1)
+    for run in range(count):
+        if area[_root(parent, run)] <= largest:
+            pixels[start[run] : start[run] + size[run]] = np.nan
+            strength[start[run] : start[run] + size[run]] = 0
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _doubled(array):  # type: ignore[no-untyped-def]
+    return np.concatenate((array, np.empty_like(array)))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _root(parent, run):  # type: ignore[no-untyped-def]
+    while parent[run] != run:
+        parent[run] = parent[parent[run]]
+        run = parent[run]
+    return run
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _join(parent, one, other):  # type: ignore[no-untyped-def]
+    one, other = _root(parent, one), _root(parent, other)
+    if one < other:
+        parent[other] = one
+    else:
+        parent[one] = other
+
+
+def drop_speckles_reference(disparity: Array, evidence: Array, step: float, largest: int) -> None:
+    """`drop_speckles` by the connected components of a graph of pixels."""
+    index = np.arange(disparity.size).reshape(disparity.shape)
+    with np.errstate(invalid="ignore"):
+        beside = np.abs(np.diff(disparity, axis=1)) <= np.float32(step)
+        above = np.abs(np.diff(disparity, axis=0)) <= np.float32(step)
+    first = np.concatenate([index[:, :-1][beside], index[:-1][above]])
+    second = np.concatenate([index[:, 1:][beside], index[1:][above]])
+    graph = coo_array((np.ones(len(first), np.uint8), (first, second)), shape=(index.size, index.size))
+    labels = connected_components(graph, directed=False)[1].reshape(disparity.shape)
+    small = (np.bincount(labels.ravel())[labels] <= largest) & np.isfinite(disparity)
+    disparity[small], evidence[small] = np.nan, 0
