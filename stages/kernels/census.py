@@ -26,8 +26,8 @@ BLOCK = 64  # pixels described at a time
 def census(image: Array, planes: Array, mirrored: bool = False) -> None:
     """Write the comparisons of each pixel into `planes`.
 
-    image: (H, W) uint8, its own border replicated beyond; planes: (H, 3, >= W rounded up to 64) uint8, of which more
-    than W columns are written; mirrored: the image is flipped left to right, and the bits are to be those it had before.
+    image: (H, W) uint8, its own border replicated beyond; planes: (H, at least 3, at least W rounded up to 64) uint8, of
+    which the first three are written, and more than W columns; mirrored: the image is flipped left to right, and the bits are to be those it had before.
     """
     columns = -(-image.shape[1] // BLOCK) * BLOCK
     padded = cv2.copyMakeBorder(image, 2, 2, 2, 2 + columns - image.shape[1], cv2.BORDER_REPLICATE)

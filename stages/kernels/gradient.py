@@ -19,7 +19,8 @@ from stages.kernels.vectors import (
     Width, average, byte, either, lanes_in, lesser, load, minus_capped, plus, plus_capped, spread, store,
 )  # fmt: skip
 
-PLANES = 2
+DX, DY = 3, 4  # after the planes of census
+PLANES = 5
 BLOCK = 64
 LARGEST = 6
 
@@ -27,8 +28,8 @@ LARGEST = 6
 def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
     """Write dx and dy of each pixel (Sobel / 4, gray levels a pixel, plus 128, within 0 to 255) into `planes`.
 
-    image: (H, W) uint8, its own border replicated beyond; planes: (H, 2, >= W rounded up to 64) uint8, of which more
-    than W columns are written; mirrored: the image is flipped left to right, and dx is to be what it was before.
+    image: (H, W) uint8, its own border replicated beyond; planes: (H, 5, at least W rounded up to 64) uint8, of which the
+    last two are written, and more than W columns; mirrored: the image is flipped left to right, and dx is to be what it was before.
     """
     columns = -(-image.shape[1] // BLOCK) * BLOCK
     padded = cv2.copyMakeBorder(image, 1, 1, 1, 1 + columns - image.shape[1], cv2.BORDER_REPLICATE)
@@ -39,7 +40,7 @@ def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
 def _gradients(image, sign, planes, columns, width):  # type: ignore[no-untyped-def]
     stride = image.shape[1]
     for y in range(planes.shape[0]):
-        dx, dy = planes[y, 0], planes[y, 1]
+        dx, dy = planes[y, DX], planes[y, DY]
         for x in range(0, columns, lanes_in(width)):
             at = (y + 1) * stride + x + 1
             west, east = _smooth(image, at - sign, stride, width), _smooth(image, at + sign, stride, width)
@@ -103,8 +104,8 @@ def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ign
 def _raw_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
     i = columns - 1 - x
     bits = differing_bits(left, right, columns, x, width)
-    dx = _difference(spread(byte(left[3], x), width), load(right[3], i, width))
-    dy = _difference(spread(byte(left[4], x), width), load(right[4], i, width))
+    dx = _difference(spread(byte(left[DX], x), width), load(right[DX], i, width))
+    dy = _difference(spread(byte(left[DY], x), width), load(right[DY], i, width))
     step = lesser(plus_capped(dx, dy), spread(LARGEST, width))
     twice = plus(step, step)
     cost = plus(plus(plus(bits, bits), step), plus(twice, twice))

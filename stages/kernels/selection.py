@@ -62,7 +62,7 @@ def _find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[n
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def fit_row(winner, votes, right, rule, pixels, evidence):  # type: ignore[no-untyped-def]
+def fit_row(winner, votes, right, partners, rule, pixels, evidence):  # type: ignore[no-untyped-def]
     """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
 
     winner, votes, right: of `find_winners`; rule: `semiglobal.Rule`; into pixels (W,) float32, px, NaN = unknown, and
@@ -73,19 +73,20 @@ def fit_row(winner, votes, right, rule, pixels, evidence):  # type: ignore[no-un
     """
     columns = winner.size
     for x in range(columns):
-        d = np.int64(winner[x])
-        low, second = np.int64(votes[0, x]), np.int64(votes[3, x])
-        before, after = np.int64(votes[1, x]), np.int64(votes[2, x])
-        partner = x - rule.minimum - d
-        agrees = abs(np.int64(right[columns - 1 - x + d]) - d) <= rule.consistency
-        bracketed = 0 < d < rule.disparities - 1 and 0 < partner < columns - 1
-        if bracketed and agrees and second - low > rule.uniqueness:
-            bend = max(before + after - 2 * low, 1)
-            pixels[x] = np.float32(rule.minimum + d) + np.float32(before - after) / np.float32(2 * bend)
-            evidence[x] = second - low
-        else:
-            pixels[x] = np.nan
-            evidence[x] = 0
+        partners[x] = right[np.uint64(columns - 1 - x + winner[x])]
+    minimum, last, top = np.int32(rule.minimum), np.int32(columns - 1), np.int32(rule.disparities - 1)
+    tolerance, margin = np.int32(rule.consistency), np.int32(rule.uniqueness)
+    for x in range(columns):
+        d = np.int32(winner[x])
+        low, lower, upper, next_best = np.int32(votes[0, x]), np.int32(votes[1, x]), np.int32(votes[2, x]), np.int32(votes[3, x])
+        partner = np.int32(np.int32(x) - minimum - d)
+        apart = abs(np.int32(np.int32(partners[x]) - d))
+        lead = np.int32(next_best - low)
+        sound = (d > 0) & (d < top) & (partner > 0) & (partner < last) & (apart <= tolerance) & (lead > margin)
+        bend = max(np.int32(lower + upper - low - low), np.int32(1))
+        value = np.float32(minimum + d) + np.float32(lower - upper) / np.float32(bend + bend)
+        pixels[x] = value if sound else np.float32(np.nan)
+        evidence[x] = np.uint8(lead) if sound else np.uint8(0)
 
 
 def select_reference(total: Array, rule: object, minimum: int) -> None: ...

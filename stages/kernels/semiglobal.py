@@ -68,6 +68,7 @@ class Scratch(NamedTuple):
     winner: Array
     votes: Array
     right: Array
+    partners: Array
     beyond: Array
     guard: Array
 
@@ -124,9 +125,9 @@ def _described(image: Array, rule: Rule, width: Width | None = None) -> Array:
         before, after = max(0, -rule.minimum), max(0, rule.minimum)
         image = cv2.copyMakeBorder(cv2.flip(image, 1), 0, 0, before, after + width.lanes, cv2.BORDER_REPLICATE)
     planes = np.empty((image.shape[0], 5 if rule.gradient else 3, -(-image.shape[1] // 64) * 64), np.uint8)
-    census(image, planes[:, :3], backwards)
+    census(image, planes, backwards)
     if rule.gradient:
-        gradients(image, planes[:, 3:], backwards)
+        gradients(image, planes, backwards)
     return planes if after == 0 else np.ascontiguousarray(planes[:, :, after:])
 
 
@@ -162,7 +163,7 @@ def _sweep(  # type: ignore[no-untyped-def]
             find_winners(
                 scratch.total, scratch.beyond, scratch.guard, step, scratch.winner, scratch.votes, scratch.right, width
             )
-            fit_row(scratch.winner, scratch.votes, scratch.right, rule, pixels[y], evidence[y])
+            fit_row(scratch.winner, scratch.votes, scratch.right, scratch.partners, rule, pixels[y], evidence[y])
         y += step
 
 
@@ -200,7 +201,7 @@ class _Half:
         self.scratch = Scratch(
             costs=space.bytes(size), column_sums=space.bytes(2 * size).reshape(2, size), total=space.bytes(size),
             winner=np.empty(columns, np.int16), votes=np.empty((4, columns), np.uint8),
-            right=np.empty(columns + lanes, index), guard=np.where(guard, np.uint8(255), np.uint8(0)),
+            right=np.empty(columns + lanes, index), partners=np.empty(columns, np.int16), guard=np.where(guard, np.uint8(255), np.uint8(0)),
             beyond=np.where(np.arange(lanes) < disparities, np.uint8(0), np.uint8(255)),
         )  # fmt: skip
 

@@ -27,46 +27,45 @@ def drop_speckles(disparity: Array, evidence: Array, step: float, largest: int) 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _drop_speckles(disparity, evidence, step, largest):  # type: ignore[no-untyped-def]
     height, columns = disparity.shape
-    room = height * ((columns + 1) // 2) + columns
-    start, size, parent = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
+    room = height * columns  # most of it is never touched, and so never becomes memory
+    start, end, parent = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
     above, here = np.full(columns, -1, np.int32), np.full(columns, -1, np.int32)
+    beside, over = np.zeros(columns + 1, np.bool_), np.zeros(columns, np.bool_)
     count = 0
     for y in range(height):
-        row = disparity[y]
-        before = np.float32(np.nan)
-        joined = -1  # the run above that the present one was joined with last
+        row, last = disparity[y], disparity[max(y - 1, 0)]
+        for x in range(1, columns):
+            beside[x] = abs(row[x] - row[x - 1]) <= step
         for x in range(columns):
-            value = row[x]
-            run = -1
-            if value == value:
-                if not abs(value - before) <= step:
-                    if count == start.size:
-                        start, size, parent = _doubled(start), _doubled(size), _doubled(parent)
-                    start[count], size[count], parent[count] = y * columns + x, 0, count
-                    count += 1
-                    joined = -1
-                run = count - 1
-                size[run] += 1
-                over = above[x]
-                if over >= 0 and over != joined and abs(value - disparity[y - 1, x]) <= step:
-                    joined = over
-                    _join(parent, run, over)
-            here[x] = run
-            before = value
+            over[x] = abs(row[x] - last[x]) <= step
+            here[x] = -1
+        x = 0
+        while x < columns:
+            if row[x] != row[x]:
+                x += 1
+                continue
+            first = x
+            x += 1
+            while beside[x]:  # ends at the row's end, where there is always False
+                x += 1
+            start[count], end[count], parent[count] = y * columns + first, y * columns + x, count
+            joined = -1  # the run above that this one was joined with last
+            for i in range(first, x):
+                here[i] = count
+                if over[i] and above[i] != joined:
+                    joined = above[i]
+                    if joined >= 0:
+                        _join(parent, count, joined)
+            count += 1
         above, here = here, above
     area = np.zeros(count, np.int32)
     for run in range(count):
-        area[_root(parent, run)] += size[run]
+        area[_root(parent, run)] += end[run] - start[run]
     pixels, strength = disparity.reshape(-1), evidence.reshape(-1)
     for run in range(count):
         if area[_root(parent, run)] <= largest:
-            pixels[start[run] : start[run] + size[run]] = np.nan
-            strength[start[run] : start[run] + size[run]] = 0
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _doubled(array):  # type: ignore[no-untyped-def]
-    return np.concatenate((array, np.empty_like(array)))
+            pixels[start[run] : end[run]] = np.nan
+            strength[start[run] : end[run]] = 0
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -1,5 +1,6 @@
 """Everything `make bench` prints."""
 
-from tests.bench import pipeline
+from tests.bench import matching, pipeline
 
+matching.main()
 pipeline.main()
