@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from stages.data import Array, Disparity, Source, StereoFrame
+from stages.data import Array, Disparity, StereoFrame
 from stages.kernels.prior import prior_costs
 from stages.kernels.semiglobal import Rule, lanes_for, match
-from stages.kernels.speckles import drop_speckles
 from stages.stage import Stage, parameter
 
 SMALLEST_SIDE = 32
@@ -59,10 +58,8 @@ class Match(Stage):
     def __call__(self, frame: StereoFrame, prior: Disparity | None = None) -> Disparity:
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
         pulls = self._pulls(frame, prior)
-        pixels, evidence = match(left, right, self._rule(), pulls, self.threads, self.memory << 20)
-        drop_speckles(pixels, evidence, self.speckle_range, self.speckle_size)
-        source = np.isfinite(pixels).view(np.uint8) * np.uint8(Source.MEASURED)
-        return Disparity(frame.stamp, pixels, source, (evidence / np.float32(255)).astype(np.float32), camera=frame.camera)
+        found = match(left, right, self._rule(), pulls, self.threads, self.memory << 20)
+        return Disparity(frame.stamp, found.pixels, found.source, found.confidence, camera=frame.camera)
 
     def _costs(self) -> tuple[int, int, int, int]:
         largest, unseen, p1, p2 = COSTS[self.cost]
@@ -73,7 +70,8 @@ class Match(Stage):
         table = np.maximum(p1 + 2, np.round(p2 / (1 + np.arange(256) / self.edge))).astype(np.uint8)
         return Rule(
             self.cost == "census+gradient", self.paths == 8, p1, table, unseen, self.disparities, self.minimum,
-            self.uniqueness, self.consistency,
+            self.uniqueness, self.consistency, self.speckle_range, self.speckle_size,
+            (np.arange(256) / 255).astype(np.float32),
         )  # fmt: skip
 
     def _pulls(self, frame: StereoFrame, prior: Disparity | None) -> tuple[Array, Array] | None:

@@ -19,8 +19,9 @@ import numpy as np
 from numba import njit
 
 from stages.data import Array
+from stages.kernels.census import differing_bits, seen_costs
 from stages.kernels.vectors import (
-    Width, byte, either, lanes_in, lesser, load, minus, minus_capped, plus_capped, shifted, smallest, spread, store,
+    Width, byte, either, lanes_in, lesser, load, minus, minus_capped, plus_capped, shifted, shifted_in_memory, smallest, spread, store,
 )  # fmt: skip
 
 BLOCK = 64
@@ -57,7 +58,7 @@ def _brightness_steps(image, image_stride, steps, rows, stride, width):  # type:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def aggregate_row(  # type: ignore[no-untyped-def]
-    costs, steps, table, p1, diagonals, paths, y, step, sums, place, total, final, width
+    costs, steps, table, p1, diagonals, paths, y, step, sums, place, total, final, width, pair, unseen, fused
 ):
     """Follow the paths of one sweep from the row before into row y, and add them up.
 
@@ -81,22 +82,26 @@ def aggregate_row(  # type: ignore[no-untyped-def]
     store(paths, fall * n, nothing)  # this path begins here, as does the one at the other end of the row
     store(paths, (2 * columns + (last + y) % columns) * n, nothing)
     path = nothing
+    left, right = pair.left[y], pair.right[y]
     x = first
     for _ in range(columns):
-        cost = load(costs, x * n, width)
+        if fused:
+            cost = seen_costs(differing_bits(left, right, columns, x, width), pair, unseen, columns, x, width)
+        else:
+            cost = load(costs, x * n, width)
         path = _continued(path, cost, small_step, byte(table, byte(steps, beside)), width)
         total_here = path
         at = (columns + x) * n
-        moved = _continued(load(paths, at, width), cost, small_step, byte(table, byte(steps, upright)), width)
+        moved = _moved(paths, at, cost, small_step, byte(table, byte(steps, upright)), width)
         store(paths, at, moved)
         total_here = plus_capped(total_here, moved)
         if diagonals:
             at = fall * n
-            moved = _continued(load(paths, at, width), cost, small_step, byte(table, byte(steps, falling)), width)
+            moved = _moved(paths, at, cost, small_step, byte(table, byte(steps, falling)), width)
             store(paths, at, moved)
             total_here = plus_capped(total_here, moved)
             at = (2 * columns + rise) * n
-            moved = _continued(load(paths, at, width), cost, small_step, byte(table, byte(steps, rising)), width)
+            moved = _moved(paths, at, cost, small_step, byte(table, byte(steps, rising)), width)
             store(paths, at, moved)
             total_here = plus_capped(total_here, moved)
         here = place + x * n
@@ -112,6 +117,14 @@ def aggregate_row(  # type: ignore[no-untyped-def]
 def _continued(before, cost, p1, p2, width):  # type: ignore[no-untyped-def]
     """L of the next pixel of a path, above its smallest value."""
     neighbour = plus_capped(lesser(shifted(before, FAR, 1), shifted(before, FAR, -1)), p1)
+    after = plus_capped(cost, lesser(lesser(neighbour, before), spread(p2, width)))
+    return minus(after, spread(smallest(after), width))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _moved(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    before = load(paths, at, width)
+    neighbour = plus_capped(lesser(shifted_in_memory(before, paths, at, FAR, 1), shifted_in_memory(before, paths, at, FAR, -1)), p1)
     after = plus_capped(cost, lesser(lesser(neighbour, before), spread(p2, width)))
     return minus(after, spread(smallest(after), width))
 

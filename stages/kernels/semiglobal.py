@@ -13,9 +13,8 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,8 +24,10 @@ from stages.data import Array
 from stages.kernels.aggregation import aggregate_row, brightness_steps
 from stages.kernels.census import census, census_costs
 from stages.kernels.gradient import gradients, smoothed_costs
+from stages.kernels.halves import pairs
 from stages.kernels.prior import add_prior
 from stages.kernels.selection import find_winners, fit_row
+from stages.kernels.speckles import drop_speckles
 from stages.kernels.vectors import Width, lanes_in
 
 NO_PRIOR = np.zeros((0, 0), np.int32), np.zeros(1, np.uint8)
@@ -44,6 +45,9 @@ class Rule(NamedTuple):
     minimum: int
     uniqueness: int
     consistency: int
+    speckle_range: float
+    speckle_size: int
+    calibration: Array  # (256,) float32, confidence for each amount of evidence
 
 
 class Pair(NamedTuple):
@@ -57,6 +61,15 @@ class Pair(NamedTuple):
     whole_to: int
     prior: Array  # (H, W) int32: where in `prior_costs` the costs of a pixel begin; or none
     prior_costs: Array  # (m,) uint8
+
+
+class Matches(NamedTuple):
+    """What `match` finds, (H, W) each."""
+
+    pixels: Array  # float32, px, NaN = unknown
+    source: Array  # uint8: 1 where known, else 0, as `stages.data.Source`
+    confidence: Array  # float32
+    evidence: Array  # uint8, of which the confidence is a function; 0 where unknown
 
 
 class Scratch(NamedTuple):
@@ -78,44 +91,39 @@ def lanes_for(disparities: int) -> int:
     return next((n for n in (16, 32, 64, 96) if disparities <= n), -(-disparities // 64) * 64)
 
 
-def match(left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, threads: int, memory: int) -> tuple[Array, Array]:
+def match(left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, threads: int, memory: int) -> Matches:
     """Disparities of a rectified pair of gray images.
 
     left, right: (H, W) uint8; prior: of `prior.prior_costs`, or None; threads: more than 2 have nothing to do; memory:
-    bytes that the sums of paths may take. Returns pixels (H, W) float32, NaN = unknown, and evidence (H, W) uint8.
+    bytes that the sums of paths may take.
     """
     height, columns = left.shape
     width = Width(lanes_for(rule.disparities))
     pixels, evidence = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
-    with ThreadPoolExecutor(1) as second, _workspaces.one() as space:
-        at_once: Callable[..., tuple[Any, Any]] = _Both(second) if threads > 1 else _in_turn
-        (left_planes, steps), right_planes = at_once(
+    with pairs(threads) as both, _workspaces.one() as space:
+        (left_planes, steps), right_planes = both(
             lambda: (_described(left, rule), brightness_steps(left)), lambda: _described(right, rule, width)
         )
         pair = Pair(left_planes, right_planes, steps, *_view(columns, rule, width), *(prior or NO_PRIOR))
-        halves = _halves(pair, rule, space, width, memory, pixels, evidence)
-        at_once(halves[0].arrive, halves[1].arrive)
-        at_once(lambda: halves[0].cross(halves[1]), lambda: halves[1].cross(halves[0]))
-    return pixels, evidence
+        upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
+        both(upper.arrive, lower.arrive)
+        both(lambda: upper.cross(lower), lambda: lower.cross(upper))
+        drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, both)
+        confidence, source = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
+        middle = height // 2
+        both(
+            lambda: _grade(evidence[:middle], rule.calibration, confidence[:middle], source[:middle]),
+            lambda: _grade(evidence[middle:], rule.calibration, confidence[middle:], source[middle:]),
+        )
+    return Matches(pixels, source, confidence, evidence)
 
 
-def _in_turn(one: Callable[[], Any], other: Callable[[], Any]) -> tuple[Any, Any]:
-    return one(), other()
-
-
-class _Both:
-    """Run two functions at once, one of them on another thread."""
-
-    def __init__(self, pool: ThreadPoolExecutor) -> None:
-        self.pool = pool
-
-    def __call__(self, one: Callable[[], Any], other: Callable[[], Any]) -> tuple[Any, Any]:
-        future = self.pool.submit(other)
-        try:
-            result = one()
-        finally:
-            elsewhere = future.result()
-        return result, elsewhere
+@njit(nogil=True, cache=True, error_model="numpy")
+def _grade(evidence, calibration, confidence, source):  # type: ignore[no-untyped-def]
+    for y in range(evidence.shape[0]):
+        for x in range(evidence.shape[1]):
+            confidence[y, x] = calibration[evidence[y, x]]
+            source[y, x] = evidence[y, x] > 0
 
 
 def _described(image: Array, rule: Rule, width: Width | None = None) -> Array:
@@ -151,13 +159,13 @@ def _sweep(  # type: ignore[no-untyped-def]
     while y != end:
         if rule.gradient:
             smoothed_costs(pair, rule.unseen, y + step, scratch.column_sums, scratch.costs, width)
-        else:
+        elif pair.prior.size > 0:
             census_costs(pair, rule.unseen, y, scratch.costs, width)
         if pair.prior.size > 0:
             add_prior(scratch.costs, pair.prior[y], pair.prior_costs, width)
         aggregate_row(
             scratch.costs, pair.steps, rule.table, rule.p1, rule.diagonals, paths, y, step,
-            sums, (y - origin) * size, scratch.total, final, width,
+            sums, (y - origin) * size, scratch.total, final, width, pair, rule.unseen, not rule.gradient and pair.prior.size == 0,
         )  # fmt: skip
         if final:
             find_winners(

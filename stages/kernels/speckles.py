@@ -7,32 +7,50 @@ has a hundred times fewer of them, and a patch is dropped run by run.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from stages.data import Array
+from stages.kernels.halves import in_turn
 
 
-def drop_speckles(disparity: Array, evidence: Array, step: float, largest: int) -> None:
+def drop_speckles(
+    disparity: Array, evidence: Array, step: float, largest: int, at_once: Callable[..., object] = in_turn
+) -> None:
     """Set patches of at most `largest` pixels to NaN, and their evidence to 0, in place.
 
-    disparity: (H, W) float32, px, NaN = unknown; evidence: (H, W) uint8.
+    disparity: (H, W) float32, px, NaN = unknown; evidence: (H, W) uint8; step: px; at_once: calls two functions, one
+    for the upper and one for the lower half of the image.
     """
-    if largest > 0:
-        _drop_speckles(disparity, evidence, np.float32(step), largest)
+    if largest == 0:
+        return
+    height, columns = disparity.shape
+    middle = height // 2
+    # As many runs as pixels at most. What is not touched never becomes memory.
+    start, end, parent = (np.empty(height * columns, np.int32) for _ in range(3))
+    seam = np.full((2, columns), -1, np.int32)
+    runs, limit = (start, end, parent), np.float32(step)
+    counts = np.array([0, middle * columns])
+    at_once(
+        lambda: _find_runs(disparity, 0, middle, limit, runs, counts[:1], seam[:1]),
+        lambda: _find_runs(disparity, middle, height, limit, runs, counts[1:], seam[1:]),
+    )
+    _drop(disparity, evidence, middle, limit, largest, runs, counts, seam)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _drop_speckles(disparity, evidence, step, largest):  # type: ignore[no-untyped-def]
-    height, columns = disparity.shape
-    room = height * columns  # most of it is never touched, and so never becomes memory
-    start, end, parent = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
+def _find_runs(disparity, first_row, end_row, step, runs, count_out, seam):  # type: ignore[no-untyped-def]
+    """Runs of some rows, joined among themselves; `seam` takes those of the row next to the other half."""
+    start, end, parent = runs
+    columns = disparity.shape[1]
+    count = count_out[0]
     above, here = np.full(columns, -1, np.int32), np.full(columns, -1, np.int32)
     beside, over = np.zeros(columns + 1, np.bool_), np.zeros(columns, np.bool_)
-    count = 0
-    for y in range(height):
+    for y in range(first_row, end_row):
         row, last = disparity[y], disparity[max(y - 1, 0)]
         for x in range(1, columns):
             beside[x] = abs(row[x] - row[x - 1]) <= step
@@ -57,15 +75,29 @@ def _drop_speckles(disparity, evidence, step, largest):  # type: ignore[no-untyp
                     if joined >= 0:
                         _join(parent, count, joined)
             count += 1
+        if y == (end_row - 1 if first_row == 0 else first_row):
+            seam[0, :] = here
         above, here = here, above
-    area = np.zeros(count, np.int32)
-    for run in range(count):
-        area[_root(parent, run)] += end[run] - start[run]
+    count_out[0] = count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _drop(disparity, evidence, middle, step, largest, runs, counts, seam):  # type: ignore[no-untyped-def]
+    start, end, parent = runs
+    columns = disparity.shape[1]
+    for x in range(columns):
+        if seam[0, x] >= 0 and seam[1, x] >= 0 and abs(disparity[middle, x] - disparity[middle - 1, x]) <= step:
+            _join(parent, seam[0, x], seam[1, x])
+    area = np.zeros(parent.size, np.int32)
+    for first, count in ((0, counts[0]), (middle * columns, counts[1])):
+        for run in range(first, count):
+            area[_root(parent, run)] += end[run] - start[run]
     pixels, strength = disparity.reshape(-1), evidence.reshape(-1)
-    for run in range(count):
-        if area[_root(parent, run)] <= largest:
-            pixels[start[run] : end[run]] = np.nan
-            strength[start[run] : end[run]] = 0
+    for first, count in ((0, counts[0]), (middle * columns, counts[1])):
+        for run in range(first, count):
+            if area[_root(parent, run)] <= largest:
+                pixels[start[run] : end[run]] = np.nan
+                strength[start[run] : end[run]] = 0
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

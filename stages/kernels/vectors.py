@@ -330,3 +330,23 @@ def where_less(typing_context: Any, x: Any, y: Any, chosen: Any, otherwise: Any)
         return _joined(b, chosen, [b.select(b.icmp_unsigned("<", p, q), u, v) for p, q, u, v in parts])
 
     return chosen(x, y, chosen, otherwise), generate
+
+
+@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+def shifted_in_memory(typing_context: Any, value: Any, array: Any, index: Any, fill: Any, step: Any) -> Any:
+    up = step.literal_value > 0
+
+    def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
+        size, chunks, edge = value.chunk, _chunks(b, args[0], value), _spread(b, value, args[3])
+        out = []
+        for i, chunk in enumerate(chunks):
+            if up and i == 0:
+                out.append(b.shuffle_vector(edge, chunk, _indices(range(size - 1, 2 * size - 1))))
+            elif not up and i == len(chunks) - 1:
+                out.append(b.shuffle_vector(chunk, edge, _indices(range(1, size + 1))))
+            else:
+                place = _place(context, b, signature.args[1:3], args[1:3], i * size + (-1 if up else 1), value.vector)
+                out.append(b.load(place, align=1))
+        return _joined(b, value, out)
+
+    return value(value, array, index, fill, step), generate

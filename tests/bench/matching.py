@@ -84,21 +84,20 @@ def speed() -> None:
 
 
 MEASURE = """
-import json, resource, sys, time
+import json, re, sys, time
 start = time.perf_counter()
 from tests.bench.matching import pair
 from stages import Match
 cost, disparities, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 frame = pair()
-Match(cost=cost, disparities=32)
-import stages.kernels.semiglobal
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1])
+before = peak()
 start = time.perf_counter()
 Match(cost=cost, disparities=disparities, threads=threads)(frame)
 first = time.perf_counter() - start
 start = time.perf_counter()
 Match(cost=cost, disparities=disparities, threads=threads)(frame)
-after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+after = peak()
 print(json.dumps([first, time.perf_counter() - start, (after - before) / 1024]))
 """
 
