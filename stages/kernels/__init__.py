@@ -1,5 +1,3 @@
 """The compiled inner loops, one algorithm a file, each beside the plain reference that its tests compare with."""
 
-from stages.kernels.cache import install
-
-install()
+import stages.kernels.compiled  # noqa: F401  (numba keeps what is compiled after this in the way told there)

@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import kernel, part
 from stages.kernels.census import differing_bits, seen_costs
 from stages.kernels.vectors import (
     Width, byte, either, lanes_in, lesser, load, minus, minus_capped, plus_capped, shifted, shifted_in_memory, smallest, spread, store,
@@ -43,7 +43,7 @@ def brightness_steps(image: Array) -> Array:
     return steps
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _brightness_steps(image, image_stride, steps, rows, stride, width):  # type: ignore[no-untyped-def]
     side = 0
     for dy, dx in SIDES:
@@ -56,7 +56,7 @@ def _brightness_steps(image, image_stride, steps, rows, stride, width):  # type:
         side += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def aggregate_row(  # type: ignore[no-untyped-def]
     costs, steps, table, p1, diagonals, paths, y, step, sums, place, total, final, width, pair, unseen, fused
 ):
@@ -113,7 +113,7 @@ def aggregate_row(  # type: ignore[no-untyped-def]
         fall, rise = _around(fall + step, columns), _around(rise + step, columns)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _continued(before, cost, p1, p2, width):  # type: ignore[no-untyped-def]
     """L of the next pixel of a path, above its smallest value."""
     neighbour = plus_capped(lesser(shifted(before, FAR, 1), shifted(before, FAR, -1)), p1)
@@ -121,7 +121,7 @@ def _continued(before, cost, p1, p2, width):  # type: ignore[no-untyped-def]
     return minus(after, spread(smallest(after), width))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _moved(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
     before = load(paths, at, width)
     neighbour = plus_capped(lesser(shifted_in_memory(before, paths, at, FAR, 1), shifted_in_memory(before, paths, at, FAR, -1)), p1)
@@ -129,7 +129,7 @@ def _moved(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
     return minus(after, spread(smallest(after), width))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _around(place, columns):  # type: ignore[no-untyped-def]
     """`place` modulo `columns`, from one step outside at most."""
     return 0 if place == columns else columns - 1 if place < 0 else place

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import kernel, part
 from stages.kernels.vectors import (
     Width, both, byte, either, exclusive_or, lanes_in, load, minus_capped, ones, plus, spread, store, where_less,
 )  # fmt: skip
@@ -34,7 +34,7 @@ def census(image: Array, planes: Array, mirrored: bool = False) -> None:
     _census(padded, -1 if mirrored else 1, planes, columns, Width(BLOCK))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _census(image, sign, planes, columns, width):  # type: ignore[no-untyped-def]
     nothing, stride = spread(0, width), image.shape[1]
     for y in range(planes.shape[0]):
@@ -64,7 +64,7 @@ def census_reference(image: Array, mirrored: bool = False) -> Array:
     return bits
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def census_costs(pair, unseen, y, costs, width):  # type: ignore[no-untyped-def]
     """The costs of row y, all pixels and disparities: costs (W * n,) uint8, pixel after pixel.
 
@@ -79,7 +79,7 @@ def census_costs(pair, unseen, y, costs, width):  # type: ignore[no-untyped-def]
         store(costs, x * n, seen_costs(bits, pair, unseen, columns, x, width))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def differing_bits(left, right, columns, x, width):  # type: ignore[no-untyped-def]
     """How many of the 24 comparisons differ between pixel x and its partner at each disparity."""
     i = columns - 1 - x
@@ -88,7 +88,7 @@ def differing_bits(left, right, columns, x, width):  # type: ignore[no-untyped-d
     return plus(bits, ones(exclusive_or(spread(byte(left[2], x), width), load(right[2], i, width))))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def seen_costs(costs, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
     """`costs` of pixel x, but `unseen` where the partner is outside the right image."""
     if pair.whole_from <= x < pair.whole_to:

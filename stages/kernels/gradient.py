@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import kernel, part
 from stages.kernels.census import differing_bits, seen_costs
 from stages.kernels.vectors import (
     Width, average, byte, either, lanes_in, lesser, load, minus_capped, plus, plus_capped, spread, store,
@@ -36,7 +36,7 @@ def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
     _gradients(padded, -1 if mirrored else 1, planes, columns, Width(BLOCK))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _gradients(image, sign, planes, columns, width):  # type: ignore[no-untyped-def]
     stride = image.shape[1]
     for y in range(planes.shape[0]):
@@ -49,14 +49,14 @@ def _gradients(image, sign, planes, columns, width):  # type: ignore[no-untyped-
             store(dy, x, _signed_difference(south, north, width))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _smooth(image, at, stride, width):  # type: ignore[no-untyped-def]
     """Mean of three pixels `stride` apart, the middle one, at `at`, twice."""
     ends = average(load(image, at - stride, width), load(image, at + stride, width))
     return average(ends, load(image, at, width))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _signed_difference(more, less, width):  # type: ignore[no-untyped-def]
     above = plus_capped(spread(128, width), minus_capped(more, less))
     return minus_capped(above, minus_capped(less, more))
@@ -76,7 +76,7 @@ def gradients_reference(image: Array, mirrored: bool = False) -> Array:
     return np.clip(planes + 128, 0, 255).astype(np.uint8)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ignore[no-untyped-def]
     """The costs of the row before row `ahead` of a sweep, all pixels and disparities: costs (W * n,) uint8.
 
@@ -89,10 +89,12 @@ def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ign
     inside = min(max(ahead, 0), pair.left.shape[0] - 1)
     left, right = pair.left[inside], pair.right[inside]
     nothing = spread(0, width)
-    here = _raw_costs(left, right, pair, unseen, columns, 0, width)
-    before = here
-    for x in range(columns):
+    before = here = nothing
+    for x in range(-1, columns):
         after = _raw_costs(left, right, pair, unseen, columns, min(x + 1, columns - 1), width)
+        if x < 0:  # beyond the border, its pixel again
+            before = here = after
+            continue
         three = plus(plus(before, here), after)
         mean = average(average(load(older, x * n, width), three), load(newer, x * n, width))
         store(older, x * n, three)
@@ -100,7 +102,7 @@ def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ign
         before, here = here, after
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _raw_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
     i = columns - 1 - x
     bits = differing_bits(left, right, columns, x, width)
@@ -112,6 +114,6 @@ def _raw_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no
     return seen_costs(cost, pair, unseen, columns, x, width)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _difference(one, other):  # type: ignore[no-untyped-def]
     return either(minus_capped(one, other), minus_capped(other, one))

@@ -8,9 +8,9 @@ where its stretch begins. Four tables serve priors of a quarter pixel; a fifth, 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import part
 from stages.kernels.vectors import lanes_in, load, plus_capped, store
 
 PHASES = 4
@@ -37,7 +37,7 @@ def prior_costs(prior: Array, minimum: int, lanes: int, weight: float, reach: fl
     return np.where(known, begin, PHASES * length).astype(np.int32), table
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def add_prior(costs, begin, table, width):  # type: ignore[no-untyped-def]
     """Add the prior's costs to those of a row: costs (W * n,) uint8; begin: (W,) int32; table: of `prior_costs`."""
     n = lanes_in(width)

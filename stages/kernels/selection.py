@@ -9,9 +9,9 @@ pixels in the lanes of one vector, which moves by one lane from pixel to pixel, 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import part
 from stages.kernels.vectors import (
     byte, count_up, either, first_equal, lanes_in, lesser, load, outermost, shifted, smallest, spread, store, where_less,
 )  # fmt: skip
@@ -19,7 +19,7 @@ from stages.kernels.vectors import (
 LARGEST_EVIDENCE = 255
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def find_winners(total, beyond, guard, step, winner, votes, right, width):  # type: ignore[no-untyped-def]
     """The best disparity of each pixel of a row, left and right; the smallest of equals.
 
@@ -49,7 +49,7 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):  # ty
         store(right, columns - 1, index)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[no-untyped-def]
     n = lanes_in(width)
     low = smallest(sums)
@@ -61,7 +61,7 @@ def _find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[n
     votes[3, x] = smallest(either(sums, load(guard, n - d, width)))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def fit_row(winner, votes, right, partners, rule, pixels, evidence):  # type: ignore[no-untyped-def]
     """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
 

@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 from stages.kernels.aggregation import aggregate_row, brightness_steps
 from stages.kernels.census import census, census_costs
 from stages.kernels.gradient import gradients, smoothed_costs
@@ -118,7 +118,7 @@ def match(left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | No
     return Matches(pixels, source, confidence, evidence)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _grade(evidence, calibration, confidence, source):  # type: ignore[no-untyped-def]
     for y in range(evidence.shape[0]):
         for x in range(evidence.shape[1]):
@@ -146,7 +146,7 @@ def _view(columns: int, rule: Rule, width: Width) -> tuple[Array, int, int]:
     return outside, rule.minimum + width.lanes - 1, columns + min(0, rule.minimum)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _sweep(  # type: ignore[no-untyped-def]
     pair, rule, width, pixels, evidence, scratch, paths, y, end, step, sums, origin, final
 ):

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from stages.data import Array
+from stages.kernels.compiled import kernel, part
 from stages.kernels.halves import in_turn
 
 
@@ -35,23 +35,25 @@ def drop_speckles(
     seam = np.full((2, columns), -1, np.int32)
     runs, limit = (start, end, parent), np.float32(step)
     counts = np.array([0, middle * columns])
-    at_once(
-        lambda: _find_runs(disparity, 0, middle, limit, runs, counts[:1], seam[:1]),
-        lambda: _find_runs(disparity, middle, height, limit, runs, counts[1:], seam[1:]),
-    )
-    _drop(disparity, evidence, middle, limit, largest, runs, counts, seam)
+
+    def find(first: int, last: int, half: int) -> None:
+        rows = np.full((2, columns), -1, np.int32), np.zeros((2, columns + 1), np.bool_)
+        _find_runs(disparity, first, last, limit, runs, counts, seam, half, *rows)
+
+    at_once(lambda: find(0, middle, 0), lambda: find(middle, height, 1))
+    _drop(disparity, evidence, middle, limit, largest, runs, np.zeros(height * columns, np.int32), counts, seam)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _find_runs(disparity, first_row, end_row, step, runs, count_out, seam):  # type: ignore[no-untyped-def]
+@kernel
+def _find_runs(disparity, first_row, end_row, step, runs, counts, seam, half, ids, links):  # type: ignore[no-untyped-def]
     """Runs of some rows, joined among themselves; `seam` takes those of the row next to the other half."""
     start, end, parent = runs
     columns = disparity.shape[1]
-    count = count_out[0]
-    above, here = np.full(columns, -1, np.int32), np.full(columns, -1, np.int32)
-    beside, over = np.zeros(columns + 1, np.bool_), np.zeros(columns, np.bool_)
+    count = counts[half]
+    beside, over = links[0], links[1]  # whether a pixel belongs to the patch of its left or of its upper neighbour
     for y in range(first_row, end_row):
         row, last = disparity[y], disparity[max(y - 1, 0)]
+        above, here = ids[(y + 1) & 1], ids[y & 1]
         for x in range(1, columns):
             beside[x] = abs(row[x] - row[x - 1]) <= step
         for x in range(columns):
@@ -75,20 +77,19 @@ def _find_runs(disparity, first_row, end_row, step, runs, count_out, seam):  # t
                     if joined >= 0:
                         _join(parent, count, joined)
             count += 1
-        if y == (end_row - 1 if first_row == 0 else first_row):
-            seam[0, :] = here
-        above, here = here, above
-    count_out[0] = count
+        if y == (end_row - 1 if half == 0 else first_row):
+            for x in range(columns):
+                seam[half, x] = here[x]
+    counts[half] = count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _drop(disparity, evidence, middle, step, largest, runs, counts, seam):  # type: ignore[no-untyped-def]
+@kernel
+def _drop(disparity, evidence, middle, step, largest, runs, area, counts, seam):  # type: ignore[no-untyped-def]
     start, end, parent = runs
     columns = disparity.shape[1]
     for x in range(columns):
         if seam[0, x] >= 0 and seam[1, x] >= 0 and abs(disparity[middle, x] - disparity[middle - 1, x]) <= step:
             _join(parent, seam[0, x], seam[1, x])
-    area = np.zeros(parent.size, np.int32)
     for first, count in ((0, counts[0]), (middle * columns, counts[1])):
         for run in range(first, count):
             area[_root(parent, run)] += end[run] - start[run]
@@ -96,11 +97,11 @@ def _drop(disparity, evidence, middle, step, largest, runs, counts, seam):  # ty
     for first, count in ((0, counts[0]), (middle * columns, counts[1])):
         for run in range(first, count):
             if area[_root(parent, run)] <= largest:
-                pixels[start[run] : end[run]] = np.nan
-                strength[start[run] : end[run]] = 0
+                for i in range(start[run], end[run]):
+                    pixels[i], strength[i] = np.nan, 0
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _root(parent, run):  # type: ignore[no-untyped-def]
     while parent[run] != run:
         parent[run] = parent[parent[run]]
@@ -108,7 +109,7 @@ def _root(parent, run):  # type: ignore[no-untyped-def]
     return run
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@part
 def _join(parent, one, other):  # type: ignore[no-untyped-def]
     one, other = _root(parent, one), _root(parent, other)
     if one < other:

@@ -1,6 +1,6 @@
-"""Where compiled kernels are kept between runs, and when they are too old to be used.
+"""How kernels are compiled: `kernel` for what Python calls, `part` for what only kernels call.
 
-numba keeps the machine code of a kernel as long as the file that defines it is unchanged. But a kernel contains the code
+They are kept between runs. numba keeps the machine code of a kernel as long as the file that defines it is unchanged. But a kernel contains the code
 of those it calls, which may be in other files, so a change there would leave old code in use. Here every kernel is as
 old as the youngest of them: the mark by which numba tells whether its copy is current is a digest of all sources of this
 folder and of the versions of numba and LLVM. numba adds the processor itself.
@@ -16,6 +16,7 @@ from typing import Any
 
 import llvmlite
 import numba
+from numba import njit
 from numba.core import event
 from numba.core.caching import CacheImpl, _CacheLocator
 
@@ -69,3 +70,10 @@ def install() -> None:
     if _KernelCacheLocator not in CacheImpl._locator_classes:
         CacheImpl._locator_classes = [_KernelCacheLocator, *CacheImpl._locator_classes]
         event.register("numba:compile", _Announcement())
+
+
+install()
+# No Python lock while they run, no exceptions for a division by 0; without the entry points that nobody calls, a third
+# of the time to compile is saved.
+kernel = njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
+part = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)
