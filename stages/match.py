@@ -19,7 +19,7 @@ from stages.stage import Stage, parameter
 SMALLEST_SIDE = 32
 LARGEST_SUM = 255
 # cost -> largest cost, cost outside the right image, default p1, default p2
-COSTS = {"census": (24, 12, 8, 70), "census+gradient": (59, 40, 16, 120)}
+COSTS = {"census": (24, 12, 12, 70), "census+gradient": (59, 40, 16, 100)}
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Match(Stage):
     p1: int = parameter(0, "penalty of a step of 1 px; 0: the one that suits the cost", low=0, high=100)
     p2: int = parameter(0, "penalty of a larger step where the image is even; 0: the one that suits", low=0, high=230)
     edge: float = parameter(10.0, "step of brightness that halves p2", unit="gray levels", low=0.1)
-    uniqueness: int = parameter(1, "by how much the best sum of paths must beat the next", low=0, high=254)
-    consistency: int = parameter(1, "largest left-right difference", unit="px", low=0, high=64)
+    uniqueness: int = parameter(0, "by how much the best sum of paths must beat the next", low=0, high=254)
+    consistency: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
     speckle_size: int = parameter(40, "largest isolated patch that is dropped, in pixels", low=0)
     speckle_range: float = parameter(1.0, "disparity step that separates patches", unit="px", low=0)
     prior_weight: float = parameter(0.5, "cost of each pixel of distance from the prior", low=0, high=16)

@@ -17,6 +17,7 @@ import numpy as np
 from stages.data import Array, Disparity, StereoCamera, StereoFrame
 from stages.kernels.background import fill_background
 from stages.match import Match
+from stages.match_opencv import MatchOpenCV
 from stages.refine import Refine
 
 PAPER_MATCH = {
@@ -59,7 +60,7 @@ def errors(pixels: Array, truth: Array, mask: Array, margin: int) -> Array:
 def chains(frame: StereoFrame, levels: int) -> dict[str, Array]:
     """Disparity pixels of each way to compute them."""
     matched = Match(disparities=levels)(frame)
-    as_paper = Match(disparities=levels, **PAPER_MATCH)(frame)
+    as_paper = MatchOpenCV(disparities=levels, **PAPER_MATCH)(frame)
     paper, rover = Refine(**PAPER_REFINE), Refine()
     results: dict[str, Disparity | Array] = {
         "rover match, filled": fill_background(matched.pixels, np.inf),

@@ -10,6 +10,7 @@ import pytest
 from stages.data import Disparity, Source, StereoCamera, StereoFrame
 from stages.kernels.background import fill_background
 from stages.match import Match
+from stages.match_opencv import MatchOpenCV
 from stages.refine import Refine
 from tests.bench.stereo_scores import PAPER_MATCH, PAPER_REFINE, errors, load_scene
 
@@ -112,7 +113,7 @@ def test_rover_beats_matching_and_paper_on_real_scenes():
     for name in ("Adirondack", "Motorcycle", "PlaytableP", "Teddy"):
         frame, truth, mask, levels = load_scene(folder / name)
         matches = Match(disparities=levels)(frame)
-        paper = Refine(**PAPER_REFINE)(frame, Match(disparities=levels, **PAPER_MATCH)(frame))
+        paper = Refine(**PAPER_REFINE)(frame, MatchOpenCV(disparities=levels, **PAPER_MATCH)(frame))
         chain = fill_background(matches.pixels, np.inf), paper.pixels, Refine()(frame, matches).pixels
         scores.append([errors(pixels, truth, mask, levels) for pixels in chain])
     matched, paper, rover = np.mean(scores, axis=0)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.data import Source, StereoCamera, StereoFrame
-from stages.match import Match
+from stages.match_opencv import MatchOpenCV
 
 
 def frame_of(left, right):
@@ -41,7 +41,7 @@ def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(paths, color):
     frame, truth = slanted_pair()
     if color:
         frame = replace(frame, left=np.dstack([frame.left] * 3), right=np.dstack([frame.right] * 3))
-    result = Match(disparities=48, paths=paths, color=color)(frame)
+    result = MatchOpenCV(disparities=48, paths=paths, color=color)(frame)
     visible = np.arange(320) >= truth
     known = np.isfinite(result.pixels)
     assert known[visible].mean() > 0.95
@@ -53,7 +53,7 @@ def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(paths, color):
 
 def test_the_left_margin_is_matched_where_the_right_image_sees_it_and_only_there():
     frame, truth = slanted_pair()
-    pixels = Match(disparities=48)(frame).pixels
+    pixels = MatchOpenCV(disparities=48)(frame).pixels
     margin = np.s_[:, :48]
     visible = (np.arange(320) >= truth + 3)[margin]
     assert np.isfinite(pixels[margin])[visible].mean() > 0.9
@@ -66,7 +66,7 @@ def test_the_left_margin_is_matched_where_the_right_image_sees_it_and_only_there
 def test_a_negative_range_finds_points_beyond_infinity():
     frame, truth = slanted_pair()
     crossed = frame_of(frame.left[:, ::-1].copy(), frame.right[:, ::-1].copy())
-    pixels = Match(disparities=48, minimum=-47)(crossed).pixels
+    pixels = MatchOpenCV(disparities=48, minimum=-47)(crossed).pixels
     known = np.isfinite(pixels)
     assert known.mean() > 0.85
     assert np.median(np.abs(pixels + truth[:, ::-1])[known]) < 0.15
@@ -75,7 +75,7 @@ def test_a_negative_range_finds_points_beyond_infinity():
 def test_sixteen_bit_images_match_like_eight_bit_ones():
     frame, truth = slanted_pair()
     deep = frame_of(frame.left.astype(np.uint16) * 9 + 700, frame.right.astype(np.uint16) * 9 + 700)
-    pixels = Match(disparities=48)(deep).pixels
+    pixels = MatchOpenCV(disparities=48)(deep).pixels
     known = np.isfinite(pixels)
     assert known[np.arange(320) >= truth].mean() > 0.95
     assert np.median(np.abs(pixels - truth)[known]) < 0.15
@@ -85,7 +85,7 @@ def test_sixteen_bit_images_match_like_eight_bit_ones():
 @pytest.mark.parametrize("level", [0, 255])
 def test_a_uniform_image_has_no_disparity(dtype, level):
     image = np.full((64, 96), level, dtype)
-    result = Match(disparities=32)(frame_of(image, image))
+    result = MatchOpenCV(disparities=32)(frame_of(image, image))
     assert np.isnan(result.pixels).all()
     assert (result.source == Source.UNKNOWN).all()
     assert (result.confidence == 0).all()
@@ -99,7 +99,7 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
 def test_any_size_gives_disparities_within_range_and_within_the_right_image(h, w, paths, disparities, minimum, seed):
     left = textured(h, w, seed).astype(np.uint8)
     right = np.roll(left, -5, axis=1)
-    result = Match(disparities=disparities, minimum=minimum, paths=paths)(frame_of(left, right))
+    result = MatchOpenCV(disparities=disparities, minimum=minimum, paths=paths)(frame_of(left, right))
     known = np.isfinite(result.pixels)
     partner = (np.arange(w) - result.pixels)[known]
     assert ((partner >= 0) & (partner <= w - 1)).all()
@@ -116,10 +116,10 @@ def test_the_bits_depend_neither_on_threads_nor_on_the_pool(paths):
     pool = cv2.getNumThreads()
     try:
         cv2.setNumThreads(1)
-        alone = Match(disparities=48, paths=paths)(frame)
+        alone = MatchOpenCV(disparities=48, paths=paths)(frame)
         cv2.setNumThreads(4)
         with ThreadPoolExecutor(3) as workers:
-            others = list(workers.map(Match(disparities=48, paths=paths, threads=4), [frame] * 4))
+            others = list(workers.map(MatchOpenCV(disparities=48, paths=paths, threads=4), [frame] * 4))
     finally:
         cv2.setNumThreads(pool)
     for other in others:
@@ -131,7 +131,7 @@ def test_confident_matches_are_right_more_often():
     frame, truth = slanted_pair()
     spoiled = frame.right.copy()
     spoiled[60:120, 100:200] = textured(60, 100, seed=5).astype(np.uint8)
-    result = Match(disparities=48, p1=0.5, p2=1, speckle_size=0)(frame_of(frame.left, spoiled))
+    result = MatchOpenCV(disparities=48, p1=0.5, p2=1, speckle_size=0)(frame_of(frame.left, spoiled))
     known = np.isfinite(result.pixels)
     wrong = (np.abs(result.pixels - truth) > 1)[known]
     sure = result.confidence[known] > np.median(result.confidence[known])
@@ -150,10 +150,10 @@ def test_confident_matches_are_right_more_often():
 )
 def test_parameters_that_cannot_work_are_refused(parameters, message):
     with pytest.raises(ValueError, match=message):
-        Match(**parameters)
+        MatchOpenCV(**parameters)
 
 
 def test_a_tiny_image_is_refused():
     image = np.zeros((20, 64), np.uint8)
     with pytest.raises(ValueError, match="64x20"):
-        Match()(frame_of(image, image))
+        MatchOpenCV()(frame_of(image, image))
