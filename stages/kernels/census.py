@@ -95,3 +95,15 @@ def seen_costs(costs, pair, unseen, columns, x, width):  # type: ignore[no-untyp
         return costs
     outside = load(pair.outside, columns - 1 - x, width)
     return either(minus_capped(costs, outside), both(outside, spread(unseen, width)))
+
+
+def census_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen: int) -> Array:
+    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 3, W) uint8, neither of them mirrored."""
+    height, _, columns = left.shape
+    costs = np.full((height, columns, lanes), unseen, np.uint8)
+    for x in range(columns):
+        for lane in range(lanes):
+            partner = x - minimum - lane
+            if 0 <= partner < columns:
+                costs[:, x, lane] = np.bitwise_count(left[:, :, x] ^ right[:, :, partner]).sum(axis=1)
+    return costs

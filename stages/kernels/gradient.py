@@ -14,7 +14,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import kernel, part
-from stages.kernels.census import differing_bits, seen_costs
+from stages.kernels.census import census_costs_reference, differing_bits, seen_costs
 from stages.kernels.vectors import (
     Width, average, byte, either, lanes_in, lesser, load, minus_capped, plus, plus_capped, spread, store,
 )  # fmt: skip
@@ -23,10 +23,11 @@ DX, DY = 3, 4  # after the planes of census
 PLANES = 5
 BLOCK = 64
 LARGEST = 6
+MIDDLE = 128  # stands for no gradient
 
 
 def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
-    """Write dx and dy of each pixel (Sobel / 4, gray levels a pixel, plus 128, within 0 to 255) into `planes`.
+    """Write dx and dy of each pixel (Sobel / 4, gray levels a pixel, plus 128, within 1 to 255) into `planes`.
 
     image: (H, W) uint8, its own border replicated beyond; planes: (H, 5, at least W rounded up to 64) uint8, of which the
     last two are written, and more than W columns; mirrored: the image is flipped left to right, and dx is to be what it was before.
@@ -58,8 +59,9 @@ def _smooth(image, at, stride, width):  # type: ignore[no-untyped-def]
 
 @part
 def _signed_difference(more, less, width):  # type: ignore[no-untyped-def]
-    above = plus_capped(spread(128, width), minus_capped(more, less))
-    return minus_capped(above, minus_capped(less, more))
+    most = spread(MIDDLE - 1, width)
+    above = plus_capped(spread(MIDDLE, width), lesser(minus_capped(more, less), most))
+    return minus_capped(above, lesser(minus_capped(less, more), most))
 
 
 def gradients_reference(image: Array, mirrored: bool = False) -> Array:
@@ -73,7 +75,7 @@ def gradients_reference(image: Array, mirrored: bool = False) -> Array:
 
     columns, rows = mean(padded[:-2], padded[1:-1], padded[2:]), mean(padded[:, :-2], padded[:, 1:-1], padded[:, 2:])
     planes = np.stack([columns[:, 2:] - columns[:, :-2], rows[2:] - rows[:-2]], axis=1)
-    return np.clip(planes + 128, 0, 255).astype(np.uint8)
+    return np.clip(planes + MIDDLE, 1, 255).astype(np.uint8)
 
 
 @part
@@ -117,3 +119,21 @@ def _raw_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no
 @part
 def _difference(one, other):  # type: ignore[no-untyped-def]
     return either(minus_capped(one, other), minus_capped(other, one))
+
+
+def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen: int) -> Array:
+    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 5, W) uint8, neither of them mirrored."""
+    bits = census_costs_reference(left[:, :DX], right[:, :DX], lanes, minimum, 0).astype(np.int64)
+    columns = left.shape[2]
+    left, right = left.astype(np.int64), right.astype(np.int64)
+    raw = np.full(bits.shape, unseen)
+    for x in range(columns):
+        for lane in range(lanes):
+            partner = x - minimum - lane
+            if 0 <= partner < columns:
+                step = np.abs(left[:, DX:, x] - right[:, DX:, partner]).sum(axis=1)
+                raw[:, x, lane] = 2 * bits[:, x, lane] + 5 * np.minimum(step, LARGEST)
+    wide = np.pad(raw, ((0, 0), (1, 1), (0, 0)), mode="edge")
+    three = np.pad(wide[:, :-2] + wide[:, 1:-1] + wide[:, 2:], ((1, 1), (0, 0), (0, 0)), mode="edge")
+    mean = ((three[:-2] + three[2:] + 1) // 2 + three[1:-1] + 1) // 2
+    return (((mean + 1) // 2 + 1) // 2).astype(np.uint8)

@@ -89,4 +89,27 @@ def fit_row(winner, votes, right, partners, rule, pixels, evidence):  # type: ig
         evidence[x] = np.uint8(lead) if sound else np.uint8(0)
 
 
-def select_reference(total: Array, rule: object, minimum: int) -> None: ...
+def select_reference(
+    total: Array, disparities: int, minimum: int, uniqueness: int, consistency: int
+) -> tuple[Array, Array]:
+    """Disparities and evidence of a row in plain numpy. total: (W, n) uint8, the sums of all paths."""
+    columns, _ = total.shape
+    sums = total[:, :disparities].astype(np.int64)
+    right = [
+        min((int(sums[x, x - minimum - r]), x - minimum - r) for x in range(columns) if 0 <= x - minimum - r < disparities)
+        if any(0 <= x - minimum - r < disparities for x in range(columns)) else (0, 0)
+        for r in range(columns)
+    ]  # fmt: skip
+    pixels, evidence = np.full(columns, np.nan, np.float32), np.zeros(columns, np.uint8)
+    for x in range(columns):
+        d = int(np.argmin(sums[x]))
+        partner = x - minimum - d
+        if not (0 < d < disparities - 1 and 0 < partner < columns - 1):
+            continue
+        low, before, after = sums[x, d], sums[x, d - 1], sums[x, d + 1]
+        lead = min([255, *sums[x, : d - 1], *sums[x, d + 2 :]]) - low
+        if abs(right[partner][1] - d) <= consistency and lead > uniqueness:
+            bend = max(before + after - 2 * low, 1)
+            pixels[x] = np.float32(minimum + d) + np.float32(before - after) / np.float32(2 * bend)
+            evidence[x] = lead
+    return pixels, evidence
