@@ -1,7 +1,8 @@
 """Semi-global matching (Hirschmüller, 2008; section 3.1 of the paper), compiled, in bytes, on any number of cores.
 
 The cost is the census transform, by default with the truncated gradient difference, smoothed over 3x3. The sums of 8
-paths decide the disparity, its fraction of a pixel, and whether left and right agree, in one go (stages.kernels.semiglobal).
+paths decide the disparity, its fraction of a pixel, and whether left and right agree, in one go
+(stages.kernels.semiglobal).
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class MatchOpenCV(Stage):
             raise ValueError(f"MatchOpenCV.p2 must be above MatchOpenCV.p1 = {self.p1}, not {self.p2}")
         scale = (3 if self.color else 1) * self.block**2
         if scale * (2 * self.prefilter + 63 + self.p2) > np.iinfo(np.int16).max:
-            raise ValueError("MatchOpenCV: block costs could exceed OpenCV's 16 bits; use a smaller block, p2 or prefilter")
+            raise ValueError("MatchOpenCV: block costs could exceed 16 bits; use a smaller block, p2 or prefilter")
 
     def __call__(self, frame: StereoFrame) -> Disparity:
         if frame.camera.raw is not None:

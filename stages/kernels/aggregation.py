@@ -3,13 +3,14 @@
     L(p, d) = C(p, d) + min(L(q, d), L(q, d - 1) + p1, L(q, d + 1) + p1, p2) - min over d of the sum before it
 
 with q the pixel before p on the path. Paths come from 8 sides: a sweep down the image follows the 4 whose q is to the
-left or above, a sweep up the other 4. p2 falls with the step of brightness from q to p, where surfaces are likely to end.
+left or above, a sweep up the other 4. p2 falls with the step of brightness from q to p, where surfaces are likely to
+end.
 
-Three tricks. L has its smallest value subtracted as soon as it is known, so that it never exceeds C + p2 and fits a byte;
-Hirschmüller subtracts the same number one pixel later. The 4 paths of a sweep are added where they stand, in one pass,
-as numbers above their own smallest; sums stop at 255, which no disparity that might win reaches. And a path along a
-diagonal keeps its place in memory: its place is x - y (or x + y), which is the same for p and q, so that one row of costs
-for each direction is enough, read and overwritten in place.
+Three tricks. L has its smallest value subtracted as soon as it is known, so that it never exceeds C + p2 and fits a
+byte; Hirschmüller subtracts the same number one pixel later. The 4 paths of a sweep are added where they stand, in
+one pass, as numbers above their own smallest; sums stop at 255, which no disparity that might win reaches. And a path
+along a diagonal keeps its place in memory: its place is x - y (or x + y), which is the same for p and q, so that one
+row of costs for each direction is enough, read and overwritten in place.
 """
 
 from __future__ import annotations
@@ -18,10 +19,23 @@ import cv2
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.compiled import kernel, part
 from stages.kernels.census import differing_bits, seen_costs
+from stages.kernels.compiled import kernel, part
 from stages.kernels.vectors import (
-    Width, byte, either, lanes_in, lesser, load, minus, minus_capped, plus_capped, shifted, shifted_in_memory, smallest, spread, store,
+    Width,
+    byte,
+    either,
+    lanes_in,
+    lesser,
+    load,
+    minus,
+    minus_capped,
+    plus_capped,
+    shifted,
+    shifted_in_memory,
+    smallest,
+    spread,
+    store,
 )  # fmt: skip
 
 BLOCK = 64
@@ -45,33 +59,32 @@ def brightness_steps(image: Array) -> Array:
 
 @kernel
 def _brightness_steps(image, image_stride, steps, rows, stride, width):  # type: ignore[no-untyped-def]
-    side = 0
-    for dy, dx in SIDES:
+    for side in range(len(SIDES)):
+        dy, dx = SIDES[side]
         for y in range(rows):
             for i in range(0, stride, lanes_in(width)):
                 here = (y + 1) * image_stride + i + 1
                 one, other = load(image, here, width), load(image, here + dy * image_stride + dx, width)
                 step = either(minus_capped(one, other), minus_capped(other, one))
                 store(steps, (side * rows + y) * stride + i, step)
-        side += 1
 
 
 @part
 def aggregate_row(  # type: ignore[no-untyped-def]
-    costs, steps, table, p1, diagonals, paths, y, step, sums, place, total, final, width, pair, unseen, fused
+    pair, rule, costs, fused, paths, y, step, sums, place, total, final, width
 ):
     """Follow the paths of one sweep from the row before into row y, and add them up.
 
-    costs: (W * n,) uint8, C of the row; steps: of `brightness_steps`; table: (256,) uint8, p2 for each step of
-    brightness; diagonals: whether the sweep follows 4 paths or 2; paths: (3 * W * n,) uint8, L of the row before, all 0
-    at first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where the sums of the row go, from
-    `place` on (W * n); final: instead, add what the other sweep left there, and put the whole into `total`.
+    pair, rule: `semiglobal.Pair` and `Rule`; costs: (W * n,) uint8, C of the row; fused: C is not in `costs` but the
+    census cost, to be made here, which saves writing and reading it; paths: (3 * W * n,) uint8, L of the row before,
+    all 0 at first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where the sums of the row go,
+    from `place` on (W * n); final: instead, add what the other sweep left there, and put the whole into `total`.
     """
     n = lanes_in(width)
     columns = costs.size // n
-    _, rows, stride = steps.shape
-    steps = steps.reshape(-1)
-    nothing, small_step = spread(0, width), spread(p1, width)
+    _, rows, stride = pair.steps.shape
+    steps, table = pair.steps.reshape(-1), rule.table  # p2 is in the table, for each step of brightness
+    nothing, small_step = spread(0, width), spread(rule.p1, width)
     first, last = (0, columns - 1) if step > 0 else (columns - 1, 0)
     upwards = 1 if step < 0 else 0  # the pair (p, q) of a sweep up is the pair (q, p) of a sweep down
     beside = y * stride + first + 1 + upwards
@@ -86,22 +99,23 @@ def aggregate_row(  # type: ignore[no-untyped-def]
     x = first
     for _ in range(columns):
         if fused:
-            cost = seen_costs(differing_bits(left, right, columns, x, width), pair, unseen, columns, x, width)
+            bits = differing_bits(left, right, columns, x, width)
+            cost = seen_costs(bits, pair, rule.unseen, columns, x, width)
         else:
             cost = load(costs, x * n, width)
         path = _continued(path, cost, small_step, byte(table, byte(steps, beside)), width)
         total_here = path
         at = (columns + x) * n
-        moved = _moved(paths, at, cost, small_step, byte(table, byte(steps, upright)), width)
+        moved = _continued_at(paths, at, cost, small_step, byte(table, byte(steps, upright)), width)
         store(paths, at, moved)
         total_here = plus_capped(total_here, moved)
-        if diagonals:
+        if rule.diagonals:
             at = fall * n
-            moved = _moved(paths, at, cost, small_step, byte(table, byte(steps, falling)), width)
+            moved = _continued_at(paths, at, cost, small_step, byte(table, byte(steps, falling)), width)
             store(paths, at, moved)
             total_here = plus_capped(total_here, moved)
             at = (2 * columns + rise) * n
-            moved = _moved(paths, at, cost, small_step, byte(table, byte(steps, rising)), width)
+            moved = _continued_at(paths, at, cost, small_step, byte(table, byte(steps, rising)), width)
             store(paths, at, moved)
             total_here = plus_capped(total_here, moved)
         here = place + x * n
@@ -114,18 +128,23 @@ def aggregate_row(  # type: ignore[no-untyped-def]
 
 
 @part
-def _continued(before, cost, p1, p2, width):  # type: ignore[no-untyped-def]
-    """L of the next pixel of a path, above its smallest value."""
-    neighbour = plus_capped(lesser(shifted(before, FAR, 1), shifted(before, FAR, -1)), p1)
-    after = plus_capped(cost, lesser(lesser(neighbour, before), spread(p2, width)))
-    return minus(after, spread(smallest(after), width))
+def _continued(path, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    """L of the next pixel of a path that is at hand, above its smallest value."""
+    near = lesser(shifted(path, FAR, 1), shifted(path, FAR, -1))
+    return _next(path, near, cost, p1, p2, width)
 
 
 @part
-def _moved(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
-    before = load(paths, at, width)
-    neighbour = plus_capped(lesser(shifted_in_memory(before, paths, at, FAR, 1), shifted_in_memory(before, paths, at, FAR, -1)), p1)
-    after = plus_capped(cost, lesser(lesser(neighbour, before), spread(p2, width)))
+def _continued_at(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    """L of the next pixel of a path that is kept in `paths`, above its smallest value."""
+    path = load(paths, at, width)
+    near = lesser(shifted_in_memory(path, paths, at, FAR, 1), shifted_in_memory(path, paths, at, FAR, -1))
+    return _next(path, near, cost, p1, p2, width)
+
+
+@part
+def _next(path, near, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    after = plus_capped(cost, lesser(lesser(plus_capped(near, p1), path), spread(p2, width)))
     return minus(after, spread(smallest(after), width))
 
 

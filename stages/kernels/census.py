@@ -1,9 +1,9 @@
 """Census cost: how many of the 24 comparisons of a pixel with its 5x5 neighbourhood differ between left and right.
 
-(Zabih and Woodfill, 1994.) Each comparison, "is the neighbour darker", is a bit, so that the cost does not feel a change
-of exposure or gain. The trick is the layout. The bits are kept as 3 planes of bytes, and the right image runs backwards:
-then the right partners of one left pixel, disparity after disparity, are neighbours in memory, and 64 costs are three
-times one load, one exclusive or and one count of bits.
+(Zabih and Woodfill, 1994.) Each comparison, "is the neighbour darker", is a bit, so that the cost does not feel a
+change of exposure or gain. The trick is the layout. The bits are kept as 3 planes of bytes, and the right image runs
+backwards: then the right partners of one left pixel, disparity after disparity, are neighbours in memory, and 64
+costs are three times one load, one exclusive or and one count of bits.
 """
 
 from __future__ import annotations
@@ -14,7 +14,19 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.compiled import kernel, part
 from stages.kernels.vectors import (
-    Width, both, byte, either, exclusive_or, lanes_in, load, minus_capped, ones, plus, spread, store, where_less,
+    Width,
+    both,
+    byte,
+    either,
+    exclusive_or,
+    lanes_in,
+    load,
+    minus_capped,
+    ones,
+    plus,
+    spread,
+    store,
+    where_less,
 )  # fmt: skip
 
 BITS = 24
@@ -26,8 +38,9 @@ BLOCK = 64  # pixels described at a time
 def census(image: Array, planes: Array, mirrored: bool = False) -> None:
     """Write the comparisons of each pixel into `planes`.
 
-    image: (H, W) uint8, its own border replicated beyond; planes: (H, at least 3, at least W rounded up to 64) uint8, of
-    which the first three are written, and more than W columns; mirrored: the image is flipped left to right, and the bits are to be those it had before.
+    image: (H, W) uint8, its own border replicated beyond; planes: (H, at least 3, at least W rounded up to 64) uint8,
+    of which the first three are written, and more than W columns; mirrored: the image is flipped left to right, and
+    the bits are to be those it had before.
     """
     columns = -(-image.shape[1] // BLOCK) * BLOCK
     padded = cv2.copyMakeBorder(image, 2, 2, 2, 2 + columns - image.shape[1], cv2.BORDER_REPLICATE)

@@ -1,9 +1,9 @@
 """How kernels are compiled: `kernel` for what Python calls, `part` for what only kernels call.
 
-They are kept between runs. numba keeps the machine code of a kernel as long as the file that defines it is unchanged. But a kernel contains the code
-of those it calls, which may be in other files, so a change there would leave old code in use. Here every kernel is as
-old as the youngest of them: the mark by which numba tells whether its copy is current is a digest of all sources of this
-folder and of the versions of numba and LLVM. numba adds the processor itself.
+They are kept between runs. numba keeps the machine code of a kernel as long as the file that defines it is unchanged.
+But a kernel contains the code of those it calls, which may be in other files, so a change there would leave old code
+in use. Here every kernel is as old as the youngest of them: the mark by which numba tells whether its copy is current
+is a digest of all sources of this folder and of the versions of numba and LLVM. numba adds the processor itself.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ def digest() -> str:
     return total.hexdigest()
 
 
-class _KernelCacheLocator(_CacheLocator):  # type: ignore[misc]
+class _KernelCacheLocator(_CacheLocator):
     """Where numba would keep a kernel of this folder, but marked with `digest`."""
 
-    usual = tuple(CacheImpl._locator_classes)
+    usual: tuple[Any, ...] = tuple(CacheImpl._locator_classes)
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
@@ -50,7 +50,7 @@ class _KernelCacheLocator(_CacheLocator):  # type: ignore[misc]
         return locator
 
 
-class _Announcement(event.Listener):  # type: ignore[misc]
+class _Announcement(event.Listener):
     """Says, once, that the first call takes longer."""
 
     def __init__(self) -> None:
@@ -67,13 +67,15 @@ class _Announcement(event.Listener):  # type: ignore[misc]
 
 def install() -> None:
     """Make numba keep this folder's kernels so, and announce when it compiles one."""
-    if _KernelCacheLocator not in CacheImpl._locator_classes:
-        CacheImpl._locator_classes = [_KernelCacheLocator, *CacheImpl._locator_classes]
-        event.register("numba:compile", _Announcement())
+    caches: Any = CacheImpl
+    if _KernelCacheLocator not in caches._locator_classes:
+        caches._locator_classes = [_KernelCacheLocator, *caches._locator_classes]
+        event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]
 
 
 install()
+_njit: Any = njit
 # No Python lock while they run, no exceptions for a division by 0; without the entry points that nobody calls, a third
 # of the time to compile is saved.
-kernel = njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
-part = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)
+kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
+part: Any = _njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)

@@ -13,10 +13,21 @@ import cv2
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.compiled import kernel, part
 from stages.kernels.census import census_costs_reference, differing_bits, seen_costs
+from stages.kernels.compiled import kernel, part
 from stages.kernels.vectors import (
-    Width, average, byte, either, lanes_in, lesser, load, minus_capped, plus, plus_capped, spread, store,
+    Width,
+    average,
+    byte,
+    either,
+    lanes_in,
+    lesser,
+    load,
+    minus_capped,
+    plus,
+    plus_capped,
+    spread,
+    store,
 )  # fmt: skip
 
 DX, DY = 3, 4  # after the planes of census
@@ -29,8 +40,9 @@ MIDDLE = 128  # stands for no gradient
 def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
     """Write dx and dy of each pixel (Sobel / 4, gray levels a pixel, plus 128, within 1 to 255) into `planes`.
 
-    image: (H, W) uint8, its own border replicated beyond; planes: (H, 5, at least W rounded up to 64) uint8, of which the
-    last two are written, and more than W columns; mirrored: the image is flipped left to right, and dx is to be what it was before.
+    image: (H, W) uint8, its own border replicated beyond; planes: (H, 5, at least W rounded up to 64) uint8, of which
+    the last two are written, and more than W columns; mirrored: the image is flipped left to right, and dx is to be
+    what it was before.
     """
     columns = -(-image.shape[1] // BLOCK) * BLOCK
     padded = cv2.copyMakeBorder(image, 1, 1, 1, 1 + columns - image.shape[1], cv2.BORDER_REPLICATE)
@@ -75,7 +87,8 @@ def gradients_reference(image: Array, mirrored: bool = False) -> Array:
 
     columns, rows = mean(padded[:-2], padded[1:-1], padded[2:]), mean(padded[:, :-2], padded[:, 1:-1], padded[:, 2:])
     planes = np.stack([columns[:, 2:] - columns[:, :-2], rows[2:] - rows[:-2]], axis=1)
-    return np.clip(planes + MIDDLE, 1, 255).astype(np.uint8)
+    result: Array = np.clip(planes + MIDDLE, 1, 255).astype(np.uint8)
+    return result
 
 
 @part
@@ -136,4 +149,5 @@ def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int
     wide = np.pad(raw, ((0, 0), (1, 1), (0, 0)), mode="edge")
     three = np.pad(wide[:, :-2] + wide[:, 1:-1] + wide[:, 2:], ((1, 1), (0, 0), (0, 0)), mode="edge")
     mean = ((three[:-2] + three[2:] + 1) // 2 + three[1:-1] + 1) // 2
-    return (((mean + 1) // 2 + 1) // 2).astype(np.uint8)
+    result: Array = (((mean + 1) // 2 + 1) // 2).astype(np.uint8)
+    return result

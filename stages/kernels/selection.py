@@ -2,8 +2,8 @@
 
 The smallest sum wins, to a fraction of a pixel by the parabola through it and its neighbours. A winner must beat every
 disparity that is not its neighbour (uniqueness), and the right image's pixel must choose the same from the same sums
-(left-right check). That choice needs all sums of a row along a diagonal; the trick is to keep the best so far of n right
-pixels in the lanes of one vector, which moves by one lane from pixel to pixel, as the partners do.
+(left-right check). That choice needs all sums of a row along a diagonal; the trick is to keep the best so far of n
+right pixels in the lanes of one vector, which moves by one lane from pixel to pixel, as the partners do.
 """
 
 from __future__ import annotations
@@ -13,7 +13,19 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.compiled import part
 from stages.kernels.vectors import (
-    byte, count_up, either, first_equal, lanes_in, lesser, load, outermost, shifted, smallest, spread, store, where_less,
+    byte,
+    count_up,
+    either,
+    first_equal,
+    lanes_in,
+    lesser,
+    load,
+    outermost,
+    shifted,
+    smallest,
+    spread,
+    store,
+    where_less,
 )  # fmt: skip
 
 LARGEST_EVIDENCE = 255
@@ -26,7 +38,8 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):  # ty
     total: (W * n,) uint8, the sums; beyond: (n,) uint8, 255 for lanes that are no disparities; guard: (2 n,) uint8, 255
     at n - 1, n, n + 1, else 0; step: direction in which to go through the row, with the same result. Into winner (W,)
     int16, votes (4, W) uint8: sum of the winner, of its lower and upper neighbour, and the smallest of the others; and
-    right (W + n,) uint8 or uint16: the right image's winners, backwards, of left pixel x and disparity d at W - 1 - x + d.
+    right (W + n,) uint8 or uint16: the right image's winners, backwards, of left pixel x and disparity d at W - 1 - x
+    + d.
     """
     n, columns = lanes_in(width), winner.size
     lanes, outside = count_up(width, right), load(beyond, 0, width)
@@ -78,7 +91,8 @@ def fit_row(winner, votes, right, partners, rule, pixels, evidence):  # type: ig
     tolerance, margin = np.int32(rule.consistency), np.int32(rule.uniqueness)
     for x in range(columns):
         d = np.int32(winner[x])
-        low, lower, upper, next_best = np.int32(votes[0, x]), np.int32(votes[1, x]), np.int32(votes[2, x]), np.int32(votes[3, x])
+        low, next_best = np.int32(votes[0, x]), np.int32(votes[3, x])
+        lower, upper = np.int32(votes[1, x]), np.int32(votes[2, x])
         partner = np.int32(np.int32(x) - minimum - d)
         apart = abs(np.int32(np.int32(partners[x]) - d))
         lead = np.int32(next_best - low)
@@ -96,9 +110,9 @@ def select_reference(
     columns, _ = total.shape
     sums = total[:, :disparities].astype(np.int64)
     right = [
-        min((int(sums[x, x - minimum - r]), x - minimum - r) for x in range(columns) if 0 <= x - minimum - r < disparities)
-        if any(0 <= x - minimum - r < disparities for x in range(columns)) else (0, 0)
-        for r in range(columns)
+        min((int(sums[x, x - minimum - r]), x - minimum - r) for x in range(columns) if 0 <= x - minimum - r <
+        disparities) if any(0 <= x - minimum - r < disparities for x in range(columns)) else (0, 0) for r in
+        range(columns)
     ]  # fmt: skip
     pixels, evidence = np.full(columns, np.nan, np.float32), np.zeros(columns, np.uint8)
     for x in range(columns):

@@ -4,8 +4,9 @@ One sweep runs down the image and one up; the second to reach a row finds the ot
 disparities. Meeting in the middle lets two threads share a frame: one sweeps the upper half down while the other sweeps
 the lower half up, then each goes on through the other's half. No path is cut, so the result has the same bits.
 
-The sums of a large image would not fit the memory. Then the first visit to a half leaves only the path costs at the head of
-each band of rows, and before the second sweep enters a band, its sums are made again from there: exact too, at 1.4 times the time.
+The sums of a large image would not fit the memory. Then the first visit to a half leaves only the path costs at the
+head of each band of rows, and before the second sweep enters a band, its sums are made again from there: exact too,
+at 1.4 times the time.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ import cv2
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.compiled import kernel
 from stages.kernels.aggregation import aggregate_row, brightness_steps
 from stages.kernels.census import census, census_costs
+from stages.kernels.compiled import kernel
 from stages.kernels.gradient import gradients, smoothed_costs
 from stages.kernels.halves import pairs
 from stages.kernels.prior import add_prior
@@ -91,7 +92,9 @@ def lanes_for(disparities: int) -> int:
     return next((n for n in (16, 32, 64, 96) if disparities <= n), -(-disparities // 64) * 64)
 
 
-def match(left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, threads: int, memory: int) -> Matches:
+def match(
+    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, threads: int, memory: int
+) -> Matches:
     """Disparities of a rectified pair of gray images.
 
     left, right: (H, W) uint8; prior: of `prior.prior_costs`, or None; threads: more than 2 have nothing to do; memory:
@@ -151,21 +154,20 @@ def _sweep(  # type: ignore[no-untyped-def]
     pair, rule, width, pixels, evidence, scratch, paths, y, end, step, sums, origin, final
 ):
     """Rows y to end (exclusive) in steps of 1 or -1; the sums of row y are at (y - origin) * W * n of `sums`."""
-    height, columns = pixels.shape
-    size = columns * lanes_in(width)
+    size = pixels.shape[1] * lanes_in(width)
+    fused = not rule.gradient and pair.prior.size == 0
     if rule.gradient:
         for ahead in (y - step, y):  # smoothed_costs needs the column sums of two rows before it can begin
             smoothed_costs(pair, rule.unseen, ahead, scratch.column_sums, scratch.costs, width)
     while y != end:
         if rule.gradient:
             smoothed_costs(pair, rule.unseen, y + step, scratch.column_sums, scratch.costs, width)
-        elif pair.prior.size > 0:
+        elif not fused:
             census_costs(pair, rule.unseen, y, scratch.costs, width)
         if pair.prior.size > 0:
             add_prior(scratch.costs, pair.prior[y], pair.prior_costs, width)
         aggregate_row(
-            scratch.costs, pair.steps, rule.table, rule.p1, rule.diagonals, paths, y, step,
-            sums, (y - origin) * size, scratch.total, final, width, pair, rule.unseen, not rule.gradient and pair.prior.size == 0,
+            pair, rule, scratch.costs, fused, paths, y, step, sums, (y - origin) * size, scratch.total, final, width
         )  # fmt: skip
         if final:
             find_winners(
@@ -175,7 +177,9 @@ def _sweep(  # type: ignore[no-untyped-def]
         y += step
 
 
-def _halves(pair: Pair, rule: Rule, space: _Workspace, width: Width, memory: int, pixels: Array, evidence: Array) -> list[_Half]:
+def _halves(
+    pair: Pair, rule: Rule, space: _Workspace, width: Width, memory: int, pixels: Array, evidence: Array
+) -> list[_Half]:
     """Both halves of the image, in bands whose sums take no more than `memory` bytes together."""
     height, columns = pixels.shape
     size = columns * width.lanes
@@ -209,7 +213,8 @@ class _Half:
         self.scratch = Scratch(
             costs=space.bytes(size), column_sums=space.bytes(2 * size).reshape(2, size), total=space.bytes(size),
             winner=np.empty(columns, np.int16), votes=np.empty((4, columns), np.uint8),
-            right=np.empty(columns + lanes, index), partners=np.empty(columns, np.int16), guard=np.where(guard, np.uint8(255), np.uint8(0)),
+            right=np.empty(columns + lanes, index), partners=np.empty(columns, np.int16),
+            guard=np.where(guard, np.uint8(255), np.uint8(0)),
             beyond=np.where(np.arange(lanes) < disparities, np.uint8(0), np.uint8(255)),
         )  # fmt: skip
 

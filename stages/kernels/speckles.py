@@ -1,8 +1,8 @@
 """Speckle removal: patches of the disparity image that are too small to be believed are dropped.
 
-A patch is a set of pixels joined through neighbours (left, right, above, below) whose disparities differ by no more than
-`step`. The trick: what is joined are not pixels but runs, stretches of a row without such a step, by union-find; a row
-has a hundred times fewer of them, and a patch is dropped run by run.
+A patch is a set of pixels joined through neighbours (left, right, above, below) whose disparities differ by no more
+than `step`. The trick: what is joined are not pixels but runs, stretches of a row without such a step, by union-find;
+a row has a hundred times fewer of them, and a patch is dropped run by run.
 """
 
 from __future__ import annotations

@@ -1,22 +1,23 @@
 """Explicit vectors of unsigned bytes for numba kernels: the layer under the matcher, and its one trick for speed.
 
-numba compiles loops over scalars and hopes that LLVM turns them into vector code. For bytes that hope fails: numba widens
-every sum of two bytes to 64 bits, and 3 of 4 lanes of the machine are lost. Here a kernel names its vectors itself. A
-value of type `Lanes(n, bits)` is n unsigned numbers of `bits` bits, and each function below is one LLVM instruction on
-all of them at once, on whatever the machine has: LLVM divides a vector into 16 (SSE), 32 (AVX2) or 64 bytes (AVX-512).
+numba compiles loops over scalars and hopes that LLVM turns them into vector code. For bytes that hope fails: numba
+widens every sum of two bytes to 64 bits, and 3 of 4 lanes of the machine are lost. Here a kernel names its vectors
+itself. A value of type `Lanes(n, bits)` is n unsigned numbers of `bits` bits, and each function below is one LLVM
+instruction on all of them at once, on whatever the machine has: LLVM divides a vector into 16 (SSE), 32 (AVX2) or 64
+bytes (AVX-512).
 
 How to read a kernel that uses it:
     n = lanes_in(width)                    # a constant of the compiled code
     costs = load(row, x * n, width)        # n bytes of a uint8 array (1-D, contiguous), from index x * n on
     best = lesser(costs, spread(90, width))  # spread: the same number in all lanes
     store(row, x * n, best)
-How many lanes there are must be known when a kernel is compiled, so it is an argument's *type*: `Width(128)` is an object
-whose numba type differs from that of `Width(192)`, and numba compiles (and caches) a kernel for each width it is called
-with. Sums wrap around at 256 (`plus`) or stop at 255 (`plus_capped`). Nothing checks bounds: an index outside the array
-reads or overwrites foreign memory.
+How many lanes there are must be known when a kernel is compiled, so it is an argument's *type*: `Width(128)` is an
+object whose numba type differs from that of `Width(192)`, and numba compiles (and caches) a kernel for each width it
+is called with. Sums wrap around at 256 (`plus`) or stop at 255 (`plus_capped`). Nothing checks bounds: an index
+outside the array reads or overwrites foreign memory.
 
-Lanes are held as chunks of at most 64 bytes, always a power of two: LLVM handles 192 lanes as 3 chunks of 64 well, as one
-vector of 192 it takes twenty times as long.
+Lanes are held as chunks of at most 64 bytes, always a power of two: LLVM handles 192 lanes as 3 chunks of 64 well, as
+one vector of 192 it takes twenty times as long.
 """
 
 from __future__ import annotations
@@ -33,11 +34,13 @@ from numba.extending import NativeValue, intrinsic, models, register_model, type
 from numba.np.arrayobj import make_array
 
 LARGEST_CHUNK = 64
+_unbox: Any = unbox
+_intrinsic: Any = intrinsic(prefer_literal=True)
 _I32 = ir.IntType(32)
 _I64 = ir.IntType(64)
 
 
-class Lanes(types.Type):  # type: ignore[misc]
+class Lanes(types.Type):
     """The numba type of a vector: `n` unsigned integers of `bits` bits, in `count` chunks of `chunk` lanes."""
 
     def __init__(self, n: int, bits: int) -> None:
@@ -60,19 +63,19 @@ class Lanes(types.Type):  # type: ignore[misc]
 
 
 @register_model(Lanes)
-class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+class _LanesModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Lanes) -> None:
-        super().__init__(dmm, fe_type, fe_type.whole)
+        super().__init__(dmm, fe_type, fe_type.whole)  # type: ignore[no-untyped-call]
 
 
 @dataclass(frozen=True)
 class Width:
-    """How many lanes the vectors of a kernel have: a multiple of 16; powers of two and multiples of 64 are the fastest."""
+    """How many lanes the vectors of a kernel have: a multiple of 16; best a power of two or multiple of 64."""
 
     lanes: int
 
 
-class _WidthType(types.Type):  # type: ignore[misc]
+class _WidthType(types.Type):
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
         super().__init__(name=f"Width({lanes})")
@@ -81,17 +84,18 @@ class _WidthType(types.Type):  # type: ignore[misc]
 register_model(_WidthType)(models.OpaqueModel)
 
 
-@typeof_impl.register(Width)  # type: ignore[untyped-decorator]
+@typeof_impl.register(Width)
 def _typeof_width(value: Width, _context: Any) -> _WidthType:
     return _WidthType(value.lanes)
 
 
-@unbox(_WidthType)  # type: ignore[untyped-decorator]
-def _unbox_width(kind: Any, value: Any, c: Any) -> NativeValue:
-    return NativeValue(c.context.get_dummy_value())  # all there is to know is in the type
+@_unbox(_WidthType)
+def _unbox_width(kind: Any, value: Any, c: Any) -> Any:
+    nothing: Any = NativeValue  # all there is to know is in the type
+    return nothing(c.context.get_dummy_value())
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_intrinsic
 def lanes_in(typing_context: Any, width: Any) -> Any:
     """The number of lanes, a constant of the compiled code."""
     return types.int64(width), lambda context, b, signature, args: _I64(width.lanes)
@@ -114,7 +118,8 @@ def _joined(b: Any, kind: Lanes, chunks: list[Any]) -> Any:
 def _call(b: Any, name: str, result: Any, arguments: list[Any]) -> Any:
     """Call the LLVM intrinsic `name`."""
     signature = ir.FunctionType(result, [argument.type for argument in arguments])
-    return b.call(cgutils.get_or_insert_function(b.module, signature, name), arguments)
+    declared: Any = cgutils.get_or_insert_function
+    return b.call(declared(b.module, signature, name), arguments)
 
 
 def _indices(lanes: Any) -> Any:
@@ -137,7 +142,8 @@ def _spread(b: Any, kind: Lanes, scalar: Any) -> Any:
 
 def _place(context: Any, b: Any, types_of: Any, args: Any, offset: int, kind: Any) -> Any:
     """Pointer to `kind` at element `args[1] + offset` of the array args[0]."""
-    data = make_array(types_of[0])(context, b, args[0]).data
+    array: Any = make_array
+    data = array(types_of[0])(context, b, args[0]).data
     index = context.cast(b, args[1], types_of[1], types.int64)
     return b.bitcast(b.gep(data, [b.add(index, _I64(offset))]), kind.as_pointer())
 
@@ -145,7 +151,7 @@ def _place(context: Any, b: Any, types_of: Any, args: Any, offset: int, kind: An
 def _on_chunks(emit: Callable[[Any, Lanes, Any, Any], Any]) -> Any:
     """The intrinsic of two vectors of one type that applies `emit(b, kind, x, y)` chunk by chunk."""
 
-    @intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+    @_intrinsic
     def operation(typing_context: Any, x: Any, y: Any) -> Any:
         def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
             pairs = zip(_chunks(b, args[0], x), _chunks(b, args[1], x), strict=True)
@@ -183,7 +189,7 @@ both = _on_chunks(lambda b, kind, x, y: b.and_(x, y))
 average = _on_chunks(_average)  # (x + y + 1) // 2, as if in wider numbers
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def load(typing_context: Any, array: Any, index: Any, width: Any) -> Any:
     """Bytes of `array` from `index` on, as many as `width` says."""
     kind = Lanes(width.lanes, 8)
@@ -198,7 +204,7 @@ def load(typing_context: Any, array: Any, index: Any, width: Any) -> Any:
     return kind(array, index, width), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
     """Write the lanes to `array` from `index` on; the array's elements are as wide as the lanes."""
 
@@ -211,7 +217,7 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, index, value), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def byte(typing_context: Any, array: Any, index: Any) -> Any:
     """One byte of `array`; like array[index], without numba's test for negative indices."""
 
@@ -221,7 +227,7 @@ def byte(typing_context: Any, array: Any, index: Any) -> Any:
     return types.uint8(array, index), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def spread(typing_context: Any, scalar: Any, width: Any) -> Any:
     """Bytes that all hold `scalar`."""
     kind = Lanes(width.lanes, 8)
@@ -232,7 +238,7 @@ def spread(typing_context: Any, scalar: Any, width: Any) -> Any:
     return kind(scalar, width), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def count_up(typing_context: Any, width: Any, array: Any) -> Any:
     """The lanes 0, 1, 2, ..., as wide as the elements of `array`, in which they are to be kept."""
     kind = Lanes(width.lanes, array.dtype.bitwidth)
@@ -244,7 +250,7 @@ def count_up(typing_context: Any, width: Any, array: Any) -> Any:
     return kind(width, array), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def ones(typing_context: Any, value: Any) -> Any:
     """How many bits of each lane are set."""
 
@@ -255,7 +261,7 @@ def ones(typing_context: Any, value: Any) -> Any:
     return value(value), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def smallest(typing_context: Any, value: Any) -> Any:
     """The smallest of all bytes, a scalar."""
 
@@ -265,16 +271,17 @@ def smallest(typing_context: Any, value: Any) -> Any:
             size //= 2
             low, high = (b.shuffle_vector(rest, rest, _indices(range(s, s + size))) for s in (0, size))
             rest = _lesser(b, low, high)
-        # Of neighbouring bytes first, then of 8 numbers of 16 bits: for those x86 has an instruction, and LLVM finds it.
+        # Of neighbouring bytes first, then of 8 numbers of 16 bits: for these LLVM finds the one instruction of x86.
         wide = ir.VectorType(ir.IntType(16), 8)
         rest = b.bitcast(rest, wide)
         low, high = b.and_(rest, ir.Constant(wide, [255] * 8)), b.lshr(rest, ir.Constant(wide, [8] * 8))
-        return b.trunc(_call(b, "llvm.vector.reduce.umin.v8i16", ir.IntType(16), [_lesser(b, low, high)]), ir.IntType(8))
+        least = _call(b, "llvm.vector.reduce.umin.v8i16", ir.IntType(16), [_lesser(b, low, high)])
+        return b.trunc(least, ir.IntType(8))
 
     return types.uint8(value), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def first_equal(typing_context: Any, value: Any, scalar: Any) -> Any:
     """Index of the first lane that equals `scalar`, which some lane must."""
 
@@ -290,7 +297,7 @@ def first_equal(typing_context: Any, value: Any, scalar: Any) -> Any:
     return types.int64(value, scalar), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def outermost(typing_context: Any, value: Any, step: Any) -> Any:
     """The lane that the next `shifted` by `step` pushes out: the last for step 1, the first for step -1."""
     result, last = types.Integer.from_bitwidth(value.bits, False), step.literal_value > 0
@@ -302,7 +309,7 @@ def outermost(typing_context: Any, value: Any, step: Any) -> Any:
     return result(value, step), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def shifted(typing_context: Any, value: Any, fill: Any, step: Any) -> Any:
     """The lanes moved by one: up (step 1: lane i holds what was in i - 1) or down (step -1); `fill` at the free end."""
     up = step.literal_value > 0
@@ -320,7 +327,7 @@ def shifted(typing_context: Any, value: Any, fill: Any, step: Any) -> Any:
     return value(value, fill, step), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def where_less(typing_context: Any, x: Any, y: Any, chosen: Any, otherwise: Any) -> Any:
     """Lane by lane `chosen` where x < y, else `otherwise`; the last two may be wider than the first two."""
 
@@ -332,21 +339,22 @@ def where_less(typing_context: Any, x: Any, y: Any, chosen: Any, otherwise: Any)
     return chosen(x, y, chosen, otherwise), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@_intrinsic
 def shifted_in_memory(typing_context: Any, value: Any, array: Any, index: Any, fill: Any, step: Any) -> Any:
+    """`shifted` of a value that has just been loaded from `array` at `index`: most of it is loaded again, from one byte
+    before or behind, for processors load faster than they move bytes across a vector."""
     up = step.literal_value > 0
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        size, chunks, edge = value.chunk, _chunks(b, args[0], value), _spread(b, value, args[3])
-        out = []
+        size, chunks, edge, moved = value.chunk, _chunks(b, args[0], value), _spread(b, value, args[3]), []
         for i, chunk in enumerate(chunks):
             if up and i == 0:
-                out.append(b.shuffle_vector(edge, chunk, _indices(range(size - 1, 2 * size - 1))))
+                moved.append(b.shuffle_vector(edge, chunk, _indices(range(size - 1, 2 * size - 1))))
             elif not up and i == len(chunks) - 1:
-                out.append(b.shuffle_vector(chunk, edge, _indices(range(1, size + 1))))
+                moved.append(b.shuffle_vector(chunk, edge, _indices(range(1, size + 1))))
             else:
-                place = _place(context, b, signature.args[1:3], args[1:3], i * size + (-1 if up else 1), value.vector)
-                out.append(b.load(place, align=1))
-        return _joined(b, value, out)
+                offset = i * size + (-1 if up else 1)
+                moved.append(b.load(_place(context, b, signature.args[1:3], args[1:3], offset, value.vector), align=1))
+        return _joined(b, value, moved)
 
     return value(value, array, index, fill, step), generate

@@ -143,7 +143,8 @@ def accuracy(folder: Path) -> None:
     for name, (kept, density, half, one) in means.items():
         print(f"{name:34} {kept:10.2f} {density:8.1f} {half:15.2f} {one:13.2f}")
         ratio = means[name] / means["OpenCV HH"]
-        print(f"{'  over OpenCV HH':34} {ratio[0]:10.3f} {density - means['OpenCV HH'][1]:+8.1f} {ratio[2]:15.3f} {ratio[3]:13.3f}")
+        points = density - means["OpenCV HH"][1]
+        print(f"{'  over OpenCV HH':34} {ratio[0]:10.3f} {points:+8.1f} {ratio[2]:15.3f} {ratio[3]:13.3f}")
 
 
 def main() -> None:

@@ -8,18 +8,16 @@ from stages.kernels.aggregation import aggregate_reference, aggregate_row, brigh
 from stages.kernels.prior import add_prior, prior_costs
 from stages.kernels.semiglobal import NO_PRIOR, Pair
 from stages.kernels.vectors import Width
+from tests.stages.test_census import rule_of
 from tests.stages.test_match_opencv import textured
 
 
 @njit
-def sweep(costs, pair, table, p1, diagonals, paths, step, sums, total, final, width):
+def sweep(costs, pair, rule, paths, step, sums, total, final, width):
     height, size = costs.shape
     for i in range(height):
         y = i if step > 0 else height - 1 - i
-        aggregate_row(
-            costs[y], pair.steps, table, p1, diagonals, paths, y, step, sums, y * size, total[y], final, width,
-            pair, 0, False,
-        )  # fmt: skip
+        aggregate_row(pair, rule, costs[y], False, paths, y, step, sums, y * size, total[y], final, width)
 
 
 @njit
@@ -38,12 +36,13 @@ def test_sums_are_those_of_the_reference(lanes, paths, height, columns):
     down, up = aggregate_reference(costs, image, table, 9, paths)
     planes = np.zeros((height, 3, columns), np.uint8)
     pair = Pair(planes, planes, brightness_steps(image), np.zeros(1, np.uint8), 0, columns, *NO_PRIOR)
+    rule = rule_of(True, lanes, 0)._replace(diagonals=paths == 8, table=table)
     size, width = columns * lanes, Width(lanes)
     flat = costs.reshape(height, size)
     sums, total = np.full(height * size, 3, np.uint8), np.zeros((height, size), np.uint8)
-    sweep(flat, pair, table, 9, paths == 8, np.zeros(3 * size, np.uint8), 1, sums, total, False, width)
+    sweep(flat, pair, rule, np.zeros(3 * size, np.uint8), 1, sums, total, False, width)
     assert np.array_equal(sums.reshape(costs.shape), down)
-    sweep(flat, pair, table, 9, paths == 8, np.zeros(3 * size, np.uint8), -1, sums, total, True, width)
+    sweep(flat, pair, rule, np.zeros(3 * size, np.uint8), -1, sums, total, True, width)
     assert np.array_equal(total.reshape(costs.shape), np.minimum(down.astype(int) + up, 255))
 
 

@@ -43,7 +43,7 @@ def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(slope, cost, paths
     known = np.isfinite(result.pixels)
     assert known[visible].mean() > (0.95 if paths == 8 else 0.85)
     error = np.abs(result.pixels - truth)[known & visible]
-    assert np.median(error) < 0.12
+    assert np.median(error) < 0.13
     assert (error > 1).mean() < 0.01
     assert (result.stamp, result.camera) == (frame.stamp, frame.camera)
 
@@ -100,8 +100,8 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
 
 @settings(max_examples=25, deadline=None)
 @given(
-    st.integers(32, 90), st.integers(32, 90), st.sampled_from([4, 8]), st.sampled_from([1, 13, 50, 64, 70, 96]), st.integers(-31, 31),
-    st.sampled_from(sorted(COSTS)), st.integers(0, 99),
+    st.integers(32, 90), st.integers(32, 90), st.sampled_from([4, 8]), st.sampled_from([1, 13, 50, 64, 70, 96]),
+    st.integers(-31, 31), st.sampled_from(sorted(COSTS)), st.integers(0, 99),
 )  # fmt: skip
 def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, disparities, minimum, cost, seed):
     left = textured(h, w, seed).astype(np.uint8)

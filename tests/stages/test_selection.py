@@ -1,4 +1,4 @@
-"""Selection: winners, checks and patches are, bit for bit, those of the plain references, whichever way they are found."""
+"""Selection: winners, checks and patches are, bit for bit, those of the references, whichever way they are found."""
 
 import numpy as np
 import pytest
