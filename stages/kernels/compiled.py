@@ -74,7 +74,7 @@ def install() -> None:
 
 
 install()
-_njit: Any = njit
+_njit: Any = njit  # whose published type lacks the options on wrappers
 # No Python lock while they run, no exceptions for a division by 0; without the entry points that nobody calls, a third
 # of the time to compile is saved.
 kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)

@@ -28,8 +28,6 @@ from stages.kernels.vectors import (
     where_less,
 )  # fmt: skip
 
-LARGEST_EVIDENCE = 255
-
 
 @part
 def find_winners(total, beyond, guard, step, winner, votes, right, width):  # type: ignore[no-untyped-def]
@@ -38,8 +36,8 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):  # ty
     total: (W * n,) uint8, the sums; beyond: (n,) uint8, 255 for lanes that are no disparities; guard: (2 n,) uint8, 255
     at n - 1, n, n + 1, else 0; step: direction in which to go through the row, with the same result. Into winner (W,)
     int16, votes (4, W) uint8: sum of the winner, of its lower and upper neighbour, and the smallest of the others; and
-    right (W + n,) uint8 or uint16: the right image's winners, backwards, of left pixel x and disparity d at W - 1 - x
-    + d.
+    right (W + n,) uint8 or uint16: the right image's winners, backwards, that of the partner of left
+    pixel x at disparity d at W - 1 - x + d.
     """
     n, columns = lanes_in(width), winner.size
     lanes, outside = count_up(width, right), load(beyond, 0, width)
@@ -109,11 +107,11 @@ def select_reference(
     """Disparities and evidence of a row in plain numpy. total: (W, n) uint8, the sums of all paths."""
     columns, _ = total.shape
     sums = total[:, :disparities].astype(np.int64)
-    right = [
-        min((int(sums[x, x - minimum - r]), x - minimum - r) for x in range(columns) if 0 <= x - minimum - r <
-        disparities) if any(0 <= x - minimum - r < disparities for x in range(columns)) else (0, 0) for r in
-        range(columns)
-    ]  # fmt: skip
+    right = np.zeros(columns, np.int64)
+    for r in range(columns):
+        seen = [x for x in range(columns) if 0 <= x - minimum - r < disparities]
+        if seen:
+            right[r] = min((sums[x, x - minimum - r], x - minimum - r) for x in seen)[1]
     pixels, evidence = np.full(columns, np.nan, np.float32), np.zeros(columns, np.uint8)
     for x in range(columns):
         d = int(np.argmin(sums[x]))
@@ -122,7 +120,7 @@ def select_reference(
             continue
         low, before, after = sums[x, d], sums[x, d - 1], sums[x, d + 1]
         lead = min([255, *sums[x, : d - 1], *sums[x, d + 2 :]]) - low
-        if abs(right[partner][1] - d) <= consistency and lead > uniqueness:
+        if abs(right[partner] - d) <= consistency and lead > uniqueness:
             bend = max(before + after - 2 * low, 1)
             pixels[x] = np.float32(minimum + d) + np.float32(before - after) / np.float32(2 * bend)
             evidence[x] = lead

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -72,11 +73,16 @@ def speed() -> None:
             for threads in (1, 2):
                 match = Match(cost=cost, disparities=disparities, threads=threads)
                 contestants[f"{cost} {disparities} x{threads}"] = lambda match=match: match(frame)
+            match = Match(cost=cost, disparities=disparities)
+            pool = ThreadPoolExecutor(2)
+            contestants[f"{cost} {disparities}, 2 frames on 2 cores"] = (
+                lambda match=match, pool=pool: list(pool.map(match, [frame, frame]))
+            )
     seconds = medians(contestants)
-    print(f"{'1280x960, median of ' + str(ROUNDS):34} {'ms':>8}  / HH   / 3WAY")
+    print(f"{'1280x960, median of ' + str(ROUNDS):42} {'ms':>8}  / HH   / 3WAY")
     for name, value in seconds.items():
         ratios = f"{value / seconds['OpenCV HH']:6.3f}  {value / seconds['OpenCV 3WAY']:6.3f}"
-        print(f"{name:34} {1e3 * value:8.1f} {ratios}")
+        print(f"{name:42} {1e3 * value:8.1f} {ratios}")
     for cost in COSTS:
         wide, narrow = seconds[f"{cost} 192 x2"], seconds[f"{cost} 128 x2"]
         print(f"{cost}: 192 disparities over 128 {wide / narrow:.2f}; 2 threads over 1 ", end="")
