@@ -21,6 +21,7 @@ from stages.data import (
 )
 from stages.level import Level
 from stages.match import Match
+from stages.match_opencv import MatchOpenCV
 from stages.rectify import Rectify
 from stages.refine import Refine
 from stages.reproject import Reproject
@@ -36,6 +37,7 @@ __all__ = [
     "ElevationMap",
     "Level",
     "Match",
+    "MatchOpenCV",
     "Mount",
     "NavigationMap",
     "PointCloud",

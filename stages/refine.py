@@ -36,7 +36,7 @@ class Refine(Stage):
     ends in the row.
     """
 
-    trusted: float = parameter(0.1, "confidence below which a match is treated as unknown", low=0, high=1)
+    trusted: float = parameter(0.5, "confidence below which a match is treated as unknown", low=0, high=1)
     median: int = parameter(5, "side of the median filter over matches, 0 = none", unit="px", choices=(0, 3, 5))
     near: float = parameter(
         1.0, "distance up to which a match moves to its median or plane; a farther one stays", unit="px", low=0

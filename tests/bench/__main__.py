@@ -1,6 +1,7 @@
 """Everything `make bench` prints."""
 
-from tests.bench import pipeline, terrain
+from tests.bench import matching, pipeline, terrain
 
+matching.main()
 pipeline.main()
 terrain.main()

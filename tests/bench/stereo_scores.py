@@ -19,10 +19,11 @@ from flow.pipeline import load
 from stages.data import Array, Disparity, StereoCamera, StereoFrame
 from stages.kernels.background import fill_background
 from stages.match import Match
+from stages.match_opencv import MatchOpenCV
 from stages.refine import Refine
 
 
-def paper_stages() -> tuple[Match, Refine]:
+def paper_stages() -> tuple[MatchOpenCV, Refine]:
     """Matching and refinement as the pipeline `paper` sets them."""
     actors = {node.name: node.actor for node in load("paper").nodes}
     return actors["matched"], actors["disparity"]

@@ -1,0 +1,180 @@
+"""Semi-global aggregation (Hirschmüller, 2008, section 2.3): the cost of the cheapest paths that lead to each pixel.
+
+    L(p, d) = C(p, d) + min(L(q, d), L(q, d - 1) + p1, L(q, d + 1) + p1, p2) - min over d of the sum before it
+
+with q the pixel before p on the path. Paths come from 8 sides: a sweep down the image follows the 4 whose q is to the
+left or above, a sweep up the other 4. p2 falls with the step of brightness from q to p, where surfaces are likely to
+end.
+
+Three tricks. L has its smallest value subtracted as soon as it is known, so that it never exceeds C + p2 and fits a
+byte; Hirschmüller subtracts the same number one pixel later. The 4 paths of a sweep are added where they stand, in
+one pass, as numbers above their own smallest; sums stop at 255, which no disparity that might win reaches. And a path
+along a diagonal keeps its place in memory: its place is x - y (or x + y), which is the same for p and q, so that one
+row of costs for each direction is enough, read and overwritten in place.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stages.data import Array
+from stages.kernels.census import differing_bits, seen_costs
+from stages.kernels.compiled import kernel, part
+from stages.kernels.vectors import (
+    Width,
+    byte,
+    either,
+    lanes_in,
+    lesser,
+    load,
+    minus,
+    minus_capped,
+    plus_capped,
+    shifted,
+    shifted_in_memory,
+    smallest,
+    spread,
+    store,
+)  # fmt: skip
+
+BLOCK = 64
+FAR = 255  # beyond either end of the search range
+SIDES = ((0, -1), (-1, -1), (-1, 0), (-1, 1))  # (dy, dx) to q of a sweep down; of a sweep up their opposites
+
+
+def brightness_steps(image: Array) -> Array:
+    """Absolute differences to the four neighbours of `SIDES`.
+
+    image: (H, W) uint8. Returns (4, H + 1, S) uint8 with S >= W + 2: pixel (y, x) is at [:, y, x + 1], differences to
+    pixels outside the image are arbitrary.
+    """
+    height, columns = image.shape
+    stride = -(-(columns + 2) // BLOCK) * BLOCK
+    padded = cv2.copyMakeBorder(image, 1, 1, 2, 1 + stride - columns, cv2.BORDER_REPLICATE)
+    steps = np.empty((len(SIDES), height + 1, stride), np.uint8)
+    _brightness_steps(padded.reshape(-1), padded.shape[1], steps.reshape(-1), height + 1, stride, Width(BLOCK))
+    return steps
+
+
+@kernel
+def _brightness_steps(image, image_stride, steps, rows, stride, width):  # type: ignore[no-untyped-def]
+    for side in range(len(SIDES)):
+        dy, dx = SIDES[side]
+        for y in range(rows):
+            for i in range(0, stride, lanes_in(width)):
+                here = (y + 1) * image_stride + i + 1
+                one, other = load(image, here, width), load(image, here + dy * image_stride + dx, width)
+                step = either(minus_capped(one, other), minus_capped(other, one))
+                store(steps, (side * rows + y) * stride + i, step)
+
+
+@part
+def aggregate_row(  # type: ignore[no-untyped-def]
+    pair, rule, costs, fused, paths, y, step, sums, place, total, final, width
+):
+    """Follow the paths of one sweep from the row before into row y, and add them up.
+
+    pair, rule: `semiglobal.Pair` and `Rule`; costs: (W * n,) uint8, C of the row; fused: C is not in `costs` but the
+    census cost, to be made here, which saves writing and reading it; paths: (3 * W * n,) uint8, L of the row before,
+    all 0 at first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where the sums of the row go,
+    from `place` on (W * n); final: instead, add what the other sweep left there, and put the whole into `total`.
+    """
+    n = lanes_in(width)
+    columns = costs.size // n
+    _, rows, stride = pair.steps.shape
+    steps, table = pair.steps.reshape(-1), rule.table  # p2 is in the table, for each step of brightness
+    nothing, small_step = spread(0, width), spread(rule.p1, width)
+    first, last = (0, columns - 1) if step > 0 else (columns - 1, 0)
+    upwards = 1 if step < 0 else 0  # the pair (p, q) of a sweep up is the pair (q, p) of a sweep down
+    beside = y * stride + first + 1 + upwards
+    falling = (rows + y + upwards) * stride + first + 1 + upwards
+    upright = (2 * rows + y + upwards) * stride + first + 1
+    rising = (3 * rows + y + upwards) * stride + first + 1 - upwards
+    fall, rise = (first - y) % columns, (first + y) % columns  # places of the diagonals through the first pixel
+    store(paths, fall * n, nothing)  # this path begins here, as does the one at the other end of the row
+    store(paths, (2 * columns + (last + y) % columns) * n, nothing)
+    path = nothing
+    left, right = pair.left[y], pair.right[y]
+    x = first
+    for _ in range(columns):
+        if fused:
+            bits = differing_bits(left, right, columns, x, width)
+            cost = seen_costs(bits, pair, rule.unseen, columns, x, width)
+        else:
+            cost = load(costs, x * n, width)
+        path = _continued(path, cost, small_step, byte(table, byte(steps, beside)), width)
+        total_here = path
+        at = (columns + x) * n
+        moved = _continued_at(paths, at, cost, small_step, byte(table, byte(steps, upright)), width)
+        store(paths, at, moved)
+        total_here = plus_capped(total_here, moved)
+        if rule.diagonals:
+            at = fall * n
+            moved = _continued_at(paths, at, cost, small_step, byte(table, byte(steps, falling)), width)
+            store(paths, at, moved)
+            total_here = plus_capped(total_here, moved)
+            at = (2 * columns + rise) * n
+            moved = _continued_at(paths, at, cost, small_step, byte(table, byte(steps, rising)), width)
+            store(paths, at, moved)
+            total_here = plus_capped(total_here, moved)
+        here = place + x * n
+        if final:
+            store(total, x * n, plus_capped(total_here, load(sums, here, width)))
+        else:
+            store(sums, here, total_here)
+        beside, falling, upright, rising, x = beside + step, falling + step, upright + step, rising + step, x + step
+        fall, rise = _around(fall + step, columns), _around(rise + step, columns)
+
+
+@part
+def _continued(path, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    """L of the next pixel of a path that is at hand, above its smallest value."""
+    near = lesser(shifted(path, FAR, 1), shifted(path, FAR, -1))
+    return _next(path, near, cost, p1, p2, width)
+
+
+@part
+def _continued_at(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    """L of the next pixel of a path that is kept in `paths`, above its smallest value."""
+    path = load(paths, at, width)
+    near = lesser(shifted_in_memory(path, paths, at, FAR, 1), shifted_in_memory(path, paths, at, FAR, -1))
+    return _next(path, near, cost, p1, p2, width)
+
+
+@part
+def _next(path, near, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    after = plus_capped(cost, lesser(lesser(plus_capped(near, p1), path), spread(p2, width)))
+    return minus(after, spread(smallest(after), width))
+
+
+@part
+def _around(place, columns):  # type: ignore[no-untyped-def]
+    """`place` modulo `columns`, from one step outside at most."""
+    return 0 if place == columns else columns - 1 if place < 0 else place
+
+
+def aggregate_reference(costs: Array, image: Array, table: Array, p1: int, paths: int) -> tuple[Array, Array]:
+    """The sums of the sweep down and of the sweep up in plain numpy.
+
+    costs: (H, W, n) uint8; image: (H, W) uint8; table, p1: as above; paths: 4 or 8. Returns two (H, W, n) uint8.
+    """
+    height, columns, n = costs.shape
+    sums = []
+    for sign in (1, -1):
+        total = np.zeros(costs.shape, np.int64)
+        for dy, dx in SIDES if paths == 8 else SIDES[::2]:
+            dy, dx = sign * dy, sign * dx
+            before = np.zeros((height + 2, columns + 2, n + 2), np.int64)  # of every pixel, a frame of paths that begin
+            before[..., 0] = before[..., -1] = FAR
+            for y in range(height)[::sign]:
+                for x in range(columns)[::sign]:
+                    q = before[y + dy + 1, x + dx + 1]
+                    inside = 0 <= y + dy < height and 0 <= x + dx < columns
+                    step = abs(int(image[y, x]) - int(image[y + dy, x + dx])) if inside else 0
+                    near = np.minimum(np.minimum(q[:-2], q[2:]) + p1, np.minimum(q[1:-1], table[step]))
+                    after = np.minimum(costs[y, x] + near, 255)
+                    before[y + 1, x + 1, 1:-1] = after - after.min()
+            total += before[1:-1, 1:-1, 1:-1]
+        sums.append(np.minimum(total, 255).astype(np.uint8))
+    return sums[0], sums[1]

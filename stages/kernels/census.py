@@ -1,0 +1,122 @@
+"""Census cost: how many of the 24 comparisons of a pixel with its 5x5 neighbourhood differ between left and right.
+
+(Zabih and Woodfill, 1994.) Each comparison, "is the neighbour darker", is a bit, so that the cost does not feel a
+change of exposure or gain. The trick is the layout. The bits are kept as 3 planes of bytes, and the right image runs
+backwards: then the right partners of one left pixel, disparity after disparity, are neighbours in memory, and 64
+costs are three times one load, one exclusive or and one count of bits.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stages.data import Array
+from stages.kernels.compiled import kernel, part
+from stages.kernels.vectors import (
+    Width,
+    both,
+    byte,
+    either,
+    exclusive_or,
+    lanes_in,
+    load,
+    minus_capped,
+    ones,
+    plus,
+    spread,
+    store,
+    where_less,
+)  # fmt: skip
+
+BITS = 24
+PLANES = BITS // 8
+OFFSETS = tuple((dy, dx) for dy in range(-2, 3) for dx in range(-2, 3) if (dy, dx) != (0, 0))
+BLOCK = 64  # pixels described at a time
+
+
+def census(image: Array, planes: Array, mirrored: bool = False) -> None:
+    """Write the comparisons of each pixel into `planes`.
+
+    image: (H, W) uint8, its own border replicated beyond; planes: (H, at least 3, at least W rounded up to 64) uint8,
+    of which the first three are written, and more than W columns; mirrored: the image is flipped left to right, and
+    the bits are to be those it had before.
+    """
+    columns = -(-image.shape[1] // BLOCK) * BLOCK
+    padded = cv2.copyMakeBorder(image, 2, 2, 2, 2 + columns - image.shape[1], cv2.BORDER_REPLICATE)
+    _census(padded, -1 if mirrored else 1, planes, columns, Width(BLOCK))
+
+
+@kernel
+def _census(image, sign, planes, columns, width):  # type: ignore[no-untyped-def]
+    nothing, stride = spread(0, width), image.shape[1]
+    for y in range(planes.shape[0]):
+        for x in range(0, columns, lanes_in(width)):
+            at = (y + 2) * stride + x + 2
+            centre = load(image, at, width)
+            bit, plane = 0, nothing
+            for dy in range(-2, 3):
+                for dx in range(-2, 3):
+                    if dy != 0 or dx != 0:
+                        neighbour = load(image, at + dy * stride + sign * dx, width)
+                        plane = either(plane, where_less(neighbour, centre, spread(1 << (bit & 7), width), nothing))
+                        bit += 1
+                        if bit & 7 == 0:
+                            store(planes[y, (bit >> 3) - 1], x, plane)
+                            plane = nothing
+
+
+def census_reference(image: Array, mirrored: bool = False) -> Array:
+    """The planes of `census`, (H, 3, W) uint8, in plain numpy."""
+    height, width = image.shape
+    padded = np.pad(image, 2, mode="edge")
+    bits = np.zeros((height, PLANES, width), np.uint8)
+    for bit, (dy, dx) in enumerate(OFFSETS):
+        neighbour = padded[2 + dy :, 2 + (-dx if mirrored else dx) :][:height, :width]
+        bits[:, bit // 8] |= (neighbour < image).astype(np.uint8) << (bit % 8)
+    return bits
+
+
+@part
+def census_costs(pair, unseen, y, costs, width):  # type: ignore[no-untyped-def]
+    """The costs of row y, all pixels and disparities: costs (W * n,) uint8, pixel after pixel.
+
+    pair: `semiglobal.Pair`, whose right planes run backwards, so that pixel x and lane d meet at W - 1 - x + d; unseen:
+    the cost where the partner is outside the right image.
+    """
+    n = lanes_in(width)
+    columns = costs.size // n
+    left, right = pair.left[y], pair.right[y]
+    for x in range(columns):
+        bits = differing_bits(left, right, columns, x, width)
+        store(costs, x * n, seen_costs(bits, pair, unseen, columns, x, width))
+
+
+@part
+def differing_bits(left, right, columns, x, width):  # type: ignore[no-untyped-def]
+    """How many of the 24 comparisons differ between pixel x and its partner at each disparity."""
+    i = columns - 1 - x
+    bits = ones(exclusive_or(spread(byte(left[0], x), width), load(right[0], i, width)))
+    bits = plus(bits, ones(exclusive_or(spread(byte(left[1], x), width), load(right[1], i, width))))
+    return plus(bits, ones(exclusive_or(spread(byte(left[2], x), width), load(right[2], i, width))))
+
+
+@part
+def seen_costs(costs, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
+    """`costs` of pixel x, but `unseen` where the partner is outside the right image."""
+    if pair.whole_from <= x < pair.whole_to:
+        return costs
+    outside = load(pair.outside, columns - 1 - x, width)
+    return either(minus_capped(costs, outside), both(outside, spread(unseen, width)))
+
+
+def census_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen: int) -> Array:
+    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 3, W) uint8, neither of them mirrored."""
+    height, _, columns = left.shape
+    costs = np.full((height, columns, lanes), unseen, np.uint8)
+    for x in range(columns):
+        for lane in range(lanes):
+            partner = x - minimum - lane
+            if 0 <= partner < columns:
+                costs[:, x, lane] = np.bitwise_count(left[:, :, x] ^ right[:, :, partner]).sum(axis=1)
+    return costs

@@ -1,0 +1,153 @@
+"""The default matching cost: census and gradient difference of the pixels, smoothed over 3x3.
+
+raw = 2 * (census bits that differ, 0..24) + 5 * min(|difference of dx| + |difference of dy|, 6)
+Census tells textured patches apart whatever the exposure; the truncated gradient difference adds what census throws
+away, how much darker. The sum over 3 columns (at most 234) and the binomial mean (1, 2, 1) over 3 rows fit a byte. The
+trick: only column sums of the two rows passed last are kept, and the next row's are made as the sweep reaches them, so
+that no cost is ever stored for the whole image.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stages.data import Array
+from stages.kernels.census import census_costs_reference, differing_bits, seen_costs
+from stages.kernels.compiled import kernel, part
+from stages.kernels.vectors import (
+    Width,
+    average,
+    byte,
+    either,
+    lanes_in,
+    lesser,
+    load,
+    minus_capped,
+    plus,
+    plus_capped,
+    spread,
+    store,
+)  # fmt: skip
+
+DX, DY = 3, 4  # after the planes of census
+PLANES = 5
+BLOCK = 64
+LARGEST = 6
+MIDDLE = 128  # stands for no gradient
+
+
+def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
+    """Write dx and dy of each pixel (Sobel / 4, gray levels a pixel, plus 128, within 1 to 255) into `planes`.
+
+    image: (H, W) uint8, its own border replicated beyond; planes: (H, 5, at least W rounded up to 64) uint8, of which
+    the last two are written, and more than W columns; mirrored: the image is flipped left to right, and dx is to be
+    what it was before.
+    """
+    columns = -(-image.shape[1] // BLOCK) * BLOCK
+    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1 + columns - image.shape[1], cv2.BORDER_REPLICATE)
+    _gradients(padded, -1 if mirrored else 1, planes, columns, Width(BLOCK))
+
+
+@kernel
+def _gradients(image, sign, planes, columns, width):  # type: ignore[no-untyped-def]
+    stride = image.shape[1]
+    for y in range(planes.shape[0]):
+        dx, dy = planes[y, DX], planes[y, DY]
+        for x in range(0, columns, lanes_in(width)):
+            at = (y + 1) * stride + x + 1
+            west, east = _smooth(image, at - sign, stride, width), _smooth(image, at + sign, stride, width)
+            north, south = _smooth(image, at - stride, 1, width), _smooth(image, at + stride, 1, width)
+            store(dx, x, _signed_difference(east, west, width))
+            store(dy, x, _signed_difference(south, north, width))
+
+
+@part
+def _smooth(image, at, stride, width):  # type: ignore[no-untyped-def]
+    """Mean of three pixels `stride` apart, the middle one, at `at`, twice."""
+    ends = average(load(image, at - stride, width), load(image, at + stride, width))
+    return average(ends, load(image, at, width))
+
+
+@part
+def _signed_difference(more, less, width):  # type: ignore[no-untyped-def]
+    most = spread(MIDDLE - 1, width)
+    above = plus_capped(spread(MIDDLE, width), lesser(minus_capped(more, less), most))
+    return minus_capped(above, lesser(minus_capped(less, more), most))
+
+
+def gradients_reference(image: Array, mirrored: bool = False) -> Array:
+    """The planes of `gradients`, (H, 2, W) uint8, in plain numpy."""
+    padded = np.pad(image.astype(np.int64), 1, mode="edge")
+    if mirrored:
+        return np.ascontiguousarray(gradients_reference(image[:, ::-1])[:, :, ::-1])
+
+    def mean(one: Array, middle: Array, other: Array) -> Array:
+        return ((one + other + 1) // 2 + middle + 1) // 2
+
+    columns, rows = mean(padded[:-2], padded[1:-1], padded[2:]), mean(padded[:, :-2], padded[:, 1:-1], padded[:, 2:])
+    planes = np.stack([columns[:, 2:] - columns[:, :-2], rows[2:] - rows[:-2]], axis=1)
+    result: Array = np.clip(planes + MIDDLE, 1, 255).astype(np.uint8)
+    return result
+
+
+@part
+def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ignore[no-untyped-def]
+    """The costs of the row before row `ahead` of a sweep, all pixels and disparities: costs (W * n,) uint8.
+
+    pair, unseen: as of `census_costs`; ahead: may be one row outside the image, whose border then counts twice;
+    column_sums: (2, W * n) uint8, those of the two rows before `ahead`; the older are replaced by those of `ahead`.
+    """
+    n = lanes_in(width)
+    columns = costs.size // n
+    older, newer = column_sums[ahead & 1], column_sums[1 - (ahead & 1)]
+    inside = min(max(ahead, 0), pair.left.shape[0] - 1)
+    left, right = pair.left[inside], pair.right[inside]
+    nothing = spread(0, width)
+    before = here = nothing
+    for x in range(-1, columns):
+        after = _raw_costs(left, right, pair, unseen, columns, min(x + 1, columns - 1), width)
+        if x < 0:  # beyond the border, its pixel again
+            before = here = after
+            continue
+        three = plus(plus(before, here), after)
+        mean = average(average(load(older, x * n, width), three), load(newer, x * n, width))
+        store(older, x * n, three)
+        store(costs, x * n, average(average(mean, nothing), nothing))
+        before, here = here, after
+
+
+@part
+def _raw_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
+    i = columns - 1 - x
+    bits = differing_bits(left, right, columns, x, width)
+    dx = _difference(spread(byte(left[DX], x), width), load(right[DX], i, width))
+    dy = _difference(spread(byte(left[DY], x), width), load(right[DY], i, width))
+    step = lesser(plus_capped(dx, dy), spread(LARGEST, width))
+    twice = plus(step, step)
+    cost = plus(plus(plus(bits, bits), step), plus(twice, twice))
+    return seen_costs(cost, pair, unseen, columns, x, width)
+
+
+@part
+def _difference(one, other):  # type: ignore[no-untyped-def]
+    return either(minus_capped(one, other), minus_capped(other, one))
+
+
+def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen: int) -> Array:
+    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 5, W) uint8, neither of them mirrored."""
+    bits = census_costs_reference(left[:, :DX], right[:, :DX], lanes, minimum, 0).astype(np.int64)
+    columns = left.shape[2]
+    left, right = left.astype(np.int64), right.astype(np.int64)
+    raw = np.full(bits.shape, unseen)
+    for x in range(columns):
+        for lane in range(lanes):
+            partner = x - minimum - lane
+            if 0 <= partner < columns:
+                step = np.abs(left[:, DX:, x] - right[:, DX:, partner]).sum(axis=1)
+                raw[:, x, lane] = 2 * bits[:, x, lane] + 5 * np.minimum(step, LARGEST)
+    wide = np.pad(raw, ((0, 0), (1, 1), (0, 0)), mode="edge")
+    three = np.pad(wide[:, :-2] + wide[:, 1:-1] + wide[:, 2:], ((1, 1), (0, 0), (0, 0)), mode="edge")
+    mean = ((three[:-2] + three[2:] + 1) // 2 + three[1:-1] + 1) // 2
+    result: Array = (((mean + 1) // 2 + 1) // 2).astype(np.uint8)
+    return result

@@ -1,0 +1,127 @@
+"""Selection: the disparity of each pixel from the sums of its paths, and whether it can be believed.
+
+The smallest sum wins, to a fraction of a pixel by the parabola through it and its neighbours. A winner must beat every
+disparity that is not its neighbour (uniqueness), and the right image's pixel must choose the same from the same sums
+(left-right check). That choice needs all sums of a row along a diagonal; the trick is to keep the best so far of n
+right pixels in the lanes of one vector, which moves by one lane from pixel to pixel, as the partners do.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.data import Array
+from stages.kernels.compiled import part
+from stages.kernels.vectors import (
+    byte,
+    count_up,
+    either,
+    first_equal,
+    lanes_in,
+    lesser,
+    load,
+    outermost,
+    shifted,
+    smallest,
+    spread,
+    store,
+    where_less,
+)  # fmt: skip
+
+
+@part
+def find_winners(total, beyond, guard, step, winner, votes, right, width):  # type: ignore[no-untyped-def]
+    """The best disparity of each pixel of a row, left and right; the smallest of equals.
+
+    total: (W * n,) uint8, the sums; beyond: (n,) uint8, 255 for lanes that are no disparities; guard: (2 n,) uint8, 255
+    at n - 1, n, n + 1, else 0; step: direction in which to go through the row, with the same result. Into winner (W,)
+    int16, votes (4, W) uint8: sum of the winner, of its lower and upper neighbour, and the smallest of the others; and
+    right (W + n,) uint8 or uint16: the right image's winners, backwards, that of the partner of left
+    pixel x at disparity d at W - 1 - x + d.
+    """
+    n, columns = lanes_in(width), winner.size
+    lanes, outside = count_up(width, right), load(beyond, 0, width)
+    best, index = spread(255, width), lanes
+    if step > 0:
+        for x in range(columns):
+            sums = either(load(total, x * n, width), outside)
+            _find_winner(sums, total, guard, x, winner, votes, width)
+            best, index = shifted(best, 255, 1), shifted(index, 0, 1)
+            index, best = where_less(sums, best, lanes, index), lesser(sums, best)
+            right[columns + n - 2 - x] = outermost(index, 1)
+        store(right, 0, index)
+    else:
+        for x in range(columns - 1, -1, -1):
+            sums = either(load(total, x * n, width), outside)
+            _find_winner(sums, total, guard, x, winner, votes, width)
+            best, index = shifted(best, 255, -1), shifted(index, 0, -1)
+            index, best = where_less(best, sums, index, lanes), lesser(sums, best)
+            right[columns - 1 - x] = outermost(index, -1)
+        store(right, columns - 1, index)
+
+
+@part
+def _find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[no-untyped-def]
+    n = lanes_in(width)
+    low = smallest(sums)
+    d = first_equal(sums, low)
+    winner[x] = d
+    votes[0, x] = low
+    votes[1, x] = byte(total, x * n + max(d - 1, 0))
+    votes[2, x] = byte(total, x * n + min(d + 1, n - 1))
+    votes[3, x] = smallest(either(sums, load(guard, n - d, width)))
+
+
+@part
+def fit_row(winner, votes, right, partners, rule, pixels, evidence):  # type: ignore[no-untyped-def]
+    """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
+
+    winner, votes, right: of `find_winners`; rule: `semiglobal.Rule`; into pixels (W,) float32, px, NaN = unknown, and
+    evidence (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown.
+
+    A winner at an end of the search range, or with a neighbour outside the right image, is none: its parabola would
+    lean on a sum that says nothing, and the smallest may lie beyond.
+    """
+    columns = winner.size
+    for x in range(columns):
+        partners[x] = right[np.uint64(columns - 1 - x + winner[x])]
+    minimum, last, top = np.int32(rule.minimum), np.int32(columns - 1), np.int32(rule.disparities - 1)
+    tolerance, margin = np.int32(rule.consistency), np.int32(rule.uniqueness)
+    for x in range(columns):
+        d = np.int32(winner[x])
+        low, next_best = np.int32(votes[0, x]), np.int32(votes[3, x])
+        lower, upper = np.int32(votes[1, x]), np.int32(votes[2, x])
+        partner = np.int32(np.int32(x) - minimum - d)
+        apart = abs(np.int32(np.int32(partners[x]) - d))
+        lead = np.int32(next_best - low)
+        sound = (d > 0) & (d < top) & (partner > 0) & (partner < last) & (apart <= tolerance) & (lead > margin)
+        bend = max(np.int32(lower + upper - low - low), np.int32(1))
+        value = np.float32(minimum + d) + np.float32(lower - upper) / np.float32(bend + bend)
+        pixels[x] = value if sound else np.float32(np.nan)
+        evidence[x] = np.uint8(lead) if sound else np.uint8(0)
+
+
+def select_reference(
+    total: Array, disparities: int, minimum: int, uniqueness: int, consistency: int
+) -> tuple[Array, Array]:
+    """Disparities and evidence of a row in plain numpy. total: (W, n) uint8, the sums of all paths."""
+    columns, _ = total.shape
+    sums = total[:, :disparities].astype(np.int64)
+    right = np.zeros(columns, np.int64)
+    for r in range(columns):
+        seen = [x for x in range(columns) if 0 <= x - minimum - r < disparities]
+        if seen:
+            right[r] = min((sums[x, x - minimum - r], x - minimum - r) for x in seen)[1]
+    pixels, evidence = np.full(columns, np.nan, np.float32), np.zeros(columns, np.uint8)
+    for x in range(columns):
+        d = int(np.argmin(sums[x]))
+        partner = x - minimum - d
+        if not (0 < d < disparities - 1 and 0 < partner < columns - 1):
+            continue
+        low, before, after = sums[x, d], sums[x, d - 1], sums[x, d + 1]
+        lead = min([255, *sums[x, : d - 1], *sums[x, d + 2 :]]) - low
+        if abs(right[partner] - d) <= consistency and lead > uniqueness:
+            bend = max(before + after - 2 * low, 1)
+            pixels[x] = np.float32(minimum + d) + np.float32(before - after) / np.float32(2 * bend)
+            evidence[x] = lead
+    return pixels, evidence

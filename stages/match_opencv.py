@@ -1,0 +1,117 @@
+"""Semi-global matching (Hirschmüller, 2008; section 3.1 of the paper), by OpenCV's StereoSGBM.
+
+The images are widened to the left by the disparity range, so that the left margin, where the matcher would otherwise
+stay silent, keeps the matches that lie inside the right image; those that would lie outside are dropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from stages.data import Array, Disparity, Source, StereoFrame
+from stages.intensity import eight_bit, gray
+from stages.stage import Stage, parameter
+
+F32 = np.float32
+MODES = {3: cv2.STEREO_SGBM_MODE_SGBM_3WAY, 5: cv2.STEREO_SGBM_MODE_SGBM, 8: cv2.STEREO_SGBM_MODE_HH}
+SMALLEST_SIDE = 32
+NEIGHBOURHOOD = 31  # side, px, of the window in which the share of known disparities is counted
+DEVIATION = 0.5  # px from the local median that halve the confidence
+UNKNOWN_LEVEL = -1e4  # stands for unknown in the median only: a pixel in the minority of a hole's rim agrees with none
+
+
+@dataclass(frozen=True)
+class MatchOpenCV(Stage):
+    """Disparities of a rectified frame, to 1/16 px; unknown where no unique, consistent and textured match was found.
+
+    `disparities` is rounded up to a multiple of 16. The confidence is a heuristic, not a probability: a match counts
+    for less the more of its neighbourhood found none and the farther it is from the median around it. (On the eight
+    quarter-size Middlebury scenes this ranks wrong matches better than texture or photometric difference do.)
+    """
+
+    disparities: int = parameter(192, "size of the search range", unit="px", low=16, high=1024)
+    minimum: int = parameter(0, "smallest disparity searched", unit="px", low=-512, high=512)
+    paths: int = parameter(5, "directions of aggregation", choices=(3, 5, 8))
+    block: int = parameter(3, "side of the block that a matching cost is summed over, odd", unit="px", low=1, high=9)
+    p1: float = parameter(2.0, "penalty of a step of 1 px, times channels * block^2 (as the paper's authors)", low=0.1)
+    p2: float = parameter(24.0, "penalty of a larger step, times channels * block^2; above p1", low=0)
+    prefilter: int = parameter(
+        63, "largest horizontal gradient that the matching cost tells apart, gray levels", low=1, high=63
+    )
+    uniqueness: int = parameter(1, "percent by which the best cost must beat the next", low=0, high=100)
+    consistency: int = parameter(1, "largest left-right difference", unit="px", low=1, high=64)
+    speckle_size: int = parameter(100, "largest isolated patch that is dropped, in pixels", low=0)
+    speckle_range: int = parameter(1, "disparity step that separates patches", unit="px", low=1)
+    texture: float = parameter(
+        0.0, "mean horizontal gradient of a block, in gray levels, that a match must exceed", low=0, high=255
+    )
+    color: bool = parameter(False, "match on RGB instead of gray")
+    threads: int = parameter(
+        1,
+        "most cores for one frame; never changes the result. OpenCV's matcher divides only paths=3, over its own pool,"
+        " whose size belongs to the program (cv2.setNumThreads): with OpenCV nothing beyond 1 is used by this stage",
+        low=1,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.block % 2 == 0:
+            raise ValueError(f"MatchOpenCV.block must be odd, not {self.block}")
+        if not self.p2 > self.p1:
+            raise ValueError(f"MatchOpenCV.p2 must be above MatchOpenCV.p1 = {self.p1}, not {self.p2}")
+        scale = (3 if self.color else 1) * self.block**2
+        if scale * (2 * self.prefilter + 63 + self.p2) > np.iinfo(np.int16).max:
+            raise ValueError("MatchOpenCV: block costs could exceed 16 bits; use a smaller block, p2 or prefilter")
+
+    def __call__(self, frame: StereoFrame) -> Disparity:
+        if frame.camera.raw is not None:
+            raise ValueError("MatchOpenCV: the frame is not rectified; put stages.Rectify before stages.MatchOpenCV")
+        left, right = eight_bit(frame.left, frame.right)
+        pixels = self._matched(left, right) if self.color else self._matched(gray(left), gray(right))
+        pixels[_texture(gray(left), self.block) <= self.texture] = np.nan
+        known = np.isfinite(pixels)
+        source = np.where(known, np.uint8(Source.MEASURED), np.uint8(Source.UNKNOWN))
+        return Disparity(frame.stamp, pixels, source, _agreement(pixels, known), camera=frame.camera)
+
+    def _matched(self, left: Array, right: Array) -> Array:
+        """The disparity image (H, W) float32, NaN where the match failed or lies outside the right image."""
+        height, width = left.shape[:2]
+        if min(height, width) < SMALLEST_SIDE:
+            raise ValueError(f"MatchOpenCV: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
+        levels = -(-self.disparities // 16) * 16
+        before, after = max(0, self.minimum + levels), max(0, -self.minimum)
+        left, right = (
+            cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right)
+        )  # fmt: skip
+        scale = (1 if left.ndim == 2 else 3) * self.block**2
+        # A matcher keeps its buffers and is not re-entrant; a new one per frame costs little and leaves nothing behind.
+        matcher = cv2.StereoSGBM.create(
+            minDisparity=self.minimum, numDisparities=levels, blockSize=self.block,
+            P1=max(1, round(self.p1 * scale)), P2=round(self.p2 * scale), disp12MaxDiff=self.consistency,
+            preFilterCap=self.prefilter, uniquenessRatio=self.uniqueness,
+            speckleWindowSize=self.speckle_size, speckleRange=self.speckle_range, mode=MODES[self.paths],
+        )  # fmt: skip
+        sixteenths = matcher.compute(left, right)[:, before : before + width]
+        pixels: Array = sixteenths.astype(np.float32) / F32(16)
+        partner = np.arange(width, dtype=np.float32) - pixels
+        pixels[(sixteenths < 16 * self.minimum) | (partner < 0) | (partner > width - 1)] = np.nan
+        return pixels
+
+
+def _texture(image: Array, block: int) -> Array:
+    """Mean absolute horizontal gradient of the block around each pixel, gray levels, (H, W) float32."""
+    gradient = np.abs(cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8))
+    texture: Array = cv2.blur(gradient, (block, block))
+    return texture
+
+
+def _agreement(pixels: Array, known: Array) -> Array:
+    """How well each known disparity is backed by those around it, (H, W) float32 in [0, 1]; 0 where unknown."""
+    median = cv2.medianBlur(np.where(known, pixels, F32(UNKNOWN_LEVEL)), 5)
+    density = cv2.blur(known.astype(np.float32), (NEIGHBOURHOOD, NEIGHBOURHOOD))
+    with np.errstate(invalid="ignore"):
+        agreement = density**4 / (1 + np.abs(median - pixels) / F32(DEVIATION))
+    return np.where(known, np.minimum(agreement, 1), F32(0))

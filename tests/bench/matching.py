@@ -1,0 +1,169 @@
+"""Match beside OpenCV's matchers: time, memory, compilation, and accuracy on real scenes with truth.
+
+Run as `python -m tests.bench.matching`. Times are medians of interleaved rounds, so that whatever else the machine does
+slows all of them; every matcher removes speckles and checks left against right. The pair is a Middlebury scene enlarged
+to 1280x960 where ROVERFLOW_DATA names the data, else a textured slope.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from stages import Match, StereoCamera, StereoFrame
+from stages.data import Array
+
+WIDTH, HEIGHT = 1280, 960
+ROUNDS = 9
+COSTS = ("census", "census+gradient")
+
+
+def pair() -> StereoFrame:
+    """The frame that is timed, gray."""
+    data = os.environ.get("ROVERFLOW_DATA")
+    if data:
+        scene = Path(data) / "middlebury-q" / "Motorcycle"
+        images = [cv2.imread(str(scene / f"im{i}.png"), cv2.IMREAD_GRAYSCALE) for i in (0, 1)]
+        left, right = (cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for image in images)
+    else:
+        noise = np.random.default_rng(0).uniform(0, 255, (HEIGHT, WIDTH + 160)).astype(np.float32)
+        texture = np.clip((cv2.GaussianBlur(noise, (0, 0), 1.2) - 127) * 3 + 127, 0, 255)
+        y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+        left = cv2.remap(texture, x + 130 - 120 * y / HEIGHT, y, cv2.INTER_LINEAR).astype(np.uint8)
+        right = cv2.remap(texture, x + 130, y, cv2.INTER_LINEAR).astype(np.uint8)
+    return StereoFrame(0, left, right, StereoCamera(1000, 1000, WIDTH / 2, HEIGHT / 2, 0.2, WIDTH, HEIGHT))
+
+
+def opencv(mode: int, disparities: int, frame: StereoFrame) -> Callable[[], object]:
+    """OpenCV's matcher with the parameters of the paper's authors, on gray images."""
+    matcher = cv2.StereoSGBM.create(0, disparities, 5, 4 * 25, 38 * 25, 1, 0, 1, 100, 2, mode)
+    return lambda: matcher.compute(frame.left, frame.right)
+
+
+def medians(contestants: dict[str, Callable[[], object]], rounds: int = ROUNDS) -> dict[str, float]:
+    """Median seconds of each, interleaved; the first round, which compiles and allocates, does not count."""
+    times: dict[str, list[float]] = {name: [] for name in contestants}
+    for round_ in range(rounds + 1):
+        for name, run in contestants.items():
+            start = time.perf_counter()
+            run()
+            if round_:
+                times[name].append(time.perf_counter() - start)
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def speed() -> None:
+    """Print times and ratios of the matchers."""
+    frame = pair()
+    contestants: dict[str, Callable[[], object]] = {
+        "OpenCV HH": opencv(cv2.STEREO_SGBM_MODE_HH, 128, frame),
+        "OpenCV 3WAY": opencv(cv2.STEREO_SGBM_MODE_SGBM_3WAY, 128, frame),
+    }
+    for cost in COSTS:
+        for disparities in (128, 192):
+            for threads in (1, 2):
+                match = Match(cost=cost, disparities=disparities, threads=threads)
+                contestants[f"{cost} {disparities} x{threads}"] = lambda match=match: match(frame)
+            match = Match(cost=cost, disparities=disparities)
+            pool = ThreadPoolExecutor(2)
+            contestants[f"{cost} {disparities}, 2 frames on 2 cores"] = (
+                lambda match=match, pool=pool: list(pool.map(match, [frame, frame]))
+            )
+    seconds = medians(contestants)
+    print(f"{'1280x960, median of ' + str(ROUNDS):42} {'ms':>8}  / HH   / 3WAY")
+    for name, value in seconds.items():
+        ratios = f"{value / seconds['OpenCV HH']:6.3f}  {value / seconds['OpenCV 3WAY']:6.3f}"
+        print(f"{name:42} {1e3 * value:8.1f} {ratios}")
+    for cost in COSTS:
+        wide, narrow = seconds[f"{cost} 192 x2"], seconds[f"{cost} 128 x2"]
+        print(f"{cost}: 192 disparities over 128 {wide / narrow:.2f}; 2 threads over 1 ", end="")
+        print(f"{narrow / seconds[f'{cost} 128 x1']:.2f}")
+
+
+MEASURE = """
+import json, re, sys, time
+start = time.perf_counter()
+from tests.bench.matching import pair
+from stages import Match
+cost, disparities, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+frame = pair()
+peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1])
+before = peak()
+start = time.perf_counter()
+Match(cost=cost, disparities=disparities, threads=threads)(frame)
+first = time.perf_counter() - start
+start = time.perf_counter()
+Match(cost=cost, disparities=disparities, threads=threads)(frame)
+after = peak()
+print(json.dumps([first, time.perf_counter() - start, (after - before) / 1024]))
+"""
+
+
+def first_call(cost: str, disparities: int, cache: Path) -> tuple[float, float, float]:
+    """Seconds of the first call in a new process, of the second, and MB that both added."""
+    command = [sys.executable, "-c", MEASURE, cost, str(disparities), "2"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    output = subprocess.check_output(command, env=environment, stderr=subprocess.DEVNULL)
+    first, second, megabytes = json.loads(output)
+    return first, second, megabytes
+
+
+def start_up(cache: Path) -> None:
+    """Print how long the first call takes without and with compiled kernels, and how much memory it needs."""
+    print(f"\n{'first call in a new process':34} {'cold s':>8} {'warm s':>7} {'next s':>7} {'MB':>6}")
+    for cost in COSTS:
+        cold, _, _ = first_call(cost, 192, cache / cost)
+        warm, following, megabytes = first_call(cost, 192, cache / cost)
+        print(f"{cost + ' 192 x2':34} {cold:8.2f} {warm:7.2f} {following:7.2f} {megabytes:6.0f}")
+
+
+def accuracy(folder: Path) -> None:
+    """Print the errors of Match and of OpenCV's best mode on scenes with truth, before refinement."""
+    from stages.kernels.background import fill_background
+    from tests.bench.stereo_scores import load_scene
+
+    rows: dict[str, list[list[float]]] = {}
+    for scene in sorted(folder.iterdir()):
+        frame, truth, mask, levels = load_scene(scene)
+        matcher = cv2.StereoSGBM.create(0, levels, 5, 300, 2850, 1, 0, 1, 100, 2, cv2.STEREO_SGBM_MODE_HH)
+        sixteenths = matcher.compute(frame.left[..., ::-1], frame.right[..., ::-1])
+        results: dict[str, Array] = {"OpenCV HH": np.where(sixteenths < 0, np.nan, sixteenths / 16).astype(np.float32)}
+        results |= {cost: Match(cost=cost, disparities=levels)(frame).pixels for cost in COSTS}
+        scored = (mask == 255) & np.isfinite(truth) & (np.arange(truth.shape[1]) >= levels)
+        for name, pixels in results.items():
+            kept = np.abs(pixels - truth)[scored & np.isfinite(pixels)]
+            filled = np.abs(fill_background(pixels, np.inf) - truth)[scored]
+            bad = [np.mean(~(filled <= limit)) for limit in (0.5, 1)]
+            rows.setdefault(name, []).append([np.mean(kept > 1), len(kept) / scored.sum(), *bad])
+    print(f"\n{'mean of the scenes, not occluded, %':34} kept bad-1  density  filled bad-0.5  filled bad-1")
+    means = {name: 100 * np.mean(values, axis=0) for name, values in rows.items()}
+    for name, (kept, density, half, one) in means.items():
+        print(f"{name:34} {kept:10.2f} {density:8.1f} {half:15.2f} {one:13.2f}")
+        ratio = means[name] / means["OpenCV HH"]
+        points = density - means["OpenCV HH"][1]
+        print(f"{'  over OpenCV HH':34} {ratio[0]:10.3f} {points:+8.1f} {ratio[2]:15.3f} {ratio[3]:13.3f}")
+
+
+def main() -> None:
+    """Print all tables."""
+    import tempfile
+
+    speed()
+    with tempfile.TemporaryDirectory() as cache:
+        start_up(Path(cache))
+    data = os.environ.get("ROVERFLOW_DATA")
+    if data:
+        accuracy(Path(data) / "middlebury-q")
+
+
+if __name__ == "__main__":
+    main()

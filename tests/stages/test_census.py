@@ -1,0 +1,82 @@
+"""Matching costs: the compiled planes and costs are, bit for bit, those of the plain references."""
+
+import numpy as np
+import pytest
+from numba import njit
+
+from stages.kernels.census import census, census_costs, census_costs_reference, census_reference
+from stages.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
+from stages.kernels.semiglobal import NO_PRIOR, Pair, Rule, _described, _view, lanes_for
+from stages.kernels.vectors import Width
+from tests.stages.test_match_opencv import textured
+
+
+@njit
+def rows_of_census(pair, unseen, costs, width):
+    for y in range(costs.shape[0]):
+        census_costs(pair, unseen, y, costs[y], width)
+
+
+@njit
+def rows_smoothed(pair, unseen, costs, sums, step, width):
+    height = costs.shape[0]
+    first = 0 if step > 0 else height - 1
+    for ahead in (first - step, first):
+        smoothed_costs(pair, unseen, ahead, sums, costs[first], width)
+    for i in range(height):
+        smoothed_costs(pair, unseen, first + (i + 1) * step, sums, costs[first + i * step], width)
+
+
+def rule_of(gradient, disparities, minimum):
+    nothing = np.zeros(256, np.uint8)
+    return Rule(gradient, True, 9, nothing, 11, disparities, minimum, 0, 1, 1.0, 0, nothing.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def images():
+    return tuple(textured(21, 77, seed).astype(np.uint8) for seed in (1, 2))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_planes_are_those_of_the_references(images, mirrored):
+    for image in images:
+        planes = np.zeros((21, 5, 128), np.uint8)
+        census(image, planes, mirrored)
+        gradients(image, planes, mirrored)
+        assert np.array_equal(planes[:, :3, :77], census_reference(image, mirrored))
+        assert np.array_equal(planes[:, 3:, :77], gradients_reference(image, mirrored))
+
+
+def test_a_mirrored_image_has_the_mirrored_planes(images):
+    image = images[0]
+    flipped = np.ascontiguousarray(image[:, ::-1])
+    assert np.array_equal(census_reference(flipped, True)[:, :, ::-1], census_reference(image))
+    assert np.array_equal(gradients_reference(flipped, True)[:, :, ::-1], gradients_reference(image))
+
+
+def test_census_does_not_feel_exposure(images):
+    brighter = (images[0] // 2 + 90).astype(np.uint8)
+    assert np.array_equal(census_reference((images[0] // 2).astype(np.uint8)), census_reference(brighter))
+
+
+@pytest.mark.parametrize(("disparities", "minimum"), [(16, 0), (40, 5), (70, -30), (90, 60), (20, -76)])
+def test_costs_are_those_of_the_references_at_every_pixel_and_disparity(images, disparities, minimum):
+    left, right = images
+    lanes = lanes_for(disparities)
+    width, bits = Width(lanes), [census_reference(image) for image in images]
+    planes = [np.concatenate([b, gradients_reference(i)], axis=1) for b, i in zip(bits, images, strict=True)]
+    costs = np.empty((21, 77 * lanes), np.uint8)
+    for gradient in (False, True):
+        rule = rule_of(gradient, disparities, minimum)
+        described = _described(left, rule), _described(right, rule, width)
+        pair = Pair(*described, np.zeros((4, 1, 1), np.uint8), *_view(77, rule, width), *NO_PRIOR)
+        if gradient:
+            expected = smoothed_costs_reference(*planes, lanes, minimum, rule.unseen)
+            for step in (1, -1):
+                costs[:] = 7
+                rows_smoothed(pair, rule.unseen, costs, np.empty((2, 77 * lanes), np.uint8), step, width)
+                assert np.array_equal(costs.reshape(expected.shape), expected)
+        else:
+            expected = census_costs_reference(*bits, lanes, minimum, rule.unseen)
+            rows_of_census(pair, rule.unseen, costs, width)
+            assert np.array_equal(costs.reshape(expected.shape), expected)

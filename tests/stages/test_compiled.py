@@ -1,0 +1,48 @@
+"""Compiled kernels: kept between runs, announced when made, and never used after any kernel's source has changed."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = """
+import numpy as np
+from stages.kernels.census import census
+planes = np.zeros((3, 3, 64), np.uint8)
+census(np.arange(120, dtype=np.uint8).reshape(3, 40) // 2, planes)
+print(planes[:, :, :40].sum())
+"""
+
+
+@pytest.fixture
+def run(tmp_path):
+    shutil.copytree(ROOT / "stages", tmp_path / "stages", ignore=shutil.ignore_patterns("__pycache__"))
+
+    def call():
+        environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
+        return done.stdout, done.stderr
+
+    return call
+
+
+def test_kernels_are_announced_once_kept_and_made_again_after_a_change_anywhere(run, tmp_path):
+    first, said = run()
+    assert "compiling kernels" in said
+    again, said = run()
+    assert (again, said) == (first, "")
+    # what is changed is called by the kernel, but is in another file
+    layer = tmp_path / "stages" / "kernels" / "vectors.py"
+    changed = re.sub(r'icmp_unsigned\("<"', 'icmp_unsigned("<="', layer.read_text())
+    assert changed != layer.read_text()
+    layer.write_text(changed)
+    after, said = run()
+    assert after != first
+    assert "compiling kernels" in said

@@ -1,0 +1,64 @@
+"""Selection: winners, checks and patches are, bit for bit, those of the references, whichever way they are found."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba import njit
+
+from stages.kernels.halves import pairs
+from stages.kernels.selection import find_winners, fit_row, select_reference
+from stages.kernels.semiglobal import lanes_for
+from stages.kernels.speckles import drop_speckles, drop_speckles_reference
+from stages.kernels.vectors import Width
+from tests.stages.test_census import rule_of
+
+
+@njit
+def select(total, beyond, guard, step, winner, votes, right, partners, rule, pixels, evidence, width):
+    find_winners(total, beyond, guard, step, winner, votes, right, width)
+    fit_row(winner, votes, right, partners, rule, pixels, evidence)
+
+
+@pytest.mark.parametrize("disparities", [9, 64, 90, 300])
+@pytest.mark.parametrize("minimum", [0, -30, 25])
+def test_a_row_is_selected_as_by_the_reference_in_either_direction(disparities, minimum):
+    rng = np.random.default_rng(disparities)
+    lanes, columns = lanes_for(disparities), 150
+    width = Width(lanes)
+    total = rng.integers(5, 40, (columns, lanes)).astype(np.uint8)  # with many ties
+    for x in range(columns):
+        d = min(disparities - 1, max(0, 50 - minimum + x // 20))
+        total[x, max(0, d - 1) : d + 2] = (4, 2, 3)[: len(total[x, max(0, d - 1) : d + 2])]
+    guard = np.where(np.abs(np.arange(2 * lanes) - lanes) <= 1, 255, 0).astype(np.uint8)
+    beyond = np.where(np.arange(lanes) < disparities, 0, 255).astype(np.uint8)
+    rule = rule_of(True, disparities, minimum)._replace(uniqueness=1, consistency=1)
+    expected = select_reference(total, disparities, minimum, 1, 1)
+    index = np.uint8 if lanes <= 256 else np.uint16
+    for step in (1, -1):
+        rows = np.empty(columns, np.int16), np.empty((4, columns), np.uint8), np.empty(columns + lanes, index)
+        pixels, evidence = np.empty(columns, np.float32), np.empty(columns, np.uint8)
+        partners = np.empty(columns, np.int16)
+        flat = np.append(total.ravel(), np.zeros(64, np.uint8))
+        select(flat, beyond, guard, step, *rows, partners, rule, pixels, evidence, width)
+        assert np.array_equal(pixels, expected[0], equal_nan=True)
+        assert np.array_equal(evidence, expected[1])
+    if disparities >= 64 and minimum == 0:
+        assert np.isfinite(pixels).sum() > 40
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(2, 30), st.integers(1, 30), st.integers(0, 12), st.integers(0, 2**32 - 1))
+def test_speckles_are_the_small_components_of_a_graph(height, columns, largest, seed):
+    rng = np.random.default_rng(seed)
+    disparity = rng.integers(0, 4, (height, columns)).astype(np.float32)
+    disparity[rng.random(disparity.shape) < 0.2] = np.nan
+    evidence = np.where(np.isfinite(disparity), 9, 0).astype(np.uint8)
+    wanted, wanted_evidence = disparity.copy(), evidence.copy()
+    drop_speckles_reference(wanted, wanted_evidence, 1.0, largest)
+    for threads in (1, 2):
+        found, found_evidence = disparity.copy(), evidence.copy()
+        with pairs(threads) as both:
+            drop_speckles(found, found_evidence, 1.0, largest, both)
+        assert np.array_equal(found, wanted, equal_nan=True)
+        assert np.array_equal(found_evidence, wanted_evidence)
