@@ -165,11 +165,19 @@ def rotation_of(quaternion: Any, what: str) -> Rotation:
     return Rotation.from_quat(values)
 
 
-def pose_of(message: Any, log_time: int, base_frame: str) -> Pose:
-    """The pose of nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped.
+def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
+    """The pose of nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped, or that of `base_frame` in
+    a tf2_msgs/TFMessage, None where it holds others only.
 
     base_frame: whose pose it is where the message does not say.
     """
+    if hasattr(message, "transforms"):
+        moved = next((item for item in message.transforms if item.child_frame_id == base_frame), None)
+        if moved is None:
+            return None
+        at = transform_of(moved)
+        quaternion = rotation_of(moved.transform.rotation, "the pose").as_quat()
+        return Pose(stamp_or(moved.header, log_time), at.translation, quaternion, at.parent, base_frame)
     placed = message.pose if hasattr(message.pose, "covariance") else None
     pose = message.pose.pose if placed is not None else message.pose
     covariance = placed.covariance.reshape(6, 6) if placed is not None else None

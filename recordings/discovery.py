@@ -253,7 +253,7 @@ def _undefined(topic: Topic) -> str:
 def _find_pose(topics: Sequence[Topic], settings: Settings, found: Topics) -> None:
     poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
     if settings.odometry is not None:
-        if settings.odometry in {topic.name for topic in poses}:
+        if settings.odometry in {topic.name for topic in topics if topic.schema in (*POSES, TRANSFORMS)}:
             found.chosen["odometry"] = settings.odometry
         else:
             found.missing["odometry"] = _not_there("odometry", settings.odometry, "pose", poses)

@@ -17,6 +17,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
 
 from flow.cli import main
 from tests.conftest import FRAMES, rewrite
@@ -125,6 +126,31 @@ def test_part_of_a_log(traverse, tmp_path):
     out = tmp_path / "part.mcap"
     assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--start", 0.7, "--end", 1.3) == 0
     assert len([topic for topic, _, _ in raw_messages(out) if topic == "/nav/points"]) == 1
+
+
+def test_the_pose_comes_from_tf_where_told(traverse, tmp_path):
+    """The simulator's /odometry is left out; its pose is written as /tf among another transform."""
+    from recordings.mcap_source import McapSource
+    from recordings.ros2 import Ros2Writer, iter_messages, transform_message
+    from stages.data import Pose, Transform
+
+    log = tmp_path / "tf.mcap"
+    with McapSource().open(traverse) as opened:
+        poses = [item for _, stream, item in opened if stream == "odometry"]
+    with Ros2Writer(log) as writer:
+        for topic, stamp, message in iter_messages(traverse):
+            if not topic.startswith(("/truth", "/odometry", "/tf")) or topic == "/tf_static":
+                writer.write(topic, message, stamp)
+        for pose in poses:
+            wheel = Transform("base_link", "wheel", np.eye(3), np.zeros(3))
+            at = Transform(pose.frame_id, "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
+            writer.write("/tf", transform_message([(wheel, pose.stamp), (at, pose.stamp)]), pose.stamp)
+    with McapSource(odometry="/tf").open(log) as opened:
+        read = [item for _, stream, item in opened if stream == "odometry"]
+    assert all(isinstance(pose, Pose) for pose in read)
+    assert [pose.stamp for pose in read] == [pose.stamp for pose in poses]
+    np.testing.assert_allclose([p.position for p in read], [p.position for p in poses], atol=1e-12)
+    assert roverflow("run", log, *SMALL, "--set", "source.odometry=/tf", "-o", tmp_path / "out.mcap", "--no-rrd") == 0
 
 
 def drop(*parts: str):
