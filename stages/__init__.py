@@ -2,6 +2,7 @@
 
 from stages.binarise import Binarise
 from stages.clean import Clean
+from stages.crosscheck import CrossCheck
 from stages.data import (
     CameraImage,
     CameraModel,
@@ -25,6 +26,7 @@ from stages.match_opencv import MatchOpenCV
 from stages.rectify import Rectify
 from stages.refine import Refine
 from stages.reproject import Reproject
+from stages.scale import Enlarge, Halve, Swap
 from stages.voxelise import Voxelise
 
 __all__ = [
@@ -33,8 +35,11 @@ __all__ = [
     "CameraModel",
     "Cell",
     "Clean",
+    "CrossCheck",
     "Disparity",
     "ElevationMap",
+    "Enlarge",
+    "Halve",
     "Level",
     "Match",
     "MatchOpenCV",
@@ -49,6 +54,7 @@ __all__ = [
     "Source",
     "StereoCamera",
     "StereoFrame",
+    "Swap",
     "Tilt",
     "Transform",
     "Voxelise",

@@ -7,29 +7,34 @@ inner loop, which runs over whole rows with the tap's offset fixed.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import fast_kernel
+from stages.kernels.halves import pairs
 
 F32 = np.float32
 
 
 def joint_bilateral(
-    disparity: Array, guide: Array, radius: int, space: float, gray: float, range_scale: float
+    disparity: Array, guide: Array, radius: int, space: float, gray: float, range_scale: float, threads: int = 1
 ) -> Array:
     """Average each known disparity with its known neighbours; an unknown one (NaN) stays unknown.
 
     disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: px; space: standard deviation of the
     spatial Gaussian, px; gray: scale of the difference in the guide, levels; range_scale: scale of the difference in
-    disparity, px. Returns (H, W) float32.
+    disparity, px; threads: 2 share the work. Returns (H, W) float32.
     """
     known = np.isfinite(disparity)
     filtered = np.empty(disparity.shape, np.float32)
     values = np.where(known, disparity, F32(0))
-    _filter(
-        values, known.astype(np.float32), guide.astype(np.float32), radius, _spatial(radius, space),
-        F32(1 / gray), F32(1 / range_scale), filtered,
-    )  # fmt: skip
+    given = values, known.astype(np.float32), guide.astype(np.float32), radius, _spatial(radius, space)
+    scales = F32(1 / gray), F32(1 / range_scale)
+    height = disparity.shape[0]
+    with pairs(threads) as both:
+        both(
+            lambda: _filter(*given, *scales, 0, height // 2, filtered),
+            lambda: _filter(*given, *scales, height // 2, height, filtered),
+        )
     filtered[~known] = np.nan
     return filtered
 
@@ -39,11 +44,11 @@ def _spatial(radius: int, space: float) -> Array:
     return np.exp(-(offsets[:, None] ** 2 + offsets**2) / 2).astype(np.float32)
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _filter(values, known, guide, radius, spatial, per_gray, per_pixel, filtered):  # type: ignore[no-untyped-def]
+@fast_kernel
+def _filter(values, known, guide, radius, spatial, per_gray, per_pixel, first, end, filtered):  # type: ignore[no-untyped-def]
     height, width = values.shape
     sums, weights = np.empty(width, np.float32), np.empty(width, np.float32)
-    for y in range(height):
+    for y in range(first, end):
         sums[:] = F32(0)
         weights[:] = F32(0)
         for down in range(max(-radius, -y), min(radius, height - 1 - y) + 1):

@@ -79,3 +79,5 @@ _njit: Any = njit  # whose published type lacks the options on wrappers
 # of the time to compile is saved.
 kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
 part: Any = _njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)
+# The same for arithmetic in which no NaN or infinity occurs and sums may be taken in any order; as deterministic.
+fast_kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True, fastmath=True)

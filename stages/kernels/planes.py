@@ -1,4 +1,5 @@
-"""A plane per superpixel (section 3.2 of the paper) by MSAC (Torr & Zisserman, 2000) and two least-squares refits.
+"""A plane per superpixel (section 3.2 of the paper) by MSAC (Torr & Zisserman, 2000) and two least-squares refits,
+weighted by confidence.
 
 The pixels of each segment are gathered once through a compressed row list, so every hypothesis is scored over
 contiguous float32. Each segment draws from its own counter-based random numbers (splitmix64 of seed and segment): the
@@ -10,9 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import fast_kernel, kernel
+from stages.kernels.halves import Pair, in_turn, pairs
 
 F32 = np.float32
 U64 = np.uint64
@@ -33,30 +35,50 @@ class Planes(NamedTuple):
 
 
 def fit_planes(
-    disparity: Array, labels: Array, count: int, threshold: float = 0.5, hypotheses: int = 64, seed: int = 0
+    disparity: Array,
+    labels: Array,
+    count: int,
+    threshold: float = 0.5,
+    hypotheses: int = 64,
+    seed: int = 0,
+    weights: Array | None = None,
+    threads: int = 1,
 ) -> Planes:
     """Fit one plane to the known disparities of each segment.
 
     disparity: (H, W) float32, px, NaN = unknown; labels: (H, W) int32 in 0..count-1; threshold: px, beyond which a
-    pixel is an outlier. The same seed gives the same planes.
+    pixel is an outlier; weights: (H, W) float32 > 0, what each pixel counts in the least squares, None = the same;
+    threads: 2 share the work, to the same result. The same seed gives the same planes.
     """
-    start, index = segment_pixels(labels, count)
     planes = Planes(np.empty((count, 3)), np.empty(count, np.float32), np.empty(count, np.float32))
-    largest = int(np.diff(start).max(initial=0))
-    points = np.empty((3, max(largest, 1)), np.float32)
-    mixed = U64(seed % 2**64)
-    _fit(disparity, start, index, F32(threshold), hypotheses, mixed, points, *planes)
+    weights = np.ones((1, 1), np.float32) if weights is None else weights
+    with pairs(threads) as both:
+        start, index = segment_pixels(labels, count, both)
+        most = int(np.diff(start).max(initial=1))
+        middle = int(np.searchsorted(start, labels.size // 2))  # half of the pixels
+        given = disparity, weights, start, index, F32(threshold), hypotheses, U64(seed % 2**64)
+        both(
+            lambda: _fit(*given, 0, middle, np.empty((4, most), np.float32), *planes),
+            lambda: _fit(*given, middle, count, np.empty((4, most), np.float32), *planes),
+        )
     return planes
 
 
-def segment_pixels(labels: Array, count: int) -> tuple[Array, Array]:
+def segment_pixels(labels: Array, count: int, both: Pair = in_turn) -> tuple[Array, Array]:
     """The pixels of each segment: those of segment s are index[start[s]:start[s + 1]], in scan order.
 
     labels: (H, W) int32 in 0..count-1. Returns start (count + 1,) int64 and index (H * W,) int32.
     """
-    start = np.zeros(count + 1, np.int64)
+    flat, middle = labels.ravel(), labels.size // 2
+    ahead, behind = np.zeros((2, count), np.int64)
+    both(lambda: _count_labels(flat[:middle], ahead), lambda: _count_labels(flat[middle:], behind))
+    start = np.concatenate([[0], np.cumsum(ahead + behind)])
     index = np.empty(labels.size, np.int32)
-    _segment_pixels(labels.ravel(), start, index)
+    next_ahead, next_behind = start[:-1].copy(), start[:-1] + ahead
+    both(
+        lambda: _place_pixels(flat[:middle], 0, next_ahead, index),
+        lambda: _place_pixels(flat[middle:], middle, next_behind, index),
+    )
     return start, index
 
 
@@ -67,19 +89,20 @@ def render_planes(coefficients: Array, labels: Array) -> Array:
     return image
 
 
-@njit(nogil=True, cache=True)
-def _segment_pixels(labels, start, index):  # type: ignore[no-untyped-def]
+@kernel
+def _count_labels(labels, counts):  # type: ignore[no-untyped-def]
     for i in range(labels.size):
-        start[labels[i] + 1] += 1
-    for s in range(start.size - 1):
-        start[s + 1] += start[s]
-    fill = start[:-1].copy()
-    for i in range(labels.size):
-        index[fill[labels[i]]] = i
-        fill[labels[i]] += 1
+        counts[labels[i]] += 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
+def _place_pixels(labels, first, place, index):  # type: ignore[no-untyped-def]
+    for i in range(labels.size):
+        index[place[labels[i]]] = first + i
+        place[labels[i]] += 1
+
+
+@kernel
 def _render(coefficients, labels, image):  # type: ignore[no-untyped-def]
     for y in range(labels.shape[0]):
         for x in range(labels.shape[1]):
@@ -87,7 +110,7 @@ def _render(coefficients, labels, image):  # type: ignore[no-untyped-def]
             image[y, x] = coefficients[s, 0] * x + coefficients[s, 1] * y + coefficients[s, 2]
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel
 def _draw(seed, segment, counter, n):  # type: ignore[no-untyped-def]
     """A number below n: splitmix64 of (seed, segment, counter)."""
     z = seed + U64(segment) * U64(0xD1B54A32D192ED03) + U64(counter) * U64(0x9E3779B97F4A7C15)
@@ -96,11 +119,16 @@ def _draw(seed, segment, counter, n):  # type: ignore[no-untyped-def]
     return np.int64((z ^ (z >> U64(31))) >> U64(33)) % n
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _fit(disparity, start, index, threshold, hypotheses, seed, points, coefficients, inlier_share, valid_share):  # type: ignore[no-untyped-def]
+@kernel
+def _fit(  # type: ignore[no-untyped-def]
+    disparity, weights, start, index, threshold, hypotheses, seed, first, end, points, coefficients, inlier_share,
+    valid_share,
+):  # fmt: skip
+    """Planes of the segments first to end; points: (4, most pixels of a segment) float32, workspace."""
     width = disparity.shape[1]
-    flat = disparity.ravel()
-    for s in range(start.size - 1):
+    flat, flat_weights = disparity.ravel(), weights.ravel()
+    weighted = weights.size == disparity.size
+    for s in range(first, end):
         total = start[s + 1] - start[s]
         coefficients[s, :] = np.nan
         inlier_share[s] = valid_share[s] = F32(0)
@@ -115,22 +143,23 @@ def _fit(disparity, start, index, threshold, hypotheses, seed, points, coefficie
                 points[0, n] = index[j] % width - origin_x
                 points[1, n] = index[j] // width - origin_y
                 points[2, n] = d
+                points[3, n] = flat_weights[index[j]] if weighted else F32(1)
                 n += 1
         valid_share[s] = F32(n / total)
         if n < LEAST_SUPPORT:
             continue
-        x, y, d = points[0, :n], points[1, :n], points[2, :n]
+        x, y, d, w = points[0, :n], points[1, :n], points[2, :n], points[3, :n]
         cost, a, b, c = _best_hypothesis(x, y, d, threshold * threshold, hypotheses, seed, s)
         if cost >= F32(1e30):
             continue
         for _ in range(2):
-            a, b, c = _least_squares(x, y, d, a, b, c, threshold * threshold)
+            a, b, c = _least_squares(x, y, d, w, a, b, c, threshold * threshold)
         inlier_share[s] = F32(_count_inliers(x, y, d, a, b, c, threshold * threshold) / n)
         coefficients[s, 0], coefficients[s, 1] = a, b
         coefficients[s, 2] = np.float64(c) - np.float64(a) * origin_x - np.float64(b) * origin_y
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@fast_kernel
 def _best_hypothesis(x, y, d, limit, hypotheses, seed, segment):  # type: ignore[no-untyped-def]
     """The plane through three drawn pixels with the least truncated squared error: (cost, a, b, c)."""
     n = x.size
@@ -155,24 +184,26 @@ def _best_hypothesis(x, y, d, limit, hypotheses, seed, segment):  # type: ignore
     return best, best_a, best_b, best_c
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _least_squares(x, y, d, a, b, c, limit):  # type: ignore[no-untyped-def]
-    """The least-squares plane of the inliers of (a, b, c), solved for the correction, about the inliers' centroid."""
+@fast_kernel
+def _least_squares(x, y, d, weights, a, b, c, limit):  # type: ignore[no-untyped-def]
+    """The weighted least-squares plane of the inliers of (a, b, c), solved for the correction, about their centroid."""
     s = sx = sy = se = F32(0)
+    inliers = 0
     for q in range(x.size):
         e = d[q] - a * x[q] - b * y[q] - c
-        w = F32(1) if e * e < limit else F32(0)
+        w = weights[q] if e * e < limit else F32(0)
+        inliers += 1 if e * e < limit else 0
         s += w
         sx += w * x[q]
         sy += w * y[q]
         se += w * e
-    if s < F32(LEAST_SUPPORT):
+    if inliers < LEAST_SUPPORT or not s > F32(0):
         return a, b, c
     mx, my, me = sx / s, sy / s, se / s
     xx = xy = yy = xe = ye = F32(0)
     for q in range(x.size):
         e = d[q] - a * x[q] - b * y[q] - c
-        w = F32(1) if e * e < limit else F32(0)
+        w = weights[q] if e * e < limit else F32(0)
         u, v, r = x[q] - mx, y[q] - my, e - me
         xx += w * u * u
         xy += w * u * v
@@ -186,7 +217,7 @@ def _least_squares(x, y, d, a, b, c, limit):  # type: ignore[no-untyped-def]
     return a + da, b + db, c + me - da * mx - db * my
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@fast_kernel
 def _count_inliers(x, y, d, a, b, c, limit):  # type: ignore[no-untyped-def]
     inliers = 0
     for q in range(x.size):
@@ -196,7 +227,13 @@ def _count_inliers(x, y, d, a, b, c, limit):  # type: ignore[no-untyped-def]
 
 
 def fit_planes_reference(
-    disparity: Array, labels: Array, count: int, threshold: float = 0.5, hypotheses: int = 64, seed: int = 0
+    disparity: Array,
+    labels: Array,
+    count: int,
+    threshold: float = 0.5,
+    hypotheses: int = 64,
+    seed: int = 0,
+    weights: Array | None = None,
 ) -> Planes:
     """`fit_planes` in plain numpy and float64, one segment after the other, drawing the same hypotheses."""
     planes = Planes(np.full((count, 3), np.nan), np.zeros(count, np.float32), np.zeros(count, np.float32))
@@ -208,6 +245,7 @@ def fit_planes_reference(
             continue
         points = np.stack([x[known], y[known], np.ones(known.sum())], axis=1).astype(np.float64)
         d = disparity[y, x][known].astype(np.float64)
+        root = np.sqrt(np.ones(len(d)) if weights is None else weights[y, x][known].astype(np.float64))
         best, plane = np.inf, None
         for h in range(hypotheses):
             corners = [_draw_reference(seed, s, 3 * h + i, len(d)) for i in range(3)]
@@ -222,7 +260,7 @@ def fit_planes_reference(
         for _ in range(2):
             inlier = (points @ plane - d) ** 2 < threshold**2
             if inlier.sum() >= LEAST_SUPPORT:
-                plane = np.linalg.lstsq(points[inlier], d[inlier], rcond=None)[0]
+                plane = np.linalg.lstsq(points[inlier] * root[inlier, None], d[inlier] * root[inlier], rcond=None)[0]
         planes.coefficients[s] = plane
         planes.inlier_share[s] = ((points @ plane - d) ** 2 < threshold**2).mean()
     return planes

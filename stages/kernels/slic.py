@@ -1,7 +1,9 @@
 """SLIC superpixels (Achanta et al., 2012; section 3.2 of the paper): k-means over colour and position.
 
 Each pixel looks only at the nine centres around its own grid cell, so all pixels of a cell share their candidates and
-the inner loop runs over a short row of pixels with one centre in registers. A flood fill makes the labels connected.
+the inner loop runs over a short row of pixels with one centre in registers. The centres settle at half resolution, at
+a quarter of the work; the last assignment is of the full image. What is not connected then is found by runs of pixels
+in a row, not pixel by pixel.
 """
 
 from __future__ import annotations
@@ -10,47 +12,98 @@ import math
 
 import cv2
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import fast_kernel, kernel
+from stages.kernels.halves import Pair, in_turn, pairs
 
 F32 = np.float32
+LEAST_CELL = 8  # px; where grid cells are smaller, the centres settle at full resolution
 
 
-def superpixels(image: Array, count: int, compactness: float = 10.0, iterations: int = 5) -> tuple[Array, int]:
+def superpixels(
+    image: Array, count: int, compactness: float = 10.0, iterations: int = 5, threads: int = 1
+) -> tuple[Array, int]:
     """Segment an image into about `count` connected superpixels.
 
     image: (H, W) gray or (H, W, 3) RGB, uint8; compactness: weight of position against colour, in CIELAB units at one
-    grid step. Returns the labels, (H, W) int32 in 0..n-1, and n.
+    grid step; iterations: all but the last at half resolution, where the image is large enough; threads: 2 share the
+    work, to the same result. Returns the labels, (H, W) int32 in 0..n-1, and n.
     """
     height, width = image.shape[:2]
     count = min(count, height * width)
     step = math.sqrt(height * width / count)
-    rows, cols = max(1, round(height / step)), max(1, round(width / step))
-    colour = _colour_planes(image)
-    centres = _grid_centres(colour, rows, cols)
-    labels = np.empty((height, width), np.int32)
-    sums = np.empty((rows * cols, 6), np.float64)
-    for _ in range(iterations):
-        _assign(colour, centres, rows, cols, F32((compactness / step) ** 2), labels, sums)
-        seen = sums[:, 5] > 0
-        centres[seen] = sums[seen, :5] / sums[seen, 5:]
+    grid = max(1, round(height / step)), max(1, round(width / step))
     smallest = int(0.25 * height * width / count)
-    connected = np.full((height, width), -1, np.int32)
-    total = _connect(labels, smallest, connected, np.empty(height * width, np.int32))
-    return connected, int(total)
+    with pairs(threads) as both:
+        colour = _colour_planes(image, both)
+        scale = 2 if min(height // grid[0], width // grid[1]) >= LEAST_CELL and min(height, width) > 1 else 1
+        small = colour if scale == 1 else _halved(colour, both)
+        centres = _grid_centres(small, *grid)
+        for _ in range(iterations - 1):
+            _move(small, centres, grid, compactness / step * scale, both)
+        if scale == 2:
+            centres[:, 3:] = centres[:, 3:] * 2 + F32(0.5)
+        labels = _labels(colour, centres, grid, compactness / step, both)[0]
+        total = connect(labels, smallest, both)
+    return labels, total
 
 
-def _colour_planes(image: Array) -> Array:
+def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Pair) -> None:
+    """One k-means step: `centres` becomes the means of what is nearest to each."""
+    sums = _labels(colour, centres, grid, weight, both)[1]
+    seen = sums[:, 5] > 0
+    centres[seen] = sums[seen, :5] / sums[seen, 5:]
+
+
+def _labels(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Pair) -> tuple[Array, Array]:
+    """The nearest centre of each pixel, (H, W) int32, and the sums of `_assign`."""
+    rows, cols = grid
+    labels = np.empty(colour.shape[1:], np.int32)
+    upper, lower = np.zeros((2, rows * cols, 6))
+    square, middle = F32(weight**2), rows // 2
+    both(
+        lambda: _assign(colour, centres, rows, cols, square, 0, middle, labels, upper),
+        lambda: _assign(colour, centres, rows, cols, square, middle, rows, labels, lower),
+    )
+    return labels, upper + lower
+
+
+def _colour_planes(image: Array, both: Pair = in_turn) -> Array:
     """The image as (3, H, W) float32 CIELAB planes (L in 0..100); a gray image has a = b = 0."""
     planes = np.zeros((3, *image.shape[:2]), np.float32)
-    if image.ndim == 2:
-        np.multiply(image, F32(100 / 255), out=planes[0])
-        return planes
-    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
-    for plane, channel, scale in zip(planes, cv2.split(lab), (100 / 255, 1.0, 1.0), strict=True):
-        np.multiply(channel, F32(scale), out=plane)
+    middle = image.shape[0] // 2
+    both(
+        lambda: _fill_colour_planes(image[:middle], planes[:, :middle]),
+        lambda: _fill_colour_planes(image[middle:], planes[:, middle:]),
+    )
     return planes
+
+
+def _fill_colour_planes(image: Array, planes: Array) -> None:
+    if image.size == 0:
+        return
+    channels = [image] if image.ndim == 2 else cv2.split(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
+    for plane, channel, scale in zip(planes, channels, (100 / 255, 1.0, 1.0), strict=False):
+        np.multiply(channel, F32(scale), out=plane)
+
+
+def _halved(colour: Array, both: Pair) -> Array:
+    """The planes at half size, each pixel the mean of four; an odd last row or column is left out."""
+    _, height, width = colour.shape
+    small = np.empty((3, height // 2, width // 2), np.float32)
+    middle = height // 4
+    both(lambda: _halve(colour, 0, middle, small), lambda: _halve(colour, middle, height // 2, small))
+    return small
+
+
+@fast_kernel
+def _halve(colour, start, stop, small):  # type: ignore[no-untyped-def]
+    for plane in range(3):
+        for y in range(start, stop):
+            upper, lower, out = colour[plane, 2 * y], colour[plane, 2 * y + 1], small[plane, y]
+            for x in range(out.size):
+                out[x] = F32(0.25) * ((upper[2 * x] + upper[2 * x + 1]) + (lower[2 * x] + lower[2 * x + 1]))
 
 
 def _grid_centres(colour: Array, rows: int, cols: int) -> Array:
@@ -63,15 +116,17 @@ def _grid_centres(colour: Array, rows: int, cols: int) -> Array:
     return centres
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _assign(colour, centres, rows, cols, position_weight, labels, sums):  # type: ignore[no-untyped-def]
-    """One k-means step: label every pixel with the nearest of nine centres; sum colour, y, x and count per label."""
+@fast_kernel
+def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, labels, sums):  # type: ignore[no-untyped-def]
+    """Label the pixels of grid rows first_row to end_row with the nearest of nine centres.
+
+    sums: (rows * cols, 6) float64, to which colour, y, x and count of each label are added.
+    """
     _, height, width = colour.shape
     first, second, third = colour[0], colour[1], colour[2]
     best = np.empty(width, np.float32)
     nearest = np.empty(width, np.int32)
-    sums[:] = 0
-    for row in range(rows):
+    for row in range(first_row, end_row):
         for y in range(row * height // rows, (row + 1) * height // rows):
             for col in range(cols):
                 start, stop = col * width // cols, (col + 1) * width // cols
@@ -103,49 +158,90 @@ def _assign(colour, centres, rows, cols, position_weight, labels, sums):  # type
                     sums[k, 5] += 1
 
 
-@njit(nogil=True, cache=True)
-def _connect(labels, smallest, connected, queue):  # type: ignore[no-untyped-def]
-    """Number the 4-connected components in scan order; one below `smallest` px joins the component before it."""
+def connect(labels: Array, smallest: int, both: Pair = in_turn) -> int:
+    """Number the 4-connected components of `labels` (H, W) int32 in scan order, in place; returns how many.
+
+    One of fewer than `smallest` pixels joins the component left of its first pixel, or above it at the left border.
+    """
     height, width = labels.shape
-    source, target = labels.ravel(), connected.ravel()
+    middle = height // 2
+    runs = np.empty((height, width), np.int32)  # of each run of equal labels in a row: where it ends
+    parent = np.empty(labels.size, np.int32)  # of each run, at its first pixel: a run of its component before it
+    both(
+        lambda: _join_runs(labels, 0, middle, runs, parent),
+        lambda: _join_runs(labels, middle, height, runs, parent),
+    )
+    return int(_number(labels, middle, smallest, runs, parent, np.zeros(labels.size, np.int32)))
+
+
+@kernel
+def _root(parent, i):  # type: ignore[no-untyped-def]
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@kernel
+def _join(labels, y, runs, parent):  # type: ignore[no-untyped-def]
+    """Join the runs of row y with those of equal label in the row above; the earliest run becomes the root."""
+    width = labels.shape[1]
+    here = above = 0
+    while here < width and above < width:
+        if labels[y, here] == labels[y - 1, above]:
+            one, other = _root(parent, y * width + here), _root(parent, (y - 1) * width + above)
+            if one < other:
+                parent[other] = one
+            else:
+                parent[one] = other
+        end, end_above = runs[y, here], runs[y - 1, above]
+        here = end if end <= end_above else here
+        above = end_above if end_above <= end else above
+
+
+@kernel
+def _join_runs(labels, first, end, runs, parent):  # type: ignore[no-untyped-def]
+    width = labels.shape[1]
+    for y in range(first, end):
+        start = 0
+        for x in range(1, width + 1):
+            if x == width or labels[y, x] != labels[y, start]:
+                runs[y, start] = x
+                parent[y * width + start] = y * width + start
+                start = x
+        if y > first:
+            _join(labels, y, runs, parent)
+
+
+@kernel
+def _number(labels, middle, smallest, runs, parent, size):  # type: ignore[no-untyped-def]
+    height, width = labels.shape
+    if 0 < middle < height:
+        _join(labels, middle, runs, parent)
+    for y in range(height):
+        x = 0
+        while x < width:
+            at = y * width + x
+            root = _root(parent, at)
+            parent[at] = root
+            size[root] += runs[y, x] - x
+            x = runs[y, x]
     total = np.int32(0)
-    for seed in range(height * width):
-        if target[seed] >= 0:
-            continue
-        label = source[seed]
-        before = np.int32(-1)
-        if seed % width > 0:
-            before = target[seed - 1]
-        elif seed >= width:
-            before = target[seed - width]
-        queue[0] = seed
-        target[seed] = total
-        head, tail = 0, 1
-        while head < tail:
-            at = queue[head]
-            head += 1
-            x = at % width
-            if x > 0 and target[at - 1] < 0 and source[at - 1] == label:
-                target[at - 1] = total
-                queue[tail] = at - 1
-                tail += 1
-            if x < width - 1 and target[at + 1] < 0 and source[at + 1] == label:
-                target[at + 1] = total
-                queue[tail] = at + 1
-                tail += 1
-            if at >= width and target[at - width] < 0 and source[at - width] == label:
-                target[at - width] = total
-                queue[tail] = at - width
-                tail += 1
-            if at + width < height * width and target[at + width] < 0 and source[at + width] == label:
-                target[at + width] = total
-                queue[tail] = at + width
-                tail += 1
-        if tail < smallest and before >= 0:
-            for i in range(tail):
-                target[queue[i]] = before
-        else:
-            total += 1
+    for y in range(height):  # a root is the first run of its component: what lies before it has its number already
+        x = 0
+        while x < width:
+            at = y * width + x
+            end = runs[y, x]
+            if parent[at] != at:
+                number = size[parent[at]]
+            elif size[at] < smallest and at > 0:
+                number = labels[y, x - 1] if x > 0 else labels[y - 1, x]
+            else:
+                number = total
+                total += np.int32(1)
+            size[at] = number  # its size is needed no more
+            labels[y, x:end] = number
+            x = end
     return total
 
 

@@ -1,0 +1,111 @@
+"""Holes of a disparity image, row by row: what only one camera sees told apart from what was merely not matched.
+
+A surface hidden from one camera lies behind the one that hides it. So where the two ends of a hole in a row lie on
+surfaces apart, the hole takes the farther one, never the foreground; where they lie on one surface, the hole is a
+mismatch and the line between its ends fills it. Both are guesses that reach only so far, and nothing is guessed above
+all that is known in a column: that is the sky.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.data import Array
+from stages.kernels.compiled import kernel
+from stages.kernels.halves import pairs
+
+APART = 2.0  # px of disparity between the ends of a hole that make them two surfaces
+KEPT, MISMATCH, OCCLUSION, OPEN = range(4)  # kinds of pixels: not a hole, filled as either, not filled
+
+
+def fill_holes(disparity: Array, reach: float, margin: float, threads: int = 1) -> tuple[Array, Array]:
+    """Fill the holes that evidence explains.
+
+    disparity: (H, W) float32, px, NaN = unknown; reach: px that a hole may be wider than the step between its ends;
+    margin: px that a hole with one end, at the image's border, is filled from it, and that a pixel may lie above the
+    uppermost known one of its column. Returns the filled image, (H, W) float32, and the kind of each pixel, (H, W)
+    uint8: `KEPT`, `MISMATCH`, `OCCLUSION` or `OPEN`.
+    """
+    height, width = disparity.shape
+    filled, kinds = np.empty((height, width), np.float32), np.empty((height, width), np.uint8)
+    top = np.full((2, width), height, np.int64)
+    middle = height // 2
+    given = float(reach), float(margin)
+    with pairs(threads) as both:
+        both(
+            lambda: _find_top(disparity, 0, middle, top[0]),
+            lambda: _find_top(disparity, middle, height, top[1]),
+        )
+        sky = top.min(axis=0) - margin
+        both(
+            lambda: _fill(disparity, 0, middle, *given, sky, filled, kinds),
+            lambda: _fill(disparity, middle, height, *given, sky, filled, kinds),
+        )
+    return filled, kinds
+
+
+@kernel
+def _find_top(disparity, first, end, top):  # type: ignore[no-untyped-def]
+    """The uppermost row of first to end in which each column is known; unchanged where there is none."""
+    for y in range(end - 1, first - 1, -1):
+        for x in range(top.size):
+            d = disparity[y, x]
+            top[x] = y if d == d else top[x]
+
+
+@kernel
+def _fill(disparity, first, end, reach, margin, sky, filled, kinds):  # type: ignore[no-untyped-def]
+    width = disparity.shape[1]
+    for y in range(first, end):
+        row, out, kind = disparity[y], filled[y], kinds[y]
+        last = -1
+        for x in range(width + 1):
+            if x < width:
+                d = row[x]
+                if d != d:
+                    continue
+                out[x], kind[x] = d, KEPT
+            _fill_hole(row, last, x, y, reach, margin, sky, out, kind)
+            last = x
+
+
+@kernel
+def _fill_hole(row, last, stop, y, reach, margin, sky, out, kind):  # type: ignore[no-untyped-def]
+    """The hole between the known pixels `last` and `stop`, either of which may be outside the row."""
+    has_left, has_right = last >= 0, stop < row.size
+    left = row[last] if has_left else np.float32(np.inf)
+    right = row[stop] if has_right else np.float32(np.inf)
+    both, step = has_left and has_right, abs(right - left)
+    explained = both and stop - last - 1 <= reach + step
+    level = both and step < APART
+    slope = (right - left) / np.float32(stop - last) if level else np.float32(0)
+    for x in range(last + 1, stop):
+        near_border = not both and ((has_left and x - last <= margin) or (has_right and stop - x <= margin))
+        if y >= sky[x] and (explained or near_border):
+            out[x] = left + slope * np.float32(x - last) if level else min(left, right)
+            kind[x] = MISMATCH if level else OCCLUSION
+        else:
+            out[x], kind[x] = np.float32(np.nan), OPEN
+
+
+def fill_holes_reference(disparity: Array, reach: float, margin: float) -> tuple[Array, Array]:
+    """`fill_holes` in plain numpy."""
+    known = np.isfinite(disparity)
+    height, width = disparity.shape
+    column, row = np.arange(width), np.arange(height)[:, None]
+    left = np.maximum.accumulate(np.where(known, column, -1), axis=1)
+    right = np.flip(np.minimum.accumulate(np.flip(np.where(known, column, width), axis=1), axis=1), axis=1)
+    padded = np.pad(disparity, ((0, 0), (1, 1)), constant_values=np.inf)
+    before, after = np.take_along_axis(padded, left + 1, axis=1), np.take_along_axis(padded, right + 1, axis=1)
+    both = (left >= 0) & (right < width)
+    step = np.abs(np.where(both, after, 0) - np.where(both, before, 0))
+    to_end = np.minimum(np.where(left >= 0, column - left, np.inf), np.where(right < width, right - column, np.inf))
+    explained = np.where(both, right - left - 1 <= reach + step, to_end <= margin)
+    under_top = row >= np.where(known.any(axis=0), known.argmax(axis=0), height) - margin
+    level = both & (step < APART)
+    with np.errstate(invalid="ignore"):
+        line = before + (after - before) / (right - left) * (column - left)
+    guess = np.where(level, line, np.minimum(before, after))
+    fill = ~known & explained & under_top
+    kinds = np.where(known, KEPT, np.where(~fill, OPEN, np.where(level, MISMATCH, OCCLUSION)))
+    return np.where(fill, guess, disparity).astype(np.float32), kinds.astype(np.uint8)

@@ -1,0 +1,137 @@
+"""Matches and planes brought together: which matches count, and where a plane moves one or stands in for it.
+
+One pass over the image for each step, in two halves, where numpy would make a dozen.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stages.data import Array, Source
+from stages.kernels.compiled import kernel
+from stages.kernels.halves import pairs
+
+F32 = np.float32
+MEASURED = int(Source.MEASURED)
+
+
+def trusted_matches(pixels: Array, source: Array, confidence: Array, least: float, threads: int = 1) -> Array:
+    """The measured, finite disparities of at least that confidence, (H, W) float32, NaN elsewhere."""
+    trusted = np.empty(pixels.shape, np.float32)
+    middle = pixels.shape[0] // 2
+    with pairs(threads) as both:
+        both(
+            lambda: _trust(pixels[:middle], source[:middle], confidence[:middle], F32(least), trusted[:middle]),
+            lambda: _trust(pixels[middle:], source[middle:], confidence[middle:], F32(least), trusted[middle:]),
+        )
+    return trusted
+
+
+def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Array:
+    """The matches, each moved to the median of the side x side px about it where that is at most `near` px away.
+
+    A match with fewer neighbours than holes about it has no median and stays. matches: (H, W) float32, NaN = unknown.
+    """
+    height = matches.shape[0]
+    low = np.nan_to_num(matches, nan=-np.inf, posinf=np.inf, neginf=-np.inf)
+    moved = np.empty(matches.shape, np.float32)
+    middle, margin = height // 2, side // 2
+
+    def upper() -> None:
+        median = cv2.medianBlur(low[: middle + margin], side)[:middle]
+        _move_near(matches[:middle], median, F32(near), moved[:middle])
+
+    def lower() -> None:
+        start = max(middle - margin, 0)
+        median = cv2.medianBlur(low[start:], side)[middle - start :]
+        _move_near(matches[middle:], median, F32(near), moved[middle:])
+
+    with pairs(threads) as both:
+        both(upper if middle else lambda: None, lower)
+    return moved
+
+
+def pull_to_planes(
+    pixels: Array, coefficients: Array, labels: Array, near: float, weight: float, fill: bool, threads: int = 1
+) -> tuple[Array, Array]:
+    """Disparities near their segment's plane drawn towards it, and holes filled from it.
+
+    pixels: (H, W) float32, px, NaN = hole; coefficients: (n, 3) float64 of the accepted planes, NaN for the others;
+    labels: (H, W) int32; near: px up to which a disparity is drawn; weight: of the plane; fill: whether holes are
+    filled, as long as the plane stays within the range of all pixels: beyond, it is extrapolated too far. Returns the
+    disparities (H, W) float32 and where a plane had its say, (H, W) bool.
+    """
+    pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
+    middle = pixels.shape[0] // 2
+    limits = F32(near), F32(weight), fill
+    with pairs(threads) as both:
+        ranges = both(lambda: _range(pixels[:middle]), lambda: _range(pixels[middle:]))
+        low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
+        both(
+            lambda: _pull(pixels, coefficients, labels, *limits, low, high, 0, middle, pulled, spoke),
+            lambda: _pull(
+                pixels, coefficients, labels, *limits, low, high, middle, len(pixels), pulled, spoke
+            ),
+        )
+    return pulled, spoke
+
+
+@kernel
+def _trust(pixels, source, confidence, least, trusted):  # type: ignore[no-untyped-def]
+    for y in range(pixels.shape[0]):
+        for x in range(pixels.shape[1]):
+            good = source[y, x] == MEASURED and confidence[y, x] >= least and np.isfinite(pixels[y, x])
+            trusted[y, x] = pixels[y, x] if good else F32(np.nan)
+
+
+@kernel
+def _move_near(matches, median, near, moved):  # type: ignore[no-untyped-def]
+    for y in range(matches.shape[0]):
+        for x in range(matches.shape[1]):
+            d, m = matches[y, x], median[y, x]
+            moved[y, x] = m if abs(m - d) <= near else d
+
+
+@kernel
+def _range(pixels):  # type: ignore[no-untyped-def]
+    low, high = F32(np.inf), F32(-np.inf)
+    for y in range(pixels.shape[0]):
+        for x in range(pixels.shape[1]):
+            d = pixels[y, x]
+            low = d if d < low else low
+            high = d if d > high else high
+    return low, high
+
+
+@kernel
+def _pull(pixels, coefficients, labels, near, weight, fill, low, high, first, end, pulled, spoke):  # type: ignore[no-untyped-def]
+    for y in range(first, end):
+        for x in range(pixels.shape[1]):
+            a, b, c = coefficients[labels[y, x]]
+            d, plane = pixels[y, x], F32(a * x + b * y + c)
+            if d == d:
+                close = abs(plane - d) <= near
+                pulled[y, x] = d + weight * (plane - d) if close else d
+                spoke[y, x] = close
+            else:
+                sane = fill and plane >= low and plane <= high
+                pulled[y, x] = plane if sane else d
+                spoke[y, x] = sane
+
+
+def pull_to_planes_reference(
+    pixels: Array, coefficients: Array, labels: Array, near: float, weight: float, fill: bool
+) -> tuple[Array, Array]:
+    """`pull_to_planes` in plain numpy."""
+    y, x = np.mgrid[: pixels.shape[0], : pixels.shape[1]]
+    a, b, c = coefficients[labels].transpose(2, 0, 1)
+    plane = (a * x + b * y + c).astype(np.float32)
+    hole = np.isnan(pixels)
+    with np.errstate(invalid="ignore"):
+        close = np.abs(plane - pixels) <= F32(near)
+    pulled = np.where(close, pixels + F32(weight) * (plane - pixels), pixels)
+    if not fill or hole.all():
+        return pulled, close
+    sane = hole & (plane >= np.nanmin(pixels)) & (plane <= np.nanmax(pixels))
+    return np.where(sane, plane, pulled), close | sane

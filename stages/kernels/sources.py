@@ -1,0 +1,73 @@
+"""Where each refined disparity comes from, and what that is worth: calibrated, so that it is a probability."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stages.data import Array, Source
+from stages.kernels.compiled import kernel
+from stages.kernels.halves import pairs
+from stages.kernels.holes import MISMATCH
+
+F32 = np.float32
+UNKNOWN, MEASURED, PLANE, FILLED = (int(code) for code in Source)
+
+
+class Trust(NamedTuple):
+    """Share of pixels right within 1 px, by origin. Of a match: at 0, at half and at full confidence of its own."""
+
+    agreed: tuple[float, float, float]  # a match that a plane agrees with
+    alone: tuple[float, float, float]  # a match that none does
+    replaced: float  # by its surroundings
+    plane: float  # a hole that a plane fills
+    mismatch: float  # a hole filled from both ends
+    occlusion: float  # and from the farther one
+
+
+def name_sources(
+    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, moved: float, trust: Trust,
+    threads: int = 1,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Source and confidence of each pixel, (H, W) uint8 codes of `Source` and float32.
+
+    matches: (H, W) float32, px, NaN = none, before refinement; confidence: (H, W) float32, theirs; agreed: (H, W) bool,
+    where a plane had its say; kinds: (H, W) uint8 of `holes.fill_holes`; refined: (H, W) float32, the result; moved: px
+    that a match may have moved and still be MEASURED.
+    """
+    source, worth = np.empty(matches.shape, np.uint8), np.empty(matches.shape, np.float32)
+    middle = len(matches) // 2
+    steps = np.arange(256) / 255
+    tables = np.array([np.interp(steps, (0, 0.5, 1), values) for values in (trust.agreed, trust.alone)], np.float32)
+    others = np.array(trust[2:], np.float32)
+
+    def name(rows: slice) -> None:
+        _name(
+            matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], F32(moved), tables, others,
+            source[rows], worth[rows],
+        )  # fmt: skip
+
+    with pairs(threads) as both:
+        both(lambda: name(slice(0, middle)), lambda: name(slice(middle, None)))
+    return source, worth
+
+
+@kernel
+def _name(matches, confidence, agreed, kinds, refined, moved, tables, others, source, worth):  # type: ignore[no-untyped-def]
+    replaced, plane, mismatch, occlusion = others
+    for y in range(matches.shape[0]):
+        for x in range(matches.shape[1]):
+            d, match = refined[y, x], matches[y, x]
+            if d != d:
+                source[y, x], worth[y, x] = UNKNOWN, F32(0)
+            elif abs(d - match) <= moved:
+                source[y, x] = MEASURED
+                step = np.int64(np.rint(confidence[y, x] * F32(255)))
+                worth[y, x] = tables[0 if agreed[y, x] else 1, step]
+            elif match == match:
+                source[y, x], worth[y, x] = PLANE, replaced
+            elif kinds[y, x] == 0:
+                source[y, x], worth[y, x] = PLANE, plane
+            else:
+                source[y, x], worth[y, x] = FILLED, mismatch if kinds[y, x] == MISMATCH else occlusion

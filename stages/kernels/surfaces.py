@@ -1,0 +1,80 @@
+"""Surfaces: superpixels grouped into regions of even colour, for planes that need more room.
+
+SLIC once more, of superpixels instead of pixels: each is one point, its mean colour and place, that counts as often as
+it has pixels. A region may be in pieces: what is asked of it is to keep to edges, and superpixels have done that.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from stages.data import Array
+from stages.kernels.compiled import kernel
+from stages.kernels.halves import pairs
+
+AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])
+
+
+def surfaces(
+    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, iterations: int = 5,
+    threads: int = 1,
+) -> tuple[Array, int]:  # fmt: skip
+    """Group superpixels into about `groups` surfaces.
+
+    image: (H, W) gray or (H, W, 3) RGB, uint8; labels: (H, W) int32 in 0..count-1; compactness: weight of position
+    against colour, in CIELAB units at one grid step. Returns the surface of each superpixel, (count,) int32 in 0..n-1,
+    and n.
+    """
+    height, width = image.shape[:2]
+    step = math.sqrt(height * width / min(groups, count))
+    rows, cols = max(1, round(height / step)), max(1, round(width / step))
+    points, size = _superpixel_points(image, labels, count, compactness / step, threads)
+    place = np.floor(points[:, 3:] / (compactness / step) * [rows / height, cols / width]).astype(int)
+    near = np.minimum(place, [rows - 1, cols - 1])[:, None] + AROUND
+    inside = ((near >= 0) & (near < [rows, cols])).all(axis=2)
+    near = np.where(inside, near[..., 0] * cols + near[..., 1], 0)
+    nearest = near[:, len(AROUND) // 2]
+    for _ in range(iterations):
+        mass = np.bincount(nearest, size, rows * cols)
+        sums = [np.bincount(nearest, size * values, rows * cols) for values in points.T]
+        centres = np.stack(sums, axis=1) / np.maximum(mass, 1)[:, None]
+        distance = ((points[:, None] - centres[near]) ** 2).sum(axis=2)
+        choice = np.where(inside & (mass[near] > 0), distance, np.inf).argmin(axis=1)
+        nearest = np.take_along_axis(near, choice[:, None], axis=1)[:, 0]
+    used, surface = np.unique(nearest, return_inverse=True)
+    return surface.astype(np.int32), len(used)
+
+
+def _superpixel_points(
+    image: Array, labels: Array, count: int, scale: float, threads: int
+) -> tuple[Array, Array]:
+    """Mean colour (CIELAB, L in 0..100) and place (y, x times `scale`) of each, (count, 5), and its size (count,)."""
+    middle = image.shape[0] // 2
+    halves = np.zeros((2, count, 6), np.int64)
+    with pairs(threads) as both:
+        both(
+            lambda: _sum_up(image[:middle], labels[:middle], 0, halves[0]),
+            lambda: _sum_up(image[middle:], labels[middle:], middle, halves[1]),
+        )
+    sums = halves[0] + halves[1]
+    means = sums[:, :5] / sums[:, 5:]
+    rgb = np.clip(np.rint(means[None, :, :3]), 0, 255).astype(np.uint8)
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)[0] * [100 / 255, 1, 1]
+    return np.concatenate([lab, (means[:, 3:] + 0.5) * scale], axis=1), sums[:, 5]
+
+
+@kernel
+def _sum_up(image, labels, first, sums):  # type: ignore[no-untyped-def]
+    """Add R, G, B, y, x and 1 of every pixel to the sums of its label; the image begins at row `first`."""
+    gray = image.ndim == 2
+    for y in range(labels.shape[0]):
+        for x in range(labels.shape[1]):
+            total = sums[labels[y, x]]
+            for channel in range(3):
+                total[channel] += np.int64(image[y, x] if gray else image[y, x, channel])
+            total[3] += first + y
+            total[4] += x
+            total[5] += 1

@@ -1,0 +1,82 @@
+"""Half size and back: how a coarse result becomes the prior of a fine one, and the pair as the right camera sees it.
+
+At half size the search range is half as long and the pixels are a quarter as many, so a coarse match costs an eighth;
+noise averages out and weak texture gains contrast. What it finds guides the search at full size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from stages.data import Array, Disparity, StereoCamera, StereoFrame
+from stages.stage import Stage
+
+
+@dataclass(frozen=True)
+class Halve(Stage):
+    """The frame at half size, each pixel the mean of four; an odd last row or column is repeated."""
+
+    def __call__(self, frame: StereoFrame) -> StereoFrame:
+        if frame.camera.raw is not None:
+            raise ValueError("Halve: the frame is not rectified; put stages.Rectify before stages.Halve")
+        left, right = _halved(frame.left), _halved(frame.right)
+        height, width = left.shape[:2]
+        camera = frame.camera
+        # Pixel centres are whole numbers: what was at u is at (u + 0.5) / 2 - 0.5.
+        cx, cy, cx_right = ((value + 0.5) / 2 - 0.5 for value in (camera.cx, camera.cy, camera.cx_right))
+        small = replace(
+            camera, fx=camera.fx / 2, fy=camera.fy / 2, cx=cx, cy=cy, cx_right=cx_right, width=width, height=height
+        )
+        return StereoFrame(frame.stamp, left, right, small)
+
+
+@dataclass(frozen=True)
+class Enlarge(Stage):
+    """A disparity image of half size at the size of a frame: a prior for matching the frame.
+
+    Each value, twice as large, stands for the pixel and, between pixels of one surface, for the line between them.
+    Source and confidence are those of the nearest pixel.
+    """
+
+    def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
+        height, width = frame.left.shape[:2]
+        small = disparity.pixels.shape
+        if small != ((height + 1) // 2, (width + 1) // 2):
+            raise ValueError(f"Enlarge: the disparity has shape {small}, which is not half of {(height, width)}")
+        size = 2 * small[1], 2 * small[0]
+        smooth = cv2.resize(disparity.pixels, size, interpolation=cv2.INTER_LINEAR)
+        nearest = cv2.resize(disparity.pixels, size, interpolation=cv2.INTER_NEAREST)
+        with np.errstate(invalid="ignore"):
+            pixels = np.where(np.abs(smooth - nearest) < 1, smooth, nearest)  # NaN beside NaN, and no value between
+        source, confidence = (
+            cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST)[:height, :width]
+            for layer in (disparity.source, disparity.confidence)
+        )
+        return Disparity(frame.stamp, 2 * pixels[:height, :width], source, confidence, camera=frame.camera)
+
+
+@dataclass(frozen=True)
+class Swap(Stage):
+    """The pair as the right camera sees it: the images exchanged and mirrored, so that disparities stay positive.
+
+    The disparity of a swapped frame, mirrored back, is that of the right image.
+    """
+
+    def __call__(self, frame: StereoFrame) -> StereoFrame:
+        camera: StereoCamera = frame.camera
+        if camera.raw is not None:
+            raise ValueError("Swap: the frame is not rectified; put stages.Rectify before stages.Swap")
+        last = camera.width - 1
+        mirrored = replace(camera, cx=last - camera.cx_right, cx_right=last - camera.cx)
+        return StereoFrame(frame.stamp, cv2.flip(frame.right, 1), cv2.flip(frame.left, 1), mirrored)
+
+
+def _halved(image: Array) -> Array:
+    height, width = image.shape[:2]
+    if height % 2 or width % 2:
+        image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    half: Array = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return half
