@@ -52,7 +52,8 @@ class Match(Stage):
 
     Penalties count in units of the matching cost: census bits that differ, or with the gradient 1.5 units for each.
     Colour is converted to gray. `prior`, an earlier or coarser result of the same size, draws the search towards it; it
-    is no evidence, and where it is unknown it says nothing.
+    is no evidence, and where it is unknown it says nothing. Where it lies nearer than the search range, what is sought
+    cannot be found, and whatever looks most alike within the range is not taken for it: the pixel is unknown.
 
     The confidence is the probability that the disparity is right within 1 px, as far as the lead of the best sum of
     paths over the others tells, with the penalties that suit the cost and 8 paths.
@@ -89,7 +90,7 @@ class Match(Stage):
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
         guide = None if prior is None else self._guide(prior)
         found = match(left, right, self._rule(), guide, self.threads, self.memory << 20)
-        blank = np.nonzero(_blank(left))
+        blank = np.nonzero(_blank(left) if prior is None else _blank(left) | self._beyond(prior))
         found.pixels[blank], found.source[blank], found.confidence[blank] = np.nan, Source.UNKNOWN, 0
         return Disparity(frame.stamp, found.pixels, found.source, found.confidence, camera=frame.camera)
 
@@ -120,6 +121,11 @@ class Match(Stage):
             self.disparities, self.minimum, self.uniqueness, self.consistency, self.speckle_range, self.speckle_size,
             confidence,
         )  # fmt: skip
+
+    def _beyond(self, prior: Disparity) -> Array:
+        """Where the prior lies nearer than the search range, (H, W) bool."""
+        beyond: Array = prior.pixels > self.minimum + self.disparities
+        return beyond
 
     def _guide(self, prior: Disparity) -> tuple[Array, Array]:
         lanes = lanes_for(self.disparities)

@@ -51,7 +51,7 @@ class Refine(Stage):
     compactness: float = parameter(10.0, "SLIC's weight of position against colour, CIELAB units", low=0.1)
     surface: int = parameter(16, "superpixels in a surface, the larger support of planes; 0 = none", low=0)
     inlier_distance: float = parameter(0.5, "deviation from a plane that makes an outlier", unit="px", low=0.01)
-    hypotheses: int = parameter(64, "planes tried per segment", low=1)
+    hypotheses: int = parameter(16, "planes tried per segment", low=1)
     inlier_share: float = parameter(0.8, "least share of inliers for a plane to be accepted", low=0, high=1)
     valid_share: float = parameter(
         0.6, "least share of matched pixels for a plane to be accepted, in a surface half of it", low=0, high=1
@@ -69,7 +69,7 @@ class Refine(Stage):
     fill_support: float = parameter(0.001, "wls: least smoothed confidence that fills a pixel", low=0)
     wls_lambda: float = parameter(8000.0, "wls: strength of the smoothing", low=0)
     wls_sigma: float = parameter(1.0, "wls: gray levels over which the coupling falls to 1/e", low=0.01)
-    bilateral_radius: int = parameter(4, "radius of the bilateral filter, 0 = none", unit="px", low=0, high=32)
+    bilateral_radius: int = parameter(3, "radius of the bilateral filter, 0 = none", unit="px", low=0, high=32)
     bilateral_space: float = parameter(3.0, "its standard deviation in the image", unit="px", low=0.1)
     bilateral_gray: float = parameter(10.0, "its scale in gray levels", low=0.1)
     bilateral_disparity: float = parameter(1.0, "its scale in disparity", unit="px", low=0.01)
@@ -113,21 +113,25 @@ class Refine(Stage):
         group, groups = surfaces(
             image, labels, count, max(1, count // self.surface), self.compactness, threads=self.threads
         )
-        regions = group[labels]
+        # Every other pixel of every other row is plenty for a surface.
+        few = np.s_[::2, ::2]
+        sparse, regions = (np.ascontiguousarray(layer[few]) for layer in (pixels, labels))
         planes = fit_planes(
-            pixels, regions, groups, self.inlier_distance, self.hypotheses, seed + 1, weights, self.threads
-        )
-        accepted = self._accepted(planes, self.valid_share / 2)
+            sparse, group[regions], groups, self.inlier_distance, self.hypotheses, seed + 1,
+            np.ascontiguousarray(weights[few]), self.threads,
+        )  # fmt: skip
+        accepted = (self._accepted(planes, self.valid_share / 2, 2) * [0.5, 0.5, 1])[group]
         pixels, again = pull_to_planes(
-            pixels, accepted, regions, self.near / 2, self.plane_weight, self.plane_fill, self.threads
+            pixels, accepted, labels, self.near / 2, self.plane_weight, self.plane_fill, self.threads
         )
         return pixels, agreed | again
 
-    def _accepted(self, planes: Planes, valid_share: float) -> Array:
-        """The coefficients (n, 3) of the planes that the evidence supports; NaN for the others."""
+    def _accepted(self, planes: Planes, valid_share: float, spacing: int = 1) -> Array:
+        """The coefficients (n, 3) of the planes that the evidence supports, of pixels `spacing` px apart; NaN for the
+        others."""
         slope = np.hypot(planes.coefficients[:, 0], planes.coefficients[:, 1])
         supported = (planes.inlier_share >= self.inlier_share) & (planes.valid_share >= valid_share)
-        return np.where((supported & (slope <= self.slope))[:, None], planes.coefficients, np.nan)
+        return np.where((supported & (slope <= self.slope * spacing))[:, None], planes.coefficients, np.nan)
 
     def _filled(self, pixels: Array, confidence: Array, guide: Array) -> tuple[Array, Array]:
         """The remaining holes filled as far as evidence reaches, (H, W) float32, and their kinds of `holes`."""

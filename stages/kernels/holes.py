@@ -28,15 +28,12 @@ def fill_holes(disparity: Array, reach: float, margin: float, threads: int = 1) 
     """
     height, width = disparity.shape
     filled, kinds = np.empty((height, width), np.float32), np.empty((height, width), np.uint8)
-    top = np.full((2, width), height, np.int64)
+    sky = np.full(width, height, np.int64)
+    _find_top(disparity, sky)
+    sky -= int(margin)
     middle = height // 2
     given = float(reach), float(margin)
     with pairs(threads) as both:
-        both(
-            lambda: _find_top(disparity, 0, middle, top[0]),
-            lambda: _find_top(disparity, middle, height, top[1]),
-        )
-        sky = top.min(axis=0) - margin
         both(
             lambda: _fill(disparity, 0, middle, *given, sky, filled, kinds),
             lambda: _fill(disparity, middle, height, *given, sky, filled, kinds),
@@ -45,12 +42,17 @@ def fill_holes(disparity: Array, reach: float, margin: float, threads: int = 1) 
 
 
 @kernel
-def _find_top(disparity, first, end, top):  # type: ignore[no-untyped-def]
-    """The uppermost row of first to end in which each column is known; unchanged where there is none."""
-    for y in range(end - 1, first - 1, -1):
+def _find_top(disparity, top):  # type: ignore[no-untyped-def]
+    """The uppermost row in which each column is known; unchanged where there is none."""
+    missing = top.size
+    for y in range(disparity.shape[0]):
+        if missing == 0:
+            break
         for x in range(top.size):
             d = disparity[y, x]
-            top[x] = y if d == d else top[x]
+            if d == d and y < top[x]:
+                top[x] = y
+                missing -= 1
 
 
 @kernel
@@ -101,7 +103,7 @@ def fill_holes_reference(disparity: Array, reach: float, margin: float) -> tuple
     step = np.abs(np.where(both, after, 0) - np.where(both, before, 0))
     to_end = np.minimum(np.where(left >= 0, column - left, np.inf), np.where(right < width, right - column, np.inf))
     explained = np.where(both, right - left - 1 <= reach + step, to_end <= margin)
-    under_top = row >= np.where(known.any(axis=0), known.argmax(axis=0), height) - margin
+    under_top = row >= np.where(known.any(axis=0), known.argmax(axis=0), height) - int(margin)
     level = both & (step < APART)
     with np.errstate(invalid="ignore"):
         line = before + (after - before) / (right - left) * (column - left)

@@ -11,6 +11,7 @@ import numpy as np
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
 from stages.kernels.halves import pairs
+from stages.kernels.holes import APART
 
 F32 = np.float32
 MEASURED = int(Source.MEASURED)
@@ -34,7 +35,7 @@ def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Arr
     A match with fewer neighbours than holes about it has no median and stays. matches: (H, W) float32, NaN = unknown.
     """
     height = matches.shape[0]
-    low = np.nan_to_num(matches, nan=-np.inf, posinf=np.inf, neginf=-np.inf)
+    low = np.fmax(matches, F32(-np.inf))  # -inf for NaN
     moved = np.empty(matches.shape, np.float32)
     middle, margin = height // 2, side // 2
 
@@ -59,8 +60,9 @@ def pull_to_planes(
 
     pixels: (H, W) float32, px, NaN = hole; coefficients: (n, 3) float64 of the accepted planes, NaN for the others;
     labels: (H, W) int32; near: px up to which a disparity is drawn; weight: of the plane; fill: whether holes are
-    filled, as long as the plane stays within the range of all pixels: beyond, it is extrapolated too far. Returns the
-    disparities (H, W) float32 and where a plane had its say, (H, W) bool.
+    filled, as long as the plane stays within the range of all pixels: beyond, it is extrapolated too far. A hole whose
+    left end lies behind its right one is hidden by that: it takes no plane nearer to that than to the other.
+    Returns the disparities (H, W) float32 and where a plane had its say, (H, W) bool.
     """
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     middle = pixels.shape[0] // 2
@@ -106,18 +108,29 @@ def _range(pixels):  # type: ignore[no-untyped-def]
 
 @kernel
 def _pull(pixels, coefficients, labels, near, weight, fill, low, high, first, end, pulled, spoke):  # type: ignore[no-untyped-def]
+    width = pixels.shape[1]
     for y in range(first, end):
-        for x in range(pixels.shape[1]):
+        row = pixels[y]
+        before, after, ceiling = F32(np.nan), -1, high  # the known pixel before x, where the one after is, see above
+        for x in range(width):
             a, b, c = coefficients[labels[y, x]]
-            d, plane = pixels[y, x], F32(a * x + b * y + c)
+            d, plane = row[x], F32(a * x + b * y + c)
             if d == d:
                 close = abs(plane - d) <= near
                 pulled[y, x] = d + weight * (plane - d) if close else d
                 spoke[y, x] = close
-            else:
-                sane = fill and plane >= low and plane <= high
-                pulled[y, x] = plane if sane else d
-                spoke[y, x] = sane
+                before = d
+                continue
+            if after < x:
+                after = x + 1
+                while after < width and row[after] != row[after]:
+                    after += 1
+                behind = row[after] if after < width else F32(np.nan)
+                apart = behind - before >= APART
+                ceiling = F32(0.5) * (before + behind) if apart else high
+            sane = fill and plane >= low and plane <= ceiling
+            pulled[y, x] = plane if sane else d
+            spoke[y, x] = sane
 
 
 def pull_to_planes_reference(
@@ -133,5 +146,12 @@ def pull_to_planes_reference(
     pulled = np.where(close, pixels + F32(weight) * (plane - pixels), pixels)
     if not fill or hole.all():
         return pulled, close
-    sane = hole & (plane >= np.nanmin(pixels)) & (plane <= np.nanmax(pixels))
+    column = np.arange(pixels.shape[1])
+    left = np.maximum.accumulate(np.where(hole, -1, column), axis=1)
+    right = np.flip(np.minimum.accumulate(np.flip(np.where(hole, len(column), column), axis=1), axis=1), axis=1)
+    padded = np.pad(pixels, ((0, 0), (1, 1)), constant_values=np.nan)
+    before, after = np.take_along_axis(padded, left + 1, axis=1), np.take_along_axis(padded, right + 1, axis=1)
+    apart = after - before >= F32(APART)
+    ceiling = np.where(apart, F32(0.5) * (before + after), np.nanmax(pixels))
+    sane = hole & (plane >= np.nanmin(pixels)) & (plane <= ceiling)
     return np.where(sane, plane, pulled), close | sane

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.compiled import part
+from stages.kernels.compiled import kernel, part
 from stages.kernels.vectors import lanes_in, load, plus_capped, store
 
 PHASES = 4
@@ -29,12 +29,19 @@ def prior_costs(prior: Array, minimum: int, lanes: int, weight: float, reach: fl
     phase = np.arange(PHASES)[:, np.newaxis] / PHASES
     costs = np.clip(np.round(weight * np.minimum(np.abs(place - phase), reach)), 0, 255)
     table = np.concatenate([costs.ravel(), np.zeros(lanes)]).astype(np.uint8)
-    with np.errstate(invalid="ignore"):
-        quarters = np.clip(np.round((prior - minimum) * PHASES), -PHASES * (far - lanes), PHASES * far)
-        known = np.isfinite(quarters)
-        quarters = np.where(known, quarters, 0).astype(np.int32)
-    begin = (quarters % PHASES) * length + far - quarters // PHASES
-    return np.where(known, begin, PHASES * length).astype(np.int32), table
+    begin = np.empty(prior.shape, np.int32)
+    _begin(prior, minimum, -PHASES * (far - lanes), PHASES * far, length, far, begin)
+    return begin, table
+
+
+@kernel
+def _begin(prior, minimum, least, most, length, far, begin):  # type: ignore[no-untyped-def]
+    for y in range(prior.shape[0]):
+        for x in range(prior.shape[1]):
+            quarters = np.rint((prior[y, x] - np.float32(minimum)) * np.float32(PHASES))
+            known = np.isfinite(quarters)
+            whole = np.int64(min(max(quarters, least), most)) if known else 0
+            begin[y, x] = (whole % PHASES) * length + far - whole // PHASES if known else PHASES * length
 
 
 @part

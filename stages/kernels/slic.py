@@ -38,7 +38,7 @@ def superpixels(
     with pairs(threads) as both:
         colour = _colour_planes(image, both)
         scale = 2 if min(height // grid[0], width // grid[1]) >= LEAST_CELL and min(height, width) > 1 else 1
-        small = colour if scale == 1 else _halved(colour, both)
+        small = colour if scale == 1 else _colour_planes(_halved(image), both)
         centres = _grid_centres(small, *grid)
         for _ in range(iterations - 1):
             _move(small, centres, grid, compactness / step * scale, both)
@@ -80,30 +80,19 @@ def _colour_planes(image: Array, both: Pair = in_turn) -> Array:
     return planes
 
 
+def _halved(image: Array) -> Array:
+    """The image at half size, each pixel the mean of four; an odd last row or column is left out."""
+    even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
+    half: Array = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return half
+
+
 def _fill_colour_planes(image: Array, planes: Array) -> None:
     if image.size == 0:
         return
     channels = [image] if image.ndim == 2 else cv2.split(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
     for plane, channel, scale in zip(planes, channels, (100 / 255, 1.0, 1.0), strict=False):
         np.multiply(channel, F32(scale), out=plane)
-
-
-def _halved(colour: Array, both: Pair) -> Array:
-    """The planes at half size, each pixel the mean of four; an odd last row or column is left out."""
-    _, height, width = colour.shape
-    small = np.empty((3, height // 2, width // 2), np.float32)
-    middle = height // 4
-    both(lambda: _halve(colour, 0, middle, small), lambda: _halve(colour, middle, height // 2, small))
-    return small
-
-
-@fast_kernel
-def _halve(colour, start, stop, small):  # type: ignore[no-untyped-def]
-    for plane in range(3):
-        for y in range(start, stop):
-            upper, lower, out = colour[plane, 2 * y], colour[plane, 2 * y + 1], small[plane, y]
-            for x in range(out.size):
-                out[x] = F32(0.25) * ((upper[2 * x] + upper[2 * x + 1]) + (lower[2 * x] + lower[2 * x + 1]))
 
 
 def _grid_centres(colour: Array, rows: int, cols: int) -> Array:

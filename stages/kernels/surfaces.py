@@ -19,7 +19,7 @@ AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])
 
 
 def surfaces(
-    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, iterations: int = 5,
+    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, iterations: int = 3,
     threads: int = 1,
 ) -> tuple[Array, int]:  # fmt: skip
     """Group superpixels into about `groups` surfaces.
