@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -60,8 +61,29 @@ def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
     summary = json.loads(result.with_suffix(".json").read_text())
     assert (summary["verdict"], summary["frames_in"], summary["frames_out"]) == ("COMPLETE", FRAMES, FRAMES)
     assert summary["drops"] == {}
+    assert summary["surveys"]["rectified"].endswith("too little to correct")
     assert summary["seconds"]["matched"] > 0
     assert set(summary["seconds"]) >= {"rectified", "disparity", "points", "elevation_map", "navigation_map"}
+
+
+def test_a_row_offset_is_measured_once_for_the_log_reported_and_corrected(traverse, tmp_path, capsys):
+    def displaced(topic, _, data):
+        if "right" in topic and "image" in topic:  # the pixels are the last of the message
+            image = np.frombuffer(data, np.uint8)[-320 * 240 * 3 :].reshape(240, 320, 3)
+            return data[: -image.size] + np.roll(image, 2, axis=0).tobytes()
+        return data
+
+    log = rewrite(traverse, tmp_path / "displaced.mcap", displaced)
+    whole, part = tmp_path / "whole.mcap", tmp_path / "part.mcap"
+    assert roverflow("run", log, *SMALL, "--no-rrd", "-o", whole, "--summary", tmp_path / "whole.json") == 0
+    (finding,) = json.loads((tmp_path / "whole.json").read_text())["surveys"].values()
+    assert f"rectified: {finding}" in capsys.readouterr().out
+    assert float(re.search(r"rows differ by (\S+) px at the centre", finding)[1]) == pytest.approx(-2, abs=0.1)
+    assert "; corrected, as row_offset=[" in finding
+    assert roverflow("run", log, *SMALL, "--no-rrd", "-o", part, "--start", "1.5") == 0
+    images = [{m for m in raw_messages(path) if m[0] == "/nav/disparity"} for path in (whole, part)]
+    assert images[1] < images[0]  # the same messages, though the run saw but a part
+    assert images[1]
 
 
 def test_the_result_reads_back_with_mcap_ros2_support(result):
