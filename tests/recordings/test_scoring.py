@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import ros2, scoring
 from recordings.errors import LogError
+from recordings.score_table import format_score
 from recordings.simulator import Simulation, log
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
 
@@ -225,7 +226,7 @@ def test_disparities_where_one_camera_sees_are_told(tmp_path, truth, frames):
     assert bold["given_occluded"] == {"pixels": np.sum(seen == 128), "share": share, "bad_2": 1}
     assert guess(1.5)["given_occluded"]["bad_2"] == 0
     painted = scored(tmp_path, truth, frames, disparity=lambda pixels: np.nan_to_num(pixels, nan=9.0)).disparity
-    assert painted["given_sky"] == {"pixels": np.sum(seen == 0), "share": np.mean(seen == 0)}
+    assert painted["given_without_truth"] == {"pixels": np.sum(seen == 0), "share": np.mean(seen == 0)}
 
 
 def test_leaving_out_a_bad_frame_scores_as_saying_unknown(tmp_path, truth, frames):
@@ -248,7 +249,7 @@ def test_a_tilt_that_cannot_be_scored_says_why(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, only=scoring.RESULTS)
     assert found.tilt is None
     assert found.untilted == {"the result has no /tf from 'level' at their stamps": 2}
-    assert "not scored in 2 frames: the result has no /tf from 'level'" in scoring.format_score(found)
+    assert "not scored in 2 frames: the result has no /tf from 'level'" in format_score(found)
     other = scored(tmp_path, truth, frames, camera="mast_camera")
     assert other.untilted == {"the truth has no mount of 'mast_camera' on 'base_link'": 2}
     partly = scored(tmp_path, truth, frames, skipped=(0,))
@@ -274,7 +275,7 @@ def test_results_at_stamps_without_truth_are_reported_and_never_compared(tmp_pat
     found = scored(tmp_path, truth, frames, shift={1: 1})
     assert (found.frames, found.compared) == (2, 1)
     assert found.unmatched == dict.fromkeys(scoring.RESULTS, 1)
-    assert "/nav/disparity: 1 messages at stamps without truth" in scoring.format_score(found)
+    assert "/nav/disparity: 1 messages at stamps without truth" in format_score(found)
     with pytest.raises(LogError, match=r"no result of .* has the stamp of a true frame"):
         scored(tmp_path, truth, frames, shift={0: 1, 1: 1})
 
@@ -291,7 +292,7 @@ def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
 
 def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, skipped=(1,), elevation=lambda layer: layer + np.float32(0.02))
-    table = scoring.format_score(found)
+    table = format_score(found)
     assert "1 of 2 have results" in table
     assert "/nav/disparity: 1 of 2 frames, scored as all unknown" in table
     assert [line.split()[4:9] for line in table.splitlines() if line.strip().startswith("0-4 m")] == [
@@ -303,5 +304,5 @@ def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
     assert read["per_frame"][0]["stamp"] == SMALL.stamp(0)
     empty = scored(tmp_path, truth, frames, elevation=lambda layer: np.full_like(layer, np.nan))
     assert json.loads(empty.to_json())["elevation"]["0-4 m"]["raw"]["rmse"] is None
-    assert "nan" not in scoring.format_score(empty)
-    assert " 0.00% |      -      -      -      -            -" in scoring.format_score(empty)
+    assert "nan" not in format_score(empty)
+    assert " 0.00% |      -      -      -      -            -" in format_score(empty)
