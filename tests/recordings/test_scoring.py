@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -104,6 +105,10 @@ def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
     assert (found.frames, found.compared, found.missing, found.unmatched) == (2, 2, {}, {})
     assert found.disparity["pixels"] == sum((frame.seen == 255).sum() for frame in frames)
     assert found.disparity["bad_0.5"] == found.disparity["rmse"] == 0
+    counts = {name: region["pixels"] for name, region in found.disparity["whole_image"].items()}
+    assert counts["nonocc"] == found.disparity["pixels"]
+    assert counts["occluded"] == sum((frame.seen == 128).sum() for frame in frames)
+    assert counts["all"] == counts["nonocc"] + counts["occluded"]
     for ring in ("0-4 m", "4-8 m", "0-8 m"):
         assert found.elevation[ring]["raw"]["rmse"] == 0
         assert found.elevation[ring]["completeness"] == found.elevation[ring]["raw"]["within_5cm"] == 1
@@ -132,6 +137,16 @@ def test_disparity_errors_are_told_apart_from_missing_disparity(tmp_path, truth,
     assert found["bad_0.5"] == found["bad_0.5_known"] == 1
     assert found["bad_1_known"] == 0
     assert (found["rmse"], found["mae"]) == pytest.approx((0.75, 0.75), abs=1e-5)
+
+
+def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth, frames):
+    widths = [
+        math.ceil(np.nanmax(log.true_disparity(SMALL, 0, frame).pixels) / 16) * 16 for frame in frames
+    ]  # fmt: skip
+    found = scored(tmp_path, truth, frames).disparity["cropped_image"]
+    assert found["leftmost_columns_cropped"] == sorted(set(widths))
+    kept = [(frame.seen == 255)[:, width:].sum() for frame, width in zip(frames, widths, strict=True)]
+    assert found["nonocc"]["pixels"] == sum(kept)
 
 
 def test_a_raised_map_is_biased_and_level(tmp_path, truth, frames):
