@@ -121,7 +121,7 @@ def parser() -> argparse.ArgumentParser:
     images.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
     images.add_argument("out", type=Path, metavar="OUT.mcap")
     _image_options(images)
-    scenes = "a Middlebury scene with its truth (the camera, of which it tells no attitude, 1 m high and looking level)"
+    scenes = "a Middlebury scene with its truth; how its camera stood is not told: it is taken to look level from 1 m"
     middlebury = command("middlebury", _import_middlebury, scenes, kinds)
     middlebury.add_argument("source", type=Path, metavar="SOURCE", help="a scene's folder, or a folder of scenes")
     middlebury.add_argument("out", type=Path, metavar="OUT", help="log; of a folder of scenes, folder for their logs")

@@ -195,7 +195,7 @@ def test_a_scene_that_cannot_be_imported_is_refused_in_one_sentence(tmp_path, ca
 def test_the_help_of_the_import_says_what_it_takes_for_granted(capsys):
     with pytest.raises(SystemExit):
         roverflow("import", "middlebury", "--help")
-    assert "1 m high and looking level" in " ".join(capsys.readouterr().out.split())
+    assert "it is taken to look level from 1 m" in " ".join(capsys.readouterr().out.split())
 
 
 def test_part_of_a_log(traverse, tmp_path):
