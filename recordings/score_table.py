@@ -43,7 +43,7 @@ def _disparity_lines(d: dict[str, Any]) -> list[str]:
         f"               whole image       pixels    known |{limits} |    mean     RMS",
         *(_region_line(name, d["whole_image"][name]) for name in REGIONS),
         _known_line("nonocc", d["whole_image"]["nonocc"]),
-        f"               without the leftmost {columns} columns (the truth's disparity range, rounded up to {CROP_STEP})",
+        f"               without the leftmost {columns} columns (its disparity range, rounded up to {CROP_STEP})",
         *(_region_line(name, d["cropped_image"][name]) for name in REGIONS),
         "             values given where stereo cannot measure",
         f"               only one camera sees  {occluded}",
