@@ -144,6 +144,7 @@ def run(
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
             "surveys": findings,
+            "outputs": [str(outputs[use]) for use in used],
         }
         sinks.close(summary)
     return summary
