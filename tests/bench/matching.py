@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stages import Match, StereoCamera, StereoFrame
+from stages import Match, Rectify, StereoCamera, StereoFrame
 from stages.data import Array
 
 WIDTH, HEIGHT = 1280, 960
@@ -138,6 +138,7 @@ def accuracy(folder: Path) -> None:
         sixteenths = matcher.compute(frame.left[..., ::-1], frame.right[..., ::-1])
         results: dict[str, Array] = {"OpenCV HH": np.where(sixteenths < 0, np.nan, sixteenths / 16).astype(np.float32)}
         results |= {cost: Match(cost=cost, disparities=levels)(frame).pixels for cost in COSTS}
+        results["census+gradient, rows corrected"] = Match(disparities=levels)(Rectify()(frame)).pixels
         scored = (mask == 255) & np.isfinite(truth) & (np.arange(truth.shape[1]) >= levels)
         for name, pixels in results.items():
             kept = np.abs(pixels - truth)[scored & np.isfinite(pixels)]
