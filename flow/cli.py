@@ -16,6 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from flow.arguments import count, seconds, size
 from flow.errors import RoverflowError, SinkError, UsageError
 
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130
@@ -77,15 +78,17 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"roverflow {_version()}")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
 
-    def command(name: str, work: Callable[[argparse.Namespace], int], help: str) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+    def command(
+        name: str, work: Callable[[argparse.Namespace], int], help: str, among: Any = commands
+    ) -> argparse.ArgumentParser:
+        sub: argparse.ArgumentParser = among.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
         sub.add_argument("--debug", action="store_true", help="show tracebacks")
         sub.set_defaults(command=work)
         return sub
 
     demo = command("demo", _demo, "simulate a short traverse, run it and score it against the truth")
     demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder for the results (demo)")
-    demo.add_argument("--frames", type=_count, default=8, metavar="N", help="frames to simulate (8)")
+    demo.add_argument("--frames", type=count, default=8, metavar="N", help="frames to simulate (8)")
 
     run = command("run", _run, "replay a log through a pipeline")
     run.add_argument("log", type=Path, metavar="LOG.mcap")
@@ -94,9 +97,9 @@ def parser() -> argparse.ArgumentParser:
     recording = run.add_mutually_exclusive_group()
     recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
     recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
-    run.add_argument("--start", type=_seconds, metavar="T", help="begin T seconds after the log's first message")
-    run.add_argument("--end", type=_seconds, metavar="T", help="stop T seconds after the log's first message")
-    run.add_argument("--workers", type=_count, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
+    run.add_argument("--start", type=seconds, metavar="T", help="begin T seconds after the log's first message")
+    run.add_argument("--end", type=seconds, metavar="T", help="stop T seconds after the log's first message")
+    run.add_argument("--workers", type=count, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
     run.add_argument("--summary", type=Path, metavar="OUT.json", help="counts, drops, times and verdict as JSON")
 
     info = command("info", _info, "what a log holds, and what is missing")
@@ -111,11 +114,17 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("out", type=Path, metavar="OUT.mcap")
     _simulation_options(simulate)
 
-    imports = command("import", _import, "make a log out of other recordings")
-    imports.add_argument("kind", choices=("images",), metavar="KIND", help="images")
-    imports.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
-    imports.add_argument("out", type=Path, metavar="OUT.mcap")
-    _image_options(imports)
+    help = "make a log out of other recordings"
+    imports = commands.add_parser("import", help=help, description=help.capitalize() + ".")
+    kinds = imports.add_subparsers(required=True, metavar="KIND")
+    images = command("images", _import_images, "a folder of left and right images", kinds)
+    images.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
+    images.add_argument("out", type=Path, metavar="OUT.mcap")
+    _image_options(images)
+    scenes = "a Middlebury scene with its truth; how its camera stood is not told: it is taken to look level from 1 m"
+    middlebury = command("middlebury", _import_middlebury, scenes, kinds)
+    middlebury.add_argument("source", type=Path, metavar="SOURCE", help="a scene's folder, or a folder of scenes")
+    middlebury.add_argument("out", type=Path, metavar="OUT", help="log; of a folder of scenes, folder for their logs")
 
     score = command("score", _score, "errors of a result log against ground truth")
     score.add_argument("result", type=Path, metavar="OUT.mcap")
@@ -132,9 +141,9 @@ def _pipeline_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulation_options(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--frames", type=_count, help="stereo frames (default 12)")
+    sub.add_argument("--frames", type=count, help="stereo frames (default 12)")
     sub.add_argument("--seed", type=int, help="another seed, another terrain")
-    sub.add_argument("--size", type=_size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
+    sub.add_argument("--size", type=size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
     sub.add_argument("--rocks", type=float, metavar="K", help="share of the ground covered by rocks (Golombek's k)")
     sub.add_argument("--slope", type=float, metavar="DEG", help="RMS slope of the terrain")
     sub.add_argument("--tilt-noise", type=float, metavar="DEG", help="inclinometer noise, one sigma")
@@ -146,33 +155,6 @@ def _image_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--roll", type=float, default=0.0, metavar="DEG", help="camera roll, right side down positive")
     sub.add_argument("--height", type=float, required=True, metavar="M", help="camera height above the ground")
     sub.add_argument("--rate", type=float, default=1.0, metavar="HZ", help="frames per second of the log (1)")
-
-
-def _count(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not '{text}'")
-    return value
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be seconds after the log's first message, not '{text}'")
-    return value
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit()):
-        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, such as 640x480, not '{text}'")
-    return int(width), int(height)
 
 
 def _version() -> str:
@@ -216,7 +198,7 @@ def _run(options: argparse.Namespace) -> int:
         keep(_as_json(error.summary))
         raise
     keep(summary)
-    _report(summary, [out, *([rrd] if rrd else [])])
+    _report(summary)
     return _exit_code_of(summary)
 
 
@@ -280,13 +262,15 @@ def _as_json(summary: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in summary.items() if name != "entries"}
 
 
-def _report(summary: dict[str, Any], outputs: Sequence[Path]) -> None:
+def _report(summary: dict[str, Any]) -> None:
     rate = f"{summary['frames_per_second']:.2f} frames/s"
     _say(f"{summary['verdict']}: {summary['frames_out']} of {summary['frames_in']} frames whole, {rate}")
-    for reason, count in summary["drops"].items():
+    for stream, finding in summary["surveys"].items():
+        _say(f"  {stream}: {finding}")
+    for reason, number in summary["drops"].items():
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
-        _say(f"  {count} {reason}, first: {first['stream']} at {first['stamp']}: {first['detail']}")
-    for path in outputs:
+        _say(f"  {number} {reason}, first: {first['stream']} at {first['stamp']}: {first['detail']}")
+    for path in map(Path, summary["outputs"]):
         _say(f"  {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
 
@@ -340,7 +324,7 @@ def simulate(out: Path, **settings: Any) -> None:
     _say(f"{out}: {simulation.frames} frames with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
 
 
-def _import(options: argparse.Namespace) -> int:
+def _import_images(options: argparse.Namespace) -> int:
     from recordings.image_log import import_images, pair_images
 
     left, right = pair_images(options.source)
@@ -353,8 +337,20 @@ def _import(options: argparse.Namespace) -> int:
     return COMPLETE
 
 
+def _import_middlebury(options: argparse.Namespace) -> int:
+    from recordings.middlebury import import_scene, logs_of
+
+    for folder, log in logs_of(options.source, options.out):
+        if log != options.out:
+            options.out.mkdir(exist_ok=True)
+        _check_outputs([log], list(folder.iterdir()))
+        _say(f"{log}: {import_scene(folder, log)}")
+    return COMPLETE
+
+
 def _score(options: argparse.Namespace) -> int:
-    from recordings.scoring import format_score, score
+    from recordings.score_table import format_score
+    from recordings.scoring import score
 
     truth = options.truth or options.result
     _check_outputs([options.json], [options.result, truth])
@@ -367,7 +363,8 @@ def _score(options: argparse.Namespace) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     from recordings.pictures import draw
-    from recordings.scoring import format_score, score
+    from recordings.score_table import format_score
+    from recordings.scoring import score
 
     folder = options.out
     folder.mkdir(parents=True, exist_ok=True)
@@ -377,7 +374,7 @@ def _demo(options: argparse.Namespace) -> int:
     _say("Replaying it through the pipeline 'rover' ...")
     summary = replay(log, "rover", out, rrd, workers=os.cpu_count() or 1)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    _report(summary, [out, rrd])
+    _report(summary)
     _say(f"\n{format_score(score(out, log))}")
     pictures = draw(out, folder / "pictures")
     _say(f"\n{len(pictures)} pictures in {folder / 'pictures'}; the timeline: rerun {rrd}")

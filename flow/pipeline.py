@@ -299,8 +299,9 @@ def _coerced(value: Any, kind: Any, parameter: Field[Any]) -> Any:
         options = get_args(kind)
         if value is None and type(None) in options:
             return None
-        kind = next(option for option in options if option is not type(None))
-        return _coerced(value, kind, parameter)
+        several = [option for option in options if get_origin(option) is tuple]
+        one = [option for option in options if option not in (type(None), *several)]
+        return _coerced(value, (several if isinstance(value, list) and several else one or several)[0], parameter)
     if get_origin(kind) is tuple:
         if not isinstance(value, list):
             raise ValueError(f"expected a list, not {value!r}")

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +19,7 @@ from flow.errors import PipelineError, SinkError, UsageError
 from flow.feeder import Event, Feeder
 from flow.graph import Graph, Sink
 from flow.ledger import Ledger, Verdict
+from flow.survey import surveyed
 
 
 class Stop:
@@ -106,7 +107,8 @@ def run(
 ) -> dict[str, Any]:
     """Run an opened log through `graph`; returns the summary.
 
-    log: iterates over (log time, stream, item), has `missing` (stream -> why the log cannot provide it).
+    log: iterates over (log time, stream, item), has `missing` (stream -> why the log cannot provide it), and where
+    stages survey it `excerpts` (see flow.survey).
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
     closed and readable by then.
@@ -117,13 +119,16 @@ def run(
         raise UsageError(str(error)) from None
     stop, ledger = stop or Stop(), Ledger()
     wall, cpu = time.perf_counter(), time.process_time()
+    findings = dict[str, str]()
+    with suppress(_StoppedError):
+        graph, findings = surveyed(graph, lambda *which: (_events(part, stop) for part in log.excerpts(*which)))
     streams = graph.frame_streams
     used = {use: sink for use, sink in graph.sinks if use in outputs}
     wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
     sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
     feeder, engine, finished = Feeder(graph, ledger), None, False
     try:
-        if sinks.open(streams, dict(about or {})):
+        if sinks.open(streams, {**(about or {}), "surveys": "\n".join(map(": ".join, findings.items()))}):
             engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
             try:
                 finished = _feed(feeder, log, engine, stop)
@@ -138,6 +143,8 @@ def run(
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
+            "surveys": findings,
+            "outputs": [str(outputs[use]) for use in used],
         }
         sinks.close(summary)
     return summary
@@ -158,7 +165,7 @@ def _feed(feeder: Feeder, log: Any, engine: Engine, stop: Stop) -> bool:
     return False
 
 
-def _events(log: Any, stop: Stop) -> Iterator[Event]:
+def _events(log: Iterable[Event], stop: Stop) -> Iterator[Event]:
     """The events of `log`; a source that breaks down ends the log with its exception, and a stop in the middle."""
     log_time, source = 0, iter(log)
     while True:

@@ -1,4 +1,4 @@
-"""Makes a log out of stereo image files and a known camera attitude, for `roverflow import images`.
+"""Makes a log out of stereo image files and a known camera attitude, for `roverflow import`.
 
 The log says everything that a rover's own would: calibration, the camera's place on the rover, and an inclinometer. The
 rover stands level on the ground and the camera is mounted on it pitched and rolled, so the attitude is in /tf_static
@@ -8,7 +8,7 @@ and the inclinometer, fixed to the rover, reads level.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from recordings.discovery import SIDES
 from recordings.errors import LogError
 from recordings.rig import BODY_FROM_OPTICAL
 from recordings.ros2 import Ros2Writer, camera_info, image, imu, transform_message
-from stages.data import Array, CameraModel, Transform
+from stages.data import Array, CameraModel, StereoCamera, StereoFrame, Transform
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
 FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
@@ -57,22 +57,41 @@ def import_images(
         )
     if not rate > 0 or not height > 0:
         raise LogError(f"rate ({rate} Hz) and height ({height} m) must be positive")
-    rotation = Rotation.from_euler("YX", [pitch_down, roll], degrees=True).as_matrix() @ BODY_FROM_OPTICAL
-    mounted = Transform("base_link", CAMERAS["left"], rotation, np.array([0.0, 0.0, height]))
-    beside = Transform(CAMERAS["left"], CAMERAS["right"], np.eye(3), np.array([values["baseline"], 0.0, 0.0]))
-    sensor = Transform("base_link", "imu_link", np.eye(3), np.zeros(3))
     period = round(1e9 / rate)
-    around = min(10_000_000, period // 4)  # ns; so that a tilt is on both sides of every frame
-    with Ros2Writer(out) as writer:
-        first = FIRST_STAMP - around
-        writer.write("/tf_static", transform_message([(t, first) for t in (mounted, beside, sensor)]), first)
-        for number, pair in enumerate(zip(left, right, strict=True)):
-            stamp = FIRST_STAMP + number * period
-            _write_tilt(writer, stamp - around)
-            _write_pair(writer, stamp, pair, values)
-            _write_tilt(writer, stamp)
-            _write_tilt(writer, stamp + around)
+    pairs = enumerate(zip(left, right, strict=True))
+    frames = (read_frame(FIRST_STAMP + number * period, pair, values) for number, pair in pairs)
+    around = min(10_000_000, period // 4)
+    write_frames(frames, out, pitch_down=pitch_down, roll=roll, height=height, around=around)
     return len(left)
+
+
+def write_frames(
+    frames: Iterable[StereoFrame],
+    out: Path,
+    *,
+    pitch_down: float,
+    roll: float = 0.0,
+    height: float,
+    around: int = 10_000_000,
+    also: Callable[[Ros2Writer, StereoFrame], None] | None = None,
+) -> None:
+    """Write rectified frames of one camera as a log, its attitude as in `import_images`.
+
+    around: ns before and after each frame at which there is a tilt as well, so that one is on both sides of it; also:
+    writes what else belongs to a frame.
+    """
+    with Ros2Writer(out) as writer:
+        for number, frame in enumerate(frames):
+            if number == 0:
+                mounts = _mounts(frame.camera.baseline, pitch_down, roll, height)
+                first = frame.stamp - around
+                writer.write("/tf_static", transform_message([(mount, first) for mount in mounts]), first)
+            _write_tilt(writer, frame.stamp - around)
+            _write_images(writer, frame)
+            if also is not None:
+                also(writer, frame)
+            _write_tilt(writer, frame.stamp)
+            _write_tilt(writer, frame.stamp + around)
 
 
 def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -143,11 +162,9 @@ def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
     return {"fy": loaded["fx"], "cx_right": loaded["cx"], **loaded}
 
 
-def _write_tilt(writer: Ros2Writer, stamp: int) -> None:
-    writer.write("/imu/data", imu(stamp, "imu_link", np.array([0.0, 0.0, 0.0, 1.0])), stamp)
-
-
-def _write_pair(writer: Ros2Writer, stamp: int, pair: tuple[Path, Path], values: dict[str, float]) -> None:
+def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) -> StereoFrame:
+    """The frame of two image files. values: fx, fy, cx, cy, cx_right (px), baseline (m), and width and height, which it
+    sets where they are not there. Raises LogError for files that cannot be read or do not fit."""
     images = [_pixels(path) for path in pair]
     height, width = images[0].shape[:2]
     if images[0].shape != images[1].shape or images[0].dtype != images[1].dtype:
@@ -156,19 +173,38 @@ def _write_pair(writer: Ros2Writer, stamp: int, pair: tuple[Path, Path], values:
     if (values.setdefault("width", width), values.setdefault("height", height)) != (width, height):
         expected = f"{values['width']:g}x{values['height']:g}"
         raise LogError(f"{pair[0]} is {width}x{height}, the calibration or the first pair is {expected}")
-    for side, pixels in zip(("left", "right"), images, strict=True):
-        model = _model(side, width, height, values)
-        writer.write(f"/stereo/{side}/camera_info", camera_info(stamp, CAMERAS[side], model), stamp)
-        writer.write(f"/stereo/{side}/image_rect", image(stamp, CAMERAS[side], pixels), stamp)
+    camera = StereoCamera(**{**values, "width": width, "height": height}, frame_id=CAMERAS["left"])
+    return StereoFrame(stamp, images[0], images[1], camera)
 
 
-def _model(side: str, width: int, height: int, values: Mapping[str, float]) -> CameraModel:
-    cx = values["cx"] if side == "left" else values["cx_right"]
-    k = np.array([[values["fx"], 0.0, cx], [0.0, values["fy"], values["cy"]], [0.0, 0.0, 1.0]])
+def _mounts(baseline: float, pitch_down: float, roll: float, height: float) -> tuple[Transform, ...]:
+    """The left camera on the rover, the right one beside it, and the inclinometer."""
+    rotation = Rotation.from_euler("YX", [pitch_down, roll], degrees=True).as_matrix() @ BODY_FROM_OPTICAL
+    return (
+        Transform("base_link", CAMERAS["left"], rotation, np.array([0.0, 0.0, height])),
+        Transform(CAMERAS["left"], CAMERAS["right"], np.eye(3), np.array([baseline, 0.0, 0.0])),
+        Transform("base_link", "imu_link", np.eye(3), np.zeros(3)),
+    )
+
+
+def _write_tilt(writer: Ros2Writer, stamp: int) -> None:
+    writer.write("/imu/data", imu(stamp, "imu_link", np.array([0.0, 0.0, 0.0, 1.0])), stamp)
+
+
+def _write_images(writer: Ros2Writer, frame: StereoFrame) -> None:
+    for side, pixels in (("left", frame.left), ("right", frame.right)):
+        model = _model(side, frame.camera)
+        writer.write(f"/stereo/{side}/camera_info", camera_info(frame.stamp, CAMERAS[side], model), frame.stamp)
+        writer.write(f"/stereo/{side}/image_rect", image(frame.stamp, CAMERAS[side], pixels), frame.stamp)
+
+
+def _model(side: str, camera: StereoCamera) -> CameraModel:
+    cx = camera.cx if side == "left" else camera.cx_right
+    k = np.array([[camera.fx, 0.0, cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
     p = np.hstack([k, np.zeros((3, 1))])
     if side == "right":
-        p[0, 3] = -values["fx"] * values["baseline"]
-    return CameraModel(width, height, k, np.zeros(5), np.eye(3), p)
+        p[0, 3] = -camera.fx * camera.baseline
+    return CameraModel(camera.width, camera.height, k, np.zeros(5), np.eye(3), p)
 
 
 def _pixels(path: Path) -> Array:

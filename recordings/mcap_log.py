@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 LEAD = 1_000_000_000  # ns; tilt and pose are read this much beyond the ends of a range, to interpolate at its frames
 AHEAD = 100_000_000  # ns; so much later a calibration may be logged than the image it is for
+EXCERPT = 4  # frames in an excerpt, so that one that is broken is not missed
 STREAMS = (*CAMERAS, "inclinometer", "mount", "odometry")
 
 
@@ -136,7 +137,18 @@ class McapLog:
 
     def events(self, streams: Sequence[str]) -> Iterator[tuple[int, str, Any]]:
         """Iterates as the log does, over some of its streams."""
-        low, high = self._range()
+        return self._between(*self._range(), streams)
+
+    def excerpts(self, count: int, streams: set[str]) -> Iterator[Iterator[tuple[int, str, Any]]]:
+        """Iterates as the log does, over some of its streams, `count` times a few frames, spread over all of it."""
+        times = self.file.times(self.channels("left")).tolist() if "left" in self.topics else []
+        for first in sorted({int((part + 0.5) * len(times) / count) for part in range(count)}) if times else ():
+            last = min(first + EXCERPT, len(times)) - 1
+            # Stamps are before log times: from behind the image before.
+            low = times[first - 1] + 1 if first else self.file.start
+            yield self._between(low, times[last] + LEAD, [name for name in STREAMS if name in streams])
+
+    def _between(self, low: int | None, high: int | None, streams: Sequence[str]) -> Iterator[tuple[int, str, Any]]:
         wide_low = None if low is None else max(low - LEAD, 0)
         wide_high = None if high is None else high + LEAD
         log_start = self.file.start if wide_low is None else max(wide_low, self.file.start)

@@ -1,4 +1,4 @@
-"""Error measures over arrays: disparity, elevation, hazards, rocks, tilt. Pure functions, no files.
+"""Error measures over arrays: elevation, hazards, rocks, tilt. Pure functions, no files.
 
 What is summed over frames comes in two steps: `..._counts` of one frame, which add up, and `..._measures` of the sum,
 so that a log of any length takes the memory of one frame and every pixel or cell, not every frame, counts the same.
@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from stages.data import Array, Cell
 
-BAD_THRESHOLDS = (0.5, 1.0, 2.0)  # px
 CLOSE = 0.05  # m, the height error that the Lunar Autonomy Challenge accepts
 NMAD_SCALE = 1.4826  # makes the median deviation of a normal distribution its standard deviation
 NMAD_BIN = 1e-5  # m, to which errors are rounded for their median
@@ -35,56 +34,6 @@ def added(first: dict[str, float], second: dict[str, float]) -> dict[str, float]
 def in_ring(radius: Array, low: float, high: float) -> Array:
     """Mask of the radii in [low, high): a cell on the border of two rings belongs to the outer one only."""
     return np.asarray((radius >= low) & (radius < high))
-
-
-def disparity_counts(estimate: Array, truth: Array, both: Array, one: Array) -> dict[str, float]:
-    """Sums for `disparity_measures` over one frame.
-
-    estimate, truth: (H, W) px, NaN = unknown; both, one: (H, W) bool, pixels seen by both cameras and by one only. What
-    is in neither mask, or has no true value, shows no ground.
-    """
-    both, one = both & np.isfinite(truth), one & ~both & np.isfinite(truth)
-    given = np.isfinite(estimate)
-    error = np.abs(estimate.astype(np.float64) - truth)
-    known, hidden = error[both & given], error[one & given]
-    counts = {
-        "pixels": np.count_nonzero(both),
-        "known": known.size,
-        "absolute": known.sum(),
-        "squares": np.square(known).sum(),
-        "values": np.count_nonzero(given),
-        "occluded": hidden.size,
-        "occluded_over_2": np.count_nonzero(hidden > 2),
-        "sky": np.count_nonzero(given & ~both & ~one),
-    } | {f"over_{limit:g}": np.count_nonzero(known > limit) for limit in BAD_THRESHOLDS}
-    return {name: float(count) for name, count in counts.items()}
-
-
-def disparity_measures(counts: dict[str, float]) -> dict[str, Any]:
-    """Disparity errors of added `disparity_counts`.
-
-    Over the pixels that both cameras see: pixels (how many), density (share of them known), bad_T (share in error by
-    more than T px, an unknown pixel being bad), bad_T_known (of the known ones), mae and rmse (px, of the known ones).
-    Over all values given: values (how many), given_occluded (those at pixels that only one camera sees: pixels, share
-    of all values, bad_2 the share of them in error by more than 2 px), given_sky (those where there is no ground:
-    pixels, share of all values).
-    """
-    pixels, known, values = counts["pixels"], counts["known"], counts["values"]
-    measures: dict[str, Any] = {"pixels": pixels, "density": share(known, pixels)}
-    for limit in BAD_THRESHOLDS:
-        over = counts[f"over_{limit:g}"]
-        measures[f"bad_{limit:g}"] = share(over + pixels - known, pixels)
-        measures[f"bad_{limit:g}_known"] = share(over, known)
-    hidden, sky = counts["occluded"], counts["sky"]
-    return measures | {
-        "mae": share(counts["absolute"], known),
-        "rmse": share(counts["squares"], known) ** 0.5,
-        "values": values,
-        "given_occluded": {
-            "pixels": hidden, "share": share(hidden, values), "bad_2": share(counts["occluded_over_2"], hidden),
-        },
-        "given_sky": {"pixels": sky, "share": share(sky, values)},
-    }  # fmt: skip
 
 
 class HeightErrors:

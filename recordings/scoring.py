@@ -1,9 +1,9 @@
 """A run's output log against the truth topics of the log it ran on: one table of errors.
 
 Results under /nav and truth under /truth meet by header stamp. Both logs are read side by side in log time and a frame
-is scored, and forgotten but for its sums, as soon as neither can add to it. Errors are counted where both cameras saw
-the ground; values given elsewhere are counted on their own, and a true frame that the run left out is scored as one of
-which it knew nothing, so that neither a guess nor silence passes for knowledge.
+is scored, and forgotten but for its sums, as soon as neither can add to it. Errors are told for what both cameras saw
+and for what one did; values given where there is no truth are counted on their own, and a true frame that the run left
+out is scored as one of which it knew nothing, so that neither a guess nor silence passes for knowledge.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2
 from recordings.errors import LogError
+from recordings.stereo_measures import StereoErrors, cropped_columns
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")
@@ -32,8 +33,6 @@ PATIENCE = 5_000_000_000  # ns of log time after which no log adds to a frame an
 RINGS = ((0.0, 4.0), (4.0, 8.0), (0.0, 8.0))  # m from base_link, the outer border not included
 NEAR = 8.0  # m from base_link, within which cells and rocks are asked for
 HIGH_ROCK = 0.2  # m
-SEEN_BY_BOTH = 255
-SEEN_BY_NONE = 0
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,8 @@ class Score:
 
     frames: in the truth; compared: those with at least one result; missing: result topic -> stamps of true frames that
     it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without truth;
-    disparity: `measures.disparity_measures`;
+    disparity: `StereoErrors.measures`, cropped by the truth's max_disparity (the data set's range where it has one,
+    else the frame's largest), rounded up to 16;
     elevation: "0-4 m", "4-8 m", "0-8 m" (borders belong outside) -> seen (cells that both cameras see), completeness
     (share of them known), raw and levelled (less the best plane of each frame) `HeightErrors.measures`;
     unseen: share of all elevations given in cells that the cameras did not both see;
@@ -135,7 +135,7 @@ class _Tally:
         self.missing: dict[str, list[int]] = {topic: [] for topic in RESULTS}
         self.unmatched: dict[str, int] = {}
         self.seen_results: set[str] = set()
-        self.disparity: dict[str, float] = {}
+        self.disparity: StereoErrors | None = None
         self.heights: measures.RingErrors | None = None
         self.values = self.values_unseen = 0
         self.hazards: dict[str, float] = {}
@@ -154,10 +154,10 @@ class _Tally:
         self.frames += 1
         self.compared += bool(results)
         for topic in RESULTS:
-            if topic not in frame:
+            if topic not in frame and topic.replace("/nav/", "/truth/") in frame:
                 self.missing[topic].append(stamp)
         row: dict[str, float] = {"stamp": stamp}
-        if {"/truth/disparity", "/truth/occlusion"} <= frame.keys():
+        if "/truth/disparity" in frame:
             row |= self._add_disparity(stamp, frame)
         if "/truth/elevation_map" in frame:
             ground = _Ground.of(frame["/truth/elevation_map"])
@@ -177,13 +177,22 @@ class _Tally:
                 f"{self.result}: /nav/disparity at {stamp} ns is {estimate.shape[1]}x{estimate.shape[0]}, the truth in "
                 f"{self.truth} is {true.shape[1]}x{true.shape[0]}; score a run of that very log"
             )
-        mask = frame["/truth/occlusion"]
-        cameras = np.asarray(mask.data).reshape(mask.height, mask.step)[:, : mask.width]
-        both, one = cameras == SEEN_BY_BOTH, (cameras != SEEN_BY_BOTH) & (cameras != SEEN_BY_NONE)
-        counts = measures.disparity_counts(estimate, true, both, one)
-        self.disparity = measures.added(self.disparity, counts)
-        found = measures.disparity_measures(counts)
+        columns = cropped_columns(frame["/truth/disparity"].max_disparity)
+        errors = StereoErrors.of(estimate, true, self._occlusion(stamp, frame, true.shape), columns)
+        self.disparity = self.disparity + errors if self.disparity else errors
+        found = errors.measures()
         return {f"disparity_{name}": found[name] for name in ("density", "bad_1", "rmse")}
+
+    def _occlusion(self, stamp: int, frame: dict[str, Any], shape: tuple[int, ...]) -> Array | None:
+        mask = frame.get("/truth/occlusion")
+        if mask is None:
+            return None
+        if (mask.height, mask.width) != shape:
+            raise LogError(
+                f"{self.truth}: /truth/occlusion at {stamp} ns is {mask.width}x{mask.height}, /truth/disparity is "
+                f"{shape[1]}x{shape[0]}; make the truth again"
+            )
+        return np.asarray(mask.data).reshape(mask.height, mask.step)[:, : mask.width]
 
     def _add_elevation(self, stamp: int, frame: dict[str, Any], ground: _Ground) -> dict[str, float]:
         elevation = np.full(ground.map.shape, np.nan, np.float32)
@@ -258,7 +267,7 @@ class _Tally:
     def score(self) -> Score:
         """The tally as a score; LogError if there was nothing to compare."""
         if not self.frames:
-            raise LogError(f"{self.truth} has no ground truth (/truth/...); give the simulated log with --truth")
+            raise LogError(f"{self.truth} has no ground truth (/truth/...); give the log that has it with --truth")
         if not self.seen_results:
             raise LogError(f"{self.result} has no results ({', '.join(RESULTS)}); give the log that a run wrote")
         if not self.compared:
@@ -268,7 +277,7 @@ class _Tally:
             self.frames, self.compared,
             missing={topic: stamps for topic, stamps in self.missing.items() if stamps},
             unmatched=self.unmatched,
-            disparity=measures.disparity_measures(self.disparity) if self.disparity else None,
+            disparity=self.disparity.measures() if self.disparity else None,
             elevation=self.heights.measures() if self.heights else None,
             unseen=measures.share(self.values_unseen, self.values),
             navigation=measures.hazard_measures(self.hazards) if self.hazards else None,
@@ -278,100 +287,6 @@ class _Tally:
             untilted=self.untilted,
             per_frame=self.per_frame,
         )  # fmt: skip
-
-
-def format_score(found: Score) -> str:
-    """The score as a table for a terminal, at most 100 columns wide."""
-    parts = [_frame_lines(found)]
-    if found.disparity is not None:
-        parts.append(_disparity_lines(found.disparity))
-    if found.elevation is not None:
-        parts.append(_elevation_lines(found.elevation, found.unseen))
-    if found.navigation is not None:
-        parts.append(_navigation_lines(found.navigation, found.rocks))
-    parts.append(_tilt_lines(found))
-    return "\n\n".join("\n".join(lines) for lines in parts if lines)
-
-
-def _frame_lines(found: Score) -> list[str]:
-    lines = [f"frames       {found.compared} of {found.frames} have results"]
-    for topic, stamps in found.missing.items():
-        lines.append(f"missing      {topic}: {len(stamps)} of {found.frames} frames, scored as all unknown")
-    for topic, count in found.unmatched.items():
-        lines.append(f"unmatched    {topic}: {count} messages at stamps without truth, not scored")
-    return lines
-
-
-def _disparity_lines(d: dict[str, Any]) -> list[str]:
-    hidden, sky = d["given_occluded"], d["given_sky"]
-    shares = [
-        (f"{limit:g} px", _percent(d[f"bad_{limit:g}"]), _percent(d[f"bad_{limit:g}_known"]))
-        for limit in measures.BAD_THRESHOLDS
-    ]
-    limits, off, known = ("".join(f"{cell:>10}" for cell in cells) for cells in zip(*shares, strict=True))
-    occluded = f"{_percent(hidden['share']):>7} of all values, {_percent(hidden['bad_2'])} of these off by over 2 px"
-    return [
-        f"disparity    at the {d['pixels']:.0f} pixels that both cameras see, {_percent(d['density'])} of them known",
-        f"               off by over           {limits}",
-        f"               of all, unknown is off{off}",
-        f"               of the known          {known}",
-        f"               error of the known: mean {_number(d['mae'], 3)} px, RMS {_number(d['rmse'], 3)} px",
-        "             values given where stereo cannot measure",
-        f"               only one camera sees  {occluded}",
-        f"               no ground (sky)       {_percent(sky['share']):>7} of all values",
-    ]
-
-
-def _elevation_lines(rings: dict[str, Any], unseen: float) -> list[str]:
-    lines = [
-        "elevation    in cells that both cameras see, by distance from base_link; errors of the known in cm",
-        "               distance      cells    known |   RMSE    MAE   bias   NMAD  within 5 cm",
-    ]
-    levelled = ["               the same with the best plane of each frame's errors removed"]
-    for kind, title in (("raw", []), ("levelled", levelled)):
-        lines += title
-        for name, ring in rings.items():
-            h = ring[kind]
-            errors = "".join(f"{_number(100 * h[key], 2):>7}" for key in ("rmse", "mae", "bias", "nmad"))
-            known, close = _percent(measures.share(h["cells"], ring["seen"])), _percent(h["within_5cm"])
-            lines.append(f"               {name:<8} {ring['seen']:10d} {known:>8} |{errors} {close:>12}")
-    return [*lines, f"             {_percent(unseen)} of all elevations given lie in cells that not both cameras see"]
-
-
-def _navigation_lines(n: dict[str, Any], rocks: dict[str, float] | None) -> list[str]:
-    unseen, high = n["free_unseen"], f"{HIGH_ROCK:g} m or higher"
-    told = f"not both cameras see ({unseen['cells']:.0f} cells, {unseen['hazards']:.0f} of them true hazards)"
-    lines = [
-        f"navigation   in the {n['cells']:.0f} cells within {NEAR:g} m that both cameras see",
-        f"               {_percent(n['recall']):>7} of true hazard cells found",
-        f"               {_percent(n['false_safe']):>7} of true hazard cells called free",
-        f"               {_percent(n['false_alarm']):>7} of truly free cells called hazard",
-        f"               {_percent(n['unknown']):>7} of all cells left unknown",
-        f"             of the {n['free']:.0f} cells called free anywhere on the map",
-        f"               {_percent(n['free_on_rock']):>7} lie on a rock {high}",
-        f"               {_percent(n['free_hazard']):>7} are true hazards, by rock or slope",
-        f"               {_percent(unseen['share']):>7} lie where {told}",
-    ]
-    if rocks is not None:
-        counts = f"{rocks['found']:.0f} of {rocks['seen']:.0f} ({_percent(rocks['recall'])})"
-        lines.append(f"             rocks {high} seen within {NEAR:g} m: {counts} found")
-    return lines
-
-
-def _tilt_lines(found: Score) -> list[str]:
-    lines = [f"tilt         not scored in {count} frames: {why}" for why, count in found.untilted.items()]
-    if (t := found.tilt) is not None:
-        mean, worst = (math.degrees(t[name]) for name in ("mean", "max"))
-        lines = [f"tilt         mean error {mean:.3f} deg, largest {worst:.3f} deg, in {t['frames']} frames", *lines]
-    return lines
-
-
-def _percent(value: float) -> str:
-    return "-" if math.isnan(value) else f"{100 * value:.2f}%"
-
-
-def _number(value: float, digits: int) -> str:
-    return "-" if math.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"  # never -0.00
 
 
 def _rotation(quaternion: Any) -> Array:

@@ -7,19 +7,21 @@ paths decide the disparity, its fraction of a pixel, and whether left and right 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from stages.data import Array, Disparity, Source, StereoFrame
+from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.prior import prior_costs
 from stages.kernels.semiglobal import Rule, lanes_for, match
 from stages.stage import Stage, parameter
 
 SMALLEST_SIDE = 32
+BEYOND = 2.0  # px; a prior so far below the range says that the match is not in it
 LARGEST_BYTE = 255
 
 
@@ -52,8 +54,8 @@ class Match(Stage):
 
     Penalties count in units of the matching cost: census bits that differ, or with the gradient 1.5 units for each.
     Colour is converted to gray. `prior`, an earlier or coarser result of the same size, draws the search towards it; it
-    is no evidence, and where it is unknown it says nothing. Where it lies nearer than the search range, what is sought
-    cannot be found, and whatever looks most alike within the range is not taken for it: the pixel is unknown.
+    is no evidence, and where it is unknown it says nothing. What it shows to lie nearer than the search range, or with
+    `farthest` beyond it, stays unknown; without a prior some of that is taken for something within the range.
 
     The confidence is the probability that the disparity is right within 1 px, as far as the lead of the best sum of
     paths over the others tells, with the penalties that suit the cost and 8 paths.
@@ -61,6 +63,9 @@ class Match(Stage):
 
     disparities: int = parameter(192, "size of the search range", unit="px", low=1, high=1024)
     minimum: int = parameter(0, "smallest disparity searched", unit="px", low=-1024, high=1024)
+    farthest: float = parameter(
+        0.0, "depth beyond which nothing is of interest and disparities are not searched; 0: no limit", unit="m", low=0
+    )
     cost: str = parameter("census+gradient", "what is compared", choices=tuple(COSTS))
     paths: int = parameter(8, "directions of aggregation", choices=(4, 8))
     p1: int = parameter(0, "penalty of a step of 1 px; 0: the one that suits the cost", low=0, high=100)
@@ -87,11 +92,17 @@ class Match(Stage):
 
     def __call__(self, frame: StereoFrame, prior: Disparity | None = None) -> Disparity:
         self._check(frame, prior)
+        search = self._search(frame.camera)
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
-        guide = None if prior is None else self._guide(prior)
-        found = match(left, right, self._rule(), guide, self.threads, self.memory << 20)
-        blank = np.nonzero(_blank(left) if prior is None else _blank(left) | self._beyond(prior))
-        found.pixels[blank], found.source[blank], found.confidence[blank] = np.nan, Source.UNKNOWN, 0
+        guide = None if prior is None else self._guide(prior, search)
+        found = match(left, right, self._rule(search), guide, self.threads, self.memory << 20)
+        nothing = _blank(left)
+        if prior is not None:
+            nothing |= prior.pixels > search.stop + BEYOND
+            if search.start > self.minimum:
+                nothing |= prior.pixels < search.start - BEYOND
+        unknown = np.nonzero(nothing)
+        found.pixels[unknown], found.source[unknown], found.confidence[unknown] = np.nan, Source.UNKNOWN, 0
         return Disparity(frame.stamp, found.pixels, found.source, found.confidence, camera=frame.camera)
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
@@ -111,25 +122,32 @@ class Match(Stage):
         cost = COSTS[self.cost]
         return self.p1 or cost.p1, self.p2 or cost.p2
 
-    def _rule(self) -> Rule:
+    def _search(self, camera: StereoCamera) -> range:
+        """The disparities that are searched."""
+        search = range(self.minimum, self.minimum + self.disparities)
+        if not self.farthest:
+            return search
+        limit = math.floor(camera.fx * camera.baseline / self.farthest - (camera.cx_right - camera.cx))
+        if limit >= search.stop:
+            raise ValueError(
+                f"Match.farthest = {self.farthest} m leaves nothing to search: a depth of {self.farthest} m is a "
+                f"disparity of {limit} px, and {search.stop - 1} px is the largest searched"
+            )
+        return range(max(search.start, limit), search.stop)
+
+    def _rule(self, search: range) -> Rule:
         cost, (p1, p2) = COSTS[self.cost], self._penalties()
         falling = np.maximum(p1 + 2, np.round(p2 / (1 + np.arange(256) / self.edge)))
         confidence = np.interp(np.arange(256), LEADS, cost.right).astype(np.float32)
         confidence[0] = 0  # unknown
         return Rule(
             self.cost == "census+gradient", self.paths == 8, p1, np.minimum(falling, p2).astype(np.uint8), cost.unseen,
-            self.disparities, self.minimum, self.uniqueness, self.consistency, self.speckle_range, self.speckle_size,
+            len(search), search.start, self.uniqueness, self.consistency, self.speckle_range, self.speckle_size,
             confidence,
         )  # fmt: skip
 
-    def _beyond(self, prior: Disparity) -> Array:
-        """Where the prior lies nearer than the search range, (H, W) bool."""
-        beyond: Array = prior.pixels > self.minimum + self.disparities
-        return beyond
-
-    def _guide(self, prior: Disparity) -> tuple[Array, Array]:
-        lanes = lanes_for(self.disparities)
-        return prior_costs(prior.pixels, self.minimum, lanes, self.prior_weight, self.prior_reach)
+    def _guide(self, prior: Disparity, search: range) -> tuple[Array, Array]:
+        return prior_costs(prior.pixels, search.start, lanes_for(len(search)), self.prior_weight, self.prior_reach)
 
 
 def _blank(image: Array) -> Array:

@@ -1,57 +1,104 @@
 """Rectification: both images resampled so that corresponding points lie on the same row.
 
 Each camera's undistortion and rectifying rotation are folded into one table of source positions (Bouguet's method, as
-in image_pipeline), computed once per camera and then only looked up.
+in image_pipeline), computed once per camera and then only looked up. What the calibration leaves of a row offset is
+measured (stages.row_offset) and folded into the right camera's table.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import cast
 
 import cv2
 import numpy as np
 
 from stages.data import Array, CameraModel, StereoFrame
+from stages.intensity import eight_bit, gray
+from stages.row_offset import RowOffset, measure, moved_down, offset_field
 from stages.stage import Stage, parameter
 
 DISTORTION_SIZES = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
+LARGEST_OFFSET = 64.0  # px
+MOST_TERMS = 5
 
 
 @dataclass(frozen=True)
 class Rectify(Stage):
     """A stereo frame with row-aligned images; rectified input passes through but for the row correction.
 
-    Pixels that no raw pixel maps to are 0.
+    Pixels that no raw pixel maps to are 0. A run measures the row offset once, on frames from all over the log
+    (`survey`), and corrects all frames alike; called on a single frame the stage measures that frame's own.
     """
 
-    row_offset: float = parameter(
-        0.0,
+    row_offset: float | tuple[float, ...] | None = parameter(
+        None,
         "rows by which rectification leaves a point lower in the left image than in the right one (v_left - v_right);"
-        " the right image is moved down by as many (Devon Island: +0.6)",
+        " the right image is moved down by as many. A number, or the weights of 1, x, y, xy, y^2 (from the centre, in"
+        " widths and heights); by default measured, and corrected where the evidence is clear",
         unit="px",
-        low=-64,
-        high=64,
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        terms = self._terms
+        if terms is not None and not (1 <= len(terms) <= MOST_TERMS and np.all(np.abs(terms) <= LARGEST_OFFSET)):
+            raise ValueError(
+                f"Rectify.row_offset must be one to {MOST_TERMS} numbers, each at most {LARGEST_OFFSET:g} px, "
+                f"not {self.row_offset}"
+            )
+
     def __call__(self, frame: StereoFrame) -> StereoFrame:
-        camera = frame.camera
-        if camera.raw is None:
-            right = _moved_down(frame.right, self.row_offset) if self.row_offset else frame.right
-            return replace(frame, right=right)
-        left_maps = _rectifying_maps(*_frozen(camera.raw[0]), 0.0)
-        right_maps = _rectifying_maps(*_frozen(camera.raw[1]), self.row_offset)
-        left = cv2.remap(frame.left, *left_maps, cv2.INTER_CUBIC)
-        right = cv2.remap(frame.right, *right_maps, cv2.INTER_CUBIC)
-        return StereoFrame(frame.stamp, left, right, replace(camera, raw=None))
+        if self._terms is not None:
+            return _rectified(frame, self._terms)
+        plain = _rectified(frame, ())
+        offset = _measured([plain])
+        return _rectified(frame, offset.terms) if offset is not None and offset.clear else plain
+
+    @property
+    def surveys(self) -> bool:
+        """Whether the stage wants to see frames of the whole log before it is called: unless told the row offset."""
+        return self.row_offset is None
+
+    def survey(self, frame: Sequence[StereoFrame]) -> tuple[Rectify, str]:
+        """The stage with the row offset that frames have in common, and a sentence about it."""
+        offset = _measured([_rectified(each, ()) for each in frame])
+        if offset is None:
+            return replace(self, row_offset=0.0), "the row offset is not clear from the images; none is corrected"
+        terms = tuple(round(term, 4) for term in offset.terms)
+        found = (
+            f"rows differ by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, +- {offset.error:.2f}"
+            f" ({offset.features} features of {len(frame)} frames)"
+        )
+        if not offset.clear:
+            return replace(self, row_offset=0.0), f"{found}: too little to correct"
+        return replace(self, row_offset=terms), f"{found}; corrected, as row_offset={list(terms)} would"
+
+    @property
+    def _terms(self) -> tuple[float, ...] | None:
+        """The given row offset as weights of the terms."""
+        if self.row_offset is None or isinstance(self.row_offset, tuple):
+            return self.row_offset
+        return (float(self.row_offset),)
 
 
-def _moved_down(image: Array, rows: float) -> Array:
-    """The image moved down by `rows`, bicubic, so that a shift by part of a row blurs least."""
-    move = np.array([[1, 0, 0], [0, 1, rows]], np.float64)
-    size = image.shape[1], image.shape[0]
-    moved: Array = cv2.warpAffine(image, move, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return moved
+def _measured(frames: Sequence[StereoFrame]) -> RowOffset | None:
+    pairs = [tuple(gray(image) for image in eight_bit(frame.left, frame.right)) for frame in frames]
+    return measure(cast(list[tuple[Array, Array]], pairs))
+
+
+def _rectified(frame: StereoFrame, row_terms: tuple[float, ...]) -> StereoFrame:
+    """The frame rectified, its right image moved down by the offset of these terms."""
+    camera, terms = frame.camera, row_terms if any(row_terms) else ()
+    if camera.raw is None:
+        return replace(frame, right=moved_down(frame.right, terms) if terms else frame.right)
+    left_maps = _rectifying_maps(*_frozen(camera.raw[0]), ())
+    right_maps = _rectifying_maps(*_frozen(camera.raw[1]), terms)
+    left = cv2.remap(frame.left, *left_maps, cv2.INTER_CUBIC)
+    right = cv2.remap(frame.right, *right_maps, cv2.INTER_CUBIC)
+    return StereoFrame(frame.stamp, left, right, replace(camera, raw=None))
 
 
 def _frozen(model: CameraModel) -> tuple[str, int, int, bytes]:
@@ -60,13 +107,13 @@ def _frozen(model: CameraModel) -> tuple[str, int, int, bytes]:
     return model.model, model.width, model.height, values.tobytes()
 
 
-@lru_cache(maxsize=4)
-def _rectifying_maps(model: str, width: int, height: int, values: bytes, rows_down: float) -> tuple[Array, Array]:
-    """Where in the raw image each rectified pixel lies, in cv2.remap's fixed-point form."""
+@lru_cache(maxsize=8)
+def _rectifying_maps(
+    model: str, width: int, height: int, values: bytes, terms: tuple[float, ...]
+) -> tuple[Array, Array]:
+    """Where in the raw image each rectified pixel lies, moved down by the offset, in cv2.remap's fixed point."""
     numbers = np.frombuffer(values)
     k, r, p, d = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:30].reshape(3, 4), numbers[30:]
-    projection = p[:, :3].copy()
-    projection[1, 2] += rows_down
     if model not in DISTORTION_SIZES:
         raise ValueError(f"Rectify: unknown distortion model '{model}'; use {', '.join(DISTORTION_SIZES)}")
     if d.size not in DISTORTION_SIZES[model]:
@@ -75,5 +122,13 @@ def _rectifying_maps(model: str, width: int, height: int, values: bytes, rows_do
             f"the calibration has {d.size}"
         )
     undistort = cv2.fisheye.initUndistortRectifyMap if model == "equidistant" else cv2.initUndistortRectifyMap
-    maps = undistort(k, d, r, projection, (width, height), cv2.CV_16SC2)
+    down = offset_field(terms, width, height)
+    above = int(np.ceil(np.abs(down).max())) if terms else 0  # rows beyond the image that the offset may look up
+    projection = p[:, :3].copy()
+    projection[1, 2] += above
+    x, y = undistort(k, d, r, projection, (width, height + 2 * above), cv2.CV_32FC1)
+    if terms:
+        columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        x, y = (cv2.remap(table, columns, rows + above - down, cv2.INTER_LINEAR) for table in (x, y))
+    maps = cv2.convertMaps(x, y, cv2.CV_16SC2)
     return maps[0], maps[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.cli import main
 from tests.conftest import FRAMES, rewrite
+from tests.recordings.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
 SMALL = ("--set", "matched.disparities=64")
@@ -60,8 +62,37 @@ def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
     summary = json.loads(result.with_suffix(".json").read_text())
     assert (summary["verdict"], summary["frames_in"], summary["frames_out"]) == ("COMPLETE", FRAMES, FRAMES)
     assert summary["drops"] == {}
+    assert summary["surveys"]["rectified"].endswith("too little to correct")
     assert summary["seconds"]["matched"] > 0
     assert set(summary["seconds"]) >= {"rectified", "disparity", "points", "elevation_map", "navigation_map"}
+
+
+def test_a_pipeline_without_a_recording_writes_and_lists_none(traverse, tmp_path, capsys):
+    pipeline = tmp_path / "short.yaml"
+    text = (ROOT / "flow" / "pipelines" / "rover.yaml").read_text()
+    pipeline.write_text(text.replace("  - {use: recordings.RerunSink}\n", ""))
+    assert roverflow("run", traverse, "-p", pipeline, *SMALL, "-o", tmp_path / "out.mcap", "--end", "0.5") == 0
+    assert ".rrd" not in capsys.readouterr().out
+
+
+def test_a_row_offset_is_measured_once_for_the_log_reported_and_corrected(traverse, tmp_path, capsys):
+    def displaced(topic, _, data):
+        if "right" in topic and "image" in topic:  # the pixels are the last of the message
+            image = np.frombuffer(data, np.uint8)[-320 * 240 * 3 :].reshape(240, 320, 3)
+            return data[: -image.size] + np.roll(image, 2, axis=0).tobytes()
+        return data
+
+    log = rewrite(traverse, tmp_path / "displaced.mcap", displaced)
+    whole, part = tmp_path / "whole.mcap", tmp_path / "part.mcap"
+    assert roverflow("run", log, *SMALL, "--no-rrd", "-o", whole, "--summary", tmp_path / "whole.json") == 0
+    (finding,) = json.loads((tmp_path / "whole.json").read_text())["surveys"].values()
+    assert f"rectified: {finding}" in capsys.readouterr().out
+    assert float(re.search(r"rows differ by (\S+) px at the centre", finding)[1]) == pytest.approx(-2, abs=0.1)
+    assert "; corrected, as row_offset=[" in finding
+    assert roverflow("run", log, *SMALL, "--no-rrd", "-o", part, "--start", "1.5") == 0
+    images = [{m for m in raw_messages(path) if m[0] == "/nav/disparity"} for path in (whole, part)]
+    assert images[1] < images[0]  # the same messages, though the run saw but a part
+    assert images[1]
 
 
 def test_the_result_reads_back_with_mcap_ros2_support(result):
@@ -120,6 +151,81 @@ def test_the_score_is_that_of_a_working_chain(traverse, result, tmp_path, capsys
     assert roverflow("score", result, "--truth", traverse, "--json", tmp_path / "score.json") == 0
     assert "disparity" in capsys.readouterr().out
     assert json.loads((tmp_path / "score.json").read_text())["frames"] == FRAMES
+
+
+MATCHING = """
+source: {use: recordings.McapSource}
+streams:
+  stereo: {use: flow.align.pair, left: left, right: right, slop: 5 ms}
+  disparity: {use: stages.Match, frame: stereo, disparities: 192}
+sinks: [{use: recordings.McapSink}]
+"""
+
+
+def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, capsys):
+    scene, log, out = write_scene(tmp_path / "Box"), tmp_path / "box.mcap", tmp_path / "out.mcap"
+    assert roverflow("import", "middlebury", scene, log) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1].endswith("run it with --set matched.disparities=32")
+    assert roverflow("run", log, "--set", "matched.disparities=32", "-o", out, "--no-rrd") == 0
+    (tmp_path / "matching.yaml").write_text(MATCHING)
+    matching = ("-p", tmp_path / "matching.yaml", "--set", "disparity.disparities=32")
+    assert roverflow("run", log, *matching, "-o", tmp_path / "matched.mcap", "--no-rrd") == 0
+    scores = []
+    for name in ("out", "matched"):
+        capsys.readouterr()
+        paths = tmp_path / f"{name}.mcap", tmp_path / f"{name}.json"
+        assert roverflow("score", paths[0], "--truth", log, "--json", paths[1]) == 0
+        table = capsys.readouterr().out
+        assert all(word in table for word in ("bad-0.5", "bad-4", "occluded", "without the leftmost 32 columns"))
+        assert "missing" not in table  # the maps, of which there is no truth
+        scores.append(json.loads(paths[1].read_text())["disparity"])
+    for score in scores:
+        assert score["whole_image"]["all"]["pixels"] == 96 * 64 - 28
+        assert score["cropped_image"]["leftmost_columns_cropped"] == [32]
+        assert score["cropped_image"]["nonocc"]["bad_1"] < 0.05
+    refined, matched = (score["whole_image"]["all"] for score in scores)
+    assert refined["density"] > matched["density"]
+
+
+def test_a_folder_of_scenes_becomes_a_log_each(tmp_path, capsys):
+    for name in ("Two", "One"):
+        write_scene(tmp_path / "trainingF" / name)
+    assert roverflow("import", "middlebury", tmp_path / "trainingF", tmp_path / "logs") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in said] == [str(tmp_path / "logs" / f"{name}.mcap") for name in ("One", "Two")]
+    assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["One.mcap", "Two.mcap"]
+    assert roverflow("import", "middlebury", tmp_path / "trainingF", tmp_path / "all.mcap") == 2
+    assert "give a folder for the logs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "out", "words"),
+    [
+        ("disp0GT.pfm", "out.mcap", "disp0GT.pfm is not a PFM file"),
+        ("calib.txt", "out.mcap", "calib.txt lacks 'cam0'"),
+        ("im1.png", "out.mcap", "im1.png is not an image"),
+        (None, "Box/im0.png", "is what is being read"),
+        (None, "Box", "is a folder or a device"),
+    ],
+)
+def test_a_scene_that_cannot_be_imported_is_refused_in_one_sentence(tmp_path, capsys, spoilt, out, words):
+    scene = write_scene(tmp_path / "Box")
+    before = (scene / "im0.png").read_bytes()
+    if spoilt:
+        (scene / spoilt).write_bytes(b"spoilt")
+    assert roverflow("import", "middlebury", scene, tmp_path / out) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["Box"]
+    assert (scene / "im0.png").read_bytes() == before
+
+
+def test_the_help_of_the_import_says_what_it_takes_for_granted(capsys):
+    with pytest.raises(SystemExit):
+        roverflow("import", "middlebury", "--help")
+    assert "it is taken to look level from 1 m" in " ".join(capsys.readouterr().out.split())
 
 
 def test_part_of_a_log(traverse, tmp_path):

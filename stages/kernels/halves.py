@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
-Pair = Callable[[Callable[[], Any], Callable[[], Any]], tuple[Any, Any]]
+AtOnce = Callable[[Callable[[], Any], Callable[[], Any]], tuple[Any, Any]]
 
 
 def in_turn(one: Callable[[], Any], other: Callable[[], Any]) -> tuple[Any, Any]:
@@ -16,7 +16,7 @@ def in_turn(one: Callable[[], Any], other: Callable[[], Any]) -> tuple[Any, Any]
 
 
 @contextmanager
-def pairs(threads: int) -> Iterator[Pair]:
+def pairs(threads: int) -> Iterator[AtOnce]:
     """What calls two functions and gives both results: at once if there are 2 threads or more, else in turn."""
     if threads < 2:
         yield in_turn

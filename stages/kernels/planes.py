@@ -14,7 +14,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel, kernel
-from stages.kernels.halves import Pair, in_turn, pairs
+from stages.kernels.halves import AtOnce, in_turn, pairs
 
 F32 = np.float32
 U64 = np.uint64
@@ -64,7 +64,7 @@ def fit_planes(
     return planes
 
 
-def segment_pixels(labels: Array, count: int, both: Pair = in_turn) -> tuple[Array, Array]:
+def segment_pixels(labels: Array, count: int, both: AtOnce = in_turn) -> tuple[Array, Array]:
     """The pixels of each segment: those of segment s are index[start[s]:start[s + 1]], in scan order.
 
     labels: (H, W) int32 in 0..count-1. Returns start (count + 1,) int64 and index (H * W,) int32.

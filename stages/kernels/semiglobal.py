@@ -25,7 +25,7 @@ from stages.kernels.aggregation import aggregate_row, brightness_steps
 from stages.kernels.census import census, census_costs
 from stages.kernels.compiled import kernel
 from stages.kernels.gradient import gradients, smoothed_costs
-from stages.kernels.halves import pairs
+from stages.kernels.halves import AtOnce, pairs
 from stages.kernels.prior import add_prior
 from stages.kernels.selection import find_winners, fit_row
 from stages.kernels.speckles import drop_speckles
@@ -103,14 +103,8 @@ def match(
     height, columns = left.shape
     width = Width(lanes_for(rule.disparities))
     pixels, evidence = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
-    with pairs(threads) as both, _workspaces.one() as space:
-        (left_planes, steps), right_planes = both(
-            lambda: (_described(left, rule), brightness_steps(left)), lambda: _described(right, rule, width)
-        )
-        pair = Pair(left_planes, right_planes, steps, *_view(columns, rule, width), *(prior or NO_PRIOR))
-        upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
-        both(upper.arrive, lower.arrive)
-        both(lambda: upper.cross(lower), lambda: lower.cross(upper))
+    with pairs(threads) as both:
+        _sweep_all(left, right, rule, width, prior, memory, pixels, evidence, both)
         drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, both)
         confidence, source = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
         middle = height // 2
@@ -119,6 +113,21 @@ def match(
             lambda: _grade(evidence[middle:], rule.calibration, confidence[middle:], source[middle:]),
         )
     return Matches(pixels, source, confidence, evidence)
+
+
+def _sweep_all(
+    left: Array, right: Array, rule: Rule, width: Width, prior: tuple[Array, Array] | None, memory: int,
+    pixels: Array, evidence: Array, both: AtOnce,
+) -> None:  # fmt: skip
+    """Fill in disparities and evidence; what that takes but the workspace is given back."""
+    with _workspaces.one() as space:
+        (left_planes, steps), right_planes = both(
+            lambda: (_described(left, rule), brightness_steps(left)), lambda: _described(right, rule, width)
+        )
+        pair = Pair(left_planes, right_planes, steps, *_view(left.shape[1], rule, width), *(prior or NO_PRIOR))
+        upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
+        both(upper.arrive, lower.arrive)
+        both(lambda: upper.cross(lower), lambda: lower.cross(upper))
 
 
 @kernel

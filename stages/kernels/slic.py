@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel, kernel
-from stages.kernels.halves import Pair, in_turn, pairs
+from stages.kernels.halves import AtOnce, in_turn, pairs
 
 F32 = np.float32
 LEAST_CELL = 8  # px; where grid cells are smaller, the centres settle at full resolution
@@ -49,14 +49,14 @@ def superpixels(
     return labels, total
 
 
-def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Pair) -> None:
+def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: AtOnce) -> None:
     """One k-means step: `centres` becomes the means of what is nearest to each."""
     sums = _labels(colour, centres, grid, weight, both)[1]
     seen = sums[:, 5] > 0
     centres[seen] = sums[seen, :5] / sums[seen, 5:]
 
 
-def _labels(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Pair) -> tuple[Array, Array]:
+def _labels(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: AtOnce) -> tuple[Array, Array]:
     """The nearest centre of each pixel, (H, W) int32, and the sums of `_assign`."""
     rows, cols = grid
     labels = np.empty(colour.shape[1:], np.int32)
@@ -69,7 +69,7 @@ def _labels(colour: Array, centres: Array, grid: tuple[int, int], weight: float,
     return labels, upper + lower
 
 
-def _colour_planes(image: Array, both: Pair = in_turn) -> Array:
+def _colour_planes(image: Array, both: AtOnce = in_turn) -> Array:
     """The image as (3, H, W) float32 CIELAB planes (L in 0..100); a gray image has a = b = 0."""
     planes = np.zeros((3, *image.shape[:2]), np.float32)
     middle = image.shape[0] // 2
@@ -147,7 +147,7 @@ def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, la
                     sums[k, 5] += 1
 
 
-def connect(labels: Array, smallest: int, both: Pair = in_turn) -> int:
+def connect(labels: Array, smallest: int, both: AtOnce = in_turn) -> int:
     """Number the 4-connected components of `labels` (H, W) int32 in scan order, in place; returns how many.
 
     One of fewer than `smallest` pixels joins the component left of its first pixel, or above it at the left border.

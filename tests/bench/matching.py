@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stages import Match, StereoCamera, StereoFrame
+from stages import Match, Rectify, StereoCamera, StereoFrame
 from stages.data import Array
 
 WIDTH, HEIGHT = 1280, 960
@@ -138,6 +138,7 @@ def accuracy(folder: Path) -> None:
         sixteenths = matcher.compute(frame.left[..., ::-1], frame.right[..., ::-1])
         results: dict[str, Array] = {"OpenCV HH": np.where(sixteenths < 0, np.nan, sixteenths / 16).astype(np.float32)}
         results |= {cost: Match(cost=cost, disparities=levels)(frame).pixels for cost in COSTS}
+        results["census+gradient, rows corrected"] = Match(disparities=levels)(Rectify()(frame)).pixels
         scored = (mask == 255) & np.isfinite(truth) & (np.arange(truth.shape[1]) >= levels)
         for name, pixels in results.items():
             kept = np.abs(pixels - truth)[scored & np.isfinite(pixels)]
@@ -153,6 +154,21 @@ def accuracy(folder: Path) -> None:
         print(f"{'  over OpenCV HH':34} {ratio[0]:10.3f} {points:+8.1f} {ratio[2]:15.3f} {ratio[3]:13.3f}")
 
 
+def rows(folder: Path) -> None:
+    """Print how the row correction changes what is matched on real rover images, right of the columns that only the
+    left camera sees and below the sky."""
+    camera = StereoCamera(968.999, 968.999, 635.139, 463.537, 0.239977, WIDTH, HEIGHT)
+    print(f"\n{'Devon Island':34} {'density':>8} {'mean confidence':>16}")
+    for path in sorted(folder.glob("*-left.png")):
+        left, right = (cv2.imread(str(path).replace("left", side)) for side in ("left", "right"))
+        frame = StereoFrame(0, left[..., ::-1], right[..., ::-1], camera)
+        for name, stage in (("as calibrated", Rectify(row_offset=0.0)), ("rows corrected", Rectify())):
+            found = Match()(stage(frame))
+            known = np.isfinite(found.pixels[300:, 192:])
+            confidence = found.confidence[300:, 192:][known].mean()
+            print(f"{path.stem.partition('-')[0] + ', ' + name:34} {100 * known.mean():8.1f} {confidence:16.3f}")
+
+
 def main() -> None:
     """Print all tables."""
     import tempfile
@@ -163,6 +179,7 @@ def main() -> None:
     data = os.environ.get("ROVERFLOW_DATA")
     if data:
         accuracy(Path(data) / "middlebury-q")
+        rows(Path(data) / "devon")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ unknown; columns left of the disparity range are not scored; RMS is over known p
 from __future__ import annotations
 
 import os
-import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,9 @@ import cv2
 import numpy as np
 
 from flow.pipeline import load
-from stages.data import Array, Disparity, StereoCamera, StereoFrame
+from recordings.middlebury import read_scene
+from recordings.stereo_measures import StereoErrors
+from stages.data import Array, Disparity, StereoFrame
 from stages.kernels.background import fill_background
 from stages.match import Match
 from stages.match_opencv import MatchOpenCV
@@ -30,30 +31,18 @@ def paper_stages() -> tuple[MatchOpenCV, Refine]:
 
 
 def load_scene(folder: Path) -> tuple[StereoFrame, Array, Array, int]:
-    """A scene's frame, true disparities (H, W) float32 with inf = unknown, non-occlusion mask and range (16s)."""
-    calibration = dict(re.findall(r"(\w+)=(.+)", (folder / "calib.txt").read_text()))
-    fx, _, cx, _, fy, cy = (float(number) for number in re.findall(r"[\d.]+", calibration["cam0"])[:6])
-    left, right = (cv2.cvtColor(cv2.imread(str(folder / f"im{i}.png")), cv2.COLOR_BGR2RGB) for i in (0, 1))
-    height, width = left.shape[:2]
-    camera = StereoCamera(
-        fx, fy, cx, cy, float(calibration["baseline"]) / 1000, width, height, cx + float(calibration["doffs"])
-    )
-    with (folder / "disp0GT.pfm").open("rb") as file:
-        scale = [file.readline() for _ in range(3)][2]
-        order = "<f4" if float(scale) < 0 else ">f4"
-        truth = np.flipud(np.frombuffer(file.read(), order).reshape(height, width)).astype(np.float32)
-    mask = cv2.imread(str(folder / "mask0nocc.png"), cv2.IMREAD_GRAYSCALE)
-    return StereoFrame(1, left, right, camera), truth, mask, -(-int(calibration["ndisp"]) // 16) * 16
+    """A scene's frame, true disparities (H, W) float32 with NaN = unknown, occlusion mask and range (16s)."""
+    scene = read_scene(folder, stamp=1)
+    assert scene.truth is not None
+    assert scene.occlusion is not None
+    return scene.frame, scene.truth, scene.occlusion, scene.disparities
 
 
 def errors(pixels: Array, truth: Array, mask: Array, margin: int) -> Array:
     """Percent of non-occluded pixels that are bad at 0.5, 1 and 2 px, the same of all, RMS (px), percent known."""
-    scored = np.isfinite(truth) & (np.arange(truth.shape[1]) >= margin)
-    error = np.where(np.isfinite(pixels) & scored, np.abs(pixels - np.where(scored, truth, 0)), np.inf)
-    bad = [100 * np.mean(error[area] > limit) for area in (scored & (mask == 255), scored) for limit in (0.5, 1, 2)]
-    known = scored & np.isfinite(pixels)
-    rms = np.sqrt(np.mean(error[known] ** 2))
-    return np.array([*bad, rms, 100 * known.sum() / scored.sum()])
+    found = StereoErrors.of(pixels, truth, mask, margin).measures()["cropped_image"]
+    bad = [found[region][f"bad_{limit}"] for region in ("nonocc", "all") for limit in ("0.5", "1", "2")]
+    return np.array([*(100 * np.array(bad)), found["all"]["rmse"], 100 * found["all"]["density"]])
 
 
 def chains(frame: StereoFrame, levels: int) -> dict[str, Array]:

@@ -130,3 +130,20 @@ def test_a_type_with_other_fields_than_its_names_is_said_and_no_failure(
         assert stream in log.missing
         list(log)
     describe(path, McapSource())
+
+
+@pytest.mark.parametrize("start", [None, 0.35])
+def test_excerpts_are_spread_over_the_whole_log_whatever_part_is_run(tmp_path: Path, start: float | None) -> None:
+    with McapSource().open(write_sample(tmp_path / "log.mcap"), start=start) as log:
+        excerpts = [list(events) for events in log.excerpts(2, {"left", "right"})]
+    stamps = [[(stream, (item.stamp - START) // PERIOD) for _, stream, item in events] for events in excerpts]
+    assert [found[0] for found in stamps] == [("left", 1), ("left", 3)]
+    assert [sorted(set(found)) for found in stamps] == [
+        sorted((side, number) for side in ("left", "right") for number in range(first, FRAMES)) for first in (1, 3)
+    ]
+
+
+def test_more_excerpts_than_frames_are_one_for_each_frame(tmp_path: Path) -> None:
+    with McapSource().open(write_sample(tmp_path / "log.mcap")) as log:
+        assert len(list(log.excerpts(20, {"left", "right"}))) == FRAMES
+        assert len(list(log.excerpts(3, {"left", "right"}))) == 3

@@ -14,69 +14,12 @@ from recordings import measures
 NAN = float("nan")
 
 
-def disparity(estimate, truth, both, one=None):
-    """The measures of one frame."""
-    one = np.zeros_like(both) if one is None else one
-    return measures.disparity_measures(measures.disparity_counts(estimate, truth, both, one))
-
-
 def heights(*parts):
     """The measures of errors added in parts."""
     errors = measures.HeightErrors()
     for part in parts:
         errors.add(part)
     return errors.measures()
-
-
-def test_disparity_errors_of_four_counted_pixels():
-    truth = np.array([[10.0, 20.0, 30.0, 40.0, 50.0, NAN]], np.float32)
-    estimate = np.array([[10.25, 20.75, NAN, 43.0, 99.0, 1.0]], np.float32)
-    both = np.array([[True, True, True, True, False, True]])
-    found = disparity(estimate, truth, both)
-    assert found["pixels"] == 4
-    assert found["density"] == 0.75
-    assert (found["bad_0.5"], found["bad_1"], found["bad_2"]) == (0.75, 0.5, 0.5)  # the unknown one is always bad
-    assert found["bad_0.5_known"] == pytest.approx(2 / 3)
-    assert found["bad_1_known"] == found["bad_2_known"] == pytest.approx(1 / 3)
-    assert found["mae"] == pytest.approx(4 / 3)
-    assert found["rmse"] == pytest.approx(np.sqrt((0.0625 + 0.5625 + 9) / 3))
-
-
-def test_values_where_stereo_cannot_measure_are_counted_on_their_own():
-    truth = np.array([[10.0, 20.0, 30.0, 40.0, 50.0, NAN, NAN, 60.0]])
-    estimate = np.array([[10.0, 22.5, 32.0, NAN, 51.0, 7.0, NAN, 60.0]])
-    both = np.array([[True, False, False, False, False, False, False, False]])
-    one = np.array([[False, True, True, True, True, False, False, False]])
-    found = disparity(estimate, truth, both, one)
-    assert (found["pixels"], found["density"], found["values"]) == (1, 1, 6)
-    assert found["given_occluded"] == {"pixels": 3, "share": 0.5, "bad_2": pytest.approx(1 / 3)}  # 2.0 is not over 2
-    assert found["given_sky"] == {"pixels": 2, "share": pytest.approx(1 / 3)}
-
-
-def test_an_error_of_exactly_the_threshold_is_not_bad():
-    found = disparity(np.array([[11.0]]), np.array([[10.0]]), np.array([[True]]))
-    assert found["bad_1"] == 0
-    assert found["bad_0.5"] == 1
-
-
-def test_an_estimate_that_knows_nothing_is_all_bad_and_has_no_error():
-    found = disparity(np.full((2, 2), NAN), np.ones((2, 2)), np.ones((2, 2), bool))
-    assert found["bad_2"] == 1
-    assert found["density"] == found["values"] == 0
-    assert np.isnan([found["rmse"], found["bad_2_known"], found["given_occluded"]["share"]]).all()
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(1, 29))
-def test_added_frames_count_as_one_large_frame(seed, cut):
-    rng = np.random.default_rng(seed)
-    truth = rng.uniform(1, 100, (30, 4))
-    estimate = np.where(rng.random((30, 4)) < 0.3, NAN, truth + rng.normal(0, 1.5, (30, 4)))
-    both, one = rng.random((30, 4)) < 0.7, rng.random((30, 4)) < 0.5
-    whole = measures.disparity_counts(estimate, truth, both, one)
-    total: dict[str, float] = {}
-    for rows in (slice(0, cut), slice(cut, 30)):
-        total = measures.added(total, measures.disparity_counts(*(a[rows] for a in (estimate, truth, both, one))))
-    assert total == pytest.approx(whole)
 
 
 def test_height_errors_by_hand():

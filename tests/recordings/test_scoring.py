@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import ros2, scoring
 from recordings.errors import LogError
+from recordings.score_table import format_score
 from recordings.simulator import Simulation, log
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
 
@@ -103,6 +105,10 @@ def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
     assert (found.frames, found.compared, found.missing, found.unmatched) == (2, 2, {}, {})
     assert found.disparity["pixels"] == sum((frame.seen == 255).sum() for frame in frames)
     assert found.disparity["bad_0.5"] == found.disparity["rmse"] == 0
+    counts = {name: region["pixels"] for name, region in found.disparity["whole_image"].items()}
+    assert counts["nonocc"] == found.disparity["pixels"]
+    assert counts["occluded"] == sum((frame.seen == 128).sum() for frame in frames)
+    assert counts["all"] == counts["nonocc"] + counts["occluded"]
     for ring in ("0-4 m", "4-8 m", "0-8 m"):
         assert found.elevation[ring]["raw"]["rmse"] == 0
         assert found.elevation[ring]["completeness"] == found.elevation[ring]["raw"]["within_5cm"] == 1
@@ -131,6 +137,16 @@ def test_disparity_errors_are_told_apart_from_missing_disparity(tmp_path, truth,
     assert found["bad_0.5"] == found["bad_0.5_known"] == 1
     assert found["bad_1_known"] == 0
     assert (found["rmse"], found["mae"]) == pytest.approx((0.75, 0.75), abs=1e-5)
+
+
+def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth, frames):
+    widths = [
+        math.ceil(np.nanmax(log.true_disparity(SMALL, 0, frame).pixels) / 16) * 16 for frame in frames
+    ]  # fmt: skip
+    found = scored(tmp_path, truth, frames).disparity["cropped_image"]
+    assert found["leftmost_columns_cropped"] == sorted(set(widths))
+    kept = [(frame.seen == 255)[:, width:].sum() for frame, width in zip(frames, widths, strict=True)]
+    assert found["nonocc"]["pixels"] == sum(kept)
 
 
 def test_a_raised_map_is_biased_and_level(tmp_path, truth, frames):
@@ -225,7 +241,7 @@ def test_disparities_where_one_camera_sees_are_told(tmp_path, truth, frames):
     assert bold["given_occluded"] == {"pixels": np.sum(seen == 128), "share": share, "bad_2": 1}
     assert guess(1.5)["given_occluded"]["bad_2"] == 0
     painted = scored(tmp_path, truth, frames, disparity=lambda pixels: np.nan_to_num(pixels, nan=9.0)).disparity
-    assert painted["given_sky"] == {"pixels": np.sum(seen == 0), "share": np.mean(seen == 0)}
+    assert painted["given_without_truth"] == {"pixels": np.sum(seen == 0), "share": np.mean(seen == 0)}
 
 
 def test_leaving_out_a_bad_frame_scores_as_saying_unknown(tmp_path, truth, frames):
@@ -248,7 +264,7 @@ def test_a_tilt_that_cannot_be_scored_says_why(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, only=scoring.RESULTS)
     assert found.tilt is None
     assert found.untilted == {"the result has no /tf from 'level' at their stamps": 2}
-    assert "not scored in 2 frames: the result has no /tf from 'level'" in scoring.format_score(found)
+    assert "not scored in 2 frames: the result has no /tf from 'level'" in format_score(found)
     other = scored(tmp_path, truth, frames, camera="mast_camera")
     assert other.untilted == {"the truth has no mount of 'mast_camera' on 'base_link'": 2}
     partly = scored(tmp_path, truth, frames, skipped=(0,))
@@ -274,7 +290,7 @@ def test_results_at_stamps_without_truth_are_reported_and_never_compared(tmp_pat
     found = scored(tmp_path, truth, frames, shift={1: 1})
     assert (found.frames, found.compared) == (2, 1)
     assert found.unmatched == dict.fromkeys(scoring.RESULTS, 1)
-    assert "/nav/disparity: 1 messages at stamps without truth" in scoring.format_score(found)
+    assert "/nav/disparity: 1 messages at stamps without truth" in format_score(found)
     with pytest.raises(LogError, match=r"no result of .* has the stamp of a true frame"):
         scored(tmp_path, truth, frames, shift={0: 1, 1: 1})
 
@@ -291,7 +307,7 @@ def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
 
 def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, skipped=(1,), elevation=lambda layer: layer + np.float32(0.02))
-    table = scoring.format_score(found)
+    table = format_score(found)
     assert "1 of 2 have results" in table
     assert "/nav/disparity: 1 of 2 frames, scored as all unknown" in table
     assert [line.split()[4:9] for line in table.splitlines() if line.strip().startswith("0-4 m")] == [
@@ -303,5 +319,5 @@ def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
     assert read["per_frame"][0]["stamp"] == SMALL.stamp(0)
     empty = scored(tmp_path, truth, frames, elevation=lambda layer: np.full_like(layer, np.nan))
     assert json.loads(empty.to_json())["elevation"]["0-4 m"]["raw"]["rmse"] is None
-    assert "nan" not in scoring.format_score(empty)
-    assert " 0.00% |      -      -      -      -            -" in scoring.format_score(empty)
+    assert "nan" not in format_score(empty)
+    assert " 0.00% |      -      -      -      -            -" in format_score(empty)

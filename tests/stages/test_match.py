@@ -76,6 +76,23 @@ def test_a_negative_range_finds_points_beyond_infinity(slope):
     assert np.median(np.abs(pixels + truth[:, ::-1])[known]) < 0.12
 
 
+def test_what_lies_beyond_the_farthest_of_interest_is_neither_searched_nor_made_up(slope):
+    frame, truth = slope
+    match = Match(disparities=48, farthest=1.5)  # 20 px: fx * baseline is 30 px m
+    coarse = np.where(np.arange(320) >= truth, truth, np.nan).astype(np.float32)
+    prior = Disparity(0, coarse, np.ones(truth.shape, np.uint8), np.ones(truth.shape, np.float32))
+    whole, near = (Match(disparities=48)(frame, prior).pixels, match(frame, prior).pixels)
+    visible = np.arange(320) >= truth + 2
+    assert np.nanmin(near) >= 20
+    assert np.isnan(near[visible & (truth < 17)]).all()
+    within = visible & (truth > 22)
+    assert np.isfinite(near[within]).mean() > 0.95
+    assert np.nanmedian(np.abs(near - whole)[within]) < 0.02
+    # A camera whose principal points differ sees the same depth at another disparity.
+    moved = replace(frame, camera=replace(frame.camera, cx_right=frame.camera.cx + 5))
+    assert 15 <= np.nanmin(match(moved).pixels) < 20
+
+
 def test_sixteen_bits_and_colour_match_like_eight_bits_and_gray(slope):
     frame, truth = slope
     deep = frame_of(frame.left.astype(np.uint16) * 9 + 700, frame.right.astype(np.uint16) * 9 + 700)
@@ -203,6 +220,8 @@ def test_frames_that_cannot_be_matched_are_refused(slope):
         Match()(frame_of(image, image))
     with pytest.raises(ValueError, match="320 px wide"):
         Match(minimum=400)(frame)
+    with pytest.raises(ValueError, match=r"farthest = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"):
+        Match(disparities=48, farthest=0.5)(frame)
     small = Disparity(0, truth[:50], np.ones((50, 320), np.uint8), np.ones((50, 320), np.float32))
     with pytest.raises(ValueError, match=r"prior has shape \(50, 320\)"):
         Match()(frame, small)

@@ -1,0 +1,75 @@
+"""The survey: stages that want to see frames of the whole log before the run are shown some, and then stay fixed.
+
+So a result depends on no order of frames, and on no part of the log that a run is restricted to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from flow.feeder import Event, Feeder
+from flow.graph import Graph, Node
+from flow.ledger import Absent, Ledger
+
+EXCERPTS = 9
+
+
+Excerpts = Callable[[int, set[str]], Iterable[Iterable[Event]]]
+
+
+def surveyed(graph: Graph, excerpts: Excerpts) -> tuple[Graph, dict[str, str]]:
+    """The graph with its surveying stages fixed, and what each found (stream -> sentence).
+
+    A stage surveys if its `surveys` is true; its `survey` takes what `__call__` takes, of several frames each, and
+    returns the stage to run and a sentence. `excerpts(count, streams)` gives that many stretches of the log, spread
+    over all of it; the first whole frame of each is taken.
+    """
+    nodes, findings = list(graph.nodes), dict[str, str]()
+    if not any(_surveys(node) for node in nodes):
+        return graph, findings
+    needed = _upstream(nodes)
+    samples = _samples(replace(graph, nodes=tuple(node for node in nodes if node.name in needed)), excerpts)
+    for place, node in enumerate(nodes):
+        if node.aligns or node.name not in needed:
+            continue
+        if _surveys(node):
+            given = {port: [sample[stream] for sample in samples] for port, stream in node.inputs.items()}
+            actor, findings[node.name] = node.actor.survey(**given)
+            nodes[place] = node = replace(node, actor=actor)
+        _advance(node, samples)
+    return replace(graph, nodes=tuple(nodes)), findings
+
+
+def _surveys(node: Node) -> bool:
+    return bool(getattr(node.actor, "surveys", False))
+
+
+def _upstream(nodes: Sequence[Node]) -> set[str]:
+    """The surveying nodes and all that they depend on."""
+    needed = {node.name for node in nodes if _surveys(node)}
+    for node in reversed(nodes):  # nodes stand after their inputs
+        if node.name in needed:
+            needed.update(node.inputs.values())
+    return needed
+
+
+def _samples(graph: Graph, excerpts: Excerpts) -> list[dict[str, Any]]:
+    """The streams that no stage makes, of the first whole frame of each excerpt."""
+    samples = dict[int, dict[str, Any]]()
+    for events in excerpts(EXCERPTS, graph.source_streams):
+        for frame in Feeder(graph, Ledger()).frames(events):
+            if not any(isinstance(value, Absent) for value in frame.values.values()):
+                samples[frame.stamp] = frame.values
+                break
+    return [samples[stamp] for stamp in sorted(samples)]
+
+
+def _advance(node: Node, samples: list[dict[str, Any]]) -> None:
+    """Add the output of a stage to the samples; one that it fails on is no sample any more."""
+    for sample in list(samples):
+        try:
+            sample[node.name] = node.actor(**{port: sample[stream] for port, stream in node.inputs.items()})
+        except Exception:  # the run will meet it again, and enter it in its ledger
+            samples.remove(sample)

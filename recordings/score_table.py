@@ -1,0 +1,114 @@
+"""The score of a run as a table for a terminal."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from recordings.measures import share
+from recordings.scoring import HIGH_ROCK, NEAR, Score
+from recordings.stereo_measures import CROP_STEP, REGIONS, THRESHOLDS
+
+
+def format_score(found: Score) -> str:
+    """The score as a table for a terminal, at most 100 columns wide."""
+    parts = [_frame_lines(found)]
+    if found.disparity is not None:
+        parts.append(_disparity_lines(found.disparity))
+    if found.elevation is not None:
+        parts.append(_elevation_lines(found.elevation, found.unseen))
+    if found.navigation is not None:
+        parts.append(_navigation_lines(found.navigation, found.rocks))
+    parts.append(_tilt_lines(found))
+    return "\n\n".join("\n".join(lines) for lines in parts if lines)
+
+
+def _frame_lines(found: Score) -> list[str]:
+    lines = [f"frames       {found.compared} of {found.frames} have results"]
+    for topic, stamps in found.missing.items():
+        lines.append(f"missing      {topic}: {len(stamps)} of {found.frames} frames, scored as all unknown")
+    for topic, count in found.unmatched.items():
+        lines.append(f"unmatched    {topic}: {count} messages at stamps without truth, not scored")
+    return lines
+
+
+def _disparity_lines(d: dict[str, Any]) -> list[str]:
+    hidden, beyond = d["given_occluded"], d["given_without_truth"]
+    occluded = f"{_percent(hidden['share']):>7} of all values, {_percent(hidden['bad_2'])} of these off by over 2 px"
+    crops = d["cropped_image"]["leftmost_columns_cropped"]
+    columns = f"{crops[0]}" if len(crops) == 1 else f"{crops[0]} to {crops[-1]}"
+    limits = "".join(f"{f'bad-{limit:g}':>8}" for limit in THRESHOLDS)
+    return [
+        "disparity    bad-T: share off by over T px, or unknown; mean and RMS error in px, of the known",
+        f"               whole image       pixels    known |{limits} |    mean     RMS",
+        *(_region_line(name, d["whole_image"][name]) for name in REGIONS),
+        _known_line("nonocc", d["whole_image"]["nonocc"]),
+        f"               without the leftmost {columns} columns (its disparity range, rounded up to {CROP_STEP})",
+        *(_region_line(name, d["cropped_image"][name]) for name in REGIONS),
+        "             values given where stereo cannot measure",
+        f"               only one camera sees  {occluded}",
+        f"               no true value         {_percent(beyond['share']):>7} of all values (sky, or not known)",
+    ]
+
+
+def _region_line(name: str, m: dict[str, float]) -> str:
+    bad = "".join(f"{_percent(m[f'bad_{limit:g}']):>8}" for limit in THRESHOLDS)
+    errors = "".join(f"{_number(m[key], 3):>8}" for key in ("mae", "rmse"))
+    return f"               {name:<12} {m['pixels']:11.0f} {_percent(m['density']):>8} |{bad} |{errors}"
+
+
+def _known_line(name: str, m: dict[str, float]) -> str:
+    bad = "".join(f"{_percent(m[f'bad_{limit:g}_known']):>8}" for limit in THRESHOLDS)
+    return f"               {f'{name}, of the known':<33} |{bad} |"
+
+
+def _elevation_lines(rings: dict[str, Any], unseen: float) -> list[str]:
+    lines = [
+        "elevation    in cells that both cameras see, by distance from base_link; errors of the known in cm",
+        "               distance      cells    known |   RMSE    MAE   bias   NMAD  within 5 cm",
+    ]
+    levelled = ["               the same with the best plane of each frame's errors removed"]
+    for kind, title in (("raw", []), ("levelled", levelled)):
+        lines += title
+        for name, ring in rings.items():
+            h = ring[kind]
+            errors = "".join(f"{_number(100 * h[key], 2):>7}" for key in ("rmse", "mae", "bias", "nmad"))
+            known, close = _percent(share(h["cells"], ring["seen"])), _percent(h["within_5cm"])
+            lines.append(f"               {name:<8} {ring['seen']:10d} {known:>8} |{errors} {close:>12}")
+    return [*lines, f"             {_percent(unseen)} of all elevations given lie in cells that not both cameras see"]
+
+
+def _navigation_lines(n: dict[str, Any], rocks: dict[str, float] | None) -> list[str]:
+    unseen, high = n["free_unseen"], f"{HIGH_ROCK:g} m or higher"
+    told = f"not both cameras see ({unseen['cells']:.0f} cells, {unseen['hazards']:.0f} of them true hazards)"
+    lines = [
+        f"navigation   in the {n['cells']:.0f} cells within {NEAR:g} m that both cameras see",
+        f"               {_percent(n['recall']):>7} of true hazard cells found",
+        f"               {_percent(n['false_safe']):>7} of true hazard cells called free",
+        f"               {_percent(n['false_alarm']):>7} of truly free cells called hazard",
+        f"               {_percent(n['unknown']):>7} of all cells left unknown",
+        f"             of the {n['free']:.0f} cells called free anywhere on the map",
+        f"               {_percent(n['free_on_rock']):>7} lie on a rock {high}",
+        f"               {_percent(n['free_hazard']):>7} are true hazards, by rock or slope",
+        f"               {_percent(unseen['share']):>7} lie where {told}",
+    ]
+    if rocks is not None:
+        counts = f"{rocks['found']:.0f} of {rocks['seen']:.0f} ({_percent(rocks['recall'])})"
+        lines.append(f"             rocks {high} seen within {NEAR:g} m: {counts} found")
+    return lines
+
+
+def _tilt_lines(found: Score) -> list[str]:
+    lines = [f"tilt         not scored in {count} frames: {why}" for why, count in found.untilted.items()]
+    if (t := found.tilt) is not None:
+        mean, worst = (math.degrees(t[name]) for name in ("mean", "max"))
+        lines = [f"tilt         mean error {mean:.3f} deg, largest {worst:.3f} deg, in {t['frames']} frames", *lines]
+    return lines
+
+
+def _percent(value: float) -> str:
+    return "-" if math.isnan(value) else f"{100 * value:.2f}%"
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"  # never -0.00

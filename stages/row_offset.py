@@ -1,0 +1,200 @@
+"""The row offset that a calibration leaves between two rectified images, measured from what both of them show.
+
+ORB features of the fine scales are paired, Lucas-Kanade tracking places each pair to a fraction of a pixel, and a
+smooth function of the place in the image is fitted to the rows by which they differ. It has the terms that a small turn
+of a camera causes: pitch moves rows by 1 and y^2, roll by x, yaw by xy; a focal length that is off by y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+
+import cv2
+import numpy as np
+
+from stages.data import Array
+
+FEATURES = 4000  # per image
+ALIKE = 64  # largest Hamming distance of a pair, of 256 bits
+DISTINCT = 0.8  # largest ratio of the distance to that of the next best (Lowe, 2004)
+REACH = 48.0  # px, largest offset that is looked for
+SPREAD = 6.0  # px, by how much the offset may differ from its most common value
+WINDOW = 15  # px, side of the tracked patch
+RETURN = 0.2  # px, how near to its start a patch tracked there and back must come
+LEAST_FEATURES = 50
+LEAST_SHARE = 0.5  # of the pairs, near the most common offset: else they are chance
+CLEAR = 0.25  # px, largest error, anywhere in the image, of a fit that counts
+DEPENDENT = 3.0  # how much larger errors are, held against exact truth, than if tracked patches erred independently
+NEGLIGIBLE = 0.06  # px, root mean square; exactly aligned images measure up to 0.05 px
+ROUNDS = 20  # of reweighting
+TUKEY = 4.685  # standard deviations, beyond which an outlier has no weight
+TERMS = (5, 3, 1)  # of the models tried, richest first: full; shift, x and y; shift
+
+
+@dataclass(frozen=True)
+class RowOffset:
+    """How many rows a point lies lower in the left image than in the right one.
+
+    terms: weights, px, of 1, x, y, xy, y^2, where x and y are the place in the right image from its centre, in widths
+    and heights; features: pairs that agree on it; error: its largest standard deviation in the image, px.
+    """
+
+    terms: tuple[float, ...]
+    features: int
+    error: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether correcting it is worth an interpolation: more than negligible, and than its error allows."""
+        typical = float(np.sqrt(np.mean(np.square(self._over_the_image))))
+        return typical > max(NEGLIGIBLE, self.error / 2)
+
+    @property
+    def largest(self) -> float:
+        """Largest magnitude in the image, px."""
+        return float(np.abs(self._over_the_image).max())
+
+    @property
+    def _over_the_image(self) -> Array:
+        return _grid_columns(len(self.terms)) @ np.array(self.terms)  # type: ignore[no-any-return]
+
+
+def offset_field(terms: Sequence[float], width: int, height: int) -> Array:
+    """The offset at every pixel, (H, W) float32, px."""
+    x = (np.arange(width, dtype=np.float32) - (width - 1) / 2) / width
+    y = (np.arange(height, dtype=np.float32)[:, None] - (height - 1) / 2) / height
+    field = np.zeros((height, width), np.float32)
+    for term, column in zip(terms, (np.ones_like(x), x, y, x * y, y * y), strict=False):
+        field += term * column
+    return field
+
+
+def moved_down(image: Array, terms: tuple[float, ...]) -> Array:
+    """An image (H, W) or (H, W, 3) moved down by the offset, bicubic, so that a shift by part of a row blurs least."""
+    maps = _moving_maps(image.shape[1], image.shape[0], terms)
+    moved: Array = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return moved
+
+
+@lru_cache(maxsize=4)
+def _moving_maps(width: int, height: int, terms: tuple[float, ...]) -> tuple[Array, Array]:
+    """Where each pixel of the moved image comes from, in cv2.remap's fixed point."""
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    maps = cv2.convertMaps(x, y - offset_field(terms, width, height), cv2.CV_16SC2)
+    return maps[0], maps[1]
+
+
+def measure(pairs: Sequence[tuple[Array, Array]]) -> RowOffset | None:
+    """The row offset that all pairs of images, (H, W) uint8, left and right, have in common; None where they show none.
+
+    The richest model is taken that the features determine to `CLEAR` everywhere in the image. Tracking draws fractions
+    of a pixel towards one half, by up to 0.03 px; so what remains after a first correction is measured once more.
+    """
+    seen = [(left, right, *_alike(*_paired_features(left, right))) for left, right in pairs]
+    fits = (_fit([_offsets(*view) for view in seen], count) for count in TERMS)
+    first = next((fit for fit in fits if fit is not None and fit.error <= CLEAR), None)
+    if first is None:
+        return None
+    corrected = [(left, moved_down(right, first.terms), *features) for left, right, *features in seen]
+    rest = _fit([_offsets(*view) for view in corrected], len(first.terms))
+    return None if rest is None else replace(rest, terms=tuple(np.add(first.terms, rest.terms).tolist()))
+
+
+def _fit(found: Sequence[tuple[Array, Array]], count: int) -> RowOffset | None:
+    """The model of so many terms that fits the found offsets; None where too few agree on it."""
+    if sum(len(rows) for _, rows in found) < LEAST_FEATURES:
+        return None
+    place, rows = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    terms, error, agreeing = _robust_fit(_columns(place, count), rows)
+    return RowOffset(tuple(terms.tolist()), agreeing, error) if agreeing >= LEAST_FEATURES else None
+
+
+def _alike(here: Array, there: Array) -> tuple[Array, Array]:
+    """The paired features (N, 2) whose row offset is near to the most common one; none where that is chance."""
+    rows = here[:, 1] - there[:, 1]
+    near = np.abs(rows - _most_common(rows)) <= SPREAD if len(rows) else np.zeros(0, bool)
+    if np.count_nonzero(near) < max(LEAST_FEATURES, LEAST_SHARE * len(rows)):
+        near[:] = False
+    return here[near], there[near]
+
+
+def _offsets(left: Array, right: Array, here: Array, there: Array) -> tuple[Array, Array]:
+    """Where features are in the right image (N, 2), from its centre in its sizes, and their row offsets (N,)."""
+    if not len(here):
+        return np.empty((0, 2)), np.empty(0)
+    found, good = _tracked(left, right, here, there)
+    back, well = _tracked(right, left, found, here)
+    kept = good & well & (np.abs(back - here).max(axis=1) < RETURN)
+    height, width = left.shape
+    # In the corrected image the feature lies on the left image's row.
+    place = np.stack([found[kept, 0], here[kept, 1]], axis=1)
+    centre, size = np.array([width - 1, height - 1]) / 2, np.array([width, height])
+    return (place - centre) / size, (here[kept, 1] - found[kept, 1]).astype(np.float64)
+
+
+def _paired_features(left: Array, right: Array) -> tuple[Array, Array]:
+    """Features of both images that are each other's clearly best partner, (N, 2) float32 px each."""
+    # Coarse scales place a feature within a pixel or two only.
+    detector = cv2.ORB.create(FEATURES, scaleFactor=1.5, nlevels=3, fastThreshold=5)
+    (points, codes), (partners, partner_codes) = (detector.detectAndCompute(image, None) for image in (left, right))
+    none = np.empty((0, 2), np.float32)
+    if len(points) < 2 or len(partners) < 2:
+        return none, none
+    pairs = [
+        best
+        for best, second in cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(codes, partner_codes, 2)
+        if best.distance <= ALIKE and best.distance < DISTINCT * second.distance
+    ]
+    here = np.array([points[pair.queryIdx].pt for pair in pairs], np.float32).reshape(-1, 2)
+    there = np.array([partners[pair.trainIdx].pt for pair in pairs], np.float32).reshape(-1, 2)
+    within = np.abs(here[:, 1] - there[:, 1]) <= REACH
+    return here[within], there[within]
+
+
+def _tracked(image: Array, other: Array, points: Array, guesses: Array) -> tuple[Array, Array]:
+    """Where patches of `image` about `points` are in `other`, near `guesses`; and whether they were found."""
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.005)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        image, other, points, guesses.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, criteria=stop,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    return found, status[:, 0] == 1
+
+
+def _most_common(values: Array) -> float:
+    """The middle of the interval of 2 `SPREAD` / 3 that holds most values."""
+    ordered = np.sort(values)
+    last = np.searchsorted(ordered, ordered + 2 * SPREAD / 3, side="right")
+    first = int(np.argmax(last - np.arange(len(ordered))))
+    return float(np.median(ordered[first : last[first]]))
+
+
+def _columns(place: Array, count: int) -> Array:
+    """The first `count` terms at places (N, 2), from the centre in sizes of the image: (N, count)."""
+    x, y = place[:, 0], place[:, 1]
+    return np.stack([np.ones_like(x), x, y, x * y, y * y][:count], axis=1)
+
+
+@cache
+def _grid_columns(count: int) -> Array:
+    """The terms on a grid over the image, its borders included."""
+    grid = np.linspace(-0.5, 0.5, 17)
+    return _columns(np.stack(np.meshgrid(grid, grid), axis=2).reshape(-1, 2), count)
+
+
+def _robust_fit(columns: Array, values: Array) -> tuple[Array, float, int]:
+    """Terms by reweighted least squares (Tukey's biweight), their largest standard deviation in the image, and how many
+    values take part."""
+    weights = np.ones(len(values))
+    for _ in range(ROUNDS):
+        roots = np.sqrt(weights)
+        terms = np.linalg.lstsq(columns * roots[:, None], values * roots, rcond=None)[0]
+        residuals = values - columns @ terms
+        scale = max(1.4826 * float(np.median(np.abs(residuals))), 0.02)
+        weights = np.square(np.clip(1 - np.square(residuals / (TUKEY * scale)), 0, None))
+    covariance = np.linalg.pinv(columns.T @ (columns * weights[:, None])) * scale**2
+    grid = _grid_columns(columns.shape[1])
+    error = DEPENDENT * float(np.sqrt(np.einsum("ij,jk,ik->i", grid, covariance, grid).max()))
+    return terms, error, int(np.count_nonzero(weights))

@@ -1,0 +1,108 @@
+"""The survey: a stage sees frames of the whole log before the run, whatever part is run and in whatever order."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import pytest
+
+from flow.pipeline import load
+from flow.run import Stop, run
+from tests.flow.toys import Couple, Keep, Log, Number
+
+PIPELINE = """
+source: {use: tests.flow.toys.Source}
+streams:
+  pair:     {use: flow.align.pair, left: left, right: right, slop: 1 ns}
+  scaled:   {use: tests.flow.toys.Scale, couple: pair, factor: 2, bad: [%s]}
+  centred:  {use: tests.flow.test_survey.Centre, couple: scaled}
+  doubled:  {use: tests.flow.toys.Add, a: centred, b: pair}
+sinks:
+  - {use: tests.flow.toys.Keep}
+"""
+
+
+@dataclass(frozen=True)
+class Centre:
+    """Takes off the mean of the frames of its survey."""
+
+    mean: float | None = None
+
+    @property
+    def surveys(self) -> bool:
+        return self.mean is None
+
+    def survey(self, couple: Sequence[Couple]) -> tuple["Centre", str]:
+        values = [one.value for one in couple]
+        mean = sum(values) / len(values) if values else 0.0
+        return replace(self, mean=mean), f"mean {mean:g} of {len(values)}"
+
+    def __call__(self, couple: Couple) -> Couple:
+        return Couple(couple.stamp, couple.value - self.mean)
+
+
+class Excerpted(Log):
+    """A log whose excerpts are the given stretches of its events."""
+
+    def __init__(self, events, stretches):
+        super().__init__(events)
+        self.stretches, self.asked = stretches, []
+
+    def excerpts(self, count, streams):
+        self.asked.append((count, streams))
+        for first, last in self.stretches:
+            yield iter(self.events[first:last])
+
+
+def both(stamp, value):
+    return [(stamp, "left", Number(stamp, value)), (stamp, "right", Number(stamp, 0.0))]
+
+
+def result_of(tmp_path, log, bad="", stop=None):
+    file = tmp_path / "p.yaml"
+    file.write_text(PIPELINE % bad)
+    graph, sink = load(str(file)), Keep()
+    graph = replace(graph, sinks=(("Keep", sink),))
+    return run(graph, log, {"Keep": tmp_path / "out.txt"}, stop=stop), sink
+
+
+EVENTS = [event for stamp in range(1, 9) for event in both(stamp, float(stamp))]
+
+
+def test_the_first_whole_frame_of_each_excerpt_is_shown_through_the_stages_before(tmp_path):
+    log = Excerpted(EVENTS, [(0, 6), (7, 12), (12, 16)])  # the second begins between a left and its right
+    summary, sink = result_of(tmp_path, log)
+    assert summary["surveys"] == {"centred": f"mean {2 * (1 + 5 + 7) / 3:g} of 3"}
+    assert sink.values("centred")[1] == pytest.approx(2 - 26 / 3)
+    assert (summary["verdict"], summary["frames_in"]) == ("COMPLETE", 8)
+    assert log.asked == [(9, {"left", "right"})]
+
+
+def test_a_frame_that_a_stage_fails_on_is_no_sample(tmp_path):
+    summary, _ = result_of(tmp_path, Excerpted(EVENTS, [(0, 6), (12, 16)]), bad="7")
+    assert summary["surveys"] == {"centred": "mean 2 of 1"}
+    assert summary["drops"] == {"failed": 1}
+
+
+def test_an_excerpt_that_breaks_down_costs_only_itself(tmp_path):
+    log = Excerpted(EVENTS, [(0, 6)])
+
+    def broken():
+        yield EVENTS[0]
+        raise OSError("gone")
+
+    log.excerpts = lambda count, streams: [broken(), iter(EVENTS[:4])]
+    summary, _ = result_of(tmp_path, log)
+    assert summary["surveys"] == {"centred": "mean 2 of 1"}
+
+
+def test_a_survey_without_frames_says_so_and_the_run_goes_on(tmp_path):
+    summary, _ = result_of(tmp_path, Excerpted(EVENTS, []))
+    assert summary["surveys"] == {"centred": "mean 0 of 0"}
+    assert summary["frames_out"] == 8
+
+
+def test_an_interrupt_during_the_survey_ends_the_run_properly(tmp_path):
+    stop = Stop()
+    stop.request()
+    summary, sink = result_of(tmp_path, Excerpted(EVENTS, [(0, 6)]), stop=stop)
+    assert (summary["interrupted"], summary["frames_in"], sink.summary["verdict"]) == (True, 0, "INCOMPLETE")

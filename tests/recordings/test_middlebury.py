@@ -1,0 +1,242 @@
+"""Middlebury scenes become logs that run, and whose truth is the scene's own, to the pixel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from recordings import McapSource, ros2, scoring
+from recordings.errors import LogError
+from recordings.image_log import FIRST_STAMP
+from recordings.middlebury import import_scene, logs_of, read_pfm, read_scene
+from recordings.score_table import format_score
+from stages.data import Disparity, StereoFrame
+from tests.recordings import middlebury_scene as scenes
+from tests.recordings.middlebury_scene import write_pfm, write_scene
+from tests.recordings.sample_log import data_folder
+
+
+def imported(folder: Path) -> tuple[Path, str]:
+    log = folder.with_suffix(".mcap")
+    return log, import_scene(folder, log)
+
+
+def frame_of(log: Path) -> StereoFrame:
+    with McapSource().open(log) as opened:
+        assert set(opened.missing) == {"odometry"}
+        images = {stream: item for _, stream, item in opened if stream in ("left", "right")}
+    return images["left"].pair_with(images["right"])
+
+
+def truth_of(log: Path) -> dict[str, object]:
+    return {topic: message for topic, _, message in ros2.iter_messages(log) if topic.startswith("/truth")}
+
+
+def result(log: Path, frame: StereoFrame, pixels: np.ndarray) -> Path:
+    """A result log that holds these disparities and nothing else."""
+    nothing = np.zeros(pixels.shape, np.uint8)
+    disparity = Disparity(frame.stamp, pixels, nothing, nothing.astype(np.float32), camera=frame.camera)
+    out = log.with_name(f"{log.stem}-nav.mcap")
+    with ros2.Ros2Writer(out) as writer:
+        writer.write("/nav/disparity", ros2.disparity_image(disparity), frame.stamp)
+    return out
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_pfm_is_read_in_either_byte_order_from_its_last_row_up(tmp_path: Path, order: str) -> None:
+    pixels = np.arange(6, dtype=np.float32).reshape(2, 3) + np.float32(0.25)
+    pixels[0, 2], pixels[1, 0] = np.inf, -np.inf
+    path = write_pfm(tmp_path / "d.pfm", pixels, order)
+    rows = np.frombuffer(path.read_bytes()[-24:], f"{order}f4")
+    assert rows[1] == 4.25  # the file begins with the lower row
+    expected = np.array([[0.25, 1.25, np.nan], [np.nan, 4.25, 5.25]], np.float32)
+    np.testing.assert_array_equal(read_pfm(path), expected)
+
+
+def test_images_and_camera_of_a_scene_come_back_from_its_log(tmp_path: Path) -> None:
+    log, said = imported(write_scene(tmp_path / "Box"))
+    assert said.endswith("run it with --set matched.disparities=32")
+    frame = frame_of(log)
+    for pixels, expected in zip((frame.left, frame.right), scenes.images(), strict=True):
+        np.testing.assert_array_equal(pixels, expected)
+    camera = frame.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.cx_right) == (100, 100, 40.25, 30, 52.75)
+    assert (camera.baseline, camera.width, camera.height, camera.raw) == (0.25, 96, 64, None)
+
+
+def test_a_plane_comes_out_at_its_distance(tmp_path: Path) -> None:
+    """Z = baseline * f / (d + doffs): 0.25 m * 100 px / (5 + 12.5) px, the box at 25 / 25.5."""
+    log, _ = imported(write_scene(tmp_path / "Box"))
+    message, camera = truth_of(log)["/truth/disparity"], frame_of(log).camera
+    distance = message.f * message.t / ros2.read_disparity(message)
+    assert distance[50, 20] == pytest.approx(25 / 17.5)
+    assert distance[20, 50] == pytest.approx(25 / 25.5)
+    ours = camera.fx * camera.baseline / (scenes.true_disparity() + camera.cx_right - camera.cx)
+    np.testing.assert_allclose(distance[np.isfinite(distance)], ours[np.isfinite(distance)], rtol=1e-6)
+
+
+def test_the_truth_is_the_scenes_own(tmp_path: Path) -> None:
+    log, said = imported(write_scene(tmp_path / "Box"))
+    assert "with true disparities and occlusions" in said
+    truth = truth_of(log)
+    true = scenes.true_disparity()
+    expected = np.where(np.isfinite(true), true + np.float32(scenes.DOFFS), np.nan)
+    disparity, mask = truth["/truth/disparity"], truth["/truth/occlusion"]
+    np.testing.assert_array_equal(ros2.read_disparity(disparity), expected)
+    assert (disparity.min_disparity, disparity.max_disparity) == (0, scenes.NDISP)
+    np.testing.assert_array_equal(np.asarray(mask.data).reshape(scenes.HEIGHT, scenes.WIDTH), scenes.occlusion())
+    assert set(np.unique(mask.data)) == {0, 128, 255}
+    assert ros2.stamp_of(disparity.header) == ros2.stamp_of(mask.header) == frame_of(log).stamp == FIRST_STAMP
+    with log.open("rb") as stream:
+        about = next(record for record in make_reader(stream).iter_metadata() if record.name == "middlebury")
+    assert (about.metadata["scene"], about.metadata["ndisp"]) == ("Box", "21")
+
+
+def test_the_score_counts_known_errors_exactly(tmp_path: Path) -> None:
+    log, _ = imported(write_scene(tmp_path / "Box"))
+    frame, true, mask = frame_of(log), scenes.true_disparity(), scenes.occlusion()
+    pixels = np.where(np.isfinite(true), true, np.float32(9))
+    pixels[20:24] += 0.75
+    pixels[30:33] -= 3
+    pixels[40:45, 30:] = np.nan
+    pixels[50] += 5
+    found = scoring.score(result(log, frame, pixels), log)
+    known, error = np.isfinite(pixels), np.abs(np.nan_to_num(pixels) - true)
+    right = np.arange(scenes.WIDTH) >= 32  # 21 rounded up to 16
+    for image, place in (("whole_image", np.ones(scenes.WIDTH, bool)), ("cropped_image", right)):
+        regions = {"nonocc": mask == 255, "all": np.isfinite(true), "occluded": mask == 128}
+        for name, region in regions.items():
+            counted, told = region & place, found.disparity[image][name]
+            assert told["pixels"] == counted.sum()
+            assert told["density"] == (counted & known).sum() / counted.sum()
+            for limit in (0.5, 1, 2, 4):
+                bad = counted & (~known | (error > limit))
+                assert told[f"bad_{limit:g}"] == bad.sum() / counted.sum()
+            errors = error[counted & known].astype(np.float64)
+            assert told["rmse"] == pytest.approx(math.sqrt(np.mean(errors**2)))
+            assert told["mae"] == pytest.approx(np.mean(errors))
+    assert found.disparity["given_without_truth"]["pixels"] == np.isinf(true).sum()
+    assert found.missing == found.unmatched == {}  # maps, of which there is no truth, are not asked for
+    table = format_score(found)
+    assert "without the leftmost 32 columns" in table
+    counted = mask == 255
+    bad = 100 * np.sum(counted & (~known | (error > 2))) / counted.sum()
+    assert f"{bad:.2f}%" in next(line for line in table.splitlines() if "nonocc" in line)
+
+
+def test_full_and_half_size_names_and_the_other_name_of_the_truth(tmp_path: Path) -> None:
+    source = tmp_path / "trainingH"
+    for name in ("Vintage", "Adirondack-perfect"):
+        scene = write_scene(source / name)
+        (scene / "disp0GT.pfm").rename(scene / "disp0.pfm")
+    (source / "notes").mkdir()
+    made = logs_of(source, tmp_path / "logs")
+    assert [folder.name for folder, _ in made] == ["Adirondack-perfect", "Vintage"]
+    assert [log for _, log in made] == [tmp_path / "logs" / f"{n}.mcap" for n in ("Adirondack-perfect", "Vintage")]
+    np.testing.assert_array_equal(np.isfinite(read_scene(made[0][0]).truth), np.isfinite(scenes.true_disparity()))
+
+
+@pytest.mark.parametrize(
+    ("without", "topics", "said"),
+    [
+        (("disp0GT.pfm",), set(), "without truth (no disp0GT.pfm or disp0.pfm)"),
+        (("disp0GT.pfm", "mask0nocc.png"), set(), "without truth"),
+        (("mask0nocc.png",), {"/truth/disparity"}, "not which are occluded (no mask0nocc.png)"),
+    ],
+)
+def test_a_scene_without_truth_says_so(tmp_path: Path, without: tuple[str, ...], topics: set[str], said: str) -> None:
+    log, sentence = imported(write_scene(tmp_path / "Box", without))
+    assert set(truth_of(log)) == topics
+    assert said in sentence
+    frame = frame_of(log)
+    run = result(log, frame, np.full(frame.left.shape[:2], 5, np.float32))
+    if topics:
+        found = scoring.score(run, log).disparity["whole_image"]
+        assert found["all"]["bad_4"] == pytest.approx(900 / (96 * 64 - 28))
+        assert found["nonocc"]["pixels"] == 0
+    else:
+        with pytest.raises(LogError, match="has no ground truth"):
+            scoring.score(run, log)
+
+
+def spoil(name: str, content: bytes):
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+def calibrate(**changes: object):
+    return lambda folder: (folder / "calib.txt").write_text(scenes.calibration(**changes))
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda folder: (folder / "im1.png").unlink(), r"cannot read .*im1\.png: No such file"),
+        (lambda folder: (folder / "calib.txt").unlink(), r"cannot read .*calib\.txt: No such file"),
+        (spoil("im0.png", b"no picture"), r"im0\.png is not an image"),
+        (spoil("calib.txt", b"\xff\xfe\x00"), r"calib\.txt is not a text file"),
+        (calibrate(doffs=None), r"calib\.txt lacks 'doffs'"),
+        (calibrate(ndisp="many"), r"calib\.txt has a line that is no number or matrix .*many"),
+        (calibrate(cam0="[1 2]"), r"calib\.txt has a line that is no number or matrix"),
+        (calibrate(cam0="[-9 0 1; 0 9 1; 0 0 1]"), r"calib\.txt: fx is -9"),
+        (calibrate(baseline=0), r"calib\.txt: baseline is 0"),
+        (calibrate(ndisp="nan"), r"calib\.txt: ndisp is nan"),
+        (calibrate(width=48), r"im0\.png is 96x64, the calibration or the first pair is 48x64"),
+        (spoil("disp0GT.pfm", b"P6\n3 2\n255\n" + bytes(18)), r"disp0GT\.pfm is not a PFM file of one channel"),
+        (spoil("disp0GT.pfm", b""), r"disp0GT\.pfm is not a PFM file"),
+        (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(23)), r"has 23 bytes of pixels where 3x2 take 24"),
+        (spoil("disp0GT.pfm", b"Pf\n3 2\n1e\n" + bytes(24)), r"its scale 1e is not a number"),
+        (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(24)), r"disp0GT\.pfm is 3x2, the images are 96x64"),
+        (spoil("mask0nocc.png", b""), r"mask0nocc\.png is not an image"),
+        (
+            lambda folder: cv2.imwrite(str(folder / "mask0nocc.png"), np.full((64, 96), 77, np.uint8)),
+            r"mask0nocc\.png has a pixel of 77; an occlusion mask has 255, 128 and 0 only",
+        ),
+        (
+            lambda folder: cv2.imwrite(str(folder / "mask0nocc.png"), np.zeros((32, 48), np.uint8)),
+            r"mask0nocc\.png is 48x32, the images are 96x64",
+        ),
+    ],
+)
+def test_a_damaged_scene_is_refused_and_leaves_no_log(tmp_path: Path, damage, said: str) -> None:
+    folder = write_scene(tmp_path / "Box")
+    damage(folder)
+    with pytest.raises(LogError, match=said) as caught:
+        imported(folder)
+    assert "\n" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["Box"]
+
+
+def test_what_holds_no_scene_and_what_cannot_hold_the_logs_is_refused(tmp_path: Path) -> None:
+    write_scene(tmp_path / "training" / "Box")
+    for out in (tmp_path / "out.mcap", tmp_path / "training" / "Box" / "im0.png"):
+        with pytest.raises(LogError, match="give a folder for the logs instead of"):
+            logs_of(tmp_path / "training", out)
+    with pytest.raises(LogError, match="holds no scene"):
+        logs_of(tmp_path, tmp_path / "logs")
+    with pytest.raises(LogError, match="is not a folder"):
+        logs_of(tmp_path / "nowhere", tmp_path / "logs")
+
+
+def test_real_scenes_score_from_their_logs_as_from_their_files(tmp_path: Path) -> None:
+    from stages.match import Match
+    from tests.bench.stereo_scores import errors, load_scene
+
+    for folder in sorted(data_folder("middlebury-q").iterdir()):
+        log = tmp_path / f"{folder.name}.mcap"
+        import_scene(folder, log)
+        frame, truth, mask, levels = load_scene(folder)
+        matched = Match(disparities=levels)(frame_of(log)).pixels
+        np.testing.assert_array_equal(matched, Match(disparities=levels)(frame).pixels)
+        direct = errors(matched, truth, mask, levels)
+        found = scoring.score(result(log, replace(frame, stamp=FIRST_STAMP), matched), log).disparity["cropped_image"]
+        bad = [100 * found[region][f"bad_{t}"] for region in ("nonocc", "all") for t in ("0.5", "1", "2")]
+        # doffs, added on the way in float32, moves an error by 1e-5 px and hardly a pixel over a threshold.
+        np.testing.assert_allclose(bad, direct[:6], atol=0.005)
+        assert (found["all"]["rmse"], 100 * found["all"]["density"]) == pytest.approx(tuple(direct[6:]), rel=1e-5)
+        assert found["leftmost_columns_cropped"] == [levels]
