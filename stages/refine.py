@@ -25,7 +25,10 @@ from stages.stage import Stage, parameter
 
 F32 = np.float32
 LEAST_WEIGHT = 0.05  # of a match that was let in, however low its confidence
-TRUST = Trust((0.8, 0.9, 0.99), (0.5, 0.8, 0.98), 0.5, 0.6, 0.5, 0.4)
+# Measured with the pipeline `rover`: means of eight Middlebury scenes and four simulated frames.
+TRUST = Trust(
+    agreed=(0.87, 0.975, 0.998), alone=(0.62, 0.87, 0.96), replaced=0.82, plane=0.78, mismatch=0.6, occlusion=0.58
+)
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,12 @@ from stages.kernels.halves import pairs
 from stages.kernels.holes import MISMATCH
 
 F32 = np.float32
+OWN = 0.5, 0.75, 1.0
 UNKNOWN, MEASURED, PLANE, FILLED = (int(code) for code in Source)
 
 
 class Trust(NamedTuple):
-    """Share of pixels right within 1 px, by origin. Of a match: at 0, at half and at full confidence of its own."""
+    """Share of pixels right within 1 px, by origin. Of a match: at the confidences `OWN` of its own."""
 
     agreed: tuple[float, float, float]  # a match that a plane agrees with
     alone: tuple[float, float, float]  # a match that none does
@@ -39,7 +40,7 @@ def name_sources(
     source, worth = np.empty(matches.shape, np.uint8), np.empty(matches.shape, np.float32)
     middle = len(matches) // 2
     steps = np.arange(256) / 255
-    tables = np.array([np.interp(steps, (0, 0.5, 1), values) for values in (trust.agreed, trust.alone)], np.float32)
+    tables = np.array([np.interp(steps, OWN, values) for values in (trust.agreed, trust.alone)], np.float32)
     others = np.array(trust[2:], np.float32)
 
     def name(rows: slice) -> None:

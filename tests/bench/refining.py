@@ -29,7 +29,7 @@ from tests.bench.stereo_scores import errors, load_scene
 DISPARITIES = 192
 SUPERPIXELS = 4000
 SAMPLE = 200  # superpixels that scikit-image fits a plane to; the time of all is extrapolated
-ROUNDS = 9
+ROUNDS = 5
 # Errors of the released code, measured with it: bad-0.5, 1, 2 of pixels that both cameras see, of all; RMS of all.
 RELEASED = {
     "Adirondack": (17.85, 9.07, 5.53, 21.69, 13.15, 9.52, 5.32),
