@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from stages.data import Array, Disparity, StereoFrame
@@ -24,6 +25,7 @@ from stages.kernels.surfaces import surfaces
 from stages.stage import Stage, parameter
 
 F32 = np.float32
+EVEN = 6  # gray levels within a census window that a camera's noise and compression make of one
 LEAST_WEIGHT = 0.05  # of a match that was let in, however low its confidence
 # Measured with the pipeline `rover`: means of eight Middlebury scenes and four simulated frames.
 TRUST = Trust(
@@ -43,6 +45,10 @@ class Refine(Stage):
     """
 
     trusted: float = parameter(0.5, "confidence below which a match is treated as unknown", low=0, high=1)
+    burnt_out: int = parameter(
+        250, "level of a colour from which an even patch is burnt out, a sky say, and matches nothing; 256 = never",
+        low=0, high=256,
+    )  # fmt: skip
     median: int = parameter(5, "side of the median filter over matches, 0 = none", unit="px", choices=(0, 3, 5))
     near: float = parameter(
         1.0, "distance up to which a match moves to its median or plane; a farther one stays", unit="px", low=0
@@ -67,7 +73,7 @@ class Refine(Stage):
         64.0, "background: how much wider than the step between its ends a filled hole may be", unit="px", low=0
     )
     fill_margin: float = parameter(
-        16.0, "background: how far beyond the last match, at the border or towards the sky", unit="px", low=0
+        16.0, "how far beyond the last match, at the image's border or towards the sky", unit="px", low=0
     )
     fill_support: float = parameter(0.001, "wls: least smoothed confidence that fills a pixel", low=0)
     wls_lambda: float = parameter(8000.0, "wls: strength of the smoothing", low=0)
@@ -86,6 +92,7 @@ class Refine(Stage):
         matches = trusted_matches(
             disparity.pixels, disparity.source, disparity.confidence, self.trusted, self.threads
         )
+        matches[_burnt_out(image, guide, self.burnt_out)] = np.nan
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
         labels, count = superpixels(image, self._count(matches.size), self.compactness, threads=self.threads)
         pixels, agreed = self._with_planes(pixels, disparity, image, labels, count)
@@ -104,12 +111,13 @@ class Refine(Stage):
     ) -> tuple[Array, Array]:
         """Matches near their planes drawn towards them, holes filled from them, (H, W) float32; where, (H, W) uint8."""
         weights, seed = disparity.confidence, disparity.stamp
+        margin = self.fill_margin if self.plane_fill else -1.0
         planes = fit_planes(
             pixels, labels, count, self.inlier_distance, self.hypotheses, seed, weights, self.threads
         )
         accepted = self._accepted(planes, self.valid_share)
         pixels, agreed = pull_to_planes(
-            pixels, accepted, labels, self.near, self.plane_weight, self.plane_fill, self.threads
+            pixels, accepted, labels, self.near, self.plane_weight, margin, self.threads
         )
         if not self.surface:
             return pixels, agreed
@@ -125,7 +133,7 @@ class Refine(Stage):
         )  # fmt: skip
         accepted = (self._accepted(planes, self.valid_share / 2, 2) * [0.5, 0.5, 1])[group]
         pixels, again = pull_to_planes(
-            pixels, accepted, labels, self.near / 2, self.plane_weight, self.plane_fill, self.threads
+            pixels, accepted, labels, self.near / 2, self.plane_weight, margin, self.threads
         )
         return pixels, agreed | again
 
@@ -156,3 +164,15 @@ class Refine(Stage):
             pixels, guide, self.bilateral_radius, self.bilateral_space, self.bilateral_gray, self.bilateral_disparity,
             self.threads,
         )  # fmt: skip
+
+
+def _burnt_out(image: Array, guide: Array, level: int) -> Array:
+    """Where the image is even and a colour of it burnt out, (H, W) bool: what is matched there is noise."""
+    brightest = image
+    if image.ndim == 3:
+        red, green, blue = cv2.split(image)
+        brightest = cv2.max(cv2.max(red, green), blue)
+    burnt: Array = brightest >= level
+    if burnt.any():
+        burnt &= cv2.morphologyEx(guide, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) <= EVEN
+    return burnt

@@ -54,19 +54,20 @@ def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Arr
 
 
 def pull_to_planes(
-    pixels: Array, coefficients: Array, labels: Array, near: float, weight: float, fill: bool, threads: int = 1
+    pixels: Array, coefficients: Array, labels: Array, near: float, weight: float, margin: float, threads: int = 1
 ) -> tuple[Array, Array]:
     """Disparities near their segment's plane drawn towards it, and holes filled from it.
 
     pixels: (H, W) float32, px, NaN = hole; coefficients: (n, 3) float64 of the accepted planes, NaN for the others;
-    labels: (H, W) int32; near: px up to which a disparity is drawn; weight: of the plane; fill: whether holes are
-    filled, as long as the plane stays within the range of all pixels: beyond, it is extrapolated too far. A hole whose
+    labels: (H, W) int32; near: px up to which a disparity is drawn; weight: of the plane; margin: px up to which a hole
+    at the image's border, with one end only, is filled, negative: no hole is. A plane fills as long as it stays within
+    the range of all pixels: beyond, it is extrapolated too far. A hole whose
     left end lies behind its right one is hidden by that: it takes no plane nearer to that than to the other.
     Returns the disparities (H, W) float32 and where a plane had its say, (H, W) bool.
     """
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     middle = pixels.shape[0] // 2
-    limits = F32(near), F32(weight), fill
+    limits = F32(near), F32(weight), margin
     with pairs(threads) as both:
         ranges = both(lambda: _range(pixels[:middle]), lambda: _range(pixels[middle:]))
         low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
@@ -107,11 +108,11 @@ def _range(pixels):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _pull(pixels, coefficients, labels, near, weight, fill, low, high, first, end, pulled, spoke):  # type: ignore[no-untyped-def]
+def _pull(pixels, coefficients, labels, near, weight, margin, low, high, first, end, pulled, spoke):  # type: ignore[no-untyped-def]
     width = pixels.shape[1]
     for y in range(first, end):
         row = pixels[y]
-        before, after, ceiling = F32(np.nan), -1, high  # the known pixel before x, where the one after is, see above
+        last, after, ceiling = -1, -1, high  # where the known pixels before and after x are; see above
         for x in range(width):
             a, b, c = coefficients[labels[y, x]]
             d, plane = row[x], F32(a * x + b * y + c)
@@ -119,22 +120,23 @@ def _pull(pixels, coefficients, labels, near, weight, fill, low, high, first, en
                 close = abs(plane - d) <= near
                 pulled[y, x] = d + weight * (plane - d) if close else d
                 spoke[y, x] = close
-                before = d
+                last = x
                 continue
             if after < x:
                 after = x + 1
                 while after < width and row[after] != row[after]:
                     after += 1
-                behind = row[after] if after < width else F32(np.nan)
-                apart = behind - before >= APART
-                ceiling = F32(0.5) * (before + behind) if apart else high
-            sane = fill and plane >= low and plane <= ceiling
+                hidden = last >= 0 and after < width and row[after] - row[last] >= APART
+                ceiling = F32(0.5) * (row[last] + row[after]) if hidden else high
+            inside = last >= 0 and after < width
+            carried = inside or (last >= 0 and x - last <= margin) or (after < width and after - x <= margin)
+            sane = margin >= 0 and carried and plane >= low and plane <= ceiling
             pulled[y, x] = plane if sane else d
             spoke[y, x] = sane
 
 
 def pull_to_planes_reference(
-    pixels: Array, coefficients: Array, labels: Array, near: float, weight: float, fill: bool
+    pixels: Array, coefficients: Array, labels: Array, near: float, weight: float, margin: float
 ) -> tuple[Array, Array]:
     """`pull_to_planes` in plain numpy."""
     y, x = np.mgrid[: pixels.shape[0], : pixels.shape[1]]
@@ -144,7 +146,7 @@ def pull_to_planes_reference(
     with np.errstate(invalid="ignore"):
         close = np.abs(plane - pixels) <= F32(near)
     pulled = np.where(close, pixels + F32(weight) * (plane - pixels), pixels)
-    if not fill or hole.all():
+    if margin < 0 or hole.all():
         return pulled, close
     column = np.arange(pixels.shape[1])
     left = np.maximum.accumulate(np.where(hole, -1, column), axis=1)
@@ -153,5 +155,8 @@ def pull_to_planes_reference(
     before, after = np.take_along_axis(padded, left + 1, axis=1), np.take_along_axis(padded, right + 1, axis=1)
     apart = after - before >= F32(APART)
     ceiling = np.where(apart, F32(0.5) * (before + after), np.nanmax(pixels))
-    sane = hole & (plane >= np.nanmin(pixels)) & (plane <= ceiling)
+    inside = (left >= 0) & (right < len(column))
+    from_left, from_right = column - np.where(left >= 0, left, -np.inf), right - column
+    to_end = np.minimum(from_left, np.where(right < len(column), from_right, np.inf))
+    sane = hole & (inside | (to_end <= margin)) & (plane >= np.nanmin(pixels)) & (plane <= ceiling)
     return np.where(sane, plane, pulled), close | sane

@@ -1,0 +1,234 @@
+"""What each step of refinement is worth: `make study` prints the errors after every step, and of variants.
+
+On real scenes with truth where ROVERFLOW_DATA names the data, and on simulated rover frames, where errors within 3 px
+of a depth edge count separately. Pictures of image, disparity, source and confidence go to the folder named on the
+command line.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from recordings.simulator import Simulation
+from stages import CrossCheck, Disparity, Enlarge, Match, Rectify, Refine, Source, StereoCamera, StereoFrame
+from stages.data import Array
+from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stereo_part
+from tests.bench.stereo_scores import errors
+
+PLAIN: dict[str, Any] = {
+    "median": 0, "plane_weight": 0, "plane_fill": False, "surface": 0, "bilateral_radius": 0, "trusted": 0,
+}  # fmt: skip
+SEEDS = (1, 2, 3)
+ABUNDANCES = (0.05, 0.15, 0.10)
+EDGE_STEP, EDGE_REACH = 2.0, 3  # px of disparity that make an edge of depth, px from it that count as near
+SOURCE_COLOURS = np.array([[40, 40, 40], [70, 160, 70], [70, 110, 210], [230, 150, 50]], np.uint8)  # as Source
+
+
+class Case(NamedTuple):
+    """A frame, rectified, with its truth: (H, W) float32 disparity, NaN = unknown, and mask, 255 = seen by both."""
+
+    name: str
+    frame: StereoFrame
+    truth: Array
+    mask: Array
+    disparities: int
+
+
+Chain = Callable[[dict[str, Any], Case], Disparity]
+
+
+def simulated(width: int = 640, height: int = 480) -> list[Case]:
+    """Frames of simulated traverses, of the ground within the search range."""
+    cases = []
+    for seed, abundance in zip(SEEDS, ABUNDANCES, strict=True):
+        simulation = Simulation(frames=4, width=width, height=height, seed=seed, abundance=abundance)
+        camera, found = simulation.camera, simulation.frame(1)
+        truth = (camera.fx * camera.baseline / found.depth).astype(np.float32)
+        disparities = 192 * width // 1280
+        truth[(truth <= 0) | (truth > disparities - 2)] = np.nan
+        cases.append(Case(f"seed {seed}", StereoFrame(seed, *found.images, camera), truth, found.seen, disparities))
+    return cases
+
+
+def real(folder: Path) -> Iterator[Case]:
+    """The scenes of a folder, rectified as a pipeline does."""
+    rectify = Rectify()
+    for name, frame, truth, mask, disparities in scenes(folder):
+        yield Case(name, rectify(frame), truth, mask, disparities)
+
+
+def refined(stream: str, **parameters: Any) -> Chain:
+    """What Refine with these parameters makes of a stream of `rover`."""
+    return lambda streams, case: Refine(**parameters)(case.frame, streams[stream])
+
+
+def alone(streams: dict[str, Any], case: Case) -> Disparity:
+    """Matching as `Match` does it alone, its holes filled along the rows."""
+    return Refine(**PLAIN)(case.frame, Match(disparities=case.disparities)(case.frame))
+
+
+def unchecked(streams: dict[str, Any], case: Case) -> Disparity:
+    """`rover` without the view from the right."""
+    return Refine()(case.frame, streams["matched"])
+
+
+def unguided(streams: dict[str, Any], case: Case) -> Disparity:
+    """`rover` without the coarse match."""
+    matched = Match(disparities=case.disparities)(case.frame)
+    return Refine()(case.frame, CrossCheck()(matched, streams["backward"]))
+
+
+def guided_unrefined(streams: dict[str, Any], case: Case) -> Disparity:
+    """`rover` with the coarse match as it is, not refined, for a guide."""
+    guide = Enlarge()(case.frame, streams["coarse"])
+    matched = Match(disparities=case.disparities, paths=4)(case.frame, guide)
+    return Refine()(case.frame, CrossCheck()(matched, streams["backward"]))
+
+
+def twice(streams: dict[str, Any], case: Case) -> Disparity:
+    """`rover`, and its result as the guide of a second match at full size."""
+    matched = Match(disparities=case.disparities, paths=4)(case.frame, streams["disparity"])
+    return Refine()(case.frame, CrossCheck()(matched, streams["backward"]))
+
+
+def eight(streams: dict[str, Any], case: Case) -> Disparity:
+    """`rover` with 8 paths at full size."""
+    matched = Match(disparities=case.disparities)(case.frame, streams["prior"])
+    return Refine()(case.frame, CrossCheck()(matched, streams["backward"]))
+
+
+def whole(pipeline: str) -> Chain:
+    """A pipeline as it ships, on the frame as given."""
+    return lambda _, case: stereo_part(pipeline, case.frame, case.disparities, entry="rectified")["disparity"]
+
+
+STEPS: dict[str, Chain] = {
+    "matching alone, rows filled": alone,
+    "coarse to fine, rows filled": refined("matched", **PLAIN),
+    "+ view from the right": refined("checked", **PLAIN),
+    "+ doubtful matches dropped": refined("checked", **{**PLAIN, "trusted": 0.5}),
+    "+ median": refined("checked", **{**PLAIN, "trusted": 0.5, "median": 5}),
+    "+ planes of superpixels": refined("checked", surface=0, plane_fill=False, bilateral_radius=0),
+    "+ they fill holes": refined("checked", surface=0, bilateral_radius=0),
+    "+ planes of surfaces": refined("checked", bilateral_radius=0),
+    "+ bilateral filter: rover": lambda streams, _: streams["disparity"],
+}
+VARIANTS: dict[str, Chain] = {
+    "rover without the coarse match": unguided,
+    "rover, coarse match not refined": guided_unrefined,
+    "rover without the right view": unchecked,
+    "rover without planes": refined("checked", plane_weight=0, plane_fill=False, surface=0),
+    "rover without surfaces": refined("checked", surface=0),
+    "rover, planes replace matches": refined("checked", near=1000, plane_weight=1, inlier_share=0),
+    "rover, holes filled by WLS": refined("checked", fill="wls"),
+    "rover, bilateral radius 6": refined("checked", bilateral_radius=6, bilateral_space=4.0),
+    "rover, 64 planes tried": refined("checked", hypotheses=64),
+    "rover with 8 paths": eight,
+    "rover, matched once more": twice,
+    "fast": whole("fast"),
+    "paper": whole("paper"),
+}
+
+
+def near_edges(truth: Array) -> Array:
+    """Where a step of the true disparity is near, (H, W) bool."""
+    window = np.ones((2 * EDGE_REACH + 1,) * 2, np.uint8)
+    known = np.nan_to_num(truth)
+    step: Array = cv2.dilate(known, np.ones((3, 3))) - cv2.erode(known, np.ones((3, 3))) > EDGE_STEP
+    near: Array = cv2.dilate(step.astype(np.uint8), window) > 0
+    return near
+
+
+def measure(cases: list[Case]) -> dict[str, Array]:
+    """Mean errors of every step and variant, and bad-1 near edges and away from them, of what both cameras see."""
+    rows: dict[str, list[Array]] = {}
+    for case in cases:
+        streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
+        edges = near_edges(case.truth)
+        for name, chain in {**STEPS, **VARIANTS}.items():
+            pixels = chain(streams, case).pixels
+            parts = []
+            for area in (edges, ~edges):
+                truth = np.where(area & (case.mask == 255), case.truth, np.float32(np.nan))
+                parts.append(errors(pixels, truth, case.mask, case.disparities)[1])
+            rows.setdefault(name, []).append(
+                np.append(errors(pixels, case.truth, case.mask, case.disparities), parts)
+            )
+    return {name: np.mean(values, axis=0) for name, values in rows.items()}
+
+
+def print_table(title: str, means: dict[str, Array], released: Array | None) -> None:
+    """Print the errors in percent (RMS in px); with `released` also their ratios to the released code's."""
+    print(f"\n{title:32} {COLUMNS}  known %  bad-1 at edges  elsewhere")
+    for name, mean in means.items():
+        print(f"{name:32}{row('', mean[:8])[12:]} {mean[8]:15.2f} {mean[9]:10.2f}")
+    if released is not None:
+        print(f"\n{'over the released code':32} {COLUMNS}")
+        for name, mean in means.items():
+            print(f"{name:32}{row('', mean[:7] / released, 3)[12:]}")
+
+
+def pictures(folder: Path, name: str, frame: StereoFrame, disparity: Disparity) -> None:
+    """Write image, disparity, source and confidence side by side, and disparity edges on the image, as JPEG."""
+    folder.mkdir(parents=True, exist_ok=True)
+    image = frame.left if frame.left.ndim == 3 else np.dstack([frame.left] * 3)
+    known = np.isfinite(disparity.pixels)
+    top = np.percentile(disparity.pixels[known], 99.5) if known.any() else 1.0
+    scaled = np.where(known, np.clip(disparity.pixels / top, 0, 1) * 255, 0).astype(np.uint8)
+    coloured = cv2.cvtColor(cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+    coloured[~known] = 0
+    trust = np.dstack([(disparity.confidence * 255).astype(np.uint8)] * 3)
+    overlay = image.copy()
+    step = cv2.dilate(scaled, np.ones((3, 3))).astype(int) - cv2.erode(scaled, np.ones((3, 3)))
+    overlay[known & (step > 255 * EDGE_STEP / top)] = (255, 40, 40)
+    rows = [np.hstack([image, coloured]), np.hstack([SOURCE_COLOURS[disparity.source], trust])]
+    for suffix, picture in (("", np.vstack(rows)), ("-edges", overlay)):
+        file = folder / f"{name}{suffix}.jpg"
+        cv2.imwrite(str(file), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+def devon(folder: Path) -> Iterator[tuple[str, StereoFrame]]:
+    """The Devon Island pairs of a folder of real data, with the camera of its FORMAT.md."""
+    camera = StereoCamera(
+        fx=968.999694824, fy=968.999694824, cx=635.139038086, cy=463.537109375, baseline=0.239977,
+        width=1280, height=960,
+    )  # fmt: skip
+    for left in sorted((folder / "devon").glob("*left*.png")):
+        right = left.with_name(left.name.replace("left", "right"))
+        pair = [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in (left, right)]
+        yield left.stem.replace("left", "").strip("_-"), StereoFrame(1, *pair, camera)
+
+
+def main(folder: Path) -> None:
+    """Print the tables and write the pictures."""
+    cv2.setNumThreads(1)
+    data = Path(os.environ["ROVERFLOW_DATA"]) if "ROVERFLOW_DATA" in os.environ else None
+    if data is not None:
+        cases = list(real(data / "middlebury-q"))
+        released = np.mean([RELEASED[case.name] for case in cases], axis=0)
+        print_table("Middlebury scenes", measure(cases), released)
+        for name, frame in devon(data):
+            pictures(folder, name, frame, stereo_part("rover", frame, 192)["disparity"])
+    cases = simulated()
+    print_table("simulated frames", measure(cases), None)
+    for case in cases:
+        streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
+        pictures(folder, case.name.replace(" ", "-"), case.frame, streams["disparity"])
+    legend = ", ".join(_legend())
+    print(f"\npictures in {folder}: image, disparity; {legend}; confidence; edges of disparity on the image")
+
+
+def _legend() -> Iterator[str]:
+    for code, colour in zip(Source, ("black", "green", "blue", "orange"), strict=True):
+        yield f"{code.name.lower()} {colour}"
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("demo/study"))
