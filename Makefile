@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test check-all bench lint clean
+.PHONY: demo test check-all bench study lint clean
 
 demo: $(READY)
 	$(BIN)/roverflow demo --out demo
@@ -17,6 +17,9 @@ check-all: $(READY) lint
 
 bench: $(READY)
 	$(BIN)/python -m tests.bench
+
+study: $(READY)
+	$(BIN)/python -m tests.study demo/study
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -15,7 +15,7 @@ import numpy as np
 from stages.data import Array, Disparity, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.bilateral import joint_bilateral
-from stages.kernels.holes import OCCLUSION, fill_holes
+from stages.kernels.holes import OCCLUSION, Extent, extent, fill_holes
 from stages.kernels.planar import near_median, pull_to_planes, trusted_matches
 from stages.kernels.planes import Planes, fit_planes
 from stages.kernels.slic import superpixels
@@ -95,8 +95,10 @@ class Refine(Stage):
         matches[_burnt_out(image, guide, self.burnt_out)] = np.nan
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
         labels, count = superpixels(image, self._count(matches.size), self.compactness, threads=self.threads)
-        pixels, agreed = self._with_planes(pixels, disparity, image, labels, count)
-        filled, kinds = self._filled(pixels, disparity.confidence, guide)
+        weights = np.where(np.isnan(matches), F32(0), disparity.confidence)
+        within = extent(pixels)
+        pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
+        filled, kinds = self._filled(pixels, weights, within, guide)
         refined = self._bilateral(filled, guide)
         source, confidence = name_sources(
             matches, disparity.confidence, agreed, kinds, refined, self.inlier_distance, TRUST, self.threads
@@ -107,17 +109,16 @@ class Refine(Stage):
         return max(1, min(self.superpixels, pixels // self.smallest))
 
     def _with_planes(
-        self, pixels: Array, disparity: Disparity, image: Array, labels: Array, count: int
+        self, pixels: Array, weights: Array, within: Extent, image: Array, labels: Array, count: int, seed: int
     ) -> tuple[Array, Array]:
-        """Matches near their planes drawn towards them, holes filled from them, (H, W) float32; where, (H, W) uint8."""
-        weights, seed = disparity.confidence, disparity.stamp
+        """Matches near their planes drawn towards them, holes filled from them, (H, W) float32; where, (H, W) bool."""
         margin = self.fill_margin if self.plane_fill else -1.0
         planes = fit_planes(
             pixels, labels, count, self.inlier_distance, self.hypotheses, seed, weights, self.threads
         )
         accepted = self._accepted(planes, self.valid_share)
         pixels, agreed = pull_to_planes(
-            pixels, accepted, labels, self.near, self.plane_weight, margin, self.threads
+            pixels, accepted, labels, within, self.near, self.plane_weight, margin, self.threads
         )
         if not self.surface:
             return pixels, agreed
@@ -133,7 +134,7 @@ class Refine(Stage):
         )  # fmt: skip
         accepted = (self._accepted(planes, self.valid_share / 2, 2) * [0.5, 0.5, 1])[group]
         pixels, again = pull_to_planes(
-            pixels, accepted, labels, self.near / 2, self.plane_weight, margin, self.threads
+            pixels, accepted, labels, within, self.near / 2, self.plane_weight, margin, self.threads
         )
         return pixels, agreed | again
 
@@ -144,10 +145,10 @@ class Refine(Stage):
         supported = (planes.inlier_share >= self.inlier_share) & (planes.valid_share >= valid_share)
         return np.where((supported & (slope <= self.slope * spacing))[:, None], planes.coefficients, np.nan)
 
-    def _filled(self, pixels: Array, confidence: Array, guide: Array) -> tuple[Array, Array]:
+    def _filled(self, pixels: Array, confidence: Array, within: Extent, guide: Array) -> tuple[Array, Array]:
         """The remaining holes filled as far as evidence reaches, (H, W) float32, and their kinds of `holes`."""
         if self.fill == "background":
-            return fill_holes(pixels, self.fill_reach, self.fill_margin, self.threads)
+            return fill_holes(pixels, within, self.fill_reach, self.fill_margin, self.threads)
         hole = np.isnan(pixels)
         kinds = np.where(hole, np.uint8(OCCLUSION), np.uint8(0))
         if self.fill == "none":

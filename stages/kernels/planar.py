@@ -11,7 +11,7 @@ import numpy as np
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
 from stages.kernels.halves import pairs
-from stages.kernels.holes import APART
+from stages.kernels.holes import APART, Extent
 
 F32 = np.float32
 MEASURED = int(Source.MEASURED)
@@ -54,28 +54,26 @@ def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Arr
 
 
 def pull_to_planes(
-    pixels: Array, coefficients: Array, labels: Array, near: float, weight: float, margin: float, threads: int = 1
-) -> tuple[Array, Array]:
+    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: float,
+    threads: int = 1,
+) -> tuple[Array, Array]:  # fmt: skip
     """Disparities near their segment's plane drawn towards it, and holes filled from it.
 
     pixels: (H, W) float32, px, NaN = hole; coefficients: (n, 3) float64 of the accepted planes, NaN for the others;
-    labels: (H, W) int32; near: px up to which a disparity is drawn; weight: of the plane; margin: px up to which a hole
-    at the image's border, with one end only, is filled, negative: no hole is. A plane fills as long as it stays within
-    the range of all pixels: beyond, it is extrapolated too far. A hole whose
-    left end lies behind its right one is hidden by that: it takes no plane nearer to that than to the other.
-    Returns the disparities (H, W) float32 and where a plane had its say, (H, W) bool.
+    labels: (H, W) int32; within: how far the evidence reaches; near: px up to which a disparity is drawn; weight: of
+    the plane; margin: px beyond the evidence that are filled, negative: no hole is. A plane fills as long as it stays
+    within the range of all pixels: beyond, it is extrapolated too far. A hole whose left end lies behind its right one
+    is hidden by that: it takes no plane nearer to that than to the other. Returns the disparities (H, W) float32 and where a plane had its say, (H, W) bool.
     """
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     middle = pixels.shape[0] // 2
-    limits = F32(near), F32(weight), margin
+    given = pixels, coefficients, labels, within, F32(near), F32(weight), int(margin)
     with pairs(threads) as both:
         ranges = both(lambda: _range(pixels[:middle]), lambda: _range(pixels[middle:]))
         low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
         both(
-            lambda: _pull(pixels, coefficients, labels, *limits, low, high, 0, middle, pulled, spoke),
-            lambda: _pull(
-                pixels, coefficients, labels, *limits, low, high, middle, len(pixels), pulled, spoke
-            ),
+            lambda: _pull(*given, low, high, 0, middle, pulled, spoke),
+            lambda: _pull(*given, low, high, middle, len(pixels), pulled, spoke),
         )
     return pulled, spoke
 
@@ -108,7 +106,9 @@ def _range(pixels):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _pull(pixels, coefficients, labels, near, weight, margin, low, high, first, end, pulled, spoke):  # type: ignore[no-untyped-def]
+def _pull(  # type: ignore[no-untyped-def]
+    pixels, coefficients, labels, within, near, weight, margin, low, high, first, end, pulled, spoke
+):
     width = pixels.shape[1]
     for y in range(first, end):
         row = pixels[y]
@@ -128,15 +128,14 @@ def _pull(pixels, coefficients, labels, near, weight, margin, low, high, first, 
                     after += 1
                 hidden = last >= 0 and after < width and row[after] - row[last] >= APART
                 ceiling = F32(0.5) * (row[last] + row[after]) if hidden else high
-            inside = last >= 0 and after < width
-            carried = inside or (last >= 0 and x - last <= margin) or (after < width and after - x <= margin)
-            sane = margin >= 0 and carried and plane >= low and plane <= ceiling
+            reached = y >= within.top[x] - margin and x >= within.first[y] - margin and x <= within.last[y] + margin
+            sane = margin >= 0 and reached and plane >= low and plane <= ceiling
             pulled[y, x] = plane if sane else d
             spoke[y, x] = sane
 
 
 def pull_to_planes_reference(
-    pixels: Array, coefficients: Array, labels: Array, near: float, weight: float, margin: float
+    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: float
 ) -> tuple[Array, Array]:
     """`pull_to_planes` in plain numpy."""
     y, x = np.mgrid[: pixels.shape[0], : pixels.shape[1]]
@@ -155,8 +154,6 @@ def pull_to_planes_reference(
     before, after = np.take_along_axis(padded, left + 1, axis=1), np.take_along_axis(padded, right + 1, axis=1)
     apart = after - before >= F32(APART)
     ceiling = np.where(apart, F32(0.5) * (before + after), np.nanmax(pixels))
-    inside = (left >= 0) & (right < len(column))
-    from_left, from_right = column - np.where(left >= 0, left, -np.inf), right - column
-    to_end = np.minimum(from_left, np.where(right < len(column), from_right, np.inf))
-    sane = hole & (inside | (to_end <= margin)) & (plane >= np.nanmin(pixels)) & (plane <= ceiling)
+    reached = (y >= within.top - margin) & (x >= within.first[:, None] - margin) & (x <= within.last[:, None] + margin)
+    sane = hole & reached & (plane >= np.nanmin(pixels)) & (plane <= ceiling)
     return np.where(sane, plane, pulled), close | sane

@@ -253,3 +253,24 @@ def assign_reference(colour: Array, centres: Array, rows: int, cols: int, positi
             closer = inside & (distance < best)
             best[closer], labels[closer] = distance[closer], k[closer]
     return labels
+
+
+def connect_reference(labels: Array, smallest: int) -> tuple[Array, int]:
+    """`connect` by scipy's components, label after label: the numbers, (H, W) int32, and how many."""
+    from scipy import ndimage
+
+    height, width = labels.shape
+    component = np.zeros((height, width), np.int64)
+    for label in np.unique(labels):
+        found, _ = ndimage.label(labels == label)
+        component = np.where(found > 0, found + component.max(), component)
+    numbers, total = np.full((height, width), -1, np.int32), 0
+    for y, x in np.ndindex(height, width):
+        if numbers[y, x] >= 0:
+            continue
+        same = component == component[y, x]
+        if same.sum() < smallest and (y, x) != (0, 0):
+            numbers[same] = numbers[y, x - 1] if x > 0 else numbers[y - 1, x]
+        else:
+            numbers[same], total = total, total + 1
+    return numbers, total

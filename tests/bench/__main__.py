@@ -1,7 +1,8 @@
 """Everything `make bench` prints."""
 
-from tests.bench import matching, pipeline, terrain
+from tests.bench import matching, pipeline, refining, terrain
 
 matching.main()
+refining.main()
 pipeline.main()
 terrain.main()

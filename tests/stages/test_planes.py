@@ -45,6 +45,24 @@ def test_equals_the_plain_reference_with_the_same_draws(tiles):
     assert np.array_equal(ours.valid_share, plain.valid_share)
 
 
+def test_weights_count_in_the_least_squares_as_in_the_reference(tiles):
+    disparity, labels, _ = tiles
+    weights = np.random.default_rng(8).uniform(0.05, 1, SHAPE).astype(np.float32)
+    ours = fit_planes(disparity, labels, 6, hypotheses=16, weights=weights)
+    plain = fit_planes_reference(disparity, labels, 6, hypotheses=16, weights=weights)
+    images = [render_planes(planes.coefficients, labels) for planes in (ours, plain)]
+    assert images[0] == pytest.approx(images[1], abs=1e-4)
+    unweighted = render_planes(fit_planes(disparity, labels, 6, hypotheses=16).coefficients, labels)
+    assert np.abs(images[0] - unweighted).max() > 1e-3
+
+
+def test_two_threads_give_the_same_planes(tiles):
+    disparity, labels, _ = tiles
+    one, two = (fit_planes(disparity, labels, 6, threads=n) for n in (1, 2))
+    for ours, theirs in zip(one, two, strict=True):
+        assert np.array_equal(ours, theirs)
+
+
 def test_a_segment_is_fitted_alike_whatever_the_others_hold(tiles):
     disparity, labels, _ = tiles
     alone = np.where(labels == 4, disparity, np.float32(np.nan))

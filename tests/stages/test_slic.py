@@ -8,6 +8,7 @@ from scipy import ndimage
 from skimage import data, segmentation
 
 from stages.kernels import slic
+from stages.kernels.halves import in_turn
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +58,21 @@ def test_every_segment_is_one_connected_piece(photo):
     assert pieces(labels) == count
 
 
+def test_two_threads_give_the_same_labels(photo):
+    one, two = (slic.superpixels(photo, 300, threads=n) for n in (1, 2))
+    assert one[1] == two[1]
+    assert np.array_equal(one[0], two[0])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 30), st.integers(1, 30), st.integers(1, 4), st.integers(0, 40), st.integers(0, 2**31))
+def test_components_are_numbered_as_a_flood_fill_does(height, width, kinds, smallest, seed):
+    labels = np.random.default_rng(seed).integers(0, kinds, (height, width), dtype=np.int32)
+    expected, total = slic.connect_reference(labels, smallest)
+    assert slic.connect(labels, smallest) == total
+    assert np.array_equal(labels, expected)
+
+
 def test_an_edge_of_the_image_is_an_edge_of_segments():
     image = np.full((120, 160), 60, np.uint8)
     image[:, 83:] = 180
@@ -68,8 +84,7 @@ def test_assignment_is_the_nearest_of_nine_centres(photo):
     image = photo[:90, :131]
     colour, rows, cols = slic._colour_planes(image), 6, 9
     centres = slic._grid_centres(colour, rows, cols)
-    labels, sums = np.empty(image.shape[:2], np.int32), np.empty((rows * cols, 6))
-    slic._assign(colour, centres, rows, cols, np.float32(0.4), labels, sums)
+    labels, sums = slic._labels(colour, centres, (rows, cols), 0.4**0.5, in_turn)
     expected = slic.assign_reference(colour, centres, rows, cols, 0.4)
     assert (labels == expected).mean() > 0.999  # float32 may break a tie differently
     assert np.array_equal(sums[:, 5], np.bincount(labels.ravel(), minlength=rows * cols))

@@ -1,0 +1,52 @@
+"""Planes and matches brought together: equal to plain references, in one piece or two."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.kernels.holes import extent
+from stages.kernels.planar import near_median, pull_to_planes, pull_to_planes_reference, trusted_matches
+
+
+def scene(height, width, seed):
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform(2, 14, (height, width)).astype(np.float32)
+    pixels[rng.random((height, width)) < 0.5] = np.nan
+    labels = rng.integers(0, 4, (height, width), dtype=np.int32)
+    coefficients = rng.uniform([-0.1, -0.1, 3], [0.1, 0.1, 12], (4, 3))
+    coefficients[2] = np.nan
+    return pixels, coefficients, labels
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 20), st.integers(1, 30), st.sampled_from([-1.0, 0.0, 3.0]), st.integers(0, 2**31),
+       st.sampled_from([1, 2]))  # fmt: skip
+def test_planes_pull_and_fill_as_the_reference_does(height, width, margin, seed, threads):
+    pixels, coefficients, labels = scene(height, width, seed)
+    within = extent(pixels)
+    pulled, spoke = pull_to_planes(pixels, coefficients, labels, within, 2.0, 0.7, margin, threads)
+    expected, expected_spoke = pull_to_planes_reference(pixels, coefficients, labels, within, 2.0, 0.7, margin)
+    assert np.allclose(pulled, expected, atol=1e-5, equal_nan=True)
+    assert np.array_equal(spoke, expected_spoke)
+
+
+@pytest.mark.parametrize("height", [1, 2, 5, 24])
+@pytest.mark.parametrize("side", [3, 5])
+def test_the_median_of_two_halves_is_that_of_the_whole(height, side):
+    pixels, *_ = scene(height, 40, 3)
+    low = np.where(np.isnan(pixels), np.float32(-np.inf), pixels)
+    median = cv2.medianBlur(low, side)
+    expected = np.where(np.abs(median - pixels) <= 1.5, median, pixels)
+    for threads in (1, 2):
+        assert np.array_equal(near_median(pixels, side, 1.5, threads), expected, equal_nan=True)
+
+
+def test_only_measured_finite_and_trusted_pixels_are_matches():
+    pixels = np.array([[1, 2, np.inf, 4, np.nan], [1, 2, 3, 4, 5]], np.float32)
+    source = np.array([[1, 2, 1, 1, 1], [0, 1, 3, 1, 1]], np.uint8)
+    confidence = np.array([[0.9, 0.9, 0.9, 0.4, 0.9], [0.9, 0.5, 0.9, 0.9, 0.49]], np.float32)
+    kept = trusted_matches(pixels, source, confidence, 0.5)
+    nan = np.nan
+    assert np.array_equal(kept, np.array([[1, nan, nan, nan, nan], [nan, 2, nan, 4, nan]], np.float32), equal_nan=True)

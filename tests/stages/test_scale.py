@@ -1,0 +1,107 @@
+"""Coarse to fine and from the other side: geometry is kept, and nothing is invented on the way."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages import CrossCheck, Disparity, Enlarge, Halve, Match, Source, StereoCamera, StereoFrame, Swap
+from stages.kernels.contradiction import contradicted, contradicted_reference
+
+
+def slope_frame(height=97, width=131):
+    """A textured ground whose disparity is 8 + 0.1 y, its camera with different principal points, and the truth."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:height, :width]
+    waves = [(rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.2), rng.uniform(0, 6)) for _ in range(12)]
+    truth = 8 + 0.1 * y
+
+    def texture(u):
+        return sum(np.sin(a * u + b * y + c) for a, b, c in waves)
+
+    left, right = (np.clip(128 + 18 * texture(u), 0, 255).astype(np.uint8) for u in (x, x + truth))
+    camera = StereoCamera(200, 200, 60, 50, 0.2, width, height, 63)
+    return StereoFrame(7, left, right, camera), truth.astype(np.float32)
+
+
+def test_a_halved_frame_sees_the_same_depth():
+    frame, truth = slope_frame()
+    small = Halve()(frame)
+    assert small.left.shape == (49, 66)
+    disparity = Match(disparities=16, speckle_size=0)(small)
+    camera = small.camera
+    depth = camera.fx * camera.baseline / (disparity.pixels + camera.cx_right - camera.cx)
+    full = frame.camera
+    expected = full.fx * full.baseline / (truth[:96:2, :130:2] + 0.05 + full.cx_right - full.cx)
+    ratio = depth[:48, 16:65] / expected[:, 16:]
+    assert np.isfinite(ratio).mean() > 0.8
+    assert np.nanmedian(np.abs(ratio - 1)) < 0.02
+
+
+def test_enlarging_doubles_disparities_between_pixels_of_one_surface_only():
+    frame, truth = slope_frame()
+    y = np.arange(49)[:, None] * np.ones(66)
+    pixels = ((8 + 0.1 * (2 * y + 0.5)) / 2).astype(np.float32)
+    pixels[:, 40:] += 20
+    pixels[10:20, 10:20] = np.nan
+    source = np.where(np.isnan(pixels), Source.UNKNOWN, Source.PLANE).astype(np.uint8)
+    large = Enlarge()(frame, Disparity(7, pixels, source, np.full(pixels.shape, 0.7, np.float32)))
+    assert large.pixels.shape == truth.shape
+    known = np.isfinite(large.pixels)
+    assert not known[20:40, 20:40].any()
+    assert known.sum() == known.size - 400
+    far, near = np.s_[2:95, :80], np.s_[2:95, 80:]
+    assert np.nanmax(np.abs(large.pixels - truth)[far]) < 0.11
+    assert np.nanmax(np.abs(large.pixels - truth - 40)[near]) < 0.11
+    assert (large.source[known] == Source.PLANE).all()
+
+
+def test_swapping_twice_is_the_frame_itself_and_disparities_stay():
+    frame, truth = slope_frame()
+    swapped = Swap()(frame)
+    again = Swap()(swapped)
+    assert np.array_equal(again.left, frame.left)
+    assert vars(again.camera) == vars(frame.camera)
+    right = Match(disparities=32, speckle_size=0)(swapped).pixels[:, ::-1]  # of the right image's pixels
+    assert np.nanmedian(np.abs(right - truth)[:, :100]) < 0.1
+    camera = swapped.camera
+    assert camera.cx_right - camera.cx == pytest.approx(frame.camera.cx_right - frame.camera.cx)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 9), st.integers(1, 30), st.sampled_from([0.5, 1.0, 3.0]), st.integers(0, 2**31),
+       st.sampled_from([1, 2]))  # fmt: skip
+def test_contradictions_equal_the_reference(height, width, tolerance, seed, threads):
+    rng = np.random.default_rng(seed)
+    maps = rng.uniform(-3, 9, (2, height, width)).astype(np.float32)
+    maps[rng.random(maps.shape) < 0.2] = np.nan
+    assert np.array_equal(contradicted(*maps, tolerance, threads), contradicted_reference(*maps, tolerance))
+
+
+def test_what_the_right_image_sees_otherwise_is_unknown():
+    pixels = np.full((2, 40), 5, np.float32)
+    backward = np.full((2, 40), 5, np.float32)  # mirrored: left pixel x asks right pixel x - 5, at 39 - (x - 5)
+    backward[0, 39 - (20 - 5)] = 9
+    backward[1, 39 - (20 - 5)] = np.nan
+    given = Disparity(1, pixels, np.ones((2, 40), np.uint8), np.full((2, 40), 0.9, np.float32))
+    checked = CrossCheck()(given, Disparity(1, backward, given.source, given.confidence))
+    assert np.argwhere(np.isnan(checked.pixels)).tolist() == [[0, 20]]
+    assert (checked.source[0, 20], checked.confidence[0, 20]) == (Source.UNKNOWN, 0)
+
+
+def test_sizes_that_do_not_fit_are_refused():
+    frame, _ = slope_frame()
+    small = np.zeros((40, 66), np.float32)
+    wrong = Disparity(7, small, small.astype(np.uint8), small)
+    with pytest.raises(ValueError, match=r"Enlarge: .*\(40, 66\)"):
+        Enlarge()(frame, wrong)
+    with pytest.raises(ValueError, match=r"CrossCheck: .* at the same size"):
+        CrossCheck()(wrong, Disparity(7, small[:30], small[:30].astype(np.uint8), small[:30]))
+
+
+def test_what_the_prior_shows_nearer_than_the_range_is_unknown():
+    frame, truth = slope_frame()
+    prior = Disparity(7, truth, np.ones(truth.shape, np.uint8), np.ones(truth.shape, np.float32))
+    found = Match(disparities=13, speckle_size=0)(frame, prior)
+    assert np.isnan(found.pixels[truth > 15.5]).all()
+    assert np.isfinite(found.pixels[(truth < 11) & (np.arange(131) > 30)]).mean() > 0.9
