@@ -63,7 +63,8 @@ def pull_to_planes(
     labels: (H, W) int32; within: how far the evidence reaches; near: px up to which a disparity is drawn; weight: of
     the plane; margin: px beyond the evidence that are filled, negative: no hole is. A plane fills as long as it stays
     within the range of all pixels: beyond, it is extrapolated too far. A hole whose left end lies behind its right one
-    is hidden by that: it takes no plane nearer to that than to the other. Returns the disparities (H, W) float32 and where a plane had its say, (H, W) bool.
+    is hidden by that: it takes no plane nearer to that than to the other. Returns the disparities (H, W) float32 and
+    where a plane had its say, (H, W) bool.
     """
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     middle = pixels.shape[0] // 2
