@@ -341,8 +341,9 @@ def _import_middlebury(options: argparse.Namespace) -> int:
     from recordings.middlebury import import_scene, logs_of
 
     for folder, log in logs_of(options.source, options.out):
-        if log != options.out:
-            options.out.mkdir(exist_ok=True)
+        if log != options.out and not options.out.exists():
+            _check_outputs([options.out], [])
+            options.out.mkdir()
         _check_outputs([log], list(folder.iterdir()))
         _say(f"{log}: {import_scene(folder, log)}")
     return COMPLETE

@@ -89,6 +89,8 @@ def _parse(text: str, file: str) -> _Value:
         return _located(root, file, yaml.SafeLoader(""))
     except RecursionError:
         raise Place(file, 1).error("a YAML anchor holds itself") from None
+    except yaml.MarkedYAMLError as error:
+        raise Place(file, error.problem_mark.line + 1 if error.problem_mark else 1).error(str(error.problem)) from error
 
 
 def _located(node: yaml.Node, file: str, loader: yaml.SafeLoader) -> _Value:
@@ -121,9 +123,9 @@ def _override(tree: _Value, setting: str) -> None:
     place = Place(f"--set {setting}", None)
     try:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
+        value = None if node is None else _located(node, place.file, yaml.SafeLoader("")).value
     except yaml.YAMLError as error:
         raise UsageError(f"--set {setting}: '{text}' is not valid YAML") from error
-    value = None if node is None else _located(node, place.file, yaml.SafeLoader("")).value
     if not isinstance(targets[stream].value, dict):
         raise targets[stream].place.error(f"'{stream}' must be a mapping of names to values")
     targets[stream].value[param] = _Value(value, place)
@@ -246,7 +248,8 @@ class _Builder:
         try:
             return kind(**values)
         except (ValueError, TypeError) as error:
-            raise item.place.error(str(error)) from error
+            set_by_hand = [item.value[key].place for key in values if item.value[key].place.line is None]
+            raise (set_by_hand or [item.place])[-1].error(str(error)) from error
 
     def _class(self, item: _Value, what: str) -> type:
         use = self._use(item, what)
