@@ -165,6 +165,8 @@ class _Builder:
             kinds[name], clocks[name] = node.output, node.clock
             nodes.append(node)
         self._check_clock(nodes, clocks)
+        for (_, sink), entry in zip(sinks, top["sinks"].value, strict=True):
+            self._check_streams(sink, entry, kinds)
         source_use = self._use(top["source"], "the source")
         return Graph(self.path.stem, self.text, source, source_use, tuple(nodes), sinks, kinds)
 
@@ -185,6 +187,14 @@ class _Builder:
         output = output_of(actor, {port: kinds[stream] for port, stream in inputs.items()}, item.place)
         clock = clock_of(name, actor, {port: clocks[stream] for port, stream in inputs.items()}, item.place)
         return Node(name, self._use(item, name), actor, inputs, output, clock, optional, item.place)
+
+    @staticmethod
+    def _check_streams(sink: Any, entry: _Value, streams: Mapping[str, type]) -> None:
+        """Whether the streams that a sink's entry names are there."""
+        for key in set(getattr(sink, "names_streams", ())) & entry.value.keys():
+            for name in entry.value[key].plain():
+                if name not in streams:
+                    raise entry.value[key].place.error(f"there is no stream '{name}'{_nearest(str(name), streams)}")
 
     def _check_clock(self, nodes: list[Node], clocks: dict[str, str]) -> None:
         stages = [node for node in nodes if not node.aligns]

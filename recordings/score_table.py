@@ -40,7 +40,7 @@ def _disparity_lines(d: dict[str, Any]) -> list[str]:
         "disparity    bad-T: share off by over T px, or unknown; mean and RMS error in px, of the known",
         f"               whole image       pixels    known |{limits} |    mean     RMS",
         *(_region_line(name, d["whole_image"][name]) for name in REGIONS),
-        _known_line("nonocc", d["whole_image"]["nonocc"]),
+        *(_known_line(name, d["whole_image"][name]) for name in ("nonocc", "all")),
         *_cropped_lines(d["cropped_image"]),
         "             values given where stereo cannot measure",
         f"               only one camera sees  {occluded}",
@@ -53,7 +53,7 @@ def _cropped_lines(cropped: dict[str, Any]) -> list[str]:
     if not any(crops):
         return []
     columns = f"{crops[0]}" if len(crops) == 1 else f"{crops[0]} to {crops[-1]}"
-    title = f"               without the leftmost {columns} columns (its disparity range, rounded up to {CROP_STEP})"
+    title = f"               without the leftmost {columns} columns (the range of the truth, rounded up to {CROP_STEP})"
     return [title, *(_region_line(name, cropped[name]) for name in REGIONS)]
 
 

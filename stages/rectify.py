@@ -24,6 +24,8 @@ from stages.stage import Stage, parameter
 
 DISTORTION_SIZES = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 LARGEST_OFFSET = 64.0  # px
+UNUSUAL = 8.0  # px, more than a calibration leaves
+MOST_CROSSED = 0.5  # of the features
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,12 @@ class Rectify(Stage):
             f"rows differ by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, +- {offset.error:.2f}"
             f" ({offset.features} features of {len(plain)} frames)"
         )
+        if offset.crossed > MOST_CROSSED:
+            found += f"; {offset.crossed:.0%} of the features look farther than infinity: are left and right swapped?"
         if not offset.clear:
             return replace(self, row_offset=0.0), f"{found}: too little to correct"
+        if offset.largest > UNUSUAL:
+            found += "; so much is unusual: are the images rectified, and with this calibration?"
         return replace(self, row_offset=terms), f"{found}; corrected, as row_offset={list(terms)} would"
 
     @property

@@ -7,6 +7,7 @@ of a camera causes: pitch moves rows by 1 and y^2, roll by x, yaw by xy; a focal
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
@@ -42,12 +43,14 @@ class RowOffset:
 
     terms: weights, px, of 1, x, y, xy, y^2, where x and y are the place in the right image from its centre, in widths
     and heights; features: pairs that agree on it; error: the largest standard deviation in the image that the terms
-    have by the scatter of the features, px: what a model of few terms cannot express is not in it.
+    have by the scatter of the features, px: what a model of few terms cannot express is not in it; crossed: the share
+    of features that lie farther right in the right image than in the left, as behind infinity.
     """
 
     terms: tuple[float, ...]
     features: int
     error: float
+    crossed: float
 
     @property
     def clear(self) -> bool:
@@ -109,8 +112,13 @@ def measure(pairs: Sequence[tuple[Array, Array]]) -> RowOffset | None:
             continue
         rest = _fit([_offsets(left, *_corrected(first, *view)) for left, *view in seen], count)
         if rest is not None and rest.error <= CLEAR:
-            return replace(rest, terms=tuple(np.add(first.terms, rest.terms).tolist()))
+            return replace(rest, terms=tuple(np.add(first.terms, rest.terms).tolist()), crossed=_crossed(seen))
     return None
+
+
+def _crossed(seen: Sequence[tuple[Array, Array, Array, Array]]) -> float:
+    """`RowOffset.crossed`, of the views with their features."""
+    return float(np.mean(np.concatenate([here[:, 0] < there[:, 0] for _, _, here, there in seen])))
 
 
 def _as_bright(image: Array, model: Array) -> Array:
@@ -141,7 +149,7 @@ def _fit(found: Sequence[tuple[Array, Array]], count: int) -> RowOffset | None:
         return None
     place, rows = (np.concatenate(parts) for parts in zip(*found, strict=True))
     terms, error, agreeing = _robust_fit(place, rows, count)
-    return RowOffset(tuple(terms.tolist()), agreeing, error) if agreeing >= LEAST_FEATURES else None
+    return RowOffset(tuple(terms.tolist()), agreeing, error, math.nan) if agreeing >= LEAST_FEATURES else None
 
 
 def _near_the_most_common(here: Array, there: Array) -> tuple[Array, Array]:

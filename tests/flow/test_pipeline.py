@@ -75,6 +75,7 @@ def test_a_setting_from_the_command_line_replaces_one_in_the_file(tmp_path):
         ("toys.Add, a: twice, b: height", "toys.Mute, a: twice", 6, ["does not say the type of its input 'a'"]),
         ("toys.Scale", "toys.Keep", 5, ["Keep is no stage"]),
         ("gain: 2.5", "gian: 2.5", 1, ["no parameter 'gian'", "did you mean 'gain'"]),
+        ("toys.Keep}", "toys.Keep, only: [sum, twise]}", 8, ["there is no stream 'twise'", "did you mean 'twice'"]),
         ("sinks:", "sinkz:", 7, ["no 'sinkz'", "did you mean 'sinks'"]),
         ("  both:", "  left:", 3, ["'left' is already a stream of the source"]),
         ("  sum: ", "  both:", 6, ["'both' stands here twice"]),
@@ -97,7 +98,13 @@ def test_a_file_that_is_no_pipeline_is_refused(tmp_path, text):
         loaded(tmp_path, text)
 
 
-@pytest.mark.parametrize("setting", ["nonsense", "twice=3", "twise.factor=3", "twice.faktor=3", "twice.bad=[", "a.b"])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "nonsense", "twice=3", "twise.factor=3", "twice.faktor=3", "twice.bad=[", "a.b", "twice.factor=-1",
+        "twice.bad=!!python/x y",
+    ],
+)  # fmt: skip
 def test_a_bad_setting_is_named(tmp_path, setting):
     with pytest.raises((PipelineError, UsageError), match="--set"):
         loaded(tmp_path, overrides=[setting])

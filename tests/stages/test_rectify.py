@@ -221,6 +221,18 @@ def test_a_survey_measures_what_its_frames_have_in_common(rectified):
     assert np.abs(alone.right[9:-9, 9:-9].astype(int) - aligned.right[9:-9, 9:-9]).max() <= 12
 
 
+@pytest.mark.parametrize(("rows", "swapped", "words"), [
+    (0.0, True, "100% of the features look farther than infinity: are left and right swapped?"),
+    (20.0, False, "so much is unusual: are the images rectified"),
+])  # fmt: skip
+def test_a_survey_tells_of_images_that_cannot_be_a_rectified_pair(rows, swapped, words):
+    left, right = a_pair((rows,), size=LARGE)
+    pair = (right, left) if swapped else (left, right)
+    _, sentence = Rectify().survey([StereoFrame(1, *pair, StereoCamera(500, 500, 320, 240, 0.1, *LARGE))])
+    assert words in sentence
+    assert ("swapped" in sentence) == swapped
+
+
 def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
     frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), StereoCamera(500, 500, 320, 240, 0.1, *LARGE))
     bad = CameraModel(*LARGE, K, np.zeros(5), np.eye(3), P_LEFT, "pinhole")
