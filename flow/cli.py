@@ -117,7 +117,7 @@ def parser() -> argparse.ArgumentParser:
     help = "make a log out of other recordings"
     imports = commands.add_parser("import", help=help, description=help.capitalize() + ".")
     kinds = imports.add_subparsers(required=True, metavar="KIND")
-    images = command("images", _import_images, "a folder of left and right images", kinds)
+    images = command("images", _import_images, "a folder of rectified left and right images", kinds)
     images.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
     images.add_argument("out", type=Path, metavar="OUT.mcap")
     _image_options(images)
@@ -150,7 +150,8 @@ def _simulation_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _image_options(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--calibration", type=Path, required=True, metavar="CAM.yaml", help="fx, fy, cx, cy, baseline")
+    camera = "of the rectified pair: fx, cx, cy (px), baseline (m), and fy, cx_right, width, height if need be"
+    sub.add_argument("--calibration", type=Path, required=True, metavar="CAM.yaml", help=camera)
     sub.add_argument("--pitch-down", type=float, required=True, metavar="DEG", help="how far the camera looks down")
     sub.add_argument("--roll", type=float, default=0.0, metavar="DEG", help="camera roll, right side down positive")
     sub.add_argument("--height", type=float, required=True, metavar="M", help="camera height above the ground")
@@ -164,6 +165,9 @@ def _version() -> str:
         return "unknown"
 
 
+_OF_OTHERS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pfm", ".txt", ".py", ".yaml", ".yml", ".bag", ".db3"}
+
+
 def _check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path]) -> None:
     """Refuse outputs that cannot be written, that would replace what is being read, or that are one file twice."""
     taken: list[Path] = []
@@ -175,6 +179,8 @@ def _check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path]) -> No
         for given in inputs:
             if path.exists() and given.exists() and path.samefile(given):
                 raise UsageError(f"{path} is what is being read; choose another name for the output")
+        if path.exists() and path.suffix.lower() in _OF_OTHERS:
+            raise UsageError(f"{path} is there already, and not the output of an earlier run; choose another name")
         if path.resolve() in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
         taken.append(path.resolve())
@@ -254,7 +260,7 @@ def replay(
 
             with interrupts(stop, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)):
                 summary = run(graph, opened, outputs, workers=workers, about=about, stop=stop, on_frame=on_frame)
-    return _as_json(summary)
+    return _as_json(summary | {"overrides": list(overrides)})
 
 
 def _as_json(summary: dict[str, Any]) -> dict[str, Any]:
@@ -338,13 +344,22 @@ def _import_images(options: argparse.Namespace) -> int:
 
 
 def _import_middlebury(options: argparse.Namespace) -> int:
+    from recordings.errors import LogError
     from recordings.middlebury import import_scene, logs_of
 
-    for folder, log in logs_of(options.source, options.out):
-        if log != options.out:
-            options.out.mkdir(exist_ok=True)
+    scenes, broken = logs_of(options.source, options.out), list[LogError]()
+    for folder, log in scenes:
+        if log != options.out and not options.out.exists():
+            _check_outputs([options.out], [])
+            options.out.mkdir()
         _check_outputs([log], list(folder.iterdir()))
-        _say(f"{log}: {import_scene(folder, log)}")
+        try:
+            _say(f"{log}: {import_scene(folder, log)}")
+        except LogError as error:  # the other scenes can still be had
+            broken.append(error)
+    if broken:
+        more = f" ({len(broken)} of {len(scenes)} scenes could not be imported)" if len(scenes) > 1 else ""
+        raise LogError(f"{broken[0]}{more}")
     return COMPLETE
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import fields
 from html import escape
+from typing import Any
 
 from flow.graph import Graph
 
@@ -31,9 +33,15 @@ def _text(graph: Graph) -> str:
     lines = [f"pipeline {graph.name}", f"  source  {graph.source_use}"]
     for node in graph.nodes:
         mark = " (optional)" if node.optional else ""
-        inputs = ", ".join(dict.fromkeys(node.inputs.values()))
-        lines.append(f"  {node.name:{width}}  {node.output.__name__:13} = {node.use}({inputs}){mark}")
+        given = ", ".join([*dict.fromkeys(node.inputs.values()), *_settings(node.actor)])
+        lines.append(f"  {node.name:{width}}  {node.output.__name__:13} = {node.use}({given}){mark}")
     return "\n".join([*lines, *(f"  sink    {use}" for use, _ in graph.sinks)])
+
+
+def _settings(actor: Any) -> list[str]:
+    """The parameters of a stage or aligner that are not as by default."""
+    given = ((item.name, getattr(actor, item.name), item.default) for item in fields(actor) if item.init)
+    return [f"{name}={value}" for name, value, default in given if value != default]
 
 
 def _mermaid(graph: Graph) -> str:

@@ -17,7 +17,10 @@ from flow.errors import PipelineError
 
 
 class Sink(Protocol):
-    """Where frames go. `write` is called once for every frame, in stamp order, by one thread at a time."""
+    """Where frames go. `write` is called once for every frame, in stamp order, by one thread at a time.
+
+    A sink whose parameters name streams says which do, in `names_streams`, for pipeline files to be checked.
+    """
 
     suffix: str
 

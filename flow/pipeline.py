@@ -45,7 +45,8 @@ class _Value:
 def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     """The pipeline `name`: one that ships with the product, or the path of a YAML file.
 
-    overrides: "stream.param=value" settings, applied before anything is checked.
+    overrides: "stream.param=value", or "name=value" for one of the file's `settings`, applied before anything is
+    checked.
     """
     path = find(name)
     try:
@@ -55,9 +56,14 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))  # stages may stand beside the file that uses them
     tree = _parse(text, path.name)
+    named = set(_texts(tree))
     for setting in overrides:
         _override(tree, setting)
-    return _Builder(path, text, tree).graph()
+    settled = _settled(tree, _settings(tree))
+    for setting, given in _settings(tree).items():
+        if f"${setting}" not in named:
+            raise given.place.error(f"the setting '{setting}' is used nowhere; write ${setting} where it belongs")
+    return _Builder(path, text, settled).graph()
 
 
 def find(name: str) -> Path:
@@ -89,6 +95,8 @@ def _parse(text: str, file: str) -> _Value:
         return _located(root, file, yaml.SafeLoader(""))
     except RecursionError:
         raise Place(file, 1).error("a YAML anchor holds itself") from None
+    except yaml.MarkedYAMLError as error:
+        raise Place(file, error.problem_mark.line + 1 if error.problem_mark else 1).error(str(error.problem)) from error
 
 
 def _located(node: yaml.Node, file: str, loader: yaml.SafeLoader) -> _Value:
@@ -108,25 +116,63 @@ def _located(node: yaml.Node, file: str, loader: yaml.SafeLoader) -> _Value:
 
 
 def _override(tree: _Value, setting: str) -> None:
-    """Apply one "stream.param=value" ("source.param=value" for the source)."""
+    """Apply one "stream.param=value" ("source.param=value" for the source), or "name=value" of the settings."""
     path, separator, text = setting.partition("=")
     stream, dot, param = path.strip().partition(".")
-    if not (separator and dot and stream and param):
+    if not (separator and stream and (param or not dot)):
         raise UsageError(f"--set {setting}: expected stream.param=value")
     top = tree.value if isinstance(tree.value, dict) else {}
-    streams = top["streams"].value if "streams" in top else {}
-    targets = {**(streams if isinstance(streams, dict) else {}), "source": top.get("source")}
-    if targets.get(stream) is None:
-        raise UsageError(f"--set {setting}: there is no stream '{stream}'{_nearest(stream, targets)}")
+    streams, settings = top["streams"].value if "streams" in top else {}, _settings(tree)
     place = Place(f"--set {setting}", None)
     try:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
+        value = None if node is None else _located(node, place.file, yaml.SafeLoader("")).value
     except yaml.YAMLError as error:
         raise UsageError(f"--set {setting}: '{text}' is not valid YAML") from error
-    value = None if node is None else _located(node, place.file, yaml.SafeLoader("")).value
+    if not dot:
+        if stream not in settings:
+            raise UsageError(f"--set {setting}: the pipeline has no setting '{stream}'{_nearest(stream, settings)}")
+        settings[stream] = _Value(value, place)
+        return
+    targets = {**(streams if isinstance(streams, dict) else {}), "source": top.get("source")}
+    if targets.get(stream) is None:
+        raise UsageError(f"--set {setting}: there is no stream '{stream}'{_nearest(stream, targets)}")
     if not isinstance(targets[stream].value, dict):
         raise targets[stream].place.error(f"'{stream}' must be a mapping of names to values")
     targets[stream].value[param] = _Value(value, place)
+
+
+def _settings(tree: _Value) -> dict[str, _Value]:
+    """The values that a pipeline file names once, to use them in several places."""
+    given = tree.value.get("settings") if isinstance(tree.value, dict) else None
+    if given is None:
+        return {}
+    if not isinstance(given.value, dict):
+        raise given.place.error("'settings' must be a mapping of names to values")
+    return given.value
+
+
+def _texts(item: _Value) -> list[Any]:
+    """All values in `item` that hold no others."""
+    if not isinstance(item.value, dict | list):
+        return [item.value]
+    parts = item.value.values() if isinstance(item.value, dict) else item.value
+    return [text for part in parts for text in _texts(part)]
+
+
+def _settled(item: _Value, settings: Mapping[str, _Value]) -> _Value:
+    """The tree `item` with the values of settings where `$name` stands."""
+    if isinstance(item.value, dict):
+        return _Value({key: _settled(value, settings) for key, value in item.value.items()}, item.place)
+    if isinstance(item.value, list):
+        return _Value([_settled(value, settings) for value in item.value], item.place)
+    if not isinstance(item.value, str) or not item.value.startswith("$"):
+        return item
+    name = item.value[1:]
+    if name not in settings:
+        raise item.place.error(f"there is no setting '{name}'{_nearest(name, settings)}")
+    given = settings[name]
+    return _Value(given.value, given.place if given.place.line is None else item.place)
 
 
 class _Builder:
@@ -138,7 +184,7 @@ class _Builder:
     def graph(self) -> Graph:
         """The checked graph."""
         top = self._mapping(self.tree, "the pipeline")
-        self._only(top, ("source", "streams", "sinks"), "a pipeline")
+        self._only(top, ("settings", "source", "streams", "sinks"), "a pipeline")
         for key in ("source", "streams", "sinks"):
             if key not in top:
                 raise self.tree.place.error(f"the pipeline has no '{key}'")
@@ -163,6 +209,8 @@ class _Builder:
             kinds[name], clocks[name] = node.output, node.clock
             nodes.append(node)
         self._check_clock(nodes, clocks)
+        for (_, sink), entry in zip(sinks, top["sinks"].value, strict=True):
+            self._check_streams(sink, entry, kinds)
         source_use = self._use(top["source"], "the source")
         return Graph(self.path.stem, self.text, source, source_use, tuple(nodes), sinks, kinds)
 
@@ -183,6 +231,14 @@ class _Builder:
         output = output_of(actor, {port: kinds[stream] for port, stream in inputs.items()}, item.place)
         clock = clock_of(name, actor, {port: clocks[stream] for port, stream in inputs.items()}, item.place)
         return Node(name, self._use(item, name), actor, inputs, output, clock, optional, item.place)
+
+    @staticmethod
+    def _check_streams(sink: Any, entry: _Value, streams: Mapping[str, type]) -> None:
+        """Whether the streams that a sink's entry names are there."""
+        for key in set(getattr(sink, "names_streams", ())) & entry.value.keys():
+            for name in entry.value[key].plain():
+                if name not in streams:
+                    raise entry.value[key].place.error(f"there is no stream '{name}'{_nearest(str(name), streams)}")
 
     def _check_clock(self, nodes: list[Node], clocks: dict[str, str]) -> None:
         stages = [node for node in nodes if not node.aligns]
@@ -246,7 +302,8 @@ class _Builder:
         try:
             return kind(**values)
         except (ValueError, TypeError) as error:
-            raise item.place.error(str(error)) from error
+            set_by_hand = [item.value[key].place for key in values if item.value[key].place.line is None]
+            raise (set_by_hand or [item.place])[-1].error(str(error)) from error
 
     def _class(self, item: _Value, what: str) -> type:
         use = self._use(item, what)

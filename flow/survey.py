@@ -11,11 +11,11 @@ from typing import Any
 
 from flow.feeder import Event, Feeder
 from flow.graph import Graph, Node
-from flow.ledger import Absent, Ledger
+from flow.ledger import Absent, Ledger, failure
 
 EXCERPTS = 9
 
-
+# (how many, of which source streams) -> the stretches of the log
 Excerpts = Callable[[int, set[str]], Iterable[Iterable[Event]]]
 
 
@@ -24,21 +24,30 @@ def surveyed(graph: Graph, excerpts: Excerpts) -> tuple[Graph, dict[str, str]]:
 
     A stage surveys if its `surveys` is true; its `survey` takes what `__call__` takes, of several frames each, and
     returns the stage to run and a sentence. `excerpts(count, streams)` gives that many stretches of the log, spread
-    over all of it; the first whole frame of each is taken.
+    over all of it; the first whole frame of each is taken. Raises PipelineError where a stage that remembers frames is
+    needed for it.
     """
     nodes, findings = list(graph.nodes), dict[str, str]()
     if not any(_surveys(node) for node in nodes):
         return graph, findings
     needed = _upstream(nodes)
     samples = _samples(replace(graph, nodes=tuple(node for node in nodes if node.name in needed)), excerpts)
+    left = sum(map(_surveys, nodes))
     for place, node in enumerate(nodes):
         if node.aligns or node.name not in needed:
             continue
+        if node.ordered:
+            raise node.place.error(f"'{node.name}' remembers frames, so nothing that depends on it can survey the log")
         if _surveys(node):
             given = {port: [sample[stream] for sample in samples] for port, stream in node.inputs.items()}
-            actor, findings[node.name] = node.actor.survey(**given)
+            try:
+                actor, findings[node.name] = node.actor.survey(**given)
+            except Exception as error:  # the stage then has no more to go by than each frame
+                actor, findings[node.name] = node.actor, f"could not survey the log: {failure(error)}"
             nodes[place] = node = replace(node, actor=actor)
-        _advance(node, samples)
+            left -= 1
+        if left:
+            _advance(node, samples)
     return replace(graph, nodes=tuple(nodes)), findings
 
 

@@ -57,6 +57,8 @@ def import_images(
         )
     if not rate > 0 or not height > 0:
         raise LogError(f"rate ({rate} Hz) and height ({height} m) must be positive")
+    if not abs(pitch_down) <= 90 or not abs(roll) <= 180:
+        raise LogError(f"no camera looks {pitch_down} degrees down, rolled by {roll}; give degrees up to 90 and 180")
     period = round(1e9 / rate)
     pairs = enumerate(zip(left, right, strict=True))
     frames = (read_frame(FIRST_STAMP + number * period, pair, values) for number, pair in pairs)
@@ -143,8 +145,13 @@ def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
     else:
         try:
             loaded = yaml.safe_load(Path(given).read_text())
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise LogError(f"cannot read the calibration {given}: {error}") from error
+        except OSError as error:
+            raise LogError(f"cannot read the calibration {given}: {error.strerror or error}") from error
+        except (UnicodeDecodeError, yaml.YAMLError) as error:
+            raise LogError(
+                f"cannot read the calibration {given}, which is not plain YAML; write fx, cx, cy and baseline into a "
+                "file of their own"
+            ) from error
     if not isinstance(loaded, dict):
         raise LogError(f"{where} must map names to numbers: {', '.join(_REQUIRED)}")
     for name in _REQUIRED:
@@ -168,8 +175,13 @@ def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) ->
     images = [_pixels(path) for path in pair]
     height, width = images[0].shape[:2]
     if images[0].shape != images[1].shape or images[0].dtype != images[1].dtype:
-        shapes = " and ".join("x".join(map(str, pixels.shape)) for pixels in images)
+        shapes = " and ".join(f"{p.shape[1]}x{p.shape[0]} {p.dtype}" for p in images)
         raise LogError(f"{pair[0]} and {pair[1]} differ in size or kind ({shapes})")
+    if not (0 <= values["cx"] < width and 0 <= values["cy"] < height):
+        raise LogError(
+            f"{pair[0]} is {width}x{height}, the calibration's centre (cx {values['cx']:g}, cy {values['cy']:g}) lies "
+            "outside; give the calibration of images of this size"
+        )
     if (values.setdefault("width", width), values.setdefault("height", height)) != (width, height):
         expected = f"{values['width']:g}x{values['height']:g}"
         raise LogError(f"{pair[0]} is {width}x{height}, the calibration or the first pair is {expected}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from recordings.errors import LogError
 from recordings.frame_record import FrameRecord, LossEntry
@@ -46,6 +46,7 @@ class McapSink:
     results: tuple[str, ...] = ("disparity", "points", "elevation_map", "navigation_map")
 
     suffix = ".mcap"
+    names_streams: ClassVar[tuple[str, ...]] = ("results",)
     _writer: Ros2Writer | None = field(default=None, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
 

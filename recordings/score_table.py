@@ -35,20 +35,26 @@ def _frame_lines(found: Score) -> list[str]:
 def _disparity_lines(d: dict[str, Any]) -> list[str]:
     hidden, beyond = d["given_occluded"], d["given_without_truth"]
     occluded = f"{_percent(hidden['share']):>7} of all values, {_percent(hidden['bad_2'])} of these off by over 2 px"
-    crops = d["cropped_image"]["leftmost_columns_cropped"]
-    columns = f"{crops[0]}" if len(crops) == 1 else f"{crops[0]} to {crops[-1]}"
     limits = "".join(f"{f'bad-{limit:g}':>8}" for limit in THRESHOLDS)
     return [
         "disparity    bad-T: share off by over T px, or unknown; mean and RMS error in px, of the known",
         f"               whole image       pixels    known |{limits} |    mean     RMS",
         *(_region_line(name, d["whole_image"][name]) for name in REGIONS),
-        _known_line("nonocc", d["whole_image"]["nonocc"]),
-        f"               without the leftmost {columns} columns (its disparity range, rounded up to {CROP_STEP})",
-        *(_region_line(name, d["cropped_image"][name]) for name in REGIONS),
+        *(_known_line(name, d["whole_image"][name]) for name in ("nonocc", "all")),
+        *_cropped_lines(d["cropped_image"]),
         "             values given where stereo cannot measure",
         f"               only one camera sees  {occluded}",
         f"               no true value         {_percent(beyond['share']):>7} of all values (sky, or not known)",
     ]
+
+
+def _cropped_lines(cropped: dict[str, Any]) -> list[str]:
+    crops = cropped["leftmost_columns_cropped"]
+    if not any(crops):
+        return []
+    columns = f"{crops[0]}" if len(crops) == 1 else f"{crops[0]} to {crops[-1]}"
+    title = f"               without the leftmost {columns} columns (the range of the truth, rounded up to {CROP_STEP})"
+    return [title, *(_region_line(name, cropped[name]) for name in REGIONS)]
 
 
 def _region_line(name: str, m: dict[str, float]) -> str:

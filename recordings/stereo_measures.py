@@ -1,9 +1,10 @@
 """Disparity errors as Middlebury counts them (Scharstein et al., GCPR 2014). Pure functions over arrays, no files.
 
 A pixel is scored where its true disparity is known: `nonocc` where both cameras see it, `occluded` where only one does,
-`all` of them; over the whole image, and without the leftmost columns, which have no partner in the right image. The one
-trick: every pixel is in one of six disjoint classes, whose sums add up over frames, so that every pixel and not every
-frame counts the same, and any region is a sum of classes.
+`all` of them; over the whole image, and without the leftmost columns, which have no partner in the right image. Unlike
+Middlebury's own code it does not clip disparities to the search range first, so a value far outside costs all of its
+error. The one trick: every pixel is in one of six disjoint classes, whose sums add up over frames, so that every pixel
+and not every frame counts the same, and any region is a sum of classes.
 """
 
 from __future__ import annotations
@@ -86,12 +87,13 @@ class StereoErrors:
         whole = {name: self._region(kinds, slice(None)) for name, kinds in REGIONS.items()}
         cropped = {name: self._region(kinds, slice(1, None)) for name, kinds in REGIONS.items()}
         hidden, columns = float(self.sums["known"][1].sum()), sorted(self.columns)
+        told = float(self.sums["pixels"][1].sum())  # whether anything is known to be occluded
         return {
             **whole["nonocc"],
             "values": float(self.values),
             "given_occluded": {
                 "pixels": hidden,
-                "share": share(hidden, self.values),
+                "share": share(hidden, self.values if told else 0),
                 "bad_2": whole["occluded"]["bad_2_known"],
             },
             "given_without_truth": {

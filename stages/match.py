@@ -101,7 +101,7 @@ class Match(Stage):
             nothing |= prior.pixels > search.stop + BEYOND
             if search.start > self.minimum:
                 nothing |= prior.pixels < search.start - BEYOND
-        unknown = np.nonzero(nothing)
+        unknown = np.nonzero(nothing | _blank_partner(right, found.pixels))
         found.pixels[unknown], found.source[unknown], found.confidence[unknown] = np.nan, Source.UNKNOWN, 0
         return Disparity(frame.stamp, found.pixels, found.source, found.confidence, camera=frame.camera)
 
@@ -154,3 +154,13 @@ def _blank(image: Array) -> Array:
     """Where the census window of a pixel shows one gray value only, (H, W) bool: nothing can be matched there, and what
     the paths carry into it (a burnt-out sky, say) is no measurement."""
     return cv2.morphologyEx(image, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) == 0  # type: ignore[no-any-return]
+
+
+def _blank_partner(right: Array, pixels: Array) -> Array:
+    """Whether the partner of each pixel is blank, (H, W) bool: a match with it has no evidence."""
+    blank = _blank(right)
+    if not blank.any():
+        return blank
+    columns = np.arange(right.shape[1], dtype=np.float32)
+    partner = np.clip(np.rint(columns - np.nan_to_num(pixels)), 0, right.shape[1] - 1).astype(np.intp)
+    return np.take_along_axis(blank, partner, axis=1)

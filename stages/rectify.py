@@ -8,8 +8,10 @@ measured (stages.row_offset) and folded into the right camera's table.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from numbers import Real
 from typing import cast
 
 import cv2
@@ -17,12 +19,13 @@ import numpy as np
 
 from stages.data import Array, CameraModel, StereoFrame
 from stages.intensity import eight_bit, gray
-from stages.row_offset import RowOffset, measure, moved_down, offset_field
+from stages.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
 from stages.stage import Stage, parameter
 
 DISTORTION_SIZES = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 LARGEST_OFFSET = 64.0  # px
-MOST_TERMS = 5
+UNUSUAL = 8.0  # px, more than a calibration leaves
+MOST_CROSSED = 0.5  # of the features
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,15 @@ class Rectify(Stage):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        terms = self._terms
-        if terms is not None and not (1 <= len(terms) <= MOST_TERMS and np.all(np.abs(terms) <= LARGEST_OFFSET)):
+        given = self.row_offset
+        if isinstance(given, list):
+            object.__setattr__(self, "row_offset", tuple(given))
+        terms = given if isinstance(given, tuple | list) else (0.0 if given is None else given,)
+        numbers = all(isinstance(term, Real) and not isinstance(term, bool) for term in terms)
+        if not (numbers and 1 <= len(terms) <= MODELS[0] and all(abs(term) <= LARGEST_OFFSET for term in terms)):
             raise ValueError(
-                f"Rectify.row_offset must be one to {MOST_TERMS} numbers, each at most {LARGEST_OFFSET:g} px, "
-                f"not {self.row_offset}"
+                f"Rectify.row_offset must be one to {MODELS[0]} numbers, each at most {LARGEST_OFFSET:g} px, "
+                f"not {given!r}"
             )
 
     def __call__(self, frame: StereoFrame) -> StereoFrame:
@@ -64,16 +71,24 @@ class Rectify(Stage):
 
     def survey(self, frame: Sequence[StereoFrame]) -> tuple[Rectify, str]:
         """The stage with the row offset that frames have in common, and a sentence about it."""
-        offset = _measured([_rectified(each, ()) for each in frame])
+        plain = []
+        for each in frame:
+            with suppress(ValueError):  # the run will meet the frame again, and say what is the matter with it
+                plain.append(_rectified(each, ()))
+        offset = _measured(plain)
         if offset is None:
             return replace(self, row_offset=0.0), "the row offset is not clear from the images; none is corrected"
         terms = tuple(round(term, 4) for term in offset.terms)
         found = (
             f"rows differ by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, +- {offset.error:.2f}"
-            f" ({offset.features} features of {len(frame)} frames)"
+            f" ({offset.features} features of {len(plain)} frames)"
         )
+        if offset.crossed > MOST_CROSSED:
+            found += f"; {offset.crossed:.0%} of the features look farther than infinity: are left and right swapped?"
         if not offset.clear:
             return replace(self, row_offset=0.0), f"{found}: too little to correct"
+        if offset.largest > UNUSUAL:
+            found += "; so much is unusual: are the images rectified, and with this calibration?"
         return replace(self, row_offset=terms), f"{found}; corrected, as row_offset={list(terms)} would"
 
     @property

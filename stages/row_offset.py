@@ -7,6 +7,7 @@ of a camera causes: pitch moves rows by 1 and y^2, roll by x, yaw by xy; a focal
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
@@ -17,6 +18,7 @@ import numpy as np
 from stages.data import Array
 
 FEATURES = 4000  # per image
+SMALLEST = 32  # px, side of an image that has any
 ALIKE = 64  # largest Hamming distance of a pair, of 256 bits
 DISTINCT = 0.8  # largest ratio of the distance to that of the next best (Lowe, 2004)
 REACH = 48.0  # px, largest offset that is looked for
@@ -24,13 +26,15 @@ SPREAD = 6.0  # px, by how much the offset may differ from its most common value
 WINDOW = 15  # px, side of the tracked patch
 RETURN = 0.2  # px, how near to its start a patch tracked there and back must come
 LEAST_FEATURES = 50
+LEAST_ALIKE = 8  # in a frame
 LEAST_SHARE = 0.5  # of the pairs, near the most common offset: else they are chance
 CLEAR = 0.25  # px, largest error, anywhere in the image, of a fit that counts
 DEPENDENT = 3.0  # how much larger errors are, held against exact truth, than if tracked patches erred independently
+CELL = 1 / 128  # of the image's sizes: what is seen at one place in many frames errs alike, and counts once
 NEGLIGIBLE = 0.06  # px, root mean square; exactly aligned images measure up to 0.05 px
 ROUNDS = 20  # of reweighting
 TUKEY = 4.685  # standard deviations, beyond which an outlier has no weight
-TERMS = (5, 3, 1)  # of the models tried, richest first: full; shift, x and y; shift
+MODELS = (5, 3, 1)  # terms of the models tried, richest first: all; shift, x and y; shift
 
 
 @dataclass(frozen=True)
@@ -38,18 +42,22 @@ class RowOffset:
     """How many rows a point lies lower in the left image than in the right one.
 
     terms: weights, px, of 1, x, y, xy, y^2, where x and y are the place in the right image from its centre, in widths
-    and heights; features: pairs that agree on it; error: its largest standard deviation in the image, px.
+    and heights; features: pairs that agree on it; error: the largest standard deviation in the image that the terms
+    have by the scatter of the features, px: what a model of few terms cannot express is not in it; crossed: the share
+    of features that lie farther right in the right image than in the left, as behind infinity.
     """
 
     terms: tuple[float, ...]
     features: int
     error: float
+    crossed: float
 
     @property
     def clear(self) -> bool:
-        """Whether correcting it is worth an interpolation: more than negligible, and than its error allows."""
-        typical = float(np.sqrt(np.mean(np.square(self._over_the_image))))
-        return typical > max(NEGLIGIBLE, self.error / 2)
+        """Whether correcting it is worth an interpolation: more than negligible, more than its error, and possible."""
+        over_the_image = self._over_the_image
+        typical = float(np.sqrt(np.mean(np.square(over_the_image))))
+        return typical > max(NEGLIGIBLE, self.error) and self.largest <= REACH
 
     @property
     def largest(self) -> float:
@@ -61,20 +69,23 @@ class RowOffset:
         return _grid_columns(len(self.terms)) @ np.array(self.terms)  # type: ignore[no-any-return]
 
 
+def offset_at(terms: Sequence[float], x: Array, y: Array) -> Array:
+    """The offset, px, at places x, y in the right image, from its centre in widths and heights (any shapes that
+    broadcast)."""
+    return sum((term * column for term, column in zip(terms, _basis(x, y), strict=False)), np.zeros(()))
+
+
 def offset_field(terms: Sequence[float], width: int, height: int) -> Array:
     """The offset at every pixel, (H, W) float32, px."""
-    x = (np.arange(width, dtype=np.float32) - (width - 1) / 2) / width
-    y = (np.arange(height, dtype=np.float32)[:, None] - (height - 1) / 2) / height
-    field = np.zeros((height, width), np.float32)
-    for term, column in zip(terms, (np.ones_like(x), x, y, x * y, y * y), strict=False):
-        field += term * column
-    return field
+    columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    field = offset_at(terms, *_centred(columns, rows, (height, width)))
+    return np.broadcast_to(field, (height, width)).astype(np.float32)
 
 
 def moved_down(image: Array, terms: tuple[float, ...]) -> Array:
-    """An image (H, W) or (H, W, 3) moved down by the offset, bicubic, so that a shift by part of a row blurs least."""
-    maps = _moving_maps(image.shape[1], image.shape[0], terms)
-    moved: Array = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    """An image (H, W) or (H, W, 3) moved down by the offset, bicubic, so that a shift by part of a row blurs least;
+    0 where nothing is known."""
+    moved: Array = cv2.remap(image, *_moving_maps(image.shape[1], image.shape[0], terms), cv2.INTER_CUBIC)
     return moved
 
 
@@ -92,14 +103,44 @@ def measure(pairs: Sequence[tuple[Array, Array]]) -> RowOffset | None:
     The richest model is taken that the features determine to `CLEAR` everywhere in the image. Tracking draws fractions
     of a pixel towards one half, by up to 0.03 px; so what remains after a first correction is measured once more.
     """
-    seen = [(left, right, *_alike(*_paired_features(left, right))) for left, right in pairs]
-    fits = (_fit([_offsets(*view) for view in seen], count) for count in TERMS)
-    first = next((fit for fit in fits if fit is not None and fit.error <= CLEAR), None)
-    if first is None:
-        return None
-    corrected = [(left, moved_down(right, first.terms), *features) for left, right, *features in seen]
-    rest = _fit([_offsets(*view) for view in corrected], len(first.terms))
-    return None if rest is None else replace(rest, terms=tuple(np.add(first.terms, rest.terms).tolist()))
+    alike = [(left, _as_bright(right, left)) for left, right in pairs]
+    seen = [(left, right, *_near_the_most_common(*_paired_features(left, right))) for left, right in alike]
+    found = [_offsets(*view) for view in seen]
+    for count in MODELS:
+        first = _fit(found, count)
+        if first is None or first.error > CLEAR:
+            continue
+        rest = _fit([_offsets(left, *_corrected(first, *view)) for left, *view in seen], count)
+        if rest is not None and rest.error <= CLEAR:
+            return replace(rest, terms=tuple(np.add(first.terms, rest.terms).tolist()), crossed=_crossed(seen))
+    return None
+
+
+def _crossed(seen: Sequence[tuple[Array, Array, Array, Array]]) -> float:
+    """`RowOffset.crossed`, of the views with their features."""
+    return float(np.mean(np.concatenate([here[:, 0] < there[:, 0] for _, _, here, there in seen])))
+
+
+def _as_bright(image: Array, model: Array) -> Array:
+    """An image scaled to the mean and the contrast of another: tracking compares brightness."""
+    mean, contrast = float(image.mean()), float(image.std())
+    if not contrast:
+        return image
+    scale = float(model.std()) / contrast
+    return cv2.convertScaleAbs(image, alpha=scale, beta=float(model.mean()) - scale * mean)
+
+
+def _corrected(offset: RowOffset, right: Array, here: Array, there: Array) -> tuple[Array, Array, Array]:
+    """The right image and the places of features in both after the offset is taken away."""
+    moved = there.copy()
+    moved[:, 1] += offset_at(offset.terms, *_centred(there[:, 0], here[:, 1], right.shape))
+    return moved_down(right, offset.terms), here, moved
+
+
+def _centred(x: Array, y: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Pixels as places from the image's centre, in its width and height."""
+    height, width = shape
+    return (x - (width - 1) / 2) / width, (y - (height - 1) / 2) / height
 
 
 def _fit(found: Sequence[tuple[Array, Array]], count: int) -> RowOffset | None:
@@ -107,15 +148,15 @@ def _fit(found: Sequence[tuple[Array, Array]], count: int) -> RowOffset | None:
     if sum(len(rows) for _, rows in found) < LEAST_FEATURES:
         return None
     place, rows = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    terms, error, agreeing = _robust_fit(_columns(place, count), rows)
-    return RowOffset(tuple(terms.tolist()), agreeing, error) if agreeing >= LEAST_FEATURES else None
+    terms, error, agreeing = _robust_fit(place, rows, count)
+    return RowOffset(tuple(terms.tolist()), agreeing, error, math.nan) if agreeing >= LEAST_FEATURES else None
 
 
-def _alike(here: Array, there: Array) -> tuple[Array, Array]:
+def _near_the_most_common(here: Array, there: Array) -> tuple[Array, Array]:
     """The paired features (N, 2) whose row offset is near to the most common one; none where that is chance."""
     rows = here[:, 1] - there[:, 1]
     near = np.abs(rows - _most_common(rows)) <= SPREAD if len(rows) else np.zeros(0, bool)
-    if np.count_nonzero(near) < max(LEAST_FEATURES, LEAST_SHARE * len(rows)):
+    if np.count_nonzero(near) < max(LEAST_ALIKE, LEAST_SHARE * len(rows)):
         near[:] = False
     return here[near], there[near]
 
@@ -127,21 +168,20 @@ def _offsets(left: Array, right: Array, here: Array, there: Array) -> tuple[Arra
     found, good = _tracked(left, right, here, there)
     back, well = _tracked(right, left, found, here)
     kept = good & well & (np.abs(back - here).max(axis=1) < RETURN)
-    height, width = left.shape
     # In the corrected image the feature lies on the left image's row.
-    place = np.stack([found[kept, 0], here[kept, 1]], axis=1)
-    centre, size = np.array([width - 1, height - 1]) / 2, np.array([width, height])
-    return (place - centre) / size, (here[kept, 1] - found[kept, 1]).astype(np.float64)
+    place = np.stack(_centred(found[kept, 0], here[kept, 1], left.shape), axis=1)
+    return place.astype(np.float64), (here[kept, 1] - found[kept, 1]).astype(np.float64)
 
 
 def _paired_features(left: Array, right: Array) -> tuple[Array, Array]:
     """Features of both images that are each other's clearly best partner, (N, 2) float32 px each."""
+    if min(left.shape) < SMALLEST:
+        return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
     # Coarse scales place a feature within a pixel or two only.
     detector = cv2.ORB.create(FEATURES, scaleFactor=1.5, nlevels=3, fastThreshold=5)
     (points, codes), (partners, partner_codes) = (detector.detectAndCompute(image, None) for image in (left, right))
-    none = np.empty((0, 2), np.float32)
     if len(points) < 2 or len(partners) < 2:
-        return none, none
+        return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
     pairs = [
         best
         for best, second in cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(codes, partner_codes, 2)
@@ -171,22 +211,27 @@ def _most_common(values: Array) -> float:
     return float(np.median(ordered[first : last[first]]))
 
 
+def _basis(x: Array, y: Array) -> tuple[Array, ...]:
+    """What the terms weigh, at places from the centre in sizes of the image."""
+    return np.ones_like(x), x, y, x * y, y * y
+
+
 def _columns(place: Array, count: int) -> Array:
-    """The first `count` terms at places (N, 2), from the centre in sizes of the image: (N, count)."""
-    x, y = place[:, 0], place[:, 1]
-    return np.stack([np.ones_like(x), x, y, x * y, y * y][:count], axis=1)
+    """The first `count` of the basis at places (N, 2): (N, count)."""
+    return np.stack(_basis(*place.T)[:count], axis=1)
 
 
 @cache
 def _grid_columns(count: int) -> Array:
-    """The terms on a grid over the image, its borders included."""
+    """The basis on a grid over the image, its borders included."""
     grid = np.linspace(-0.5, 0.5, 17)
     return _columns(np.stack(np.meshgrid(grid, grid), axis=2).reshape(-1, 2), count)
 
 
-def _robust_fit(columns: Array, values: Array) -> tuple[Array, float, int]:
+def _robust_fit(place: Array, values: Array, count: int) -> tuple[Array, float, int]:
     """Terms by reweighted least squares (Tukey's biweight), their largest standard deviation in the image, and how many
     values take part."""
+    columns = _columns(place, count)
     weights = np.ones(len(values))
     for _ in range(ROUNDS):
         roots = np.sqrt(weights)
@@ -194,7 +239,8 @@ def _robust_fit(columns: Array, values: Array) -> tuple[Array, float, int]:
         residuals = values - columns @ terms
         scale = max(1.4826 * float(np.median(np.abs(residuals))), 0.02)
         weights = np.square(np.clip(1 - np.square(residuals / (TUKEY * scale)), 0, None))
-    covariance = np.linalg.pinv(columns.T @ (columns * weights[:, None])) * scale**2
-    grid = _grid_columns(columns.shape[1])
+    repeated = len(place) / len(np.unique(np.floor(place / CELL), axis=0))
+    covariance = np.linalg.pinv(columns.T @ (columns * weights[:, None])) * scale**2 * repeated
+    grid = _grid_columns(count)
     error = DEPENDENT * float(np.sqrt(np.einsum("ij,jk,ik->i", grid, covariance, grid).max()))
     return terms, error, int(np.count_nonzero(weights))

@@ -199,6 +199,15 @@ def test_a_folder_of_scenes_becomes_a_log_each(tmp_path, capsys):
     assert "give a folder for the logs" in capsys.readouterr().err
 
 
+def test_a_broken_scene_does_not_keep_the_others_from_being_imported(tmp_path, capsys):
+    for name in ("One", "Two", "Three"):
+        write_scene(tmp_path / "scenes" / name)
+    (tmp_path / "scenes" / "One" / "disp0GT.pfm").write_bytes(b"spoilt")
+    assert roverflow("import", "middlebury", tmp_path / "scenes", tmp_path / "logs") == 2
+    assert "1 of 3 scenes could not be imported" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["Three.mcap", "Two.mcap"]
+
+
 @pytest.mark.parametrize(
     ("spoilt", "out", "words"),
     [
@@ -207,10 +216,13 @@ def test_a_folder_of_scenes_becomes_a_log_each(tmp_path, capsys):
         ("im1.png", "out.mcap", "im1.png is not an image"),
         (None, "Box/im0.png", "is what is being read"),
         (None, "Box", "is a folder or a device"),
+        (None, "Bex.png", "not the output of an earlier run"),
     ],
 )
 def test_a_scene_that_cannot_be_imported_is_refused_in_one_sentence(tmp_path, capsys, spoilt, out, words):
     scene = write_scene(tmp_path / "Box")
+    if out == "Bex.png":
+        (tmp_path / out).write_bytes(b"a picture")
     before = (scene / "im0.png").read_bytes()
     if spoilt:
         (scene / spoilt).write_bytes(b"spoilt")
@@ -218,7 +230,7 @@ def test_a_scene_that_cannot_be_imported_is_refused_in_one_sentence(tmp_path, ca
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["Box"]
+    assert {path.name for path in tmp_path.iterdir()} - {"Bex.png"} == {"Box"}
     assert (scene / "im0.png").read_bytes() == before
 
 
@@ -403,6 +415,11 @@ def test_graph_draws_every_stream(form, capsys):
     drawn = capsys.readouterr().out
     for stream in ("stereo", "tilt", "matched", "disparity", "points", "elevation_map", "navigation_map"):
         assert stream in drawn
+
+
+def test_graph_shows_what_is_set(capsys):
+    assert roverflow("graph", "--set", "matched.disparities=128") == 0
+    assert "disparities=128" in capsys.readouterr().out
 
 
 def test_info_says_what_a_log_holds(traverse, capsys):

@@ -12,6 +12,7 @@ at 1.4 times the time.
 from __future__ import annotations
 
 import functools
+import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -194,7 +195,8 @@ def _halves(
     size = columns * width.lanes
     middle = height // 2
     largest = height - middle
-    band = largest if 2 * largest * size <= memory else max(1, memory // (2 * size))
+    # Shorter bands would take more for their heads than they save.
+    band = largest if 2 * largest * size <= memory else max(memory // (2 * size), math.isqrt(3 * largest))
     heads = 0 if band == largest else -(-largest // band)
     space.reserve(2 * (size * (10 + band + 3 * heads) + 64 * (8 + heads)))
     sweep = functools.partial(_sweep, pair, rule, width, pixels, evidence)

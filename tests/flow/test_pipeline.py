@@ -75,6 +75,7 @@ def test_a_setting_from_the_command_line_replaces_one_in_the_file(tmp_path):
         ("toys.Add, a: twice, b: height", "toys.Mute, a: twice", 6, ["does not say the type of its input 'a'"]),
         ("toys.Scale", "toys.Keep", 5, ["Keep is no stage"]),
         ("gain: 2.5", "gian: 2.5", 1, ["no parameter 'gian'", "did you mean 'gain'"]),
+        ("toys.Keep}", "toys.Keep, only: [sum, twise]}", 8, ["there is no stream 'twise'", "did you mean 'twice'"]),
         ("sinks:", "sinkz:", 7, ["no 'sinkz'", "did you mean 'sinks'"]),
         ("  both:", "  left:", 3, ["'left' is already a stream of the source"]),
         ("  sum: ", "  both:", 6, ["'both' stands here twice"]),
@@ -97,7 +98,39 @@ def test_a_file_that_is_no_pipeline_is_refused(tmp_path, text):
         loaded(tmp_path, text)
 
 
-@pytest.mark.parametrize("setting", ["nonsense", "twice=3", "twise.factor=3", "twice.faktor=3", "twice.bad=[", "a.b"])
+SETTINGS = "settings: {stretch: 25 cm}\n" + GOOD.replace("factor: 25 cm", "factor: $stretch")
+
+
+def test_a_setting_stands_wherever_it_is_named(tmp_path):
+    def factor(**options):
+        return next(node.actor.factor for node in loaded(tmp_path, SETTINGS, **options).nodes if node.name == "twice")
+
+    assert factor() == 0.25
+    assert factor(overrides=["stretch=3 m"]) == 3
+    assert factor(overrides=["twice.factor=4 m"]) == 4
+
+
+@pytest.mark.parametrize(("text", "overrides", "message"), [
+    (SETTINGS.replace("$stretch", "$strech"), [], r"toy.yaml:6: there is no setting 'strech'; did you mean 'stretch'"),
+    (GOOD.replace("25 cm", "$stretch"), [], r"toy.yaml:5: there is no setting 'stretch'"),
+    (SETTINGS.replace("$stretch", "2 m"), [], r"toy.yaml:1: the setting 'stretch' is used nowhere"),
+    (SETTINGS.replace("25 cm", "25 s"), [], r"toy.yaml:6: .*'25 s' is a time"),
+    (SETTINGS, ["stretch=-1 m"], r"--set stretch=-1 m: .*at least 0 m"),
+    (SETTINGS, ["strech=1 m"], r"--set strech=1 m: the pipeline has no setting 'strech'; did you mean 'stretch'"),
+    ("settings: 3\n" + GOOD, [], r"toy.yaml:1: 'settings' must be a mapping"),
+])  # fmt: skip
+def test_a_setting_that_cannot_be_is_named(tmp_path, text, overrides, message):
+    with pytest.raises((PipelineError, UsageError), match=message):
+        loaded(tmp_path, text, overrides=overrides)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "nonsense", "twice=3", "twise.factor=3", "twice.faktor=3", "twice.bad=[", "a.b", "twice.factor=-1",
+        "twice.bad=!!python/x y",
+    ],
+)  # fmt: skip
 def test_a_bad_setting_is_named(tmp_path, setting):
     with pytest.raises((PipelineError, UsageError), match="--set"):
         loaded(tmp_path, overrides=[setting])

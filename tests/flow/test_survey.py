@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 
+from flow.errors import PipelineError
 from flow.pipeline import load
 from flow.run import Stop, run
 from tests.flow.toys import Couple, Keep, Log, Number
@@ -99,6 +100,20 @@ def test_a_survey_without_frames_says_so_and_the_run_goes_on(tmp_path):
     summary, _ = result_of(tmp_path, Excerpted(EVENTS, []))
     assert summary["surveys"] == {"centred": "mean 0 of 0"}
     assert summary["frames_out"] == 8
+
+
+def test_a_survey_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(Centre, "survey", lambda self, couple: 1 // 0)
+    summary, _ = result_of(tmp_path, Excerpted(EVENTS, [(0, 6)]))
+    assert summary["surveys"]["centred"].startswith("could not survey the log: ZeroDivisionError: ")
+    assert summary["drops"] == {"failed": 8}  # this stage cannot do without
+
+
+def test_a_stage_that_remembers_cannot_stand_before_a_survey(tmp_path):
+    file = tmp_path / "p.yaml"
+    file.write_text((PIPELINE % "").replace("toys.Scale, couple: pair, factor: 2, bad: []", "toys.Total, couple: pair"))
+    with pytest.raises(PipelineError, match=r"p\.yaml:5: 'scaled' remembers frames"):
+        run(load(str(file)), Excerpted(EVENTS, [(0, 6)]), {})
 
 
 def test_an_interrupt_during_the_survey_ends_the_run_properly(tmp_path):

@@ -124,6 +124,8 @@ class Keep:
     """A sink that keeps what it is given."""
 
     suffix: ClassVar[str] = ".txt"
+    names_streams: ClassVar[tuple[str, ...]] = ("only",)
+    only: tuple[str, ...] = ()
     fail_at: int | None = None
     records: list[Any] = field(default_factory=list, init=False)
     summary: dict[str, Any] | None = field(default=None, init=False)

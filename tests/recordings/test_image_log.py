@@ -126,6 +126,7 @@ def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
         ({"focal": 3.0}, "has the unknown 'focal'"),
         ({"fx": "wide"}, "'fx' must be a number, not 'wide'"),
         ({"baseline": -0.2}, "'baseline' must be positive"),
+        ({"cx": 24.5}, "is 24x16, the calibration's centre .cx 24.5, cy 7.5. lies outside"),
         ({"width": 640}, "is 24x16, the calibration or the first pair is 640x16"),
     ],
 )
@@ -137,6 +138,13 @@ def test_a_calibration_that_does_not_fit_is_refused_and_leaves_no_file(
     with pytest.raises(LogError, match=said):
         import_images(left, right, calibration, tmp_path / "out.mcap", pitch_down=0, height=1)
     assert not list(tmp_path.glob("out*"))
+
+
+@pytest.mark.parametrize(("pitch_down", "roll"), [(91, 0), (float("nan"), 0), (0, 181)])
+def test_an_attitude_that_no_camera_has_is_refused(tmp_path: Path, pitch_down: float, roll: float) -> None:
+    left, right = make_pairs(tmp_path, 1)
+    with pytest.raises(LogError, match="no camera looks"):
+        import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=pitch_down, roll=roll, height=1)
 
 
 def test_the_calibration_may_be_a_file(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Rectification: an image distorted by a camera model comes back straight, for every model; rows end up aligned."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -126,6 +127,53 @@ def test_the_row_offset_is_measured_to_a_tenth_of_a_pixel_anywhere_in_the_image(
     assert measured.features > 500
 
 
+@pytest.mark.parametrize("rows", [20.4, -45.0])
+def test_a_large_offset_is_measured_as_well(rows):
+    measured = measure([a_pair((rows,), size=LARGE)])
+    assert np.abs(offset_field(measured.terms, *LARGE) - rows).max() < 0.15
+    assert measured.features > 500
+    assert measured.clear
+
+
+@pytest.mark.parametrize(("gain", "bias"), [(0.6, 0), (1.0, -40), (0.5, 60)])
+def test_the_cameras_need_not_expose_alike(gain, bias):
+    left, right = a_pair(TURNED, size=LARGE)
+    measured = measure([(left, cv2.convertScaleAbs(right, alpha=gain, beta=bias))])
+    assert np.abs(offset_field(measured.terms, *LARGE) - offset_field(TURNED, *LARGE)).max() < 0.2
+
+
+def test_aligned_images_with_little_texture_are_left_alone():
+    corrected = 0
+    for seed in range(20):
+        left, right = (image.copy() for image in a_pair(seed=seed, size=LARGE))
+        noise = np.random.default_rng(seed).normal(0, 2, (2, *left.shape))
+        shown = np.zeros(left.shape, bool)
+        shown[100:280, 80 + 10 * seed : 260 + 10 * seed] = True
+        views = [(np.where(shown, image, 90) + n).clip(0, 255).astype(np.uint8)
+                 for image, n in zip((left, right), noise, strict=True)]  # fmt: skip
+        offset = measure([tuple(views)])
+        corrected += offset is not None and offset.clear
+    assert corrected <= 1
+
+
+def test_the_same_view_again_and_again_proves_no_more():
+    left, right = (image.copy() for image in a_pair((1.0,), size=LARGE))
+    for image in (left, right):
+        image[150:], image[:, 200:] = 90, 90
+    once, often = measure([(left, right)]), measure([(left, right)] * 9)
+    assert often.error == pytest.approx(once.error, rel=0.1)
+    assert len(often.terms) == len(once.terms)
+
+
+def test_the_measured_offset_is_the_same_on_any_number_of_threads():
+    pair, threads = a_pair(TURNED, size=LARGE), cv2.getNumThreads()
+    try:
+        found = [cv2.setNumThreads(number) or measure([pair]) for number in (1, 2, 4)]
+    finally:
+        cv2.setNumThreads(threads)
+    assert found[0] == found[1] == found[2]
+
+
 def test_the_measured_offset_does_not_follow_outliers():
     left, right = a_pair(TURNED, size=LARGE)
     right = right.copy()
@@ -173,7 +221,32 @@ def test_a_survey_measures_what_its_frames_have_in_common(rectified):
     assert np.abs(alone.right[9:-9, 9:-9].astype(int) - aligned.right[9:-9, 9:-9]).max() <= 12
 
 
-@pytest.mark.parametrize("row_offset", [(), (1, 2, 3, 4, 5, 6), 65.0, (0.5, float("nan"))])
+@pytest.mark.parametrize(("rows", "swapped", "words"), [
+    (0.0, True, "100% of the features look farther than infinity: are left and right swapped?"),
+    (20.0, False, "so much is unusual: are the images rectified"),
+])  # fmt: skip
+def test_a_survey_tells_of_images_that_cannot_be_a_rectified_pair(rows, swapped, words):
+    left, right = a_pair((rows,), size=LARGE)
+    pair = (right, left) if swapped else (left, right)
+    _, sentence = Rectify().survey([StereoFrame(1, *pair, StereoCamera(500, 500, 320, 240, 0.1, *LARGE))])
+    assert words in sentence
+    assert ("swapped" in sentence) == swapped
+
+
+def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
+    frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), StereoCamera(500, 500, 320, 240, 0.1, *LARGE))
+    bad = CameraModel(*LARGE, K, np.zeros(5), np.eye(3), P_LEFT, "pinhole")
+    broken = StereoFrame(2, frame.left, frame.right, replace(frame.camera, raw=(bad, bad)))
+    stage, sentence = Rectify().survey([broken, frame])
+    assert stage.row_offset[0] == pytest.approx(1.0, abs=0.1)
+    assert "of 1 frames" in sentence
+
+
+def test_a_list_of_terms_is_taken_as_the_survey_prints_it():
+    assert Rectify(row_offset=[0.5, 0.1]) == Rectify(row_offset=(0.5, 0.1))
+
+
+@pytest.mark.parametrize("row_offset", [(), (1, 2, 3, 4, 5, 6), 65.0, (0.5, float("nan")), "0.5", True])
 def test_a_row_offset_that_is_none_is_refused(row_offset):
     with pytest.raises(ValueError, match=r"Rectify\.row_offset must be"):
         Rectify(row_offset=row_offset)
@@ -188,7 +261,10 @@ def test_a_real_raw_pair_ends_up_row_aligned():
     calibrated = Rectify(row_offset=0)(frame)
     assert abs(row_offset(frame)) > 2.0
     assert 1.0 < abs(row_offset(calibrated)) < 2.0  # its calibration leaves about 1.6 px
-    assert abs(row_offset(Rectify()(frame))) < 0.1
+    aligned = Rectify()(frame)
+    rest = measure([(aligned.left, aligned.right)])
+    assert not rest.clear
+    assert rest.largest < 0.5
 
 
 def polar_camera(folder, size):
