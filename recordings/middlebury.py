@@ -66,7 +66,7 @@ def import_scene(folder: Path, out: Path) -> str:
         said = f"with true disparities, but not which are occluded (no {MASK})"
     else:
         said = "with true disparities and occlusions"
-    return f"1 stereo frame {said}; run it with --set matched.disparities={scene.disparities}"
+    return f"1 stereo frame {said}; run it with --set disparities={scene.disparities}"
 
 
 def logs_of(source: Path, out: Path) -> list[tuple[Path, Path]]:

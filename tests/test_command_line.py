@@ -25,7 +25,7 @@ from tests.conftest import FRAMES, rewrite
 from tests.recordings.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
-SMALL = ("--set", "matched.disparities=64")
+SMALL = ("--set", "disparities=64")
 RESULTS = {
     "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/tf", "/nav/diagnostics",
 }  # fmt: skip
@@ -166,8 +166,8 @@ def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, capsys):
     scene, log, out = write_scene(tmp_path / "Box"), tmp_path / "box.mcap", tmp_path / "out.mcap"
     assert roverflow("import", "middlebury", scene, log) == 0
     said = capsys.readouterr().out.splitlines()
-    assert said[-1].endswith("run it with --set matched.disparities=32")
-    assert roverflow("run", log, "--set", "matched.disparities=32", "-o", out, "--no-rrd") == 0
+    assert said[-1].endswith("run it with --set disparities=32")
+    assert roverflow("run", log, "--set", "disparities=32", "-o", out, "--no-rrd") == 0
     (tmp_path / "matching.yaml").write_text(MATCHING)
     matching = ("-p", tmp_path / "matching.yaml", "--set", "disparity.disparities=32")
     assert roverflow("run", log, *matching, "-o", tmp_path / "matched.mcap", "--no-rrd") == 0
@@ -418,7 +418,7 @@ def test_graph_draws_every_stream(form, capsys):
 
 
 def test_graph_shows_what_is_set(capsys):
-    assert roverflow("graph", "--set", "matched.disparities=128") == 0
+    assert roverflow("graph", "--set", "disparities=128") == 0
     assert "disparities=128" in capsys.readouterr().out
 
 

@@ -30,7 +30,7 @@ def main() -> None:
 
 
 def _bench(log: Path, pipeline: str, size: str, disparities: int, cores: int) -> None:
-    arguments = ("run", log, "-p", pipeline, "--set", f"matched.disparities={disparities}", "--workers", cores)
+    arguments = ("run", log, "-p", pipeline, "--set", f"disparities={disparities}", "--workers", cores)
     out, summary_file = log.with_name("out.mcap"), log.with_name("summary.json")
     _roverflow(*arguments, "-o", out, "--end", 0.6)
     _roverflow(*arguments, "-o", out, "--summary", summary_file)

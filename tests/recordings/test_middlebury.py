@@ -61,7 +61,7 @@ def test_a_pfm_is_read_in_either_byte_order_from_its_last_row_up(tmp_path: Path,
 
 def test_images_and_camera_of_a_scene_come_back_from_its_log(tmp_path: Path) -> None:
     log, said = imported(write_scene(tmp_path / "Box"))
-    assert said.endswith("run it with --set matched.disparities=32")
+    assert said.endswith("run it with --set disparities=32")
     frame = frame_of(log)
     for pixels, expected in zip((frame.left, frame.right), scenes.images(), strict=True):
         np.testing.assert_array_equal(pixels, expected)
