@@ -1,5 +1,6 @@
 """The method: plain callables over the data types of `stages.data`."""
 
+from stages.assess import Assess
 from stages.binarise import Binarise
 from stages.clean import Clean
 from stages.data import (
@@ -28,6 +29,7 @@ from stages.reproject import Reproject
 from stages.voxelise import Voxelise
 
 __all__ = [
+    "Assess",
     "Binarise",
     "CameraImage",
     "CameraModel",

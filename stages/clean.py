@@ -9,7 +9,7 @@ as method "knn".
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -52,13 +52,7 @@ class Clean(Stage):
         if cloud.sensor is not None:
             raise ValueError(f"Clean: the cloud is in frame '{cloud.frame_id}', not its camera's; Clean precedes Level")
         keep = self._organised(cloud) if self.method == "organised" else self._knn(cloud)
-        return replace(
-            cloud,
-            points=cloud.points.take(keep, axis=0),
-            colors=cloud.colors.take(keep, axis=0),
-            sigma=cloud.sigma.take(keep),
-            pixel=cloud.pixel.take(keep),
-        )
+        return cloud.only(keep)
 
     def _organised(self, cloud: PointCloud) -> Array:
         """Indices of the points that stay, by their neighbours in the image."""
