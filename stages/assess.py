@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import label
 
 from stages.data import Array, ElevationMap
 from stages.kernels.footprint import fit_planes
@@ -21,11 +22,10 @@ from stages.stage import Stage, parameter
 _LEVERAGE = 0.25
 # Under a wheel there are few cells, and it is the slope that counts.
 _WHEEL_LEVERAGE = 0.35
-# How far above the wide plane ground may lie, round by round, in shares of `obstacle`: first hardly at all, so that the
-# plane sinks off the rocks, whose sides and tops would else hold it up.
-_ABOVE = (0.06, 0.06, 0.18, 0.18, 0.18)
-# How far below the wide plane ground may lie in the end: deeper is a pit, which would pull the narrow planes down.
-_BELOW = 0.6
+# How far above and below the wide plane ground may lie, round by round, in shares of `obstacle`. Both ways, so that a
+# ditch is as little ground as a row of rocks, whichever covers less than the ground does; farther below than above,
+# for rocks are many and pits are few, and from wide to narrow, for the first plane leans on all of them.
+_WITHIN = ((0.4, 0.8), (0.25, 0.6), (0.18, 0.6), (0.18, 0.6), (0.18, 0.6))
 # How far off the plane between the wheels ground may lie, both ways. Ground is found anew each round, and with it a
 # crest that bends away from the wide plane comes back, from its sides inwards.
 _ABOUT = (0.3, 0.3, 0.3)
@@ -38,7 +38,8 @@ class Assess(Stage):
     - ground, m: height of the ground under a cell, its own obstacle not counted, and under small holes too;
     - step, m: how far the cell reaches from the ground, the largest of: its top above the lowest cell within a wheel's
       reach, what the slope of the surroundings explains taken off; its top above `ground`; its bottom below `ground`;
-      its top above its bottom. One stray point makes no step: an extreme counts up to four times as far as the mean;
+      its top above its bottom. One stray point makes no step: an extreme counts up to four times as far as the mean.
+      An obstacle is as high as its highest cell: cells off the ground by `skirt` that join share the largest step;
     - slope, rad: of the ground under the footprint;
     - steepness, rad: of all that is no obstacle, under a wheel;
     - roughness, m: root mean square of the same off its plane under the footprint;
@@ -52,6 +53,9 @@ class Assess(Stage):
     wheel: float = parameter(0.3, "diameter of a wheel: its reach, and the window of steepness", unit="m", low=0.05)
     surroundings: float = parameter(2.5, "width of the window in which an obstacle stands out", unit="m", low=0.05)
     obstacle: float = parameter(0.17, "what reaches farther from the ground is no part of it", unit="m", low=0.01)
+    skirt: float = parameter(
+        0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.01
+    )
     steepest: float = parameter(
         0.349, "slope of the surroundings up to which it is no step (20 degrees)", unit="rad", low=0.0, high=1.5
     )
@@ -87,10 +91,10 @@ class Assess(Stage):
         wide = _cells(max(self.surroundings, self.footprint), resolution)
         narrow = _cells(self.wheel_track, resolution)
         ground = observed
-        for share in _ABOVE:
+        for above, below in _WITHIN:
             around = fit_planes(height, ground, wide, _LEVERAGE)
-            ground = observed & ~(height - around[0] > share * self.obstacle)
-        ground &= ~(around[0] - height > _BELOW * self.obstacle)
+            off = height - around[0]
+            ground = observed & ~((off > above * self.obstacle) | (off < -below * self.obstacle))
         for share in _ABOUT:
             local = fit_planes(height, ground, narrow, _LEVERAGE)
             level = np.where(np.isfinite(local[0]), local[0], around[0])
@@ -117,7 +121,16 @@ class Assess(Stage):
         below = np.minimum(ground - bottom, 4 * (ground - height))
         within = np.minimum(top - bottom, 4 * np.minimum(height - bottom, top - height))
         step = np.fmax.reduce([rise, above, below, within, np.zeros_like(height)])
-        return np.where(observed, step, np.nan), support
+        raised = observed & ((np.abs(height - ground) >= self.skirt) | (step >= self.obstacle))
+        return np.where(observed, _as_whole_obstacles(step, raised), np.nan), support
+
+
+def _as_whole_obstacles(step: Array, raised: Array) -> Array:
+    """The steps (rows, cols), all `raised` cells that join, corners included, having the largest of theirs."""
+    obstacle, _ = label(raised, np.ones((3, 3)))
+    highest = np.zeros(obstacle.max() + 1)
+    np.maximum.at(highest, obstacle[raised], step[raised])
+    return np.where(raised, highest[obstacle], step)
 
 
 def _slope(plane: Array, resolution: float) -> Array:

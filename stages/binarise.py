@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_dilation, label
+from scipy.ndimage import binary_dilation
 
 from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason
 from stages.stage import Stage, parameter
@@ -26,8 +26,7 @@ class Binarise(Stage):
     """Classifies each cell as free, hazard or unknown, with the reason.
 
     method "rover": a hazard is a cell that
-    - STEP: reaches `max_step` from the ground, or is part of an obstacle that does: off the ground by `skirt` and
-      joined to such a cell by others like it;
+    - STEP: reaches `max_step` from the ground, or is part of an obstacle that does;
     - CLEARANCE: stands `ground_clearance` above the ground between the wheels;
     - SLOPE: lies on ground steeper than `max_slope` under the footprint, or under a wheel;
     - ROUGHNESS: has heights about it whose root mean square off their plane exceeds `max_roughness`;
@@ -50,9 +49,6 @@ class Binarise(Stage):
     max_roughness: float = parameter(0.06, "root mean square of heights off their plane", unit="m", low=0.0)
     margin: float = parameter(
         0.03, "a height this close to its limit counts as reaching it: cells blunt a peak", unit="m", low=0.0
-    )
-    skirt: float = parameter(
-        0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.01
     )
     beside: float = parameter(0.05, "cells this near to an obstacle are hazards too", unit="m", low=0.0)
     max_sigma: float = parameter(
@@ -90,7 +86,6 @@ class Binarise(Stage):
         ground, step, slope, steepness, roughness, support = (elevation.layers[name] for name in LAYERS)
         above = elevation.layers["elevation"] - ground
         high = observed & (step >= self.max_step - self.margin)
-        high = _whole_obstacles(high, observed & (np.abs(above) >= self.skirt))
         belly = observed & (above >= self.ground_clearance - self.margin)
         limit = self.max_slope + _SLOPE_ROUNDING
 
@@ -108,14 +103,6 @@ class Binarise(Stage):
         if "variance" not in elevation.layers:
             return np.ones(elevation.shape, bool)
         return elevation.layers["variance"] <= self.max_sigma**2
-
-
-def _whole_obstacles(peaks: Array, raised: Array) -> Array:
-    """The cells of all connected sets of `raised` cells that have one of `peaks` among them, (rows, cols) bool."""
-    obstacles, _ = label(raised | peaks, np.ones((3, 3)))
-    dangerous = np.bincount(obstacles[peaks], minlength=obstacles.max() + 1) > 0
-    dangerous[0] = False
-    return dangerous[obstacles]  # type: ignore[no-any-return]
 
 
 def _near(cells: Array, distance: float) -> Array:
