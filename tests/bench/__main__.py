@@ -4,4 +4,4 @@ from tests.bench import matching, pipeline, terrain
 
 matching.main()
 pipeline.main()
-terrain.main()
+terrain.main(["--stride", "10"])

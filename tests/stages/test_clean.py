@@ -112,7 +112,8 @@ def test_filled_points_support_nobody_and_are_kept_within_the_crop() -> None:
     pixels = np.where(source == Source.FILLED, np.float32(d[301, 101]), disparity.pixels)
     cloud = Reproject(filled=True)(blank_frame(), replace(disparity, pixels=pixels, source=source))
     clean = Clean()(cloud)
-    assert clean.source is not None and cloud.source is not None
+    assert clean.source is not None
+    assert cloud.source is not None
     assert 301 * 640 + 101 not in clean.pixel  # a speck, though all the filled pixels about it agree
     assert (clean.source == Source.FILLED).sum() == (cloud.source == Source.FILLED).sum() > 400
     far = replace(disparity, pixels=np.where(source == Source.FILLED, np.float32(12.0), pixels), source=source)
