@@ -17,6 +17,7 @@ An unknown cell is neither free nor a hazard: it finds no rock and raises no ala
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ NEAR = 8.0  # m from base_link, within which cells and rocks are asked for
 RINGS = ((0.0, 2.0), (2.0, 4.0), (4.0, 6.0), (6.0, 8.0), (0.0, 4.0), (4.0, 8.0), (0.0, 8.0))  # m from base_link
 HIGH_ROCK, HIGHER_ROCK = 0.2, 0.3  # m
 SHOWN, PIXELS = 0.5, 20
+ROCK_COUNTS = ("in_view", "found", "glimpsed", "glimpsed_found")
 SLOPES = (0.0, 5.0, 10.0, 15.0, 20.0)  # degrees, borders of the bins of false alarms
 
 
@@ -127,7 +129,7 @@ class TerrainTally:
         }
         rocks = {
             f"{limit:g} m": {
-                **{name: c.get(f"{name}_{limit:g}", 0.0) for name in ("in_view", "found", "glimpsed", "glimpsed_found")},
+                **{name: c.get(f"{name}_{limit:g}", 0.0) for name in ROCK_COUNTS},
                 "recall": share(c.get(f"found_{limit:g}", 0.0), c.get(f"in_view_{limit:g}", 0.0)),
             }
             for limit in (HIGH_ROCK, HIGHER_ROCK)
@@ -152,14 +154,14 @@ class TerrainTally:
                 "false_alarm": part("safe_told", "safe"),
                 "unknown": part("unknown", "seen"),
                 "by_slope": {f"{low:g}-{high:g} deg": part(f"safe_told_{low:g}", f"safe_{low:g}")
-                             for low, high in zip(SLOPES[:-1], SLOPES[1:], strict=True)},
+                             for low, high in pairwise(SLOPES)},
             },
         }  # fmt: skip
 
 
 def _hazards(truth: TrueGround, cells: Array) -> dict[str, float]:
-    """Sums over one frame, of seen cells: hazards, told, called free; the same of those on a rock; safe ones, told to be
-    hazards, also by slope; unknown ones. And of all cells called free, wherever they are: how many lie on a rock."""
+    """Sums over one frame, of seen cells: hazards, told, called free; the same of those on a rock; safe ones, told to
+    be hazards, also by slope; unknown ones. And of all cells called free, wherever they are, those on a rock."""
     free, told, seen = cells == Cell.FREE, cells == Cell.HAZARD, truth.seen
     on_rock = truth.rock >= np.float32(HIGH_ROCK)
     safe = seen & ~truth.hazard
@@ -177,7 +179,7 @@ def _hazards(truth: TrueGround, cells: Array) -> dict[str, float]:
         "free": free,
         "free_on_rock": free & on_rock,
     }
-    for low, high in zip(SLOPES[:-1], SLOPES[1:], strict=True):
+    for low, high in pairwise(SLOPES):
         inside = safe & (truth.slope >= np.radians(low)) & (truth.slope < np.radians(high))
         masks |= {f"safe_{low:g}": inside, f"safe_told_{low:g}": inside & told}
     return _summed(masks)
@@ -213,25 +215,27 @@ def format_terrain(found: dict[str, Any]) -> list[str]:
     """The measures as lines for a terminal, at most 100 columns wide."""
     heights, hazards, rocks, intervals = (found[name] for name in ("heights", "hazards", "rocks", "intervals"))
     lines = ["terrain      in cells that a pixel of both cameras hits, by distance from base_link",
-             "               distance    known | levelled RMSE   bias  within 5 cm"]  # fmt: skip
+             "               distance       known | levelled RMSE   bias  within 5 cm"]  # fmt: skip
     for name, ring in heights.items():
         level = ring["levelled"]
-        lines.append(f"               {name:<8} {_percent(ring['completeness']):>8} | {_cm(level['rmse']):>13}"
+        lines.append(f"               at {name:<8} {_percent(ring['completeness']):>8} | {_cm(level['rmse']):>13}"
                      f" {_cm(level['bias']):>6} {_percent(level['within_5cm']):>12}")  # fmt: skip
     made_up, random, total = found["made_up"], intervals["random"], intervals["total"]
+    on_rocks = _percent(hazards["rock_recall"]), _percent(hazards["rock_false_safe"])
+    held = [_percent(interval[k]) for interval in (random, total) for k in ("1", "2")]
     lines += [
         f"             {_percent(made_up['of_values'])} of all values lie where no camera could see",
-        f"             errors within 1 and 2 stated sigmas: {_percent(random['1'])}, {_percent(random['2'])} levelled; "
-        f"{_percent(total['1'])}, {_percent(total['2'])} with the tilt's",
+        f"             {held[0]} and {held[1]} of levelled errors within 1 and 2 stated sigmas,",
+        f"             {held[2]} and {held[3]} of raw ones within those with the tilt's",
     ]
     for name, rock in rocks.items():
-        lines.append(f"             rocks of {name} and higher: {rock['found']:.0f} of {rock['in_view']:.0f} in view found, "
-                     f"{rock['glimpsed_found']:.0f} of {rock['glimpsed']:.0f} of which anything shows")  # fmt: skip
+        found_of = f"{rock['found']:.0f} of {rock['in_view']:.0f} in view found"
+        glimpsed = f"{rock['glimpsed_found']:.0f} of {rock['glimpsed']:.0f}"
+        lines.append(f"             rocks of {name} and higher: {found_of}, {glimpsed} of which anything shows")
     slopes = ", ".join(f"{name} {_percent(value)}" for name, value in hazards["by_slope"].items())
     return [
         *lines,
-        f"             cells on rocks: {_percent(hazards['rock_recall'])} hazard, "
-        f"{_percent(hazards['rock_false_safe'])} free; of the free cells {_percent(hazards['free_on_rock'])} lie on one",
+        f"             cells on rocks: {on_rocks[0]} hazard, {on_rocks[1]} free",
         f"             false alarms by slope: {slopes}",
     ]
 

@@ -32,11 +32,12 @@ class Binarise(Stage):
     - ROUGHNESS: has heights about it whose root mean square off their plane exceeds `max_roughness`;
     - BESIDE: is measured, and within `beside` of a cell that is a hazard for STEP or CLEARANCE: to a cell or so nobody
       knows where a rock ends.
-    Other cells are unknown where they have no points (OCCLUDED where the map says so, else UNOBSERVED), and UNSURE where
-    so few cells lie about them that the ground is not determined or a step not ruled out, or where the layer
+    Other cells are unknown where they have no points (OCCLUDED where the map says so, else UNOBSERVED), and UNSURE
+    where so few cells lie about them that the ground is not determined or a step not ruled out, or where the layer
     `variance`, if the map has it, does not say that the height is known to `max_sigma`. The rest is free (CLEAR).
 
-    Ground wider than Assess.surroundings is terrain, not an obstacle: its edge is a hazard, its top is judged by itself.
+    Ground wider than Assess.surroundings is terrain, not an obstacle: its edge is a hazard, its top is judged as
+    ground.
 
     method "absolute", the paper's: a hazard is a cell whose elevation exceeds `max_step` (ELEVATION); all others with
     points are free, however little is known of their height.

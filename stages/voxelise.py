@@ -129,7 +129,8 @@ def _lever(cloud: PointCloud, height: Array, x: Array, y: Array, east: Array, no
 
 def _occluded(cloud: PointCloud, known: Array, grid: tuple[float, tuple[float, float], int, float]) -> Array:
     """The layer `occluded`."""
-    assert cloud.sensor is not None and cloud.shape is not None
+    assert cloud.sensor is not None
+    assert cloud.shape is not None
     x, y = (float(value) for value in cloud.sensor.translation[:2])
     hidden = hidden_cells(cloud.points, cloud.pixel, cloud.shape[1], (x, y), *grid)
     return np.where(known, 0.0, np.where(hidden, 1.0, np.nan))

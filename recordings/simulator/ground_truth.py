@@ -25,8 +25,8 @@ def map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, to
                surface: Array) -> dict[str, Array]:  # fmt: skip
     """Further true layers over cells with centres x, y (rows, cols), m, in the frame's level frame.
 
-    top: (rows, cols) elevation, m; visible: (rows, cols), 1 where a pixel of both cameras hits the cell; surface: (rows,
-    cols) int, the rock that one meets from above at the centre, or the ground.
+    top: (rows, cols) elevation, m; visible: (rows, cols), 1 where a pixel of both cameras hits the cell; surface:
+    (rows, cols) int, the rock that one meets from above at the centre, or the ground.
 
     Returns float32 (rows, cols): mean, m, of the surface over the cell, NaN where it is not visible; in_view, 1 where
     both cameras could see some of it within the region, else 0; rock, m, the height of the rock at the centre, 0 for
@@ -34,7 +34,7 @@ def map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, to
     """
     terrain, step = simulation.terrain, simulation.map_resolution
     near = np.hypot(x, y) <= simulation.region + step
-    ahead = near & ((visible > 0) | _in_images(simulation, truth, x, y, top))
+    ahead = (visible > 0) | (near & _in_images(simulation, truth, x, y, top))
     row, col = np.nonzero(ahead)
     offset = ((np.arange(FINE) + 0.5) / FINE - 0.5) * step
     dx, dy = (part.ravel() for part in np.meshgrid(offset, offset))

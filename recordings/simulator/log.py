@@ -108,8 +108,9 @@ def true_disparity(simulation: Simulation, stamp: int, truth: FrameTruth) -> Dis
 def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[ElevationMap, NavigationMap]:
     """Elevation (top surface, rocks included) with the mask `visible`, and hazards, over the square about base_link.
 
-    The elevation map has the layers of `ground_truth.map_layers` besides. A cell is a hazard if its centre lies on a rock at least 0.2 m high or on ground steeper than 20 degrees. A cell is
-    visible if a pixel that both cameras see hits it within the region.
+    The elevation map has the layers of `ground_truth.map_layers` besides. A cell is a hazard if its centre lies on a
+    rock at least 0.2 m high or on ground steeper than 20 degrees. A cell is visible if a pixel that both cameras see
+    hits it within the region.
     """
     terrain, half, step = simulation.terrain, simulation.map_half_width, simulation.map_resolution
     count = round(2 * half / step)

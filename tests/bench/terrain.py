@@ -67,9 +67,8 @@ def measured_tilt(simulation: Simulation, stamp: int) -> Tilt:
     for sample in (number, number + 1):
         at = simulation.begin + round(sample / simulation.tilt_rate * 1e9)
         random = np.random.default_rng([simulation.seed, 4, sample])
-        reading = traverse.inclinometer_reading(
-            simulation.base_at(at), simulation.mounts[2], simulation.tilt_noise, random
-        )
+        base, mount = simulation.base_at(at), simulation.mounts[2]
+        reading = traverse.inclinometer_reading(base, mount, simulation.tilt_noise, random)
         up = Rotation.from_quat(reading).as_matrix()[2]
         samples.append(Tilt(at, up / np.linalg.norm(up)))
     return samples[0].interpolated(samples[1], stamp)
@@ -85,7 +84,7 @@ def seen_by_both(simulation: Simulation, stamp: int, truth: FrameTruth) -> Dispa
 
 
 def through(pipeline: str, streams: dict[str, Any]) -> tuple[dict[str, Any], float]:
-    """All streams of a pipeline for one frame, those given left as they are, and the terrain stages' processor seconds."""
+    """All streams of a pipeline for one frame, those given left alone, and the processor seconds of terrain stages."""
     streams, seconds = dict(streams), 0.0
     for node in load(pipeline).nodes:
         if node.aligns or node.name in streams or (node.name == "matched" and "disparity" in streams):
