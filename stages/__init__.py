@@ -19,6 +19,7 @@ from stages.data import (
     StereoFrame,
     Tilt,
     Transform,
+    VoxelMap,
 )
 from stages.level import Level
 from stages.match import Match
@@ -27,6 +28,7 @@ from stages.rectify import Rectify
 from stages.refine import Refine
 from stages.reproject import Reproject
 from stages.voxelise import Voxelise
+from stages.voxels import Voxels
 
 __all__ = [
     "Assess",
@@ -53,5 +55,7 @@ __all__ = [
     "StereoFrame",
     "Tilt",
     "Transform",
+    "VoxelMap",
     "Voxelise",
+    "Voxels",
 ]

@@ -361,6 +361,24 @@ class ElevationMap:
 
 
 @dataclass(frozen=True, eq=False)
+class VoxelMap:
+    """Cubes of space that hold points. index: (N, 3) int32, a cube reaching from index * resolution, m, to (index + 1)
+    * resolution along x, y, z of `frame_id`; colors: (N, 3) uint8 RGB, mean; count: (N,) int32, points."""
+
+    stamp: int
+    index: Array
+    colors: Array
+    count: Array
+    resolution: float
+    frame_id: str
+
+    def __post_init__(self) -> None:
+        publish(self, "index", (None, 3), np.int32)
+        publish(self, "colors", (len(self.index), 3), np.uint8)
+        publish(self, "count", (len(self.index),), np.int32)
+
+
+@dataclass(frozen=True, eq=False)
 class NavigationMap:
     """Where the rover may drive. cells: (rows, cols) int8, codes of `Cell`; reason: (rows, cols) uint8, codes of
     `Reason`; grid as in `ElevationMap`."""

@@ -13,6 +13,7 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -83,10 +84,16 @@ def seen_by_both(simulation: Simulation, stamp: int, truth: FrameTruth) -> Dispa
     return Disparity(stamp, pixels, source, known.astype(np.float32), camera=simulation.camera)
 
 
+@cache
+def nodes(pipeline: str) -> list[Any]:
+    """The stages and aligners of a pipeline, each after those it needs."""
+    return list(load(pipeline).nodes)
+
+
 def through(pipeline: str, streams: dict[str, Any]) -> tuple[dict[str, Any], float]:
     """All streams of a pipeline for one frame, those given left alone, and the processor seconds of terrain stages."""
     streams, seconds = dict(streams), 0.0
-    for node in load(pipeline).nodes:
+    for node in nodes(pipeline):
         if node.aligns or node.name in streams or (node.name == "matched" and "disparity" in streams):
             continue
         start = time.thread_time()
