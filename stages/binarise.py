@@ -30,8 +30,8 @@ class Binarise(Stage):
     - CLEARANCE: stands `ground_clearance` above the ground between the wheels;
     - SLOPE: lies on ground steeper than `max_slope` under the footprint, or under a wheel;
     - ROUGHNESS: has heights about it whose root mean square off their plane exceeds `max_roughness`;
-    - BESIDE: is measured, and within `beside` of a cell that is a hazard for STEP or CLEARANCE: to a cell or so nobody
-      knows where a rock ends.
+    - BESIDE: is measured, and within `beside` of a cell that is a hazard for STEP or CLEARANCE: to a cell or two nobody
+      knows where a rock ends (0.25 px of disparity are 7 cm at 8 m).
     Other cells are unknown where they have no points (OCCLUDED where the map says so, else UNOBSERVED), and UNSURE
     where so few cells lie about them that the ground is not determined or a step not ruled out, or where the layer
     `variance`, if the map has it, does not say that the height is known to `max_sigma`. The rest is free (CLEAR).
@@ -51,7 +51,7 @@ class Binarise(Stage):
     margin: float = parameter(
         0.03, "a height this close to its limit counts as reaching it: cells blunt a peak", unit="m", low=0.0
     )
-    beside: float = parameter(0.05, "cells this near to an obstacle are hazards too", unit="m", low=0.0)
+    beside: float = parameter(0.1, "cells this near to an obstacle are hazards too", unit="m", low=0.0)
     max_sigma: float = parameter(
         0.067, "standard deviation of a cell's height beyond which it is not free (3 are a step)", unit="m", low=0.0
     )

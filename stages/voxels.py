@@ -28,9 +28,10 @@ class Voxels(Stage):
         if cloud.frame_id != LEVEL_FRAME:
             raise ValueError(f"Voxels: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
         x, y = cloud.points[:, 0], cloud.points[:, 1]
-        inside = np.isfinite(cloud.points).all(axis=1) & (x * x + y * y <= self.region**2)
+        inside = np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.region**2)
         if cloud.source is not None:
             inside &= cloud.source != Source.FILLED
-        index, count, colors = voxel_means(cloud.points[inside], cloud.colors[inside], self.resolution)
+        near = cloud.only(inside)
+        index, count, colors = voxel_means(near.points, near.colors, self.resolution)
         kept = count >= self.least
         return VoxelMap(cloud.stamp, index[kept], colors[kept], count[kept], self.resolution, LEVEL_FRAME)

@@ -32,41 +32,40 @@ def voxel_means(points: Array, colors: Array, edge: float) -> tuple[Array, Array
 def _voxel_means(points, colors, edge, low, high):  # type: ignore[no-untyped-def]
     n = points.shape[0]
     cols, rows, levels = high[0] - low[0] + 1, high[1] - low[1] + 1, high[2] - low[2] + 1
-    place = np.empty(n, np.int64)
+    place, height = np.empty(n, np.int32), np.empty(n, np.int32)
     start = np.zeros(rows * cols + 1, np.int64)
     for i in range(n):
         col = int(np.floor(np.float64(points[i, 0]) / edge)) - low[0]
         row = int(np.floor(np.float64(points[i, 1]) / edge)) - low[1]
         place[i] = row * cols + col
+        height[i] = int(np.floor(np.float64(points[i, 2]) / edge)) - low[2]
         start[place[i] + 1] += 1
     for k in range(rows * cols):
         start[k + 1] += start[k]
-    order, filled = np.empty(n, np.int64), start[:-1].copy()
+    order, end = np.empty(n, np.int32), start[:-1].copy()
     for i in range(n):
-        order[filled[place[i]]] = i
-        filled[place[i]] += 1
-    index, count, total = np.empty((n, 3), np.int32), np.zeros(n, np.int32), np.zeros((n, 3), np.int64)
-    found, slot = 0, np.full(levels, -1, np.int64)
+        order[end[place[i]]] = i
+        end[place[i]] += 1
+    index, count, total = np.empty((n, 3), np.int32), np.empty(n, np.int32), np.empty((n, 3), np.int32)
+    sums = np.zeros((levels, 4), np.int32)  # of one column: points, red, green, blue
+    found = 0
     for k in range(rows * cols):
         bottom, top = levels, -1
         for j in range(start[k], start[k + 1]):
-            level = int(np.floor(np.float64(points[order[j], 2]) / edge)) - low[2]
-            slot[level] = 0
+            i = order[j]
+            level = height[i]
             bottom, top = min(bottom, level), max(top, level)
+            sums[level, 0] += 1
+            for channel in range(3):
+                sums[level, channel + 1] += colors[i, channel]
         for level in range(bottom, top + 1):
-            if slot[level] == 0:
-                slot[level] = found
+            if sums[level, 0]:
                 index[found, 0], index[found, 1] = k % cols + low[0], k // cols + low[1]
                 index[found, 2] = level + low[2]
+                count[found] = sums[level, 0]
+                total[found] = sums[level, 1:]
+                sums[level] = 0
                 found += 1
-        for j in range(start[k], start[k + 1]):
-            i = order[j]
-            cube = slot[int(np.floor(np.float64(points[i, 2]) / edge)) - low[2]]
-            count[cube] += 1
-            for channel in range(3):
-                total[cube, channel] += colors[i, channel]
-        for level in range(bottom, top + 1):
-            slot[level] = -1
     return index[:found].copy(), count[:found].copy(), total[:found].copy()
 
 

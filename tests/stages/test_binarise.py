@@ -47,10 +47,10 @@ def with_plane(elevation: ElevationMap, gx: float, gy: float, offset: float = 0.
 
 
 def shares(terrain: Terrain, result: NavigationMap) -> tuple[float, float, float, float]:
-    """Recall of cells 0.2 m above the ground, share of them called free, false alarms two cells and more from any rock,
-    share of rocks found."""
+    """Recall of cells 0.2 m above the ground, share of them called free, false alarms three cells and more from any
+    rock, share of rocks found."""
     hazard = result.cells == Cell.HAZARD
-    high, clear = terrain.above_mean >= 0.2, ~binary_dilation(terrain.rock > 0, np.ones((5, 5)))
+    high, clear = terrain.above_mean >= 0.2, ~binary_dilation(terrain.rock > 0, np.ones((7, 7)))
     found = [hazard[terrain.rock == k].any() for k in range(1, terrain.rock.max() + 1)]
     free = (result.cells == Cell.FREE)[high].mean()
     return float(hazard[high].mean()), float(free), float(hazard[clear].mean()), float(np.mean(found))
@@ -130,7 +130,7 @@ def test_a_rock_on_a_slope_is_a_hazard_and_the_slope_beside_it_is_free() -> None
     result = decided(map_of(z))
     assert (result.reason[distance < 0.18] == Reason.STEP).all()
     assert (result.cells[distance > 0.45] == Cell.FREE).all()
-    assert (result.cells[distance > 0.35] == Cell.FREE).mean() > 0.995
+    assert (result.cells[distance > 0.35] == Cell.FREE).mean() > 0.98
 
 
 @pytest.mark.parametrize("step", [0.12, 0.16, 0.18, 0.25])
@@ -241,8 +241,8 @@ def test_a_cell_whose_height_is_not_known_to_a_step_is_not_free_and_a_hazard_sta
     flat[60:64, 60:64] = 0.4
     sigma = np.full(flat.shape, 0.02)
     sigma[10:20, 10:20], sigma[30, 30], sigma[60:64, 60:64] = 0.1, np.nan, 0.1
-    doubtful = ~(sigma <= 0.05) & (flat == 0) & ~binary_dilation(flat > 0, np.ones((3, 3)))
-    level = ~doubtful & ~binary_dilation(flat > 0, np.ones((3, 3)))
+    apart = ~binary_dilation(flat > 0, np.ones((5, 5)))
+    doubtful, level = ~(sigma <= 0.05) & apart, (sigma <= 0.05) & apart
     result = decided(map_of(flat, variance=sigma**2))
     assert (result.reason[doubtful] == Reason.UNSURE).all()
     assert (result.cells[doubtful] == Cell.UNKNOWN).all()
