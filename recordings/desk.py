@@ -34,6 +34,7 @@ class Panel(Enum):
     SUPERPIXELS = auto()
     SOURCE = auto()
     CLOUD = auto()
+    VOXELS = auto()
     TERRAIN = auto()
     CAMERA = auto()
     TRAJECTORY = auto()
@@ -121,7 +122,7 @@ def _superpixels(drawn: Places) -> list[_View]:
 
 def _space(drawn: Places) -> _Part | None:
     """Per frame of reference the clouds and the terrains, each with the cameras; and the trajectory so far."""
-    clouds = _tabs(_spaces(drawn, Panel.CLOUD, "cloud"))
+    clouds = _tabs([*_spaces(drawn, Panel.VOXELS, "voxels"), *_spaces(drawn, Panel.CLOUD, "cloud")])
     terrains = _tabs([*_trajectories(drawn), *_spaces(drawn, Panel.TERRAIN, "terrain")])
     return _stack([clouds, terrains])
 

@@ -28,6 +28,7 @@ from stages.data import (
     Source,
     StereoFrame,
     Tilt,
+    VoxelMap,
 )
 
 DISPARITY_STEPS = 8  # disparities are kept to 1/8 px: four fifths of the size that 1/16 px takes
@@ -165,6 +166,18 @@ def draw_cloud(canvas: Canvas, path: str, cloud: PointCloud) -> str:
             canvas.log(f"{path}/{rr.escape_entity_path_part(name)}", rr.Scalars(angle))
         canvas.hung.setdefault((Panel.ANGLE, path), Place(Panel.ANGLE, path, path))
     return f"{path} {len(cloud.points)} points"
+
+
+@draws(VoxelMap)
+def draw_voxels(canvas: Canvas, path: str, voxels: VoxelMap) -> str:
+    """The cubes, each in its mean colour, as many as the canvas shows points at most."""
+    some = slice(None, None, max(1, -(-len(voxels.index) // canvas.max_points)))
+    centres = (voxels.index[some] + np.float32(0.5)) * np.float32(voxels.resolution)
+    half = np.full((1, 3), voxels.resolution / 2, np.float32)
+    boxes = rr.Boxes3D(centers=centres, half_sizes=np.broadcast_to(half, centres.shape), colors=voxels.colors[some],
+                       fill_mode=rr.components.FillMode.Solid)  # fmt: skip
+    canvas.log(f"{path}/voxels", boxes, Place(Panel.VOXELS, f"{path}/voxels", path, voxels.frame_id))
+    return f"{path} {len(voxels.index)} voxels"
 
 
 @draws(Tilt)

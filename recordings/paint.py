@@ -33,10 +33,14 @@ CELLS: Mapping[int, tuple[str, Rgb]] = {
 REASONS: Mapping[int, tuple[str, Rgb]] = {
     Reason.CLEAR: ("clear", CELLS[Cell.FREE][1]),
     Reason.UNOBSERVED: ("unobserved", UNKNOWN_RGB),
-    Reason.ELEVATION: ("elevation", (216, 62, 48)),
+    Reason.ELEVATION: ("elevation", (200, 40, 90)),
     Reason.STEP: ("step", (240, 140, 40)),
     Reason.SLOPE: ("slope", (168, 90, 200)),
     Reason.ROUGHNESS: ("roughness", (90, 140, 230)),
+    Reason.CLEARANCE: ("clearance", (216, 62, 48)),
+    Reason.BESIDE: ("beside", (250, 205, 130)),
+    Reason.OCCLUDED: ("occluded", (96, 84, 110)),
+    Reason.UNSURE: ("unsure", (120, 130, 128)),
 }
 
 _LIGHT = np.array([1.0, 1.0, np.sqrt(2.0)]) / 2.0  # from ahead on the left, 45 degrees high: the upper left of the map

@@ -22,7 +22,7 @@ from recordings.drawings import PICTURES, Canvas
 from recordings.errors import LogError
 from recordings.frame_record import FrameRecord, LossEntry
 from recordings.whole_file import give_name, temporary_name, unwritable
-from stages.data import Array, StereoFrame
+from stages.data import Array, ElevationMap, StereoFrame
 
 RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well
 END = b"RRF2FOOT"  # the last magic number of a whole recording, before a checksum of 4 bytes
@@ -148,7 +148,7 @@ class RerunSink:
         present = {stream: items[stream] for stream in self._streams if stream in items}
         captions = []
         for stream, item in present.items():
-            if isinstance(item, StereoFrame) and _drawn_later(stream, present):
+            if _drawn_later(stream, present):
                 continue
             for kinds, draw in PICTURES.items():
                 if len(kinds) == 1 and isinstance(item, kinds[0]):
@@ -190,13 +190,17 @@ def _last(items: Mapping[str, Any], kind: type) -> list[str]:
 
 
 def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
-    """Whether a later stereo stream has the very same pixels, as where the log was rectified already."""
-    later = islice(items.values(), list(items).index(stream) + 1, None)
-    mine = items[stream]
-    return any(
-        isinstance(item, StereoFrame) and _same(item.left, mine.left) and _same(item.right, mine.right)
-        for item in later
-    )  # fmt: skip
+    """Whether a later stream shows the same: stereo with the very same pixels, as where the log was rectified already,
+    or an elevation map of the same heights with layers added."""
+    mine, later = items[stream], islice(items.values(), list(items).index(stream) + 1, None)
+    if isinstance(mine, StereoFrame):
+        frames = (item for item in later if isinstance(item, StereoFrame))
+        return any(_same(item.left, mine.left) and _same(item.right, mine.right) for item in frames)
+    if isinstance(mine, ElevationMap):
+        maps = (item.layers for item in later if isinstance(item, ElevationMap))
+        return any(mine.layers.keys() <= layers.keys() and _same(layers["elevation"], mine.layers["elevation"])
+                   for layers in maps)  # fmt: skip
+    return False
 
 
 def _same(one: Array, other: Array) -> bool:

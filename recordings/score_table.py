@@ -8,6 +8,7 @@ from typing import Any
 from recordings.measures import share
 from recordings.scoring import HIGH_ROCK, NEAR, Score
 from recordings.stereo_measures import CROP_STEP, REGIONS, THRESHOLDS
+from recordings.terrain_measures import format_terrain
 
 
 def format_score(found: Score) -> str:
@@ -19,6 +20,8 @@ def format_score(found: Score) -> str:
         parts.append(_elevation_lines(found.elevation, found.unseen))
     if found.navigation is not None:
         parts.append(_navigation_lines(found.navigation, found.rocks))
+    if found.terrain is not None:
+        parts.append(format_terrain(found.terrain))
     parts.append(_tilt_lines(found))
     return "\n\n".join("\n".join(lines) for lines in parts if lines)
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings import measures, ros2
+from recordings import measures, ros2, terrain_measures
 from recordings.errors import LogError
 from recordings.stereo_measures import StereoErrors, cropped_columns
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap
@@ -47,6 +47,7 @@ class Score:
     (share of them known), raw and levelled (less the best plane of each frame) `HeightErrors.measures`;
     unseen: share of all elevations given in cells that the cameras did not both see;
     navigation: `measures.hazard_measures` within 8 m; rocks: seen, found, recall of those 0.2 m or higher;
+    terrain: `terrain_measures.TerrainTally.measures`;
     tilt: frames, mean, max; untilted: why -> frames with a true tilt whose own could not be scored;
     per_frame: the main figures of each frame. None where the truth has no such topics (tilt: where no frame has both).
     """
@@ -60,6 +61,7 @@ class Score:
     unseen: float = math.nan
     navigation: dict[str, Any] | None = None
     rocks: dict[str, float] | None = None
+    terrain: dict[str, Any] | None = None
     tilt: dict[str, float] | None = None
     untilted: dict[str, int] = field(default_factory=dict)
     per_frame: list[dict[str, float]] = field(default_factory=list)
@@ -140,6 +142,7 @@ class _Tally:
         self.values = self.values_unseen = 0
         self.hazards: dict[str, float] = {}
         self.rocks: dict[str, float] = {}
+        self.terrain: terrain_measures.TerrainTally | None = None
         self.tilts: list[float] = []
         self.untilted: dict[str, int] = {}
         self.per_frame: list[dict[str, float]] = []
@@ -164,6 +167,7 @@ class _Tally:
             row |= self._add_elevation(stamp, frame, ground)
             if "/truth/navigation_map" in frame:
                 row |= self._add_navigation(stamp, frame, ground)
+                self._add_terrain(stamp, frame, ground)
         if "/truth/tilt" in frame:
             row |= self._add_tilt(frame)
         self.per_frame.append(row)
@@ -229,6 +233,23 @@ class _Tally:
             self.rocks = measures.added(self.rocks, {name: row[f"rocks_{name}"] for name in ("seen", "found")})
         return row
 
+    def _add_terrain(self, stamp: int, frame: dict[str, Any], ground: _Ground) -> None:
+        hazard = self._cells(self.truth, stamp, frame["/truth/navigation_map"], ground) == Cell.HAZARD
+        rocks = _rocks(frame["/truth/rocks"]) if "/truth/rocks" in frame else np.zeros((0, 0))
+        truth = terrain_measures.TrueGround.of(ground.map, hazard, rocks)
+        if truth is None:
+            return
+        layers: dict[str, Array] = {}
+        if "/nav/elevation_map" in frame:
+            given = ros2.read_grid_map(frame["/nav/elevation_map"])
+            wanted = given.layers.keys() & {"elevation", "variance", "common_variance"}
+            layers = {name: self._aligned(self.result, stamp, given, given.layers[name], ground.map, np.nan)
+                      for name in sorted(wanted)}  # fmt: skip
+        message = frame.get("/nav/navigation_map")
+        cells = None if message is None else self._cells(self.result, stamp, message, ground)
+        self.terrain = self.terrain or terrain_measures.TerrainTally()
+        self.terrain.add(truth, layers, cells)
+
     def _cells(self, log: Path, stamp: int, message: Any, ground: _Ground) -> Array:
         grid = ros2.read_occupancy_grid(message)
         return self._aligned(log, stamp, grid, grid.cells, ground.map, Cell.UNKNOWN)
@@ -283,6 +304,7 @@ class _Tally:
             navigation=measures.hazard_measures(self.hazards) if self.hazards else None,
             rocks=self.rocks | {"recall": measures.share(self.rocks["found"], self.rocks["seen"])}
             if self.rocks else None,
+            terrain=self.terrain.measures() if self.terrain else None,
             tilt={"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)} if tilts else None,
             untilted=self.untilted,
             per_frame=self.per_frame,
@@ -294,15 +316,19 @@ def _rotation(quaternion: Any) -> Array:
     return np.asarray(Rotation.from_quat(xyzw).as_matrix())
 
 
-def _high_rocks(message: Any) -> Array:
-    """x, y, diameter (N, 3) m of the rocks of /truth/rocks (all within 10 m of base_link) that are hazards."""
+def _rocks(message: Any) -> Array:
+    """x, y, diameter, height, m, and, where told, pixels and shown, of /truth/rocks (all within 10 m of base_link)."""
     offsets = {item.name: item.offset for item in message.fields}
     rows = np.ascontiguousarray(message.data).reshape(message.width, message.point_step)
-    x, y, diameter, height = (
-        np.ascontiguousarray(rows[:, offsets[name] : offsets[name] + 4]).view("<f4")[:, 0]
-        for name in ("x", "y", "diameter", "height")
-    )
-    return np.asarray(np.column_stack([x, y, diameter])[height >= np.float32(HIGH_ROCK)])
+    names = [name for name in ("x", "y", "diameter", "height", "pixels", "shown") if name in offsets]
+    columns = (np.ascontiguousarray(rows[:, offsets[name] : offsets[name] + 4]).view("<f4")[:, 0] for name in names)
+    return np.column_stack(list(columns))
+
+
+def _high_rocks(message: Any) -> Array:
+    """x, y, diameter (N, 3) m of the rocks of /truth/rocks that are hazards."""
+    rocks = _rocks(message)
+    return np.asarray(rocks[rocks[:, 3] >= np.float32(HIGH_ROCK), :3])
 
 
 def _without_nan(value: Any) -> Any:

@@ -1,5 +1,6 @@
 """The method: plain callables over the data types of `stages.data`."""
 
+from stages.assess import Assess
 from stages.binarise import Binarise
 from stages.clean import Clean
 from stages.crosscheck import CrossCheck
@@ -19,6 +20,7 @@ from stages.data import (
     StereoFrame,
     Tilt,
     Transform,
+    VoxelMap,
 )
 from stages.level import Level
 from stages.match import Match
@@ -28,8 +30,10 @@ from stages.refine import Refine
 from stages.reproject import Reproject
 from stages.scale import Enlarge, Halve, Swap
 from stages.voxelise import Voxelise
+from stages.voxels import Voxels
 
 __all__ = [
+    "Assess",
     "Binarise",
     "CameraImage",
     "CameraModel",
@@ -57,5 +61,7 @@ __all__ = [
     "Swap",
     "Tilt",
     "Transform",
+    "VoxelMap",
     "Voxelise",
+    "Voxels",
 ]

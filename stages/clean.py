@@ -9,12 +9,12 @@ as method "knn".
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from stages.data import Array, PointCloud
+from stages.data import Array, PointCloud, Source
 from stages.kernels.outliers import supported, usual_slope
 from stages.kernels.patches import depth_images, patch_sizes
 from stages.stage import Stage, parameter
@@ -52,18 +52,14 @@ class Clean(Stage):
         if cloud.sensor is not None:
             raise ValueError(f"Clean: the cloud is in frame '{cloud.frame_id}', not its camera's; Clean precedes Level")
         keep = self._organised(cloud) if self.method == "organised" else self._knn(cloud)
-        return replace(
-            cloud,
-            points=cloud.points.take(keep, axis=0),
-            colors=cloud.colors.take(keep, axis=0),
-            sigma=cloud.sigma.take(keep),
-            pixel=cloud.pixel.take(keep),
-        )
+        return cloud.only(keep)
 
     def _organised(self, cloud: PointCloud) -> Array:
         """Indices of the points that stay, by their neighbours in the image."""
         if cloud.shape is None:
             raise ValueError("Clean: the cloud does not say its image's shape; set it, or use method: knn")
+        if cloud.source is not None and (cloud.source == Source.FILLED).any():
+            return self._with_filled(cloud)
         if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < cloud.shape[0] * cloud.shape[1]:
             raise ValueError(f"Clean: the cloud has pixel indices outside its image of shape {cloud.shape}")
         kept = np.flatnonzero(
@@ -80,6 +76,16 @@ class Clean(Stage):
             )
         )
         return kept[self._patches(cloud, kept, cloud.shape) >= self.patch * len(kept)]
+
+    def _with_filled(self, cloud: PointCloud) -> Array:
+        """The same where the cloud has filled points: those are no evidence, so they support nobody and are cropped
+        only."""
+        filled = cloud.source == Source.FILLED
+        square = np.einsum("ij,ij->i", cloud.points, cloud.points)
+        kept = filled & (cloud.points[:, 2] > 0) & (square <= (self.region + self.margin) ** 2)
+        measured = np.flatnonzero(~filled)
+        kept[measured[self._organised(cloud.only(measured))]] = True
+        return np.flatnonzero(kept)
 
     def _patches(self, cloud: PointCloud, kept: Array, shape: tuple[int, int]) -> Array:
         """Of each point that was kept, how many points its patch has."""

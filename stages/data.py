@@ -55,6 +55,10 @@ class Reason(IntEnum):
     STEP = 3
     SLOPE = 4
     ROUGHNESS = 5
+    CLEARANCE = 6  # it would touch the rover's belly
+    BESIDE = 7  # next to a hazard, by less than where heights lie is known
+    OCCLUDED = 8  # unknown: hidden from the cameras, or not matched, amid ground that was measured
+    UNSURE = 9  # unknown: measured, but on too little evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +293,9 @@ class PointCloud:
 
     points: (N, 3) float32, m, in `frame_id`; colors: (N, 3) uint8 RGB; sigma: (N,) float32, depth standard deviation,
     m; pixel: (N,) int32, index into the flattened left image; sensor: where the camera is in `frame_id`, None where
-    the cloud is still in the camera's own frame; shape: (H, W) of the left image that `pixel` indexes, where known.
+    the cloud is still in the camera's own frame; shape: (H, W) of the left image that `pixel` indexes, where known;
+    source: (N,) uint8, codes of `Source`, None where all points are measured; tilt_sigma: standard deviation of the
+    direction of up that the cloud was levelled with, about each horizontal axis, rad.
     """
 
     stamp: int
@@ -300,6 +306,8 @@ class PointCloud:
     frame_id: str
     shape: tuple[int, int] | None = None
     sensor: Transform | None = None
+    source: Array | None = None
+    tilt_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         publish(self, "points", (None, 3), np.float32)
@@ -307,6 +315,20 @@ class PointCloud:
         publish(self, "colors", (n, 3), np.uint8)
         publish(self, "sigma", (n,), np.float32)
         publish(self, "pixel", (n,), np.int32)
+        if self.source is not None:
+            publish(self, "source", (n,), np.uint8)
+
+    def only(self, kept: Array) -> PointCloud:
+        """The points of the indices or the mask `kept`, in that order."""
+        kept = np.flatnonzero(kept) if kept.dtype == bool else kept
+        return replace(
+            self,
+            points=self.points.take(kept, axis=0),
+            colors=self.colors.take(kept, axis=0),
+            sigma=self.sigma.take(kept),
+            pixel=self.pixel.take(kept),
+            source=None if self.source is None else self.source.take(kept),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,6 +358,24 @@ class ElevationMap:
             raise ValueError(f"ElevationMap.resolution must be positive, not {self.resolution}")
         object.__setattr__(self, "layers", MappingProxyType({n: read_only(layer) for n, layer in layers.items()}))
         object.__setattr__(self, "shape", (rows, cols))
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelMap:
+    """Cubes of space that hold points. index: (N, 3) int32, a cube reaching from index * resolution, m, to (index + 1)
+    * resolution along x, y, z of `frame_id`; colors: (N, 3) uint8 RGB, mean; count: (N,) int32, points."""
+
+    stamp: int
+    index: Array
+    colors: Array
+    count: Array
+    resolution: float
+    frame_id: str
+
+    def __post_init__(self) -> None:
+        publish(self, "index", (None, 3), np.int32)
+        publish(self, "colors", (len(self.index), 3), np.uint8)
+        publish(self, "count", (len(self.index),), np.int32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,11 @@ class Level(Stage):
     camera_height: float = parameter(
         1.0, "height of the left camera above the origin, where base_link is not known", unit="m", low=0.0
     )
+    tilt_sigma: float = parameter(
+        0.0042, "standard deviation of the tilt about each horizontal axis, for the map's common variance (0.24 "
+        "degrees: 0.3 of a reading, less by interpolation between two)",
+        unit="rad", low=0.0, high=0.5,
+    )  # fmt: skip
 
     def __call__(self, cloud: PointCloud, tilt: Tilt, mount: Mount | None = None) -> PointCloud:
         """The cloud in frame `level`, with `sensor` telling where the camera is in it.
@@ -43,7 +48,7 @@ class Level(Stage):
             mount = Mount(tilt.stamp, np.eye(3))
         sensor = level_transform(tilt, mount, cloud.frame_id, self.camera_height)
         points = transform_points(cloud.points, sensor.rotation, sensor.translation)
-        return replace(cloud, points=points, frame_id=LEVEL_FRAME, sensor=sensor)
+        return replace(cloud, points=points, frame_id=LEVEL_FRAME, sensor=sensor, tilt_sigma=self.tilt_sigma)
 
 
 def level_transform(tilt: Tilt, mount: Mount, camera_frame: str, camera_height: float = 1.0) -> Transform:

@@ -19,16 +19,17 @@ from stages.stage import Stage, parameter
 class Reproject(Stage):
     """Triangulates a disparity image.
 
-    The standard deviation of a disparity falls linearly with its confidence: `sigma_worst` at 0, `sigma_best` at 1
-    (0.1 to 0.25 px is what makers of stereo cameras measure on good texture). Filled disparities get at least
-    `sigma_filled`.
+    The standard deviation of a matched disparity falls geometrically with its confidence, `sigma_worst` at 0 and
+    `sigma_best` at 1; a pixel of source PLANE has `sigma_plane`, of source FILLED `sigma_filled`. On simulated frames
+    68 % of the errors of the matcher's pixels are within it, at every confidence from 0.5 to 1.
     """
 
     max_depth: float = parameter(20.0, "points deeper than this are left out", unit="m", low=0.1)
     filled: bool = parameter(False, "whether filled disparities, which no camera measured, become points")
-    sigma_best: float = parameter(0.25, "disparity standard deviation at confidence 1", unit="px", low=0.0)
-    sigma_worst: float = parameter(1.0, "disparity standard deviation at confidence 0", unit="px", low=0.0)
-    sigma_filled: float = parameter(3.0, "least standard deviation of a filled disparity", unit="px", low=0.0)
+    sigma_best: float = parameter(0.088, "disparity standard deviation at confidence 1", unit="px", low=1e-3)
+    sigma_worst: float = parameter(6.0, "disparity standard deviation at confidence 0", unit="px", low=1e-3)
+    sigma_plane: float = parameter(0.75, "disparity standard deviation where only a plane knows", unit="px", low=0.0)
+    sigma_filled: float = parameter(3.0, "disparity standard deviation of a filled pixel", unit="px", low=0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -55,7 +56,8 @@ class Reproject(Stage):
             camera,
             self.max_depth,
             self.filled,
-            (self.sigma_best, self.sigma_worst, self.sigma_filled),
+            (self.sigma_best, self.sigma_worst, self.sigma_plane, self.sigma_filled),
         )
         shape = (int(disparity.pixels.shape[0]), int(disparity.pixels.shape[1]))
-        return PointCloud(frame.stamp, points, colors, sigma, pixel, camera.frame_id, shape)
+        source = disparity.source.ravel().take(pixel)
+        return PointCloud(frame.stamp, points, colors, sigma, pixel, camera.frame_id, shape, source=source)

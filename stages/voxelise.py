@@ -1,8 +1,8 @@
 """Voxelise: from a levelled cloud to an elevation map (paper section 4, "Digital Elevation Model").
 
 The grid is the same for every frame: a square about the level frame's origin, wide enough for the region. Each cell
-keeps the mean of its heights, as the paper has it, with their extremes, their number and the variance of that mean.
-A cell without points stays a hole.
+keeps the mean of its heights, as the paper has it, with their extremes, their number and how sure the mean is. A cell
+without measured points stays a hole, and a layer of its own says whether it was hidden or never looked at.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
-from stages.kernels.grid import FIGURES, cell_statistics
+from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Source
+from stages.kernels.grid import FIGURES, cell_percentile, cell_statistics
+from stages.kernels.neighbours import lie_of_cells
+from stages.kernels.occlusion import hidden_cells
 from stages.stage import Stage, parameter
 
 
@@ -20,18 +22,38 @@ from stages.stage import Stage, parameter
 class Voxelise(Stage):
     """Averages a levelled cloud over the cells of a grid.
 
-    Layers: elevation (mean), minimum, maximum (m), count (points), variance (m^2). Cells without points have count 0
-    and NaN elsewhere.
+    Layers:
+    - elevation (mean), minimum, maximum, m, and count, of the measured points; without any, count is 0, the others NaN;
+    - variance, m^2: of the mean against the cell's true mean height, from what is random within a frame;
+    - common_variance, m^2: from the tilt's uncertainty, which moves a whole frame at once, so that neither many points
+      nor many cells average it out: (tilt_sigma * range)^2;
+    - occluded: 1 in empty cells between measured ground and measured ground, or behind it, as the camera looks: hidden,
+      or not matched; 0 in measured cells; NaN in cells never looked at; absent where the camera is not known;
+    - filled, m: mean of points of source FILLED, in cells without measured ones; only where the cloud has such points;
+    - percentile_P for each P in `percentiles`, m.
 
-    variance is that of the mean against the cell's true mean height, from what is random within a frame:
-    (s^2 + q) / max(1, count / correlated), with s^2 the scatter of the heights in the cell, q the mean of the squared
-    vertical part of the points' depth noise, and `correlated` the number of neighbouring points that share one matching
-    error. Tilt and calibration errors move a whole frame at once and are no part of it.
+    The random variance of a mean of n points is noise * (systematic + correlated / n) + shape: noise is the mean square
+    of what the points' depth errors do to a height, on a slope more or less than on the level; shape is what the mean
+    of some points misses of an uneven cell, by its scatter beyond the slope's and by its height off its neighbours;
+    few points miss more (`sampling`^2 / n).
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
     region: float = parameter(8.0, "horizontal range from the level frame's origin kept in the map", unit="m", low=0.1)
-    correlated: float = parameter(25.0, "neighbouring points that share one matching error (5 x 5 pixels)", low=1.0)
+    correlated: float = parameter(10.0, "neighbouring points that share one matching error", low=1.0)
+    systematic: float = parameter(0.05, "share of the points' variance that no averaging removes", low=0.0, high=1.0)
+    scatter: float = parameter(0.21, "share of the scatter beyond the slope's in the variance", low=0.0)
+    bend: float = parameter(0.28, "share of the square of the height off the neighbours in the variance", low=0.0)
+    sampling: float = parameter(0.005, "what a single point may miss of its cell", unit="m", low=0.0)
+    percentiles: tuple[float, ...] = parameter((), "further layers: percentiles of a cell's heights, 50 the median")
+    filled: str = parameter(
+        "apart", "filled points: a layer of their own, or counted as measured", choices=("apart", "counted")
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not all(0 <= value <= 100 for value in self.percentiles):
+            raise ValueError(f"Voxelise.percentiles must be between 0 and 100, not {self.percentiles}")
 
     def __call__(self, cloud: PointCloud) -> ElevationMap:
         """The elevation map of a cloud in frame `level`."""
@@ -39,30 +61,83 @@ class Voxelise(Stage):
             raise ValueError(f"Voxelise: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
         half = int(np.ceil(self.region / self.resolution - 1e-9))
         origin = (-half * self.resolution, -half * self.resolution)
-        figures = cell_statistics(
-            cloud.points, cloud.sigma, _lever(cloud), self.resolution, origin, 2 * half, self.region
+        measured, guessed = self._parted(cloud)
+        grid = self.resolution, origin, 2 * half, self.region
+        figures = cell_statistics(measured.points, measured.sigma, *grid)
+        layers = self._layers(figures, measured, origin)
+        if cloud.sensor is not None and cloud.shape is not None:
+            layers["occluded"] = _occluded(measured, layers["count"] > 0, grid)
+        if guessed is not None:
+            layers["filled"] = _filled(cell_statistics(guessed.points, guessed.sigma, *grid), layers["count"] > 0)
+        for value in self.percentiles:
+            layers[f"percentile_{value:g}"] = cell_percentile(measured.points, value, *grid)
+        return ElevationMap(
+            cloud.stamp, {n: layer.astype(np.float32) for n, layer in layers.items()}, self.resolution, origin,
+            LEVEL_FRAME,
         )  # fmt: skip
-        return ElevationMap(cloud.stamp, self._layers(figures), self.resolution, origin, LEVEL_FRAME)
 
-    def _layers(self, figures: Array) -> dict[str, Array]:
+    def _parted(self, cloud: PointCloud) -> tuple[PointCloud, PointCloud | None]:
+        """The points that count as measured, and those that are guesses, if there are any."""
+        if cloud.source is None or self.filled == "counted":
+            return cloud, None
+        guess = cloud.source == Source.FILLED
+        return (cloud.only(~guess), cloud.only(guess)) if guess.any() else (cloud, None)
+
+    def _layers(self, figures: Array, cloud: PointCloud, origin: tuple[float, float]) -> dict[str, Array]:
         count, total, squares, minimum, maximum, noise = (figures[:, :, i] for i in range(len(FIGURES)))
         empty = count == 0
         n = np.where(empty, np.nan, count)
         mean = total / n
         scatter = np.maximum(squares / n - mean * mean, 0.0)
-        variance = (scatter + noise / n) / np.maximum(1.0, n / self.correlated)
-        layers = {
+        middle = np.arange(len(count)) + 0.5
+        x, y = middle[None, :] * self.resolution + origin[0], middle[:, None] * self.resolution + origin[1]
+        return {
             "elevation": mean,
             "minimum": np.where(empty, np.nan, minimum),
             "maximum": np.where(empty, np.nan, maximum),
             "count": count,
-            "variance": variance,
+            "variance": self._variance(n, mean, scatter, noise / n, cloud, x, y),
+            "common_variance": np.where(empty, np.nan, cloud.tilt_sigma**2 * (x * x + y * y)),
         }
-        return {name: layer.astype(np.float32) for name, layer in layers.items()}
+
+    def _variance(
+        self, n: Array, mean: Array, scatter: Array, noise: Array, cloud: PointCloud, x: Array, y: Array
+    ) -> Array:
+        """The random variance of the cells' means. n, mean, scatter, noise (of depth): (rows, cols), NaN = empty."""
+        east, north, bend = lie_of_cells(mean)
+        uneven = np.maximum(scatter - (east * east + north * north) / 12, 0.0)
+        noise = noise * _lever(cloud, mean, x, y, east / self.resolution, north / self.resolution) ** 2
+        return np.asarray(
+            noise * (self.systematic + self.correlated / n)
+            + self.scatter * uneven
+            + self.bend * bend * bend
+            + self.sampling**2 / n
+        )
 
 
-def _lever(cloud: PointCloud) -> Array:
-    """Position and viewing axis of the sensor, as `cell_statistics` wants them."""
+def _lever(cloud: PointCloud, height: Array, x: Array, y: Array, east: Array, north: Array) -> Array:
+    """How far the surface found over (x, y) moves up for each metre of depth error: the point moves along its line of
+    sight, and with it, on a slope (east, north), the surface. 1 where the camera is not known."""
     if cloud.sensor is None:
-        return np.zeros(7)
-    return np.concatenate([cloud.sensor.translation, cloud.sensor.rotation[:, 2], [1.0]])
+        return np.ones_like(height)
+    axis, place = cloud.sensor.rotation[:, 2], cloud.sensor.translation
+    dx, dy, dz = x - place[0], y - place[1], height - place[2]
+    depth = dx * axis[0] + dy * axis[1] + dz * axis[2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.where(depth > 0, (dz - east * dx - north * dy) / depth, 1.0))
+
+
+def _occluded(cloud: PointCloud, known: Array, grid: tuple[float, tuple[float, float], int, float]) -> Array:
+    """The layer `occluded`."""
+    assert cloud.sensor is not None
+    assert cloud.shape is not None
+    x, y = (float(value) for value in cloud.sensor.translation[:2])
+    hidden = hidden_cells(cloud.points, cloud.pixel, cloud.shape[1], (x, y), *grid)
+    return np.where(known, 0.0, np.where(hidden, 1.0, np.nan))
+
+
+def _filled(figures: Array, known: Array) -> Array:
+    """The layer `filled`."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = figures[:, :, 1] / figures[:, :, 0]
+    return np.where(known, np.nan, mean)

@@ -1,4 +1,4 @@
-"""What the whole chain makes of simulated traverses, against their exact truth: slow, so run by `make check-all`."""
+"""The whole chain on simulated traverses, log to score: the map is near the truth, knows it, and finds the rocks."""
 
 from __future__ import annotations
 
@@ -23,9 +23,23 @@ def test_terrain_is_within_centimetres_of_the_truth_and_better_than_the_papers(t
         assert main(["score", str(out), "--truth", str(log), "--json", str(score)]) == 0
         scores[pipeline] = json.loads(score.read_text())
     rover, paper = scores["rover"], scores["paper"]
-    assert rover["elevation"]["0-4 m"]["raw"]["rmse"] < 0.02
-    assert rover["elevation"]["4-8 m"]["raw"]["rmse"] < 0.03
-    assert rover["elevation"]["0-8 m"]["completeness"] > 0.85
-    assert rover["navigation"]["false_alarm"] < 0.02
+    heights, hazards, rocks = (rover["terrain"][name] for name in ("heights", "hazards", "rocks"))
+    assert heights["0-4 m"]["levelled"]["rmse"] < 0.01
+    assert heights["4-8 m"]["levelled"]["rmse"] < 0.02
+    assert heights["0-8 m"]["completeness"] > 0.85
+    assert heights["0-8 m"]["levelled"]["within_5cm"] > 0.98
+    assert rover["terrain"]["made_up"]["of_cells"] < 0.01
+    random, total = (rover["terrain"]["intervals"][name] for name in ("random", "total"))
+    assert 0.61 < random["1"] < 0.80
+    assert 0.90 < random["2"] < 0.99
+    assert total["2"] > 0.90
+    assert rocks["0.2 m"]["recall"] in (None, 1.0)
+    assert hazards["free_on_rock"] < 0.002
+    assert hazards["rock_false_safe"] < 0.05
+    assert hazards["false_alarm"] < 0.05
     assert rover["disparity"]["bad_1_known"] < 0.75 * paper["disparity"]["bad_1_known"]
-    assert rover["elevation"]["4-8 m"]["raw"]["rmse"] < paper["elevation"]["4-8 m"]["raw"]["rmse"]
+    theirs = paper["terrain"]
+    assert heights["4-8 m"]["levelled"]["rmse"] < theirs["heights"]["4-8 m"]["levelled"]["rmse"]
+    assert heights["0-8 m"]["completeness"] > theirs["heights"]["0-8 m"]["completeness"]
+    assert hazards["rock_false_safe"] < 0.1 * theirs["hazards"]["rock_false_safe"]
+    assert rocks["0.2 m"]["found"] > theirs["rocks"]["0.2 m"]["found"]

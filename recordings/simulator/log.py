@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings import ros2
-from recordings.simulator import raycast, traverse
+from recordings.simulator import ground_truth, raycast, traverse
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -35,6 +35,7 @@ Logged = tuple[int, str, Any]
 HAZARD_ROCK = 0.2  # m, height above the ground around it
 HAZARD_SLOPE = float(np.radians(20))
 ROCKS_WITHIN = 10.0  # m of base_link
+ROCK_FIELDS = ("x", "y", "z", "diameter", "height", "pixels", "shown")
 
 
 def static_transforms(simulation: Simulation, log_time: int) -> list[Logged]:
@@ -107,8 +108,9 @@ def true_disparity(simulation: Simulation, stamp: int, truth: FrameTruth) -> Dis
 def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[ElevationMap, NavigationMap]:
     """Elevation (top surface, rocks included) with the mask `visible`, and hazards, over the square about base_link.
 
-    A cell is a hazard if its centre lies on a rock at least 0.2 m high or on ground steeper than 20 degrees. A cell is
-    visible if a pixel that both cameras see hits it within the region.
+    The elevation map has the layers of `ground_truth.map_layers` besides. A cell is a hazard if its centre lies on a
+    rock at least 0.2 m high or on ground steeper than 20 degrees. A cell is visible if a pixel that both cameras see
+    hits it within the region.
     """
     terrain, half, step = simulation.terrain, simulation.map_half_width, simulation.map_resolution
     count = round(2 * half / step)
@@ -120,7 +122,9 @@ def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[E
     on_high_rock = np.append(terrain.rocks.height >= HAZARD_ROCK, False)[np.maximum(surface, raycast.GROUND)]
     hazard = on_high_rock | (terrain.slope(world[:, 0], world[:, 1]) > HAZARD_SLOPE)
     cells = np.where(hazard, np.int8(Cell.HAZARD), np.int8(Cell.FREE)).reshape(x.shape)
-    layers = {"elevation": elevation, "visible": visible_cells(simulation, truth, count)}
+    visible = visible_cells(simulation, truth, count)
+    more = ground_truth.map_layers(simulation, truth, x, y, elevation, visible, surface.reshape(x.shape))
+    layers = {"elevation": elevation, "visible": visible, **more}
     reason = np.where(on_high_rock, Reason.STEP, np.where(hazard, Reason.SLOPE, Reason.CLEAR)).astype(np.uint8)
     return (
         ElevationMap(stamp, layers, step, (-half, -half), LEVEL_FRAME),
@@ -150,11 +154,13 @@ def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Arra
 
 
 def rocks_in_level(simulation: Simulation, truth: FrameTruth) -> Array:
-    """Rocks within 10 m of base_link, (N, 5) float32: x, y, z of the base in the level frame, diameter, height, m."""
+    """Rocks within 10 m of base_link, (N, 7) float32: x, y, z of the base in the level frame, diameter, height, m, and
+    the two columns of `ground_truth.rocks_in_view`."""
     terrain, here = simulation.terrain, truth.level.translation
     near = here[:2] + (terrain.rocks.center - here[:2] + terrain.extent / 2) % terrain.extent - terrain.extent / 2
     points = truth.level.inverse()(np.column_stack([near, terrain.rocks.base]))
-    table = np.column_stack([points, terrain.rocks.diameter, terrain.rocks.height])
+    seen = ground_truth.rocks_in_view(simulation, truth)
+    table = np.column_stack([points, terrain.rocks.diameter, terrain.rocks.height, seen])
     return table[np.hypot(points[:, 0], points[:, 1]) <= ROCKS_WITHIN].astype(np.float32)
 
 
@@ -162,11 +168,11 @@ def _rocks_message(simulation: Simulation, stamp: int, truth: FrameTruth) -> Any
     table = rocks_in_level(simulation, truth)
     fields = [
         ros2.make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=ros2.FLOAT32, count=1)
-        for place, name in enumerate(("x", "y", "z", "diameter", "height"))
+        for place, name in enumerate(ROCK_FIELDS)
     ]
     return ros2.make(
         "sensor_msgs/msg/PointCloud2", header=ros2.header(stamp, LEVEL_FRAME), height=1, width=len(table),
-        fields=fields, is_bigendian=False, point_step=20, row_step=20 * len(table),
+        fields=fields, is_bigendian=False, point_step=4 * len(ROCK_FIELDS), row_step=4 * table.size,
         data=table.view(np.uint8).reshape(-1), is_dense=True,
     )  # fmt: skip
 

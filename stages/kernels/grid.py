@@ -1,7 +1,8 @@
 """Cell statistics of points over a regular grid, in one pass (paper section 4, "voxelisation").
 
 The six running figures of a cell lie next to each other, so a point touches one cache line; sums are float64, so that
-neither the order of magnitude nor the number of points costs accuracy.
+neither the order of magnitude nor the number of points costs accuracy. Percentiles need the points of a cell in order:
+one sort of all points by cell and height, for those who ask.
 """
 
 from __future__ import annotations
@@ -15,23 +16,20 @@ FIGURES = ("count", "sum", "sum_of_squares", "minimum", "maximum", "noise")
 
 
 def cell_statistics(
-    points: Array, noise: Array, lever: Array, resolution: float, origin: tuple[float, float], size: int, region: float
+    points: Array, sigma: Array, resolution: float, origin: tuple[float, float], size: int, region: float
 ) -> Array:
     """Figures of the heights that fall in each cell of a square grid.
 
-    points: (N, 3) float32, m; noise: (N,) float32, depth standard deviation of each point, m; lever: (7,) float64,
-    sensor position and viewing axis in the points' frame and 1, or zeros where the sensor is not known: a depth error
-    e moves a point by e * (p - position) / depth, so that ratio's vertical part scales the noise; resolution: m;
+    points: (N, 3) float32, m; sigma: (N,) float32, depth standard deviation of each point, m; resolution: m;
     origin: (x, y) of the corner of cell [0, 0]; size: rows and columns; region: m, points at a larger horizontal range
     from (0, 0) are left out.
 
-    Returns (size, size, 6) float64, the figures named in `FIGURES`; `noise` is the sum of the vertical noise's squares.
+    Returns (size, size, 6) float64, the figures named in `FIGURES`; `noise` is the sum of the squares of `sigma`.
     Cells without points hold 0, 0, 0, inf, -inf, 0.
     """
     return _cell_statistics(  # type: ignore[no-any-return]
         np.ascontiguousarray(points),
-        np.ascontiguousarray(noise),
-        np.ascontiguousarray(lever, dtype=np.float64),
+        np.ascontiguousarray(sigma),
         1.0 / resolution,
         float(origin[0]),
         float(origin[1]),
@@ -41,7 +39,7 @@ def cell_statistics(
 
 
 @numba.njit(nogil=True, cache=True)
-def _cell_statistics(points, noise, lever, cells_per_metre, x0, y0, size, region):  # type: ignore[no-untyped-def]
+def _cell_statistics(points, sigma, cells_per_metre, x0, y0, size, region):  # type: ignore[no-untyped-def]
     cells = np.zeros((size, size, 6), np.float64)
     cells[:, :, 3] = np.inf
     cells[:, :, 4] = -np.inf
@@ -54,13 +52,7 @@ def _cell_statistics(points, noise, lever, cells_per_metre, x0, y0, size, region
         row = int(np.floor((y - y0) * cells_per_metre))
         if row < 0 or row >= size or col < 0 or col >= size:
             continue
-        share = 1.0
-        if lever[6] != 0.0:
-            dz = z - lever[2]
-            depth = (x - lever[0]) * lever[3] + (y - lever[1]) * lever[4] + dz * lever[5]
-            if depth > 0.0:
-                share = dz / depth
-        error = share * noise[i]
+        error = np.float64(sigma[i])
         cell = cells[row, col]
         cell[0] += 1.0
         cell[1] += z
@@ -72,25 +64,47 @@ def _cell_statistics(points, noise, lever, cells_per_metre, x0, y0, size, region
 
 
 def cell_statistics_reference(
-    points: Array, noise: Array, lever: Array, resolution: float, origin: tuple[float, float], size: int, region: float
+    points: Array, sigma: Array, resolution: float, origin: tuple[float, float], size: int, region: float
 ) -> Array:
     """The same as `cell_statistics`, in plain numpy."""
-    p = points.astype(np.float64)
-    share = np.ones(len(p))
-    if lever[6]:
-        ray = p - lever[:3]
-        depth = ray @ lever[3:6]
-        share = np.where(depth > 0, ray[:, 2] / np.where(depth > 0, depth, 1), 1.0)
-    col = np.floor((p[:, 0] - origin[0]) * (1.0 / resolution))
-    row = np.floor((p[:, 1] - origin[1]) * (1.0 / resolution))
-    inside = (p[:, 0] ** 2 + p[:, 1] ** 2 <= region**2) & np.isfinite(p[:, 2])
-    inside &= (row >= 0) & (row < size) & (col >= 0) & (col < size)
-    flat = (row[inside] * size + col[inside]).astype(np.int64)
-    z = p[inside, 2]
+    flat, inside = _cells_of(points, resolution, origin, size, region)
+    z = points[inside, 2].astype(np.float64)
     cells = np.zeros((size * size, 6))
     cells[:, 3], cells[:, 4] = np.inf, -np.inf
-    for figure, weight in ((0, np.ones(len(z))), (1, z), (2, z * z), (5, (share * noise)[inside] ** 2)):
+    for figure, weight in ((0, np.ones(len(z))), (1, z), (2, z * z), (5, sigma[inside].astype(np.float64) ** 2)):
         cells[:, figure] = np.bincount(flat, weight, minlength=size * size)
     np.minimum.at(cells[:, 3], flat, z)
     np.maximum.at(cells[:, 4], flat, z)
     return cells.reshape(size, size, 6)
+
+
+def cell_percentile(
+    points: Array, percentile: float, resolution: float, origin: tuple[float, float], size: int, region: float
+) -> Array:
+    """The height below which `percentile` percent of each cell's points lie, (size, size) float32, NaN without points.
+
+    Arguments as of `cell_statistics`; between two points it is interpolated, as numpy does.
+    """
+    flat, inside = _cells_of(points, resolution, origin, size, region)
+    z = points[inside, 2]
+    order = np.lexsort((z, flat))
+    flat, z = flat[order], z[order].astype(np.float64)
+    cell, start, count = np.unique(flat, return_index=True, return_counts=True)
+    place = percentile / 100 * (count - 1)
+    below = np.floor(place).astype(np.int64)
+    low, high = z[start + below], z[start + np.minimum(below + 1, count - 1)]
+    heights = np.full(size * size, np.nan, np.float32)
+    heights[cell] = low + (place - below) * (high - low)
+    return heights.reshape(size, size)
+
+
+def _cells_of(
+    points: Array, resolution: float, origin: tuple[float, float], size: int, region: float
+) -> tuple[Array, Array]:
+    """Flat cell index of the points on the grid, and which points those are, (N,) bool."""
+    p = points.astype(np.float64)
+    col = np.floor((p[:, 0] - origin[0]) * (1.0 / resolution))
+    row = np.floor((p[:, 1] - origin[1]) * (1.0 / resolution))
+    inside = (p[:, 0] ** 2 + p[:, 1] ** 2 <= region**2) & np.isfinite(p[:, 2])
+    inside &= (row >= 0) & (row < size) & (col >= 0) & (col < size)
+    return (row[inside] * size + col[inside]).astype(np.int64), inside

@@ -12,6 +12,7 @@ import numpy as np
 from stages.data import Array, Source, StereoCamera
 
 _FILLED = int(Source.FILLED)
+_PLANE = int(Source.PLANE)
 _UNKNOWN = int(Source.UNKNOWN)
 
 
@@ -23,13 +24,14 @@ def triangulate(
     camera: StereoCamera,
     max_depth: float,
     filled: bool,
-    sigmas: tuple[float, float, float],
+    sigmas: tuple[float, float, float, float],
 ) -> tuple[Array, Array, Array, Array]:
     """The points of a disparity image, in the left optical frame, in raster order.
 
     disparity: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `Source`; confidence: (H, W) float32;
     colors: (H, W) or (H, W, 3) uint8; max_depth: m; filled: whether pixels of source FILLED become points;
-    sigmas: standard deviation of the disparity, px, at confidence 1, at confidence 0, and at least for filled pixels.
+    sigmas: standard deviation of the disparity, px: at confidence 1, at confidence 0 (between the two it falls
+    geometrically), of pixels of source PLANE, and of source FILLED.
 
     Returns points (N, 3) float32 m, colors (N, 3) uint8, depth standard deviation (N,) float32 m, pixel (N,) int32.
     """
@@ -42,7 +44,7 @@ def triangulate(
         (camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline, camera.cx_right - camera.cx),
         float(max_depth),
         bool(filled),
-        (float(sigmas[0]), float(sigmas[1]), float(sigmas[2])),
+        (float(np.log(sigmas[0])), float(np.log(sigmas[1])), float(sigmas[2]), float(sigmas[3])),
     )
 
 
@@ -59,7 +61,7 @@ def _depth(disparity, source, shift, focal_baseline, max_depth, filled):  # type
 @numba.njit(nogil=True, cache=True)
 def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, sigmas):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy, focal_baseline, shift = camera
-    sigma_best, sigma_worst, sigma_filled = sigmas
+    log_best, log_worst, sigma_plane, sigma_filled = sigmas
     count = 0
     for i in range(disparity.size):
         if _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled) > 0.0:
@@ -77,10 +79,13 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
             points[n, 1] = (i // width - cy) * z / fy
             points[n, 2] = z
             rgb[n, 0], rgb[n, 1], rgb[n, 2] = colors[i, 0], colors[i, green], colors[i, blue]
-            trust = min(np.float64(confidence[i]), 1.0) if confidence[i] > 0.0 else 0.0
-            sigma_d = sigma_worst + (sigma_best - sigma_worst) * trust
             if source[i] == _FILLED:
-                sigma_d = max(sigma_d, sigma_filled)
+                sigma_d = sigma_filled
+            elif source[i] == _PLANE:
+                sigma_d = sigma_plane
+            else:
+                trust = min(np.float64(confidence[i]), 1.0) if confidence[i] > 0.0 else 0.0
+                sigma_d = np.exp(log_worst + (log_best - log_worst) * trust)
             sigma[n] = z * z / focal_baseline * sigma_d
             pixel[n] = i
             n += 1
@@ -95,7 +100,7 @@ def triangulate_reference(
     camera: StereoCamera,
     max_depth: float,
     filled: bool,
-    sigmas: tuple[float, float, float],
+    sigmas: tuple[float, float, float, float],
 ) -> tuple[Array, Array, Array, Array]:
     """The same as `triangulate`, in plain numpy."""
     effective = disparity.astype(np.float64) + camera.cx_right - camera.cx
@@ -106,8 +111,9 @@ def triangulate_reference(
     points = np.column_stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z])
     rgb = colors[v, u] if colors.ndim == 3 else np.repeat(colors[v, u][:, None], 3, axis=1)
     trust = np.clip(np.nan_to_num(confidence[v, u].astype(np.float64)), 0, 1)
-    sigma_d = sigmas[1] + (sigmas[0] - sigmas[1]) * trust
-    sigma_d = np.where(source[v, u] == Source.FILLED, np.maximum(sigma_d, sigmas[2]), sigma_d)
+    sigma_d = sigmas[1] * (sigmas[0] / sigmas[1]) ** trust
+    sigma_d = np.where(source[v, u] == Source.PLANE, sigmas[2], sigma_d)
+    sigma_d = np.where(source[v, u] == Source.FILLED, sigmas[3], sigma_d)
     sigma = z * z / (camera.fx * camera.baseline) * sigma_d
     pixel = v * disparity.shape[1] + u
     return points.astype(np.float32), rgb, sigma.astype(np.float32), pixel.astype(np.int32)

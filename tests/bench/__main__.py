@@ -5,4 +5,4 @@ from tests.bench import matching, pipeline, refining, terrain
 matching.main()
 refining.main()
 pipeline.main()
-terrain.main()
+terrain.main(["--stride", "10"])

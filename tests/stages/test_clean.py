@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.clean import Clean
-from stages.data import LEVEL_FRAME, Array, PointCloud, Transform
+from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Transform
 from stages.kernels.outliers import supported, supported_reference
 from stages.kernels.patches import patch_sizes, patch_sizes_reference
 from stages.reproject import Reproject
@@ -29,7 +29,7 @@ RINGS = ((0, 2), (2, 4), (4, 6), (6, 8))
 def cloud_with_noise(seed: int = 0, sigma: float = 0.25) -> PointCloud:
     d = seen_disparity()
     d = d + np.random.default_rng(seed).normal(0, sigma, d.shape)
-    return Reproject(max_depth=50)(blank_frame(), as_disparity(d))
+    return Reproject(max_depth=50, sigma_best=0.25)(blank_frame(), as_disparity(d))
 
 
 def with_floaters(cloud: PointCloud, share: float, seed: int = 1) -> tuple[PointCloud, Array]:
@@ -67,8 +67,7 @@ def test_a_cloud_of_every_nth_pixel_is_judged_as_well(stride: int) -> None:
     cloud, floats = with_floaters(cloud_with_noise(), 0.02)
     row, col = np.divmod(cloud.pixel, CAMERA.width)
     take = (row % stride == 0) & (col % stride == 0)
-    thin = replace(cloud, points=cloud.points[take], colors=cloud.colors[take], sigma=cloud.sigma[take],
-                   pixel=cloud.pixel[take])  # fmt: skip
+    thin = cloud.only(take)
     kept = np.isin(thin.pixel, Clean()(thin).pixel)
     inside = np.linalg.norm(thin.points, axis=1) < 9
     assert (~kept[floats[take]]).mean() >= 0.98
@@ -101,6 +100,24 @@ def test_a_mismatch_of_a_hundred_pixels_that_supports_itself_goes() -> None:
     patch = (np.arange(300, 308)[:, None] * 640 + np.arange(100, 112)).ravel()
     assert not np.isin(patch, Clean()(cloud).pixel).any()
     assert np.isin(patch[20:70], Clean(patch=0.0)(cloud).pixel).any()
+
+
+def test_filled_points_support_nobody_and_are_kept_within_the_crop() -> None:
+    d = seen_disparity()
+    d[300:303, 100:103] *= 2
+    disparity = as_disparity(d)
+    source = disparity.source.copy()
+    source[290:312, 90:112][source[290:312, 90:112] > 0] = Source.FILLED
+    source[300:303, 100:103] = Source.MEASURED
+    pixels = np.where(source == Source.FILLED, np.float32(d[301, 101]), disparity.pixels)
+    cloud = Reproject(filled=True)(blank_frame(), replace(disparity, pixels=pixels, source=source))
+    clean = Clean()(cloud)
+    assert clean.source is not None
+    assert cloud.source is not None
+    assert 301 * 640 + 101 not in clean.pixel  # a speck, though all the filled pixels about it agree
+    assert (clean.source == Source.FILLED).sum() == (cloud.source == Source.FILLED).sum() > 400
+    far = replace(disparity, pixels=np.where(source == Source.FILLED, np.float32(12.0), pixels), source=source)
+    assert (Clean()(Reproject(filled=True)(blank_frame(), far)).source == Source.FILLED).sum() == 0
 
 
 def test_patch_kernel_equals_scipys_connected_components() -> None:

@@ -132,3 +132,11 @@ def test_kernel_equals_the_plain_reference() -> None:
     arguments = (cloud.points, level_from_camera(), np.array([1.0, 2.0, 3.0]))
     got, want = transform_points(*arguments), transform_points_reference(*arguments)
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-6)
+
+
+def test_the_cloud_carries_how_sure_the_tilt_is() -> None:
+    cloud = cloud_of(scattered())
+    assert Level(tilt_sigma=0.01)(cloud, Tilt(3, UP), BARE).tilt_sigma == 0.01
+    assert cloud.tilt_sigma == 0
+    with pytest.raises(ValueError, match="tilt_sigma"):
+        Level(tilt_sigma=-0.01)

@@ -44,7 +44,7 @@ def test_kernel_equals_the_plain_reference() -> None:
     confidence[0, 5] = np.nan
     for colors in (random.integers(0, 256, (12, 16, 3), np.uint8), random.integers(0, 256, (12, 16), np.uint8)):
         for filled in (False, True):
-            arguments = (pixels, source, confidence, colors, SMALL, 8.0, filled, (0.25, 1.0, 3.0))
+            arguments = (pixels, source, confidence, colors, SMALL, 8.0, filled, (0.25, 1.0, 0.7, 3.0))
             for got, want in zip(triangulate(*arguments), triangulate_reference(*arguments), strict=True):
                 assert got.dtype == want.dtype
                 np.testing.assert_allclose(got, want, rtol=1e-6)
@@ -56,9 +56,11 @@ def test_a_filled_disparity_is_left_out_or_marked_as_uncertain_and_a_plane_is_ke
     disparity = Disparity(0, np.full((1, 4), 5, np.float32), source, np.ones((1, 4), np.float32))
     frame = blank_frame(camera)
     assert Reproject()(frame, disparity).pixel.tolist() == [0, 1]
-    cloud = Reproject(filled=True, sigma_best=0.2, sigma_filled=3.0)(frame, disparity)
+    cloud = Reproject(filled=True, sigma_best=0.2, sigma_plane=0.7, sigma_filled=3.0)(frame, disparity)
     assert cloud.pixel.tolist() == [0, 1, 2]
-    assert cloud.sigma == pytest.approx(np.array([0.2, 0.2, 3.0]) * 4.0**2 / (100 * 0.2))
+    assert cloud.sigma == pytest.approx(np.array([0.2, 0.7, 3.0]) * 4.0**2 / (100 * 0.2))
+    assert cloud.source is not None
+    assert cloud.source.tolist() == [Source.MEASURED, Source.PLANE, Source.FILLED]
 
 
 def test_depth_uncertainty_predicts_the_scatter_of_noisy_disparities() -> None:
@@ -72,7 +74,8 @@ def test_uncertainty_grows_as_confidence_falls() -> None:
     camera = StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 5, 1)
     confidence = np.linspace(1, 0, 5, dtype=np.float32)[None]
     disparity = Disparity(0, np.full((1, 5), 5, np.float32), np.ones((1, 5), np.uint8), confidence)
-    assert np.all(np.diff(Reproject()(blank_frame(camera), disparity).sigma) > 0)
+    sigma = Reproject(sigma_best=0.1, sigma_worst=1.6)(blank_frame(camera), disparity).sigma
+    assert sigma / sigma[0] == pytest.approx([1, 2, 4, 8, 16])
 
 
 def test_nothing_beyond_max_depth_and_nothing_at_all_is_a_legal_cloud() -> None:
@@ -120,4 +123,4 @@ def test_a_disparity_of_another_size_and_an_unrectified_frame_are_refused() -> N
     with pytest.raises(ValueError, match="put Rectify before"):
         Reproject()(blank_frame(raw), as_disparity(np.ones((12, 16)), SMALL))
     with pytest.raises(ValueError, match="sigma_worst must be at least"):
-        Reproject(sigma_best=2.0)
+        Reproject(sigma_best=7.0)

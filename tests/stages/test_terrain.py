@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from stages.assess import Assess
 from stages.binarise import Binarise
 from stages.clean import Clean
 from stages.data import Cell, Disparity, ElevationMap, Mount, NavigationMap, StereoCamera, StereoFrame, Tilt
@@ -22,7 +23,7 @@ def mapped(
     frame: StereoFrame, disparity: Disparity, tilt: Tilt, camera_height: float
 ) -> tuple[ElevationMap, NavigationMap]:
     cloud = Level(camera_height=camera_height)(Clean()(Reproject()(frame, disparity)), tilt, Mount(7, np.eye(3)))
-    elevation = Voxelise()(cloud)
+    elevation = Assess()(Voxelise()(cloud))
     return elevation, Binarise()(elevation)
 
 

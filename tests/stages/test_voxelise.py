@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.data import LEVEL_FRAME, Array, PointCloud, Transform
+from stages.clean import Clean
+from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Tilt, Transform
 from stages.kernels.grid import cell_statistics, cell_statistics_reference
+from stages.kernels.neighbours import lie_of_cells, lie_of_cells_reference
+from stages.kernels.occlusion import hidden_cells, hidden_cells_reference
+from stages.level import Level
+from stages.reproject import Reproject
 from stages.voxelise import Voxelise
-from tests.stages.terrain_scene import HEIGHT, level_from_camera
+from tests.stages.terrain_scene import (
+    CAMERA,
+    HEIGHT,
+    UP,
+    as_disparity,
+    blank_frame,
+    level_from_camera,
+    seen_disparity,
+)
 
 SENSOR = Transform(LEVEL_FRAME, "camera", level_from_camera(), np.array([0, 0, HEIGHT]))
 
@@ -64,13 +79,63 @@ def test_the_order_of_points_moves_at_most_the_last_bits_and_one_order_gives_the
 def test_the_layers_of_one_cell_are_those_of_its_points() -> None:
     heights = np.array([0.1, 0.2, 0.6])
     points = np.column_stack([np.full(3, 2.01), np.full(3, -1.02), heights])
-    grid = Voxelise()(cloud_of(points, sigma=0.0))
+    grid = Voxelise(percentiles=(50.0, 75.0), sampling=0.0, scatter=1.0)(cloud_of(points, sigma=0.0))
     row, col = int((-1.02 - grid.origin[1]) / 0.05), int((2.01 - grid.origin[0]) / 0.05)
     value = {name: float(layer[row, col]) for name, layer in grid.layers.items()}
     assert value == pytest.approx(
-        {"elevation": 0.3, "minimum": 0.1, "maximum": 0.6, "count": 3, "variance": heights.var()}, rel=1e-5
-    )
+        {
+            "elevation": 0.3, "minimum": 0.1, "maximum": 0.6, "count": 3, "variance": heights.var(),
+            "common_variance": 0.0, "percentile_50": 0.2, "percentile_75": 0.4,
+        }, rel=1e-5,
+    )  # fmt: skip
     assert (grid.layers["count"] > 0).sum() == 1
+
+
+def test_the_tilts_uncertainty_is_the_common_variance_and_not_part_of_the_random_one() -> None:
+    """A cloud turned by the tilt's sigma is off by its common standard deviation, wherever it lies across the turn."""
+    cloud = cloud_of(scattered(5, 20000) * [1, 1, 0])
+    sure, unsure = Voxelise()(cloud), Voxelise()(replace(cloud, tilt_sigma=0.01))
+    np.testing.assert_array_equal(sure.layers["variance"], unsure.layers["variance"])
+    assert np.nanmax(sure.layers["common_variance"]) == 0
+    turned = cloud.points.astype(np.float64).copy()
+    turned[:, 2] = -np.sin(0.01) * turned[:, 0]
+    heights = Voxelise()(replace(cloud, points=turned.astype(np.float32))).layers["elevation"]
+    row = 160  # along x, so that the turn is all there is
+    known = np.isfinite(heights[row]) & (np.abs(np.arange(320) - 160) > 20)
+    assert known.sum() > 20
+    ratio = np.abs(heights[row, known]) / np.sqrt(unsure.layers["common_variance"][row, known])
+    np.testing.assert_allclose(ratio, 1.0, atol=0.05)
+
+
+def test_filled_points_are_a_layer_of_their_own_unless_they_are_to_count() -> None:
+    points = np.array([[2.01, 0.01, 0.1], [2.01, 0.01, 0.9], [3.01, 0.01, 0.5]])
+    source = np.array([Source.MEASURED, Source.FILLED, Source.FILLED], np.uint8)
+    cloud = replace(cloud_of(points), source=source)
+    apart, counted = Voxelise()(cloud), Voxelise(filled="counted")(cloud)
+    known = np.isfinite(apart.layers["elevation"])
+    assert apart.layers["elevation"][known] == pytest.approx([0.1])
+    assert apart.layers["filled"][np.isfinite(apart.layers["filled"])] == pytest.approx([0.5])
+    assert not np.isfinite(apart.layers["filled"][known]).any()
+    assert counted.layers["elevation"][np.isfinite(counted.layers["elevation"])] == pytest.approx([0.5, 0.5])
+    assert "filled" not in counted.layers
+    assert "filled" not in Voxelise()(cloud_of(points)).layers
+
+
+def test_a_cell_behind_a_rock_is_occluded_and_one_beside_the_view_was_never_looked_at() -> None:
+    frame, rocks = blank_frame(), ((4.0, 0.0, 0.4),)
+    cloud = Reproject()(frame, as_disparity(seen_disparity(rocks)))
+    grid = Voxelise()(Level(camera_height=HEIGHT)(Clean()(cloud), Tilt(7, UP, CAMERA.frame_id)))
+    middle = grid.origin[0] + (np.arange(grid.shape[0]) + 0.5) * grid.resolution
+    x, y = np.meshgrid(middle, middle)
+    occluded, known = grid.layers["occluded"], np.isfinite(grid.layers["elevation"])
+    np.testing.assert_array_equal(occluded[known], 0)
+    # The camera at 1 m sees the top of the rock, 0.4 m high at 4 m, before ground at 6.7 m.
+    shadow = (np.abs(y) < 0.2) & (x > 4.6) & (x < 6.3)
+    assert shadow.sum() > 200
+    assert (occluded[shadow] == 1).all()
+    beside = (np.abs(np.arctan2(y, x)) > np.deg2rad(40)) & (np.hypot(x, y) < 8)
+    below = (np.hypot(x, y) < 1.0) & (x > 0)
+    assert np.isnan(occluded[beside | below | (x < 0)]).all()
 
 
 def test_a_hole_stays_a_hole_and_an_empty_cloud_is_an_empty_map_of_the_usual_shape() -> None:
@@ -84,22 +149,29 @@ def test_a_hole_stays_a_hole_and_an_empty_cloud_is_an_empty_map_of_the_usual_sha
         np.testing.assert_array_equal(np.isnan(full.layers[name]), full.layers["count"] == 0)
 
 
-def test_variance_is_that_of_the_mean_when_errors_are_independent() -> None:
-    """Flat ground 4 m ahead, each point wrong by its own depth error: the map's error is what the variance says."""
+PURE = Voxelise(correlated=1.0, systematic=0.0, scatter=0.0, bend=0.0, sampling=0.0)
+
+
+@pytest.mark.parametrize("slope", [-0.1, 0.0, 0.3])
+def test_variance_is_that_of_the_mean_when_errors_are_independent(slope: float) -> None:
+    """Ground 4 m ahead, level or sloping, each point wrong by its own depth error: the map's error is as stated."""
     random = np.random.default_rng(8)
     truth = np.column_stack([random.uniform(3, 5, 200_000), random.uniform(-1, 1, 200_000), np.zeros(200_000)])
+    truth[:, 2] = slope * (truth[:, 0] - 4)
     ray = truth - SENSOR.translation
     depth = ray @ SENSOR.rotation[:, 2]
-    seen = truth + ray * (random.normal(0, 0.05, len(truth)) / depth)[:, None]
-    grid = Voxelise(correlated=1.0)(cloud_of(seen, sigma=0.05))
+    seen = truth + ray * (random.normal(0, 0.02, len(truth)) / depth)[:, None]
+    grid = PURE(cloud_of(seen, sigma=0.02))
     full = grid.layers["count"] > 60
     # Away from the ground's edges, where only points thrown outwards arrive.
     x = grid.origin[0] + (np.arange(320) + 0.5) * 0.05
     full &= (x > 3.3) & (x < 4.7)
-    ratio = grid.layers["elevation"][full] ** 2 / grid.layers["variance"][full]
-    # Scatter and depth noise are the same error here, counted twice on purpose: a cell never claims too little.
-    assert 0.4 < ratio.mean() < 0.6
-    correlated = Voxelise(correlated=25.0)(cloud_of(seen, sigma=0.05)).layers["variance"][full]
+    error = (grid.layers["elevation"] - slope * (x - 4))[full]
+    # What a slope adds by where in the cell the points happen to lie is no error of theirs.
+    unevenness = slope**2 * 0.05**2 / 12 / grid.layers["count"][full]
+    ratio = (error**2 - unevenness) / grid.layers["variance"][full]
+    assert 0.85 < ratio.mean() < 1.25
+    correlated = replace(PURE, correlated=25.0)(cloud_of(seen, sigma=0.02)).layers["variance"][full]
     np.testing.assert_allclose(correlated, grid.layers["variance"][full] * 25, rtol=1e-4)
 
 
@@ -107,10 +179,26 @@ def test_kernel_equals_the_plain_reference() -> None:
     points = scattered(9, 5000).astype(np.float32)
     points[3] = np.nan
     noise = np.random.default_rng(1).uniform(0, 0.1, len(points)).astype(np.float32)
-    lever = np.concatenate([SENSOR.translation, SENSOR.rotation[:, 2], [1.0]])
-    for at in (lever, np.zeros(7)):
-        arguments = (points, noise, at, 0.1, (-8.0, -8.0), 160, 8.0)
-        np.testing.assert_allclose(cell_statistics(*arguments), cell_statistics_reference(*arguments), rtol=1e-9)
+    arguments = (points, noise, 0.1, (-8.0, -8.0), 160, 8.0)
+    np.testing.assert_allclose(cell_statistics(*arguments), cell_statistics_reference(*arguments), rtol=1e-9)
+
+
+def test_neighbour_kernel_equals_the_plain_reference() -> None:
+    random = np.random.default_rng(2)
+    heights = random.normal(0, 1, (20, 30))
+    heights[random.random(heights.shape) < 0.4] = np.nan
+    np.testing.assert_allclose(lie_of_cells(heights), lie_of_cells_reference(heights), atol=1e-12)
+
+
+def test_occlusion_kernel_equals_the_plain_reference() -> None:
+    random = np.random.default_rng(3)
+    cloud = Reproject()(blank_frame(), as_disparity(seen_disparity()))
+    some = np.sort(random.choice(len(cloud.points), 3000, replace=False))
+    levelled = Level(camera_height=HEIGHT)(cloud.only(some), Tilt(7, UP, CAMERA.frame_id))
+    arguments = (levelled.points, levelled.pixel, 640, (0.0, 0.0), 0.1, (-8.0, -8.0), 160, 8.0)
+    got, want = hidden_cells(*arguments), hidden_cells_reference(*arguments)
+    assert 0.05 < want.mean() < 0.5
+    assert (got != want).mean() < 1e-3  # samples on the border of two cells round either way
 
 
 def test_a_cloud_that_is_not_level_is_refused() -> None:

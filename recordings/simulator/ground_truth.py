@@ -1,0 +1,119 @@
+"""What is true of a frame's map beyond heights and hazards: what could be seen of it, and of which rocks how much.
+
+A cell could be seen if a line of sight from each camera reaches some of its surface, tried at nine points of it, be
+there a pixel on that line or not: a map may have values between the pixels, but not behind what hides them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import njit
+
+from recordings.simulator import raycast
+from stages.data import Array
+
+if TYPE_CHECKING:
+    from recordings.simulator.simulation import FrameTruth, Simulation
+
+FINE = 3  # points along each side of a cell
+SHORT = 0.002  # m before its end that a line of sight may stop
+
+
+def map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, top: Array, visible: Array,
+               surface: Array) -> dict[str, Array]:  # fmt: skip
+    """Further true layers over cells with centres x, y (rows, cols), m, in the frame's level frame.
+
+    top: (rows, cols) elevation, m; visible: (rows, cols), 1 where a pixel of both cameras hits the cell; surface:
+    (rows, cols) int, the rock that one meets from above at the centre, or the ground.
+
+    Returns float32 (rows, cols): mean, m, of the surface over the cell, NaN where it is not visible; in_view, 1 where
+    both cameras could see some of it within the region, else 0; rock, m, the height of the rock at the centre, 0 for
+    the ground; slope, rad, of the bare ground over 1 m.
+    """
+    terrain, step = simulation.terrain, simulation.map_resolution
+    near = np.hypot(x, y) <= simulation.region + step
+    ahead = (visible > 0) | (near & _in_images(simulation, truth, x, y, top))
+    row, col = np.nonzero(ahead)
+    offset = ((np.arange(FINE) + 0.5) / FINE - 0.5) * step
+    dx, dy = (part.ravel() for part in np.meshgrid(offset, offset))
+    fine_x, fine_y = x[row, col, None] + dx, y[row, col, None] + dy
+    world = truth.level(np.stack([fine_x.ravel(), fine_y.ravel(), np.zeros(fine_x.size)], axis=1))
+    heights, _ = raycast.tops_at(terrain.scene, world[:, 0], world[:, 1], float(terrain.scene.ceiling))
+    world[:, 2] = heights
+    mean, in_view = np.full(x.shape, np.nan, np.float32), (visible > 0).astype(np.float32)
+    mean[row, col] = (heights - truth.level.translation[2]).reshape(fine_x.shape).mean(axis=1)
+    mean[visible == 0] = np.nan
+    unseen = np.repeat(visible[row, col] == 0, FINE**2)
+    sighted = np.zeros(len(world), bool)
+    sighted[unseen] = in_sight(simulation, truth, world[unseen])
+    in_view[row, col] = np.maximum(in_view[row, col], sighted.reshape(fine_x.shape).any(axis=1))
+    height = np.append(terrain.rocks.height, 0.0)[np.maximum(surface, raycast.GROUND)]
+    centre = truth.level(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
+    slope = terrain.slope(centre[:, 0], centre[:, 1], 1.0).reshape(x.shape)
+    return {"mean": mean, "in_view": in_view, "rock": height.astype(np.float32), "slope": slope.astype(np.float32)}
+
+
+def in_sight(simulation: Simulation, truth: FrameTruth, points: Array) -> Array:
+    """Which points (N, 3) of the world, m, both cameras see within the region: (N,) bool."""
+    seen = np.ones(len(points), bool)
+    for number, mount in enumerate(simulation.mounts[:2]):
+        eye = truth.base.after(mount)
+        if number == 0:
+            seen &= np.linalg.norm(points - eye.translation, axis=1) <= simulation.region
+        seen &= _within_image(simulation, (points - eye.translation) @ eye.rotation)
+        asked = np.flatnonzero(seen)
+        clear = np.zeros(len(asked), np.bool_)
+        _clear_lines(simulation.terrain.scene, eye.translation, points[asked], clear)
+        seen[asked] = clear
+    return seen
+
+
+def rocks_in_view(simulation: Simulation, truth: FrameTruth) -> Array:
+    """Of each rock of the tile: the pixels that both cameras see within the region, and the part of its height that
+    these span, (N, 2) float32."""
+    camera, rocks = simulation.camera, simulation.terrain.rocks
+    a = (np.arange(camera.width) - camera.cx) / camera.fx
+    b = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
+    seen = (truth.seen == 255) & (truth.surface >= 0) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
+    row, col = np.nonzero(seen)
+    rock, depth = truth.surface[row, col], truth.depth[row, col]
+    up = truth.base.after(simulation.mounts[0]).rotation[2]
+    height = depth * (up[0] * a[col] + up[1] * b[row, 0] + up[2])
+    low, high = np.full(len(rocks), np.inf), np.full(len(rocks), -np.inf)
+    np.minimum.at(low, rock, height)
+    np.maximum.at(high, rock, height)
+    pixels = np.bincount(rock, minlength=len(rocks))
+    shown = np.where(pixels > 0, (high - low) / rocks.height, 0.0)
+    return np.column_stack([pixels, np.minimum(shown, 1.0)]).astype(np.float32)
+
+
+def _in_images(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, z: Array) -> Array:
+    """Which points of the level frame, of any shape, lie within both images, give or take a few pixels."""
+    points = truth.level(np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1))
+    inside = np.ones(len(points), bool)
+    for mount in simulation.mounts[:2]:
+        eye = truth.base.after(mount)
+        inside &= _within_image(simulation, (points - eye.translation) @ eye.rotation, 20.0)
+    return inside.reshape(x.shape)
+
+
+def _within_image(simulation: Simulation, points: Array, margin: float = 0.0) -> Array:
+    """Which points (N, 3) of a camera's optical frame its image holds."""
+    camera = simulation.camera
+    depth = np.where(points[:, 2] > 0.05, points[:, 2], np.nan)
+    u, v = points[:, 0] / depth * camera.fx + camera.cx, points[:, 1] / depth * camera.fy + camera.cy
+    reach = 0.5 + margin
+    return np.asarray(
+        (u >= -reach) & (u < camera.width - 1 + reach) & (v >= -reach) & (v < camera.height - 1 + reach)
+    )
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _clear_lines(scn: Any, eye: Any, points: Any, clear: Any) -> None:
+    """Which points (N, 3) nothing hides from `eye`, into clear (N,) bool."""
+    for k in range(points.shape[0]):
+        dx, dy, dz = points[k, 0] - eye[0], points[k, 1] - eye[1], points[k, 2] - eye[2]
+        end = 1.0 - SHORT / np.sqrt(dx * dx + dy * dy + dz * dz)
+        clear[k] = raycast.first_hit(scn, eye[0], eye[1], eye[2], dx, dy, dz, 0.0, end)[1] == raycast.SKY

@@ -1,0 +1,153 @@
+"""Assess: what the terrain would do to a rover, as layers of the elevation map (paper section 4, "slope filtering").
+
+The trick is to measure everything against the ground and not against gravity: a rise against what lies within a wheel's
+reach, a height against the plane between the wheels, roughness off the footprint's plane. The ground is found by
+planes, first wide and then the rover's size, each time fitted to the cells that the plane before called ground, so that
+a rock stands out of the ground instead of bending it. None of it changes when the whole scene is tilted or raised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import label
+
+from stages.data import Array, ElevationMap
+from stages.kernels.footprint import fit_planes
+from stages.kernels.relief import lowest_around
+from stages.stage import Stage, parameter
+
+# A plane's height at the cell must be known at least as well as the mean of four cells.
+_LEVERAGE = 0.25
+# Under a wheel there are few cells, and it is the slope that counts.
+_WHEEL_LEVERAGE = 0.35
+# How far above and below the wide plane ground may lie, round by round, in shares of `obstacle`. Both ways, so that a
+# ditch is as little ground as a row of rocks, whichever covers less than the ground does; farther below than above,
+# for rocks are many and pits are few, and from wide to narrow, for the first plane leans on all of them.
+_WITHIN = ((0.4, 0.8), (0.25, 0.6), (0.18, 0.6), (0.18, 0.6), (0.18, 0.6))
+# How far off the plane between the wheels ground may lie, both ways. Ground is found anew each round, and with it a
+# crest that bends away from the wide plane comes back, from its sides inwards.
+_ABOUT = (0.3, 0.3, 0.3)
+
+
+@dataclass(frozen=True)
+class Assess(Stage):
+    """Adds to an elevation map, where they can be told:
+
+    - ground, m: height of the ground under a cell, its own obstacle not counted, and under small holes too;
+    - step, m: how far the cell reaches from the ground, the largest of: its top above the lowest cell within a wheel's
+      reach, what the slope of the surroundings explains taken off; its top above `ground`; its bottom below `ground`;
+      its top above its bottom. One stray point makes no step: an extreme counts up to four times as far as the mean.
+      An obstacle is as high as its highest cell: cells off the ground by `skirt` that join share the largest step;
+    - slope, rad: of the ground under the footprint;
+    - steepness, rad: of all that is no obstacle, under a wheel;
+    - roughness, m: root mean square of the same off its plane under the footprint;
+    - support: share of the cells within a wheel's reach that are known.
+    """
+
+    footprint: float = parameter(1.0, "width and length of the rover: the window of slope and roughness", unit="m",
+                                 low=0.05)  # fmt: skip
+    wheel_track: float = parameter(1.0, "distance between left and right wheels: the window of `ground`", unit="m",
+                                   low=0.05)  # fmt: skip
+    wheel: float = parameter(0.3, "diameter of a wheel: its reach, and the window of steepness", unit="m", low=0.05)
+    surroundings: float = parameter(2.5, "width of the window in which an obstacle stands out", unit="m", low=0.05)
+    obstacle: float = parameter(0.17, "what reaches farther from the ground is no part of it", unit="m", low=0.01)
+    skirt: float = parameter(
+        0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.01
+    )
+    steepest: float = parameter(
+        0.349, "slope of the surroundings up to which it is no step (20 degrees)", unit="rad", low=0.0, high=1.5
+    )
+
+    def __call__(self, elevation: ElevationMap) -> ElevationMap:
+        """The map with the layers added."""
+        height = elevation.layers["elevation"].astype(np.float64)
+        observed = np.isfinite(height)
+        height = np.where(observed, height, 0.0)
+        ground, trend, slope = self._ground(height, observed, elevation.resolution)
+        step, support = self._step(elevation, height, observed, ground, trend)
+        passable = observed & ~(step >= self.obstacle)
+        steepness = fit_planes(height, passable, _cells(self.wheel, elevation.resolution), _WHEEL_LEVERAGE)
+        roughness = fit_planes(height, passable, _cells(self.footprint, elevation.resolution), _LEVERAGE)[3]
+        layers = {
+            "ground": ground,
+            "step": step,
+            "slope": np.where(observed, slope, np.nan),
+            "steepness": np.where(passable, _slope(steepness, elevation.resolution), np.nan),
+            "roughness": np.where(observed, roughness, np.nan),
+            "support": np.where(observed, support, np.nan),
+        }
+        added = {name: layer.astype(np.float32) for name, layer in layers.items()}
+        return replace(elevation, layers={**elevation.layers, **added})
+
+    def _ground(self, height: Array, observed: Array, resolution: float) -> tuple[Array, Array, Array]:
+        """Height of the ground at each cell, the slope (2, rows, cols) of its surroundings, rise per cell, and the
+        slope under the footprint, rad.
+
+        Where the plane between the wheels is not known (the middle of a large rock), the height is that of the
+        surroundings' plane; where that is not known, a step is measured against the level.
+        """
+        wide = _cells(max(self.surroundings, self.footprint), resolution)
+        narrow = _cells(self.wheel_track, resolution)
+        ground = observed
+        for above, below in _WITHIN:
+            around = fit_planes(height, ground, wide, _LEVERAGE)
+            off = height - around[0]
+            ground = observed & ~((off > above * self.obstacle) | (off < -below * self.obstacle))
+        for share in _ABOUT:
+            local = fit_planes(height, ground, narrow, _LEVERAGE)
+            level = np.where(np.isfinite(local[0]), local[0], around[0])
+            ground = observed & (np.abs(height - level) <= share * self.obstacle)
+        local = fit_planes(height, ground, narrow, _LEVERAGE)
+        footprint = _cells(self.footprint, resolution)
+        under = local if footprint == narrow else fit_planes(height, ground, footprint, _LEVERAGE)
+        level = np.where(np.isfinite(local[0]), local[0], around[0])
+        return level, self._trend(around[1:3], resolution), _slope(under, resolution)
+
+    def _trend(self, slopes: Array, resolution: float) -> Array:
+        """The slopes (2, rows, cols), rise per cell, cut to `steepest`; 0 where they are not known."""
+        steep = np.hypot(*slopes) / (np.tan(self.steepest) * resolution + 1e-12)
+        return np.where(np.isfinite(steep), slopes / np.maximum(steep, 1.0), 0.0)
+
+    def _step(
+        self, elevation: ElevationMap, height: Array, observed: Array, ground: Array, trend: Array
+    ) -> tuple[Array, Array]:
+        """The layers `step` and `support`."""
+        lowest, support = lowest_around(height, observed, trend, _reach(self.wheel, elevation.resolution))
+        top, bottom = (_finite(elevation.layers.get(extreme), height) for extreme in ("maximum", "minimum"))
+        rise = np.minimum(top - lowest, 4 * (height - lowest))
+        above = np.minimum(top - ground, 4 * (height - ground))
+        below = np.minimum(ground - bottom, 4 * (ground - height))
+        within = np.minimum(top - bottom, 4 * np.minimum(height - bottom, top - height))
+        step = np.fmax.reduce([rise, above, below, within, np.zeros_like(height)])
+        raised = observed & ((np.abs(height - ground) >= self.skirt) | (step >= self.obstacle))
+        return np.where(observed, _as_whole_obstacles(step, raised), np.nan), support
+
+
+def _as_whole_obstacles(step: Array, raised: Array) -> Array:
+    """The steps (rows, cols), all `raised` cells that join, corners included, having the largest of theirs."""
+    obstacle, _ = label(raised, np.ones((3, 3)))
+    highest = np.zeros(obstacle.max() + 1)
+    np.maximum.at(highest, obstacle[raised], step[raised])
+    return np.where(raised, highest[obstacle], step)
+
+
+def _slope(plane: Array, resolution: float) -> Array:
+    """Slope, rad, of planes (4, rows, cols) as `fit_planes` gives them."""
+    return np.asarray(np.arctan(np.hypot(plane[1], plane[2]) / resolution))
+
+
+def _finite(layer: Array | None, height: Array) -> Array:
+    """A layer of heights as float64, with `height` where it is missing or not finite."""
+    return height if layer is None else np.where(np.isfinite(layer), layer, height).astype(np.float64)
+
+
+def _cells(width: float, resolution: float) -> int:
+    """Half a window's width in whole cells, at least one."""
+    return max(1, round(width / resolution / 2))
+
+
+def _reach(distance: float, resolution: float) -> int:
+    """A distance in whole cells, at least one."""
+    return max(1, round(distance / resolution))

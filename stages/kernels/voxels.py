@@ -1,0 +1,78 @@
+"""Counts and mean colours of the cubes that points fall in.
+
+The points are sorted by the column of cubes they stand in, by counting, so that a column's levels fit in a short list;
+no table of all cubes is needed, nor a comparison of two points.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from stages.data import Array
+
+
+def voxel_means(points: Array, colors: Array, edge: float) -> tuple[Array, Array, Array]:
+    """The cubes of `edge` m, aligned with the origin, that hold points.
+
+    points: (N, 3) float32, m, finite; colors: (N, 3) uint8.
+
+    Returns index (M, 3) int32, a cube reaching from index * edge to (index + 1) * edge, ordered by y, x, z; count (M,)
+    int32 of its points; and their mean colour (M, 3) uint8, rounded down.
+    """
+    if not len(points):
+        return np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros((0, 3), np.uint8)
+    low = np.floor(points.min(axis=0).astype(np.float64) / edge).astype(np.int64)
+    high = np.floor(points.max(axis=0).astype(np.float64) / edge).astype(np.int64)
+    index, count, total = _voxel_means(np.ascontiguousarray(points), np.ascontiguousarray(colors), edge, low, high)
+    return index, count, (total // count[:, None]).astype(np.uint8)
+
+
+@numba.njit(nogil=True, cache=True)
+def _voxel_means(points, colors, edge, low, high):  # type: ignore[no-untyped-def]
+    n = points.shape[0]
+    cols, rows, levels = high[0] - low[0] + 1, high[1] - low[1] + 1, high[2] - low[2] + 1
+    place, height = np.empty(n, np.int32), np.empty(n, np.int32)
+    start = np.zeros(rows * cols + 1, np.int64)
+    for i in range(n):
+        col = int(np.floor(np.float64(points[i, 0]) / edge)) - low[0]
+        row = int(np.floor(np.float64(points[i, 1]) / edge)) - low[1]
+        place[i] = row * cols + col
+        height[i] = int(np.floor(np.float64(points[i, 2]) / edge)) - low[2]
+        start[place[i] + 1] += 1
+    for k in range(rows * cols):
+        start[k + 1] += start[k]
+    order, end = np.empty(n, np.int32), start[:-1].copy()
+    for i in range(n):
+        order[end[place[i]]] = i
+        end[place[i]] += 1
+    index, count, total = np.empty((n, 3), np.int32), np.empty(n, np.int32), np.empty((n, 3), np.int32)
+    sums = np.zeros((levels, 4), np.int32)  # of one column: points, red, green, blue
+    found = 0
+    for k in range(rows * cols):
+        bottom, top = levels, -1
+        for j in range(start[k], start[k + 1]):
+            i = order[j]
+            level = height[i]
+            bottom, top = min(bottom, level), max(top, level)
+            sums[level, 0] += 1
+            for channel in range(3):
+                sums[level, channel + 1] += colors[i, channel]
+        for level in range(bottom, top + 1):
+            if sums[level, 0]:
+                index[found, 0], index[found, 1] = k % cols + low[0], k // cols + low[1]
+                index[found, 2] = level + low[2]
+                count[found] = sums[level, 0]
+                total[found] = sums[level, 1:]
+                sums[level] = 0
+                found += 1
+    return index[:found].copy(), count[:found].copy(), total[:found].copy()
+
+
+def voxel_means_reference(points: Array, colors: Array, edge: float) -> tuple[Array, Array, Array]:
+    """The same as `voxel_means`, in plain numpy."""
+    cubes = np.floor(points.astype(np.float64) / edge).astype(np.int32)
+    order, which, count = np.unique(cubes[:, [1, 0, 2]], axis=0, return_inverse=True, return_counts=True)
+    which = which.ravel()
+    total = np.stack([np.bincount(which, colors[:, c], minlength=len(order)) for c in range(3)], axis=1)
+    return order[:, [1, 0, 2]], count.astype(np.int32), (total // count[:, None]).astype(np.uint8)

@@ -1,0 +1,37 @@
+"""Voxels: the cubes of space that hold measured points, with their number and mean colour.
+
+An elevation map keeps one height a cell; here an overhang, a wall and a floater remain to be seen. For the timeline:
+nothing is decided on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.data import LEVEL_FRAME, PointCloud, Source, VoxelMap
+from stages.kernels.voxels import voxel_means
+from stages.stage import Stage, parameter
+
+
+@dataclass(frozen=True)
+class Voxels(Stage):
+    """Sorts the measured points of a levelled cloud into cubes; filled points are left out."""
+
+    resolution: float = parameter(0.05, "edge of a cube", unit="m", low=0.005, high=2.0)
+    region: float = parameter(8.0, "horizontal range from the level frame's origin", unit="m", low=0.1)
+    least: int = parameter(1, "points without which a cube is left out", low=1)
+
+    def __call__(self, cloud: PointCloud) -> VoxelMap:
+        """The cubes of a cloud in frame `level`; there may be none."""
+        if cloud.frame_id != LEVEL_FRAME:
+            raise ValueError(f"Voxels: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
+        x, y = cloud.points[:, 0], cloud.points[:, 1]
+        inside = np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.region**2)
+        if cloud.source is not None:
+            inside &= cloud.source != Source.FILLED
+        near = cloud.only(inside)
+        index, count, colors = voxel_means(near.points, near.colors, self.resolution)
+        kept = count >= self.least
+        return VoxelMap(cloud.stamp, index[kept], colors[kept], count[kept], self.resolution, LEVEL_FRAME)

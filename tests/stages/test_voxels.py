@@ -1,0 +1,64 @@
+"""Voxels holds every measured point once, in the cube it is in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.data import LEVEL_FRAME, Array, PointCloud, Source
+from stages.kernels.voxels import voxel_means, voxel_means_reference
+from stages.voxels import Voxels
+
+
+def cloud_of(points: Array, colors: Array) -> PointCloud:
+    n = len(points)
+    return PointCloud(
+        5, points.astype(np.float32), colors, np.full(n, 0.02, np.float32), np.arange(n, dtype=np.int32), LEVEL_FRAME
+    )
+
+
+def some(seed: int, n: int = 4000) -> PointCloud:
+    random = np.random.default_rng(seed)
+    return cloud_of(random.normal(0, 0.4, (n, 3)), random.integers(0, 256, (n, 3), np.uint8))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), edge=st.sampled_from([0.05, 0.13, 1.0]))
+def test_kernel_equals_the_plain_reference(seed: int, edge: float) -> None:
+    cloud = some(seed, 500)
+    for got, want in zip(voxel_means(cloud.points, cloud.colors, edge),
+                         voxel_means_reference(cloud.points, cloud.colors, edge), strict=True):  # fmt: skip
+        np.testing.assert_array_equal(got, want)
+
+
+def test_every_measured_point_within_the_region_is_in_its_cube_and_in_one_only() -> None:
+    cloud = some(1)
+    filled = np.arange(len(cloud.points)) % 4 == 0
+    source = np.where(filled, Source.FILLED, Source.MEASURED).astype(np.uint8)
+    voxels = Voxels(region=0.6, resolution=0.1)(replace(cloud, source=source))
+    inside = ~filled & (np.hypot(cloud.points[:, 0], cloud.points[:, 1]) <= 0.6)
+    assert voxels.count.sum() == inside.sum()
+    cubes = {tuple(cube) for cube in np.floor(cloud.points[inside] / np.float64(0.1)).astype(int)}
+    assert {tuple(cube) for cube in voxels.index} == cubes
+    assert len(voxels.index) == len(cubes)
+
+
+def test_a_wall_and_what_hangs_over_it_are_cubes_of_their_own_colour() -> None:
+    points = np.array([[1.01, 1.01, 0.01], [1.02, 1.02, 0.02], [1.01, 1.01, 1.01]])
+    colors = np.array([[10, 20, 30], [20, 30, 41], [200, 0, 0]], np.uint8)
+    voxels = Voxels()(cloud_of(points, colors))
+    assert voxels.index.tolist() == [[20, 20, 0], [20, 20, 20]]
+    assert voxels.colors.tolist() == [[15, 25, 35], [200, 0, 0]]
+    assert voxels.count.tolist() == [2, 1]
+    assert Voxels(least=2)(cloud_of(points, colors)).count.tolist() == [2]
+
+
+def test_no_points_make_no_cubes_and_a_cloud_that_is_not_level_is_refused() -> None:
+    empty = cloud_of(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    assert Voxels()(empty).index.shape == (0, 3)
+    with pytest.raises(ValueError, match="'cam', not 'level'"):
+        Voxels()(replace(empty, frame_id="cam"))
