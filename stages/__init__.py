@@ -19,6 +19,7 @@ from stages.data import (
     Tilt,
     Transform,
 )
+from stages.fuse import Fuse
 from stages.level import Level
 from stages.match import Match
 from stages.match_opencv import MatchOpenCV
@@ -35,6 +36,7 @@ __all__ = [
     "Clean",
     "Disparity",
     "ElevationMap",
+    "Fuse",
     "Level",
     "Match",
     "MatchOpenCV",

@@ -1,0 +1,270 @@
+"""Fuse: local clouds into one regional elevation map in the pose's frame, by inverse variance.
+
+The trick is to resample nothing: a levelled cloud is turned to its heading in the pose's frame and shifted by less than
+a cell before it is binned, so that its cells are cells of the region. What moves a frame as a whole, the error of its
+tilt and of the pose's height, is a plane, found where the frame overlaps the map and taken off; so neighbouring frames
+join without a seam.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
+from stages.kernels.rigid import transform_points
+from stages.overlap import fit_plane
+from stages.stage import Stage, parameter
+from stages.tiles import Tiles
+from stages.voxelise import Voxelise
+
+# What is remembered of a cell, 30 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
+# best: the smallest standard deviation among them; below, above: from the height to the cell's extremes; first, last:
+# ms since the first frame.
+CELL = np.dtype(
+    [
+        ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u4"),
+        ("first", "u4"), ("last", "u4"), ("frames", "u2"), ("contradictions", "u2"),
+    ]
+)  # fmt: skip
+_MOST = np.iinfo(np.uint16).max
+_MS = 1_000_000
+# Beyond this the pose's frame does not have z up. An odometry that knows no tilt may differ by the slope of the ground.
+_LARGEST_LEAN = np.radians(30.0)
+
+
+@dataclass(eq=False)
+class Region:
+    """The map so far: its frame, the stamp of its first frame, ns, and its cells."""
+
+    frame_id: str = ""
+    epoch: int = 0
+    last: int = -1
+    cells: Tiles = field(default_factory=lambda: Tiles(CELL))
+
+
+@dataclass(frozen=True)
+class Fuse(Stage):
+    """Merges levelled clouds into a regional map, and gives the part of it around the rover.
+
+    The map that a frame gives is a square of `window` about the rover, its sides along the axes of the pose's frame. It
+    holds all that the frame changed, so the maps of a run, each laid over those before, are the whole region. Layers:
+    - elevation, minimum, maximum, m: means over frames, weighted by inverse variance;
+    - variance, m^2: of the elevation against what lies about it. Frames see a cell alike and err alike: the share
+      `shared` of the smallest variance stays, however many frames there are;
+    - count (points); first, last: when the evidence in the cell was gathered, s since the first frame of the run;
+      frames: how many it is from; contradictions: how often the height was contradicted.
+
+    A frame contradicts a cell if it is off by more than `contradiction` standard deviations. Then the cell's evidence
+    loses half its weight, and as soon as the newer is as sure, the newer takes its place. The frame's plane is limited
+    by what is expected of its errors (`tilt_sigma`, `height_sigma`), and the share `follow` of it is left in, so that
+    the map follows gravity and the pose in the long run and not the errors of its first frame.
+    """
+
+    resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
+    region: float = parameter(8.0, "horizontal range from the rover that a frame adds to the map", unit="m", low=0.1)
+    window: float = parameter(20.0, "width of the map that is given with each frame", unit="m", low=0.5)
+    tilt_sigma: float = parameter(0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0)
+    height_sigma: float = parameter(0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0)
+    alignment: float = parameter(
+        0.005, "standard deviation that errors of position add to a cell's height", unit="m", low=0.0
+    )
+    follow: float = parameter(0.05, "share of a frame's own tilt and height that the map takes over", low=0.0, high=1.0)
+    contradiction: float = parameter(3.0, "standard deviations that two heights of a cell may differ", low=1.0)
+    shared: float = parameter(0.3, "share of a cell's variance that is the same in all frames", low=0.0, high=1.0)
+
+    ordered: ClassVar[bool] = True
+    _map: Region = field(default_factory=Region, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.window < 2 * (self.region + self.resolution):
+            raise ValueError(
+                f"Fuse.window must be more than twice the region ({self.region} m), not {self.window} m: the map given "
+                "with a frame holds all that the frame changed"
+            )
+
+    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> ElevationMap:
+        """The regional map around the rover, in the pose's frame, with the cloud, in frame `level`, fused in.
+
+        mount: how the camera sits on the frame whose pose is given; may be left out where that is the camera itself.
+        """
+        self._check(cloud, pose)
+        placed = placement(cloud, pose, mount)
+        local, row, col = local_cells(cloud, placed, self.resolution, self.region)
+        if self._map.last < 0:
+            self._map.frame_id, self._map.epoch = pose.frame_id, pose.stamp
+        cells = self._map.cells.read(row, col, *local.shape)
+        known = np.isfinite(local.layers["elevation"])
+        seen = {name: local.layers[name][known].astype(np.float64) for name in local.layers}
+        seen["variance"] += self.alignment**2
+        x, y = _offsets(known, row, col, placed, self.resolution)
+        plane = self._plane(cells[known], seen, x, y)
+        rise = plane[0] + plane[1] * x + plane[2] * y
+        for height in ("elevation", "minimum", "maximum"):
+            seen[height] += rise
+        cells[known] = self._merged(cells[known], seen, (cloud.stamp - self._map.epoch) // _MS)
+        self._map.cells.write(row, col, cells, known)
+        self._map.last = cloud.stamp
+        return self._around(cloud.stamp, _lifted(placed, plane))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the map so far, bytes."""
+        return self._map.cells.nbytes
+
+    def _check(self, cloud: PointCloud, pose: Pose) -> None:
+        if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
+            raise ValueError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
+        if self._map.last >= 0 and pose.frame_id != self._map.frame_id:
+            raise ValueError(
+                f"Fuse: the pose is in frame '{pose.frame_id}', the map in '{self._map.frame_id}'; give poses of one "
+                "frame"
+            )
+        if cloud.stamp <= self._map.last:
+            raise ValueError(f"Fuse: the cloud of {cloud.stamp} ns comes after that of {self._map.last} ns")
+
+    def _plane(self, cells: Array, seen: dict[str, Array], x: Array, y: Array) -> Array:
+        """What a frame has to rise to join the map: (3,) height at the rover, m, and slopes along x and y.
+
+        cells, seen: of the cells that the frame sees, at (x, y) from the rover.
+        """
+        both = cells["frames"] > 0
+        cells, x, y = cells[both], x[both], y[both]
+        off = cells["height"].astype(np.float64) - seen["elevation"][both]
+        variance = self._variance(cells) + seen["variance"][both]
+        expected = np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])
+        return (1 - self.follow) * fit_plane(x, y, off, variance, expected, self.resolution)
+
+    def _variance(self, cells: Array) -> Array:
+        """Variance of the heights of known cells, m^2."""
+        return 1 / cells["weight"].astype(np.float64) + self.shared * cells["best"].astype(np.float64) ** 2
+
+    def _merged(self, cells: Array, seen: dict[str, Array], now: int) -> Array:
+        """The cells (n,) with what a frame saw in them at `now`, ms."""
+        cells = cells.copy()
+        height, variance = seen["elevation"], seen["variance"]
+        known = cells["frames"] > 0
+        have = np.full(len(cells), np.inf)
+        have[known] = self._variance(cells[known])
+        contradicted = known & (np.abs(height - cells["height"]) > self.contradiction * np.sqrt(have + variance))
+        cells["weight"][contradicted] /= 2
+        cells["best"][contradicted] *= np.float16(np.sqrt(2))
+        counted = np.minimum(cells["contradictions"][contradicted], _MOST - 1) + 1
+        have[contradicted] *= 2
+        new = ~known | (contradicted & (variance <= have))
+        cells[new] = np.zeros((), CELL)
+        cells["first"][new] = now
+        cells["contradictions"][contradicted] = counted
+
+        added = new | (known & ~contradicted)
+        weight = 1 / ((1 - self.shared) * variance[added] + 1e-12)
+        before = cells[added]
+        total = before["weight"] + weight
+        share = weight / total
+        middle = before["height"] + share * (height[added] - before["height"])
+        extremes = {
+            name: before[name] + share * (sign * (seen[extreme] - height)[added] - before[name])
+            for name, extreme, sign in (("below", "minimum", -1), ("above", "maximum", 1))
+        }
+        spread = np.sqrt(variance[added])
+        after = before.copy()
+        after["height"], after["weight"] = middle, total
+        after["below"], after["above"] = extremes["below"], extremes["above"]
+        after["best"] = np.where(before["frames"] > 0, np.minimum(before["best"], spread), spread)
+        after["count"] = before["count"] + seen["count"][added].astype(np.uint32)
+        after["last"] = now
+        after["frames"] = np.minimum(before["frames"], _MOST - 1) + 1
+        cells[added] = after
+        return cells
+
+    def _around(self, stamp: int, placed: Transform) -> ElevationMap:
+        """The map around the rover."""
+        half = int(np.ceil(self.window / 2 / self.resolution - 1e-9))
+        col, row = (int(np.floor(place / self.resolution)) - half for place in placed.translation[:2])
+        cells = self._map.cells.read(row, col, 2 * half, 2 * half)
+        known = cells["frames"] > 0
+        layers = {name: np.full(known.shape, np.nan, np.float32) for name in ("elevation", "minimum", "maximum")}
+        seen = cells[known]
+        layers["elevation"][known] = seen["height"]
+        layers["minimum"][known] = seen["height"] - seen["below"]
+        layers["maximum"][known] = seen["height"] + seen["above"]
+        layers["count"] = cells["count"].astype(np.float32)
+        layers["variance"] = np.full(known.shape, np.nan, np.float32)
+        layers["variance"][known] = self._variance(seen)
+        for name in ("first", "last"):
+            layers[name] = np.where(known, cells[name] / 1e3, np.nan).astype(np.float32)
+        for name in ("frames", "contradictions"):
+            layers[name] = cells[name].astype(np.float32)
+        origin = (col * self.resolution, row * self.resolution)
+        return ElevationMap(stamp, layers, self.resolution, origin, self._map.frame_id, level=placed)
+
+
+def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> Transform:
+    """Frame `level` of a levelled cloud in the pose's frame: upright, turned by the pose's heading.
+
+    Pitch and roll of the pose are not used: which way is up, the inclinometer knows. Raises ValueError where nothing
+    tells how the frame whose pose it is sits to the camera, or where the pose's frame does not have z up.
+    """
+    assert cloud.sensor is not None
+    child = _child_from_camera(pose, cloud.sensor, mount)
+    camera = Rotation.from_quat(pose.quaternion).as_matrix() @ child.rotation
+    turned = camera @ cloud.sensor.rotation.T
+    lean = float(np.arccos(np.clip(turned[2, 2], -1.0, 1.0)))
+    if lean > _LARGEST_LEAN:
+        raise ValueError(
+            f"Fuse: z of the pose's frame '{pose.frame_id}' is {np.degrees(lean):.0f} degrees off the vertical of the "
+            "tilt; give a pose in a frame whose z points up"
+        )
+    yaw = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
+    rotation = Rotation.from_euler("z", yaw).as_matrix()
+    origin = cloud.sensor(child.inverse().translation)  # of the frame whose pose it is, in level
+    return Transform(pose.frame_id, LEVEL_FRAME, rotation, pose.position - rotation @ origin)
+
+
+def _child_from_camera(pose: Pose, sensor: Transform, mount: Mount | None) -> Transform:
+    """The camera in the frame whose pose is given."""
+    if pose.child_frame_id == sensor.child:
+        return Transform(sensor.child, sensor.child, np.eye(3), np.zeros(3))
+    base = mount.base_from_camera if mount is not None else None
+    if base is None or base.parent != pose.child_frame_id:
+        raise ValueError(
+            f"Fuse: the pose is that of '{pose.child_frame_id}', and nothing tells how the camera '{sensor.child}' "
+            "sits on it; record its static transform, or set base_frame of the source"
+        )
+    return base
+
+
+def local_cells(
+    cloud: PointCloud, placed: Transform, resolution: float, region: float
+) -> tuple[ElevationMap, int, int]:
+    """The elevation map of one cloud in the cells of the region, and the row and column there of its first cell.
+
+    cloud: in frame `level`, which is `placed` upright in the region's frame. The map's heights are in that frame.
+    """
+    cell = np.floor(placed.translation[:2] / resolution).astype(int)
+    rest = Transform("", LEVEL_FRAME, placed.rotation, [*(placed.translation[:2] - cell * resolution), 0.0])
+    points = transform_points(cloud.points, rest.rotation, rest.translation)
+    sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
+    local = Voxelise(resolution=resolution, region=region)(replace(cloud, points=points, sensor=sensor))
+    col, row = (int(number) - extent // 2 for number, extent in zip(cell, local.shape[::-1], strict=True))
+    heights = ("elevation", "minimum", "maximum")
+    lifted = {name: local.layers[name] + np.float32(placed.translation[2]) for name in heights}
+    origin = (col * resolution, row * resolution)
+    return replace(local, layers={**local.layers, **lifted}, origin=origin, frame_id=placed.parent), row, col
+
+
+def _offsets(known: Array, row: int, col: int, placed: Transform, resolution: float) -> tuple[Array, Array]:
+    """x and y of the centres of the known cells from the rover, m."""
+    rows, cols = np.nonzero(known)
+    x, y = ((col + cols + 0.5) * resolution, (row + rows + 0.5) * resolution)
+    return x - placed.translation[0], y - placed.translation[1]
+
+
+def _lifted(placed: Transform, plane: Array) -> Transform:
+    """The placement with its plane (height, slopes) added: a rise, and the small rotation that makes the slopes."""
+    turn = Rotation.from_rotvec([plane[2], -plane[1], 0.0]).as_matrix()
+    return replace(placed, rotation=turn @ placed.rotation, translation=placed.translation + [0.0, 0.0, plane[0]])
