@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stages.publish import check_rotation, publish, publish_image, publish_vector, read_only
+from stages.tiles import Tiles as Tiles
 
 Array = NDArray[Any]
 

@@ -14,11 +14,10 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
+from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Tiles, Transform
 from stages.kernels.rigid import transform_points
 from stages.overlap import fit_plane
 from stages.stage import Stage, parameter
-from stages.tiles import Tiles
 from stages.voxelise import Voxelise
 
 # What is remembered of a cell, 30 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
@@ -246,7 +245,7 @@ def local_cells(
     cloud: in frame `level`, which is `placed` upright in the region's frame. The map's heights are in that frame.
     """
     cell = np.floor(placed.translation[:2] / resolution).astype(int)
-    rest = Transform("", LEVEL_FRAME, placed.rotation, [*(placed.translation[:2] - cell * resolution), 0.0])
+    rest = replace(placed, translation=np.append(placed.translation[:2] - cell * resolution, 0.0))
     points = transform_points(cloud.points, rest.rotation, rest.translation)
     sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
     local = Voxelise(resolution=resolution, region=region)(replace(cloud, points=points, sensor=sensor))
@@ -267,4 +266,4 @@ def _offsets(known: Array, row: int, col: int, placed: Transform, resolution: fl
 def _lifted(placed: Transform, plane: Array) -> Transform:
     """The placement with its plane (height, slopes) added: a rise, and the small rotation that makes the slopes."""
     turn = Rotation.from_rotvec([plane[2], -plane[1], 0.0]).as_matrix()
-    return replace(placed, rotation=turn @ placed.rotation, translation=placed.translation + [0.0, 0.0, plane[0]])
+    return replace(placed, rotation=turn @ placed.rotation, translation=placed.translation + np.array([0, 0, plane[0]]))

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stages.data import Array
+Array = NDArray[Any]
 
 SIDE = 64  # cells of a tile's side: 3.2 m of 0.05 m cells, so that a track of 20 m wastes a sixth at its borders
 
