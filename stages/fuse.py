@@ -20,16 +20,15 @@ from stages.overlap import fit_plane
 from stages.stage import Stage, parameter
 from stages.voxelise import Voxelise
 
-# What is remembered of a cell, 30 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
+# What is remembered of a cell, 27 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
 # best: the smallest standard deviation among them; below, above: from the height to the cell's extremes; first, last:
-# ms since the first frame.
+# ms since the first frame; numbers stop at the largest of their type.
 CELL = np.dtype(
     [
-        ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u4"),
-        ("first", "u4"), ("last", "u4"), ("frames", "u2"), ("contradictions", "u2"),
+        ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u2"),
+        ("first", "u4"), ("last", "u4"), ("frames", "u2"), ("contradictions", "u1"),
     ]
 )  # fmt: skip
-_MOST = np.iinfo(np.uint16).max
 _MS = 1_000_000
 # Beyond this the pose's frame does not have z up. An odometry that knows no tilt may differ by the slope of the ground.
 _LARGEST_LEAN = np.radians(30.0)
@@ -55,7 +54,7 @@ class Fuse(Stage):
     - variance, m^2: of the elevation against what lies about it. Frames see a cell alike and err alike: the share
       `shared` of the smallest variance stays, however many frames there are;
     - count (points); first, last: when the evidence in the cell was gathered, s since the first frame of the run;
-      frames: how many it is from; contradictions: how often the height was contradicted.
+      frames: how many it is from (at most 65535); contradictions: how often the height was contradicted.
 
     A frame contradicts a cell if it is off by more than `contradiction` standard deviations. Then the cell's evidence
     loses half its weight, and as soon as the newer is as sure, the newer takes its place. The frame's plane is limited
@@ -152,7 +151,7 @@ class Fuse(Stage):
         contradicted = known & (np.abs(height - cells["height"]) > self.contradiction * np.sqrt(have + variance))
         cells["weight"][contradicted] /= 2
         cells["best"][contradicted] *= np.float16(np.sqrt(2))
-        counted = np.minimum(cells["contradictions"][contradicted], _MOST - 1) + 1
+        counted = _sum(cells["contradictions"][contradicted], 1)
         have[contradicted] *= 2
         new = ~known | (contradicted & (variance <= have))
         cells[new] = np.zeros((), CELL)
@@ -174,9 +173,9 @@ class Fuse(Stage):
         after["height"], after["weight"] = middle, total
         after["below"], after["above"] = extremes["below"], extremes["above"]
         after["best"] = np.where(before["frames"] > 0, np.minimum(before["best"], spread), spread)
-        after["count"] = before["count"] + seen["count"][added].astype(np.uint32)
+        after["count"] = _sum(before["count"], seen["count"][added])
         after["last"] = now
-        after["frames"] = np.minimum(before["frames"], _MOST - 1) + 1
+        after["frames"] = _sum(before["frames"], 1)
         cells[added] = after
         return cells
 
@@ -200,6 +199,12 @@ class Fuse(Stage):
             layers[name] = cells[name].astype(np.float32)
         origin = (col * self.resolution, row * self.resolution)
         return ElevationMap(stamp, layers, self.resolution, origin, self._map.frame_id, level=placed)
+
+
+def _sum(numbers: Array, more: Array | int) -> Array:
+    """Unsigned numbers with `more` added, or the largest of their type."""
+    most = np.iinfo(numbers.dtype).max
+    return np.asarray(np.minimum(numbers + np.asarray(more, np.float64), most).astype(numbers.dtype))
 
 
 def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> Transform:

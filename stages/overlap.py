@@ -1,7 +1,8 @@
 """What a frame has to rise and tilt to lie on a map that it overlaps: a robust plane through the height differences.
 
 Errors of neighbouring cells are alike, so a patch of them counts as one; and cells that changed, or that stand at the
-edge of a rock, lie far off and must not pull, so the fit is Huber's, by reweighting.
+edge of a rock, lie far off and must not pull. The fit is by reweighting: Huber's weights first, which lead to the one
+solution there is, then Cauchy's, with which what is far off pulls the less the farther it is.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ import numpy as np
 from stages.data import Array
 
 PATCH = 0.3  # m, within which errors of stereo heights are alike
-_HUBER = 1.345  # standard deviations; 95 % as efficient as least squares where all errors are normal
-_ROUNDS = 12
+# Standard deviations; 95 % as efficient as least squares where all errors are normal
+_HUBER, _CAUCHY = 1.345, 2.385
+_ROUNDS = 8  # of each
 
 
 def fit_plane(x: Array, y: Array, off: Array, variance: Array, expected: Array, resolution: float) -> Array:
@@ -28,9 +30,12 @@ def fit_plane(x: Array, y: Array, off: Array, variance: Array, expected: Array, 
     trust = 1 / (variance * max(1.0, (PATCH / resolution) ** 2))
     prior = np.diag(1 / expected[known] ** 2)
     spread = np.sqrt(variance)
-    for _ in range(_ROUNDS if len(x) else 0):
-        residual = np.abs(off - plane[known] @ design)
-        weight = trust * np.minimum(1.0, _HUBER * spread / np.maximum(residual, 1e-12))
-        weighted = design * weight
+    for number in range(2 * _ROUNDS if len(x) else 0):
+        residual = np.abs(off - plane[known] @ design) / spread
+        if number < _ROUNDS:
+            weight = np.minimum(1.0, _HUBER / np.maximum(residual, 1e-12))
+        else:
+            weight = 1 / (1 + (residual / _CAUCHY) ** 2)
+        weighted = design * (weight * trust)
         plane[known] = np.linalg.solve(weighted @ design.T + prior, weighted @ off)
     return plane

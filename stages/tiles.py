@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-SIDE = 64  # cells of a tile's side: 3.2 m of 0.05 m cells, so that a track of 20 m wastes a sixth at its borders
+SIDE = 32  # cells of a tile's side: 1.6 m of 0.05 m cells, so that a track of 20 m wastes a twelfth at its borders
 
 
 @dataclass(eq=False)
