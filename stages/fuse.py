@@ -29,6 +29,7 @@ CELL = np.dtype(
         ("first", "u4"), ("last", "u4"), ("frames", "u2"), ("contradictions", "u1"),
     ]
 )  # fmt: skip
+MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that no map ends where they still change
 _MS = 1_000_000
 # Beyond this the pose's frame does not have z up. An odometry that knows no tilt may differ by the slope of the ground.
 _LARGEST_LEAN = np.radians(30.0)
@@ -79,10 +80,11 @@ class Fuse(Stage):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.window < 2 * (self.region + self.resolution):
+        least = 2 * (self.region + MARGIN)
+        if self.window < least:
             raise ValueError(
-                f"Fuse.window must be more than twice the region ({self.region} m), not {self.window} m: the map given "
-                "with a frame holds all that the frame changed"
+                f"Fuse.window must be at least {least:g} m, not {self.window:g} m: it holds all that a frame changed "
+                f"(region, {self.region:g} m) and {MARGIN:g} m about it"
             )
 
     def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> ElevationMap:

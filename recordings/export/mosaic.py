@@ -14,7 +14,7 @@ import numpy as np
 from recordings.errors import LogError
 from stages.data import Array, Tiles
 
-RIM = 1.5  # m; slopes and steps are measured over windows about twice as wide
+RIM = 1.5  # m; slopes and steps are measured over less than that; what a frame changes lies farther inside
 _ON_GRID = 1e-3  # of a cell; how far from its place a grid's corner may be by rounding
 
 
