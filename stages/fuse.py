@@ -20,13 +20,15 @@ from stages.overlap import fit_plane
 from stages.stage import Stage, parameter
 from stages.voxelise import Voxelise
 
-# What is remembered of a cell, 27 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
+# What is remembered of a cell, 28 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
 # best: the smallest standard deviation among them; below, above: from the height to the cell's extremes; first, last:
-# ms since the first frame; numbers stop at the largest of their type.
+# ms since the first frame; numbers stop at the largest of their type. hidden: 1 where nothing is known, but a frame
+# looked and could not see it.
 CELL = np.dtype(
     [
         ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u2"),
         ("first", "u4"), ("last", "u4"), ("frames", "u2"), ("contradictions", "u1"),
+        ("hidden", "u1"),
     ]
 )  # fmt: skip
 MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that no map ends where they still change
@@ -37,11 +39,13 @@ _LARGEST_LEAN = np.radians(30.0)
 
 @dataclass(eq=False)
 class Region:
-    """The map so far: its frame, the stamp of its first frame, ns, and its cells."""
+    """The map so far: its frame, the stamps of its first and last frame, ns, whether those tell what was hidden from
+    them, and its cells."""
 
     frame_id: str = ""
     epoch: int = 0
     last: int = -1
+    hides: bool = False
     cells: Tiles = field(default_factory=lambda: Tiles(CELL))
 
 
@@ -55,12 +59,15 @@ class Fuse(Stage):
     - variance, m^2: of the elevation against what lies about it. Frames see a cell alike and err alike: the share
       `shared` of the smallest variance stays, however many frames there are;
     - count (points); first, last: when the evidence in the cell was gathered, s since the first frame of the run;
-      frames: how many it is from (at most 65535); contradictions: how often the height was contradicted.
+      frames: how many it is from (at most 65535); contradictions: how often the height was contradicted;
+    - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere.
 
     A frame contradicts a cell if it is off by more than `contradiction` standard deviations. Then the cell's evidence
-    loses half its weight, and as soon as the newer is as sure, the newer takes its place. The frame's plane is limited
-    by what is expected of its errors (`tilt_sigma`, `height_sigma`), and the share `follow` of it is left in, so that
-    the map follows gravity and the pose in the long run and not the errors of its first frame.
+    loses half its weight, and as soon as the newer is as sure, the newer takes its place.
+
+    The plane that joins a frame to the map is limited by what is expected of its errors (`tilt_sigma`, `height_sigma`).
+    A small share of it is left in (`follow_tilt`, `follow_height`), so that in the long run the map follows gravity and
+    the pose and not the errors of its first frame.
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
@@ -71,7 +78,10 @@ class Fuse(Stage):
     alignment: float = parameter(
         0.005, "standard deviation that errors of position add to a cell's height", unit="m", low=0.0
     )
-    follow: float = parameter(0.05, "share of a frame's own tilt and height that the map takes over", low=0.0, high=1.0)
+    follow_tilt: float = parameter(0.05, "share of a frame's own tilt that the map takes over", low=0.0, high=1.0)
+    follow_height: float = parameter(
+        0.003, "share of its own height; much less, for heights that are pulled lean the map", low=0.0, high=1.0
+    )
     contradiction: float = parameter(3.0, "standard deviations that two heights of a cell may differ", low=1.0)
     shared: float = parameter(0.3, "share of a cell's variance that is the same in all frames", low=0.0, high=1.0)
 
@@ -96,7 +106,7 @@ class Fuse(Stage):
         placed = placement(cloud, pose, mount)
         local, row, col = local_cells(cloud, placed, self.resolution, self.region)
         if self._map.last < 0:
-            self._map.frame_id, self._map.epoch = pose.frame_id, pose.stamp
+            self._map.frame_id, self._map.epoch = pose.frame_id, cloud.stamp
         cells = self._map.cells.read(row, col, *local.shape)
         known = np.isfinite(local.layers["elevation"])
         seen = {name: local.layers[name][known].astype(np.float64) for name in local.layers}
@@ -107,8 +117,10 @@ class Fuse(Stage):
         for height in ("elevation", "minimum", "maximum"):
             seen[height] += rise
         cells[known] = self._merged(cells[known], seen, (cloud.stamp - self._map.epoch) // _MS)
-        self._map.cells.write(row, col, cells, known)
-        self._map.last = cloud.stamp
+        hidden = ~known & (local.layers.get("occluded", np.zeros(known.shape)) == 1)
+        cells["hidden"][hidden] = cells["frames"][hidden] == 0
+        self._map.cells.write(row, col, cells, known | hidden)
+        self._map.last, self._map.hides = cloud.stamp, "occluded" in local.layers
         return self._around(cloud.stamp, _lifted(placed, plane))
 
     @property
@@ -137,7 +149,8 @@ class Fuse(Stage):
         off = cells["height"].astype(np.float64) - seen["elevation"][both]
         variance = self._variance(cells) + seen["variance"][both]
         expected = np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])
-        return (1 - self.follow) * fit_plane(x, y, off, variance, expected, self.resolution)
+        plane = fit_plane(x, y, off, variance, expected, self.resolution)
+        return np.asarray(plane * (1 - np.array([self.follow_height, self.follow_tilt, self.follow_tilt])))
 
     def _variance(self, cells: Array) -> Array:
         """Variance of the heights of known cells, m^2."""
@@ -199,6 +212,8 @@ class Fuse(Stage):
             layers[name] = np.where(known, cells[name] / 1e3, np.nan).astype(np.float32)
         for name in ("frames", "contradictions"):
             layers[name] = cells[name].astype(np.float32)
+        if self._map.hides:
+            layers["occluded"] = np.where(known, 0, np.where(cells["hidden"] == 1, 1, np.nan)).astype(np.float32)
         origin = (col * self.resolution, row * self.resolution)
         return ElevationMap(stamp, layers, self.resolution, origin, self._map.frame_id, level=placed)
 

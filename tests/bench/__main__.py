@@ -1,7 +1,8 @@
 """Everything `make bench` prints."""
 
-from tests.bench import matching, pipeline, terrain
+from tests.bench import matching, pipeline, regional, terrain
 
 matching.main()
 pipeline.main()
 terrain.main()
+regional.main()

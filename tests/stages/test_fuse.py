@@ -112,6 +112,24 @@ def test_frames_with_errors_of_their_tilt_join_without_a_seam():
     assert np.max(seams, axis=0)[1] < 0.008
 
 
+def test_the_tilt_error_of_the_first_frame_fades_and_does_not_swing_back():
+    fuse, lean, found = Fuse(), np.radians(0.6), []
+    for frame in range(61):
+        cloud, pose = drive(frame, flat, tilt=(lean if frame == 0 else 0.0, 0.0), at=(0.25 * frame, 0.0, 0.0))
+        placed = fuse(part(cloud, np.s_[::10]), pose, MOUNT).level
+        found.append(np.arcsin(placed.rotation[2, 0]) / lean)
+    assert found[1] == pytest.approx(0.92, abs=0.05)  # it joins the map as that is
+    assert abs(found[40]) < 0.15
+    assert abs(found[60]) < 0.1
+    assert min(found) > -0.1
+    assert abs(placed.translation[2]) < 0.1
+
+
+def part(cloud, of):
+    """Some points of a cloud, by a slice."""
+    return replace(cloud, **{name: getattr(cloud, name)[of] for name in ("points", "colors", "sigma", "pixel")})
+
+
 def test_a_mean_over_frames_is_weighted_by_inverse_variance():
     fuse = Fuse(tilt_sigma=0.0, height_sigma=0.0)
     clouds = [
@@ -260,10 +278,7 @@ def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(c
 def test_an_empty_cloud_changes_nothing():
     fuse = Fuse()
     cloud, pose = drive(0)
-    empty = replace(
-        cloud, points=cloud.points[:0], colors=cloud.colors[:0], sigma=cloud.sigma[:0], pixel=cloud.pixel[:0]
-    )
-    assert np.isnan(fuse(empty, pose, MOUNT).layers["elevation"]).all()
+    assert np.isnan(fuse(part(cloud, np.s_[:0]), pose, MOUNT).layers["elevation"]).all()
     assert np.isfinite(fuse(*drive(1), MOUNT).layers["elevation"]).any()
 
 
@@ -299,5 +314,5 @@ def test_a_kilometre_of_20_metres_width_fits_into_500_megabytes(metres):
     done = subprocess.run([sys.executable, "-c", TRACK, str(metres)], capture_output=True, text=True, check=True)
     cells, map_size, process_size = (float(value) for value in done.stdout.split())
     assert cells == pytest.approx(metres * 20 / 0.05**2, rel=0.01)
-    assert map_size < 0.25 * metres + 2
-    assert process_size < 500 - 0.25 * (1000 - metres)
+    assert map_size < 0.26 * metres + 2
+    assert process_size < 500 - 0.26 * (1000 - metres)
