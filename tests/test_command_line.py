@@ -13,17 +13,14 @@ import time
 from collections import Counter
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-import rasterio
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from flow.cli import main
-from recordings import ros2
 from tests.conftest import FRAMES, rewrite
 from tests.recordings.middlebury_scene import write_scene
 
@@ -261,48 +258,6 @@ def test_the_pose_comes_from_tf_where_told(traverse, tmp_path):
     assert [pose.stamp for pose in read] == [pose.stamp for pose in poses]
     np.testing.assert_allclose([p.position for p in read], [p.position for p in poses], atol=1e-12)
     assert roverflow("run", log, *SMALL, "--set", "source.odometry=/tf", "-o", tmp_path / "out.mcap", "--no-rrd") == 0
-
-
-def test_a_log_without_a_pose_is_run_without_a_regional_map(traverse, tmp_path, capsys):
-    log, out = rewrite(traverse, tmp_path / "log.mcap", drop("/odometry")), tmp_path / "out.mcap"
-    assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd") == 0
-    counts = Counter(topic for topic, _, _ in raw_messages(out))
-    assert set(counts) == RESULTS - {"/nav/regional_map", "/nav/regional_navigation_map"}
-    assert roverflow("export", out, tmp_path / "maps") == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "had no pose" in said
-    assert "--frames" in said
-    assert roverflow("export", out, tmp_path / "maps", "--frames") == 0
-    assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == FRAMES
-
-
-def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, capsys):
-    assert roverflow("export", result, tmp_path / "maps") == 0
-    assert f"{tmp_path / 'maps'}: 14 files" in capsys.readouterr().out
-    with rasterio.open(tmp_path / "maps" / "frames.tif") as file:
-        assert file.read(1).max() == FRAMES
-    with rasterio.open(tmp_path / "maps" / "elevation.tif") as file:
-        known = np.isfinite(file.read(1)).sum()
-        assert file.shape == cv2.imread(str(tmp_path / "maps" / "navigation_map.pgm"), cv2.IMREAD_UNCHANGED).shape
-    own = [
-        np.isfinite(ros2.read_grid_map(message).layers["elevation"]).sum()
-        for _, _, message in ros2.iter_messages(result, ["/nav/elevation_map"])
-    ]
-    assert max(own) < known < sum(own)
-
-
-@pytest.mark.parametrize(
-    ("where", "words"), [("file", "is a file; give the name of a folder"), ("gone", "cannot read")]
-)
-def test_an_export_that_cannot_be_done_is_one_sentence(result, tmp_path, where, words, capsys):
-    (tmp_path / "file").write_text("mine")
-    log = tmp_path / "gone.mcap" if where == "gone" else result
-    assert roverflow("export", log, tmp_path / "file" if where == "file" else tmp_path / "maps") == 2
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("\n") == 1
-    assert (tmp_path / "file").read_text() == "mine"
 
 
 def drop(*parts: str):

@@ -118,7 +118,7 @@ def test_the_tilt_error_of_the_first_frame_fades_and_does_not_swing_back():
         cloud, pose = drive(frame, flat, tilt=(lean if frame == 0 else 0.0, 0.0), at=(0.25 * frame, 0.0, 0.0))
         placed = fuse(part(cloud, np.s_[::10]), pose, MOUNT).level
         found.append(np.arcsin(placed.rotation[2, 0]) / lean)
-    assert found[1] == pytest.approx(0.92, abs=0.05)  # it joins the map as that is
+    assert 0.7 < found[1] < 1.0  # it joins the map much as that is
     assert abs(found[40]) < 0.15
     assert abs(found[60]) < 0.1
     assert min(found) > -0.1
@@ -128,6 +128,23 @@ def test_the_tilt_error_of_the_first_frame_fades_and_does_not_swing_back():
 def part(cloud, of):
     """Some points of a cloud, by a slice."""
     return replace(cloud, **{name: getattr(cloud, name)[of] for name in ("points", "colors", "sigma", "pixel")})
+
+
+def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(monkeypatch):
+    def hiding(*arguments):
+        local, row, col = local_cells(*arguments)
+        x, y = centres(local)
+        looked = np.hypot(x, y) < 3
+        occluded = np.where(np.isfinite(local.layers["elevation"]), 0, np.where(looked, 1, np.nan)).astype(np.float32)
+        return replace(local, layers={**local.layers, "occluded": occluded}), row, col
+
+    monkeypatch.setattr("stages.fuse.local_cells", hiding)
+    fuse = Fuse()
+    fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
+    terrain = fuse(*drive(1, flat, at=(0.0, 0.0, 1.2)), MOUNT)
+    assert [cell(terrain, *place, "occluded") for place in ((1.02, 0.02), (2.52, 0.02), (1.02, 2.22))] == [1, 0, 0]
+    assert np.isnan(cell(terrain, -5.0, 0.02, "occluded"))
+    assert np.isnan(cell(terrain, 1.02, 0.02))
 
 
 def test_a_mean_over_frames_is_weighted_by_inverse_variance():
