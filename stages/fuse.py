@@ -76,7 +76,7 @@ class Fuse(Stage):
     tilt_sigma: float = parameter(0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0)
     height_sigma: float = parameter(0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0)
     alignment: float = parameter(
-        0.005, "standard deviation that errors of position add to a cell's height", unit="m", low=0.0
+        0.005, "standard deviation that errors of position add to a cell's height", unit="m", low=1e-4
     )
     follow_tilt: float = parameter(0.05, "share of a frame's own tilt that the map takes over", low=0.0, high=1.0)
     follow_height: float = parameter(
@@ -108,7 +108,7 @@ class Fuse(Stage):
         if self._map.last < 0:
             self._map.frame_id, self._map.epoch = pose.frame_id, cloud.stamp
         cells = self._map.cells.read(row, col, *local.shape)
-        known = np.isfinite(local.layers["elevation"])
+        known = np.isfinite(local.layers["elevation"]) & np.isfinite(local.layers["variance"])
         seen = {name: local.layers[name][known].astype(np.float64) for name in local.layers}
         seen["variance"] += self.alignment**2
         x, y = _offsets(known, row, col, placed, self.resolution)

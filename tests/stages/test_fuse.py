@@ -299,6 +299,18 @@ def test_an_empty_cloud_changes_nothing():
     assert np.isfinite(fuse(*drive(1), MOUNT).layers["elevation"]).any()
 
 
+def test_points_whose_error_is_not_known_do_not_enter_the_map():
+    fuse, (cloud, pose) = Fuse(), drive(0)
+    unsure = cloud.sigma.copy()
+    left = cloud.points[:, 1] > 0
+    unsure[left] = np.nan
+    terrain = fuse(replace(cloud, sigma=unsure), pose, MOUNT)
+    assert 0 < np.isfinite(terrain.layers["elevation"]).sum() < 0.6 * len(cloud.points) / 6
+    terrain = fuse(*drive(1), MOUNT)
+    known = np.isfinite(terrain.layers["elevation"])
+    assert np.abs(terrain.layers["elevation"] - rolling(*centres(terrain)))[known].max() < 0.03
+
+
 def test_a_window_that_cannot_hold_what_a_frame_changes_is_refused():
     with pytest.raises(ValueError, match=r"Fuse\.window must be at least 19 m, not 15 m"):
         Fuse(region=8.0, window=15.0)
