@@ -130,6 +130,11 @@ def parser() -> argparse.ArgumentParser:
     score.add_argument("result", type=Path, metavar="OUT.mcap")
     score.add_argument("--truth", type=Path, metavar="LOG.mcap", help="log with the /truth topics (the result itself)")
     score.add_argument("--json", type=Path, metavar="FILE", help="write every figure as JSON")
+
+    export = command("export", _export, "a result log's maps as GeoTIFF, PGM with YAML (map_server), PLY and PNG")
+    export.add_argument("result", type=Path, metavar="OUT.mcap")
+    export.add_argument("folder", type=Path, metavar="DIR", help="folder for the files, made where it is missing")
+    export.add_argument("--frames", action="store_true", help="maps and points of every frame, not the regional map")
     return top
 
 
@@ -373,6 +378,17 @@ def _score(options: argparse.Namespace) -> int:
     if options.json:
         options.json.write_text(result.to_json() + "\n")
     _say(format_score(result))
+    return COMPLETE
+
+
+def _export(options: argparse.Namespace) -> int:
+    from recordings.export.bundle import export
+
+    if options.folder.exists() and not options.folder.is_dir():
+        raise UsageError(f"{options.folder} is a file; give the name of a folder")
+    files = export(options.result, options.folder, options.frames)
+    size = sum(file.stat().st_size for file in files)
+    _say(f"{options.folder}: {len(files)} files ({size / 1e6:.1f} MB)")
     return COMPLETE
 
 

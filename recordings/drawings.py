@@ -45,8 +45,8 @@ PICTURES: dict[tuple[type, ...], Draw] = {}
 
 def draws(*kinds: type) -> Callable[[Draw], Draw]:
     """Register a picture: `draw(canvas, path, item, ...)` logs items of these types under `path`, and may say in a few
-    words what it saw. A picture of one type is drawn for every stream of it; one of several types once a frame, from
-    the last stream of each, under the path of the first."""
+    words what it saw. A picture of one type is drawn for every stream of it; one of several types once for every frame
+    of reference, from the last stream of each, under the path of the first."""
 
     def register(draw: Draw) -> Draw:
         PICTURES[kinds] = draw
@@ -291,8 +291,18 @@ def _lines_ahead(canvas: Canvas, path: str, shape: tuple[int, int], grid: Elevat
     canvas.log(path, rr.LineStrips2D(lines, colors=[(255, 255, 255, 80)], radii=thin, draw_order=20.0))
     marks = [(width, depth) for depth in depths]
     names = [f"{x:.0f} m" for x in ahead]
-    if grid.frame_id == LEVEL_FRAME:  # its origin is the rover
-        marks, names = [*marks, (left / grid.resolution, far / grid.resolution)], [*names, "rover"]
+    rover = _rover(grid)
+    if rover is not None:
+        spot = ((left - rover[1]) / grid.resolution, (far - rover[0]) / grid.resolution)
+        marks, names = [*marks, spot], [*names, "rover"]
     dot = rr.Radius.ui_points(2.0)
     points = rr.Points2D(marks, labels=names, show_labels=True, colors=[(255, 255, 255)], radii=dot, draw_order=21.0)
     canvas.log(f"{path}/distances", points)
+
+
+def _rover(grid: ElevationMap | NavigationMap) -> tuple[float, float] | None:
+    """Where the rover is in a grid, m: at the origin of frame `level`; None where that is not known."""
+    if grid.frame_id == LEVEL_FRAME:
+        return 0.0, 0.0
+    level = getattr(grid, "level", None)
+    return None if level is None else (float(level.translation[0]), float(level.translation[1]))

@@ -6,7 +6,7 @@ differs between two equal runs goes in (no times of day, no durations): equal ru
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,7 +23,7 @@ from recordings.ros2 import (
     point_cloud,
     transform_message,
 )
-from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose
+from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, Transform
 
 _BUILDERS: dict[type, Callable[[Any], Any]] = {
     Disparity: disparity_image,
@@ -43,7 +43,9 @@ class McapSink:
     results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each.
     """
 
-    results: tuple[str, ...] = ("disparity", "points", "elevation_map", "navigation_map")
+    results: tuple[str, ...] = (
+        "disparity", "points", "elevation_map", "navigation_map", "regional_map", "regional_navigation_map",
+    )  # fmt: skip
 
     suffix = ".mcap"
     names_streams: ClassVar[tuple[str, ...]] = ("results",)
@@ -74,10 +76,7 @@ class McapSink:
             data = record.items.get(stream)
             if data is not None:
                 writer.write(f"/nav/{stream}", _BUILDERS[type(data)](data), stamp)
-        clouds = [item for item in record.items.values() if isinstance(item, PointCloud) and item.sensor is not None]
-        transforms = {
-            (cloud.sensor.parent, cloud.sensor.child): (cloud.sensor, stamp) for cloud in clouds if cloud.sensor
-        }
+        transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)
         writer.write("/nav/diagnostics", diagnostics(stamp, _statuses(record.entries)), stamp)
@@ -103,6 +102,14 @@ class McapSink:
         if self._writer is None:
             raise LogError("McapSink has not been opened")
         return self._writer
+
+
+def _transforms(items: Iterable[Any]) -> Iterator[Transform]:
+    """Where the clouds were seen from, and where regional maps have the frame `level`."""
+    for item in items:
+        known = item.sensor if isinstance(item, PointCloud) else getattr(item, "level", None)
+        if known is not None:
+            yield known
 
 
 def _statuses(entries: Iterable[LossEntry]) -> list[tuple[int, str, str, dict[str, str]]]:

@@ -139,11 +139,14 @@ def value_limits(layer: Array) -> tuple[float, float]:
     return low, high if high > low else low + 1.0
 
 
-def hillshade(elevation: Array, resolution: float) -> Array:
-    """Brightness of sunlit ground, (rows, cols) float in [0, 1]; slopes next to unknown cells are one-sided."""
+def hillshade(elevation: Array, resolution: float, light: Array = _LIGHT) -> Array:
+    """Brightness of sunlit ground, (rows, cols) float in [0, 1]; slopes next to unknown cells are one-sided.
+
+    light: unit vector (3,) towards the sun, along x, y and up.
+    """
     slope_x, slope_y = (_slope(elevation, axis) / resolution for axis in (1, 0))
     normal = np.sqrt(slope_x**2 + slope_y**2 + 1.0)
-    lit: Array = np.clip((_LIGHT[2] - _LIGHT[0] * slope_x - _LIGHT[1] * slope_y) / normal, 0.0, 1.0)
+    lit: Array = np.clip((light[2] - light[0] * slope_x - light[1] * slope_y) / normal, 0.0, 1.0)
     return _AMBIENT + (1.0 - _AMBIENT) * lit
 
 

@@ -6,7 +6,7 @@ its default mere warnings, are raised.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -155,8 +155,7 @@ class RerunSink:
                     captions.append(draw(self._canvas, stream, item))
         for kinds, draw in PICTURES.items():
             if len(kinds) > 1:
-                chosen = [stream for kind in kinds for stream in _last(present, kind)]
-                if len(chosen) == len(kinds):
+                for chosen in _together(present, kinds):
                     captions.append(draw(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
         return [caption for caption in captions if caption]
 
@@ -185,8 +184,17 @@ class RerunSink:
             self._recording.send_blueprint(desk(self._canvas.hung.values()))
 
 
-def _last(items: Mapping[str, Any], kind: type) -> list[str]:
-    return [stream for stream, item in items.items() if isinstance(item, kind)][-1:]
+def _together(items: Mapping[str, Any], kinds: tuple[type, ...]) -> Iterator[list[str]]:
+    """The streams that a picture of several types is drawn from: the last of each type, for every frame of reference.
+
+    A type that names no frame goes with every one.
+    """
+    frames = {getattr(item, "frame_id", None): None for item in items.values() if isinstance(item, kinds)}
+    for frame in [frame for frame in frames if frame is not None] or [None]:
+        fitting = {stream: item for stream, item in items.items() if getattr(item, "frame_id", frame) == frame}
+        chosen = [[stream for stream, item in fitting.items() if isinstance(item, kind)][-1:] for kind in kinds]
+        if all(chosen):
+            yield [stream for streams in chosen for stream in streams]
 
 
 def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:

@@ -34,7 +34,7 @@ from stages.data import (
 __all__ = [
     "TYPES", "Ros2Writer", "camera_info", "diagnostics", "disparity_image", "grid_map", "header", "image", "imu",
     "iter_messages", "make", "occupancy_grid", "odometry", "point_cloud", "read_disparity", "read_grid_map",
-    "read_occupancy_grid", "stamp_of", "transform_message",
+    "read_occupancy_grid", "read_point_cloud", "stamp_of", "transform_message",
 ]  # fmt: skip
 
 REASON_UNTOLD = 255  # in a map read back: a hazard, of which OccupancyGrid cannot say why
@@ -132,6 +132,24 @@ def point_cloud(cloud: PointCloud) -> Any:
         fields=fields, is_bigendian=False, point_step=20, row_step=20 * count,
         data=packed.view(np.uint8).reshape(-1), is_dense=bool(np.isfinite(cloud.points).all()),
     )  # fmt: skip
+
+
+def read_point_cloud(message: Any) -> dict[str, Array]:
+    """The fields of a sensor_msgs/PointCloud2 of float32 fields, name -> (N,); "rgb" comes as (N, 3) uint8 "colors"."""
+    if any(known.datatype != FLOAT32 or known.count != 1 for known in message.fields):
+        raise ValueError("a point cloud with other fields than single float32 is not read")
+    order, names = ">" if message.is_bigendian else "<", [known.name for known in message.fields]
+    layout = {
+        "names": names, "formats": [f"{order}f4"] * len(names), "offsets": [known.offset for known in message.fields],
+        "itemsize": message.point_step,
+    }  # fmt: skip
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.row_step)
+    packed = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(np.dtype(layout)).reshape(-1)  # type: ignore[call-overload]
+    fields: dict[str, Array] = {name: packed[name].astype(np.float32) for name in names if name != "rgb"}
+    if "rgb" in names:
+        bits = np.ascontiguousarray(packed["rgb"]).view(f"{order}u4")
+        fields["colors"] = np.stack([bits >> shift & 0xFF for shift in (16, 8, 0)], axis=1).astype(np.uint8)
+    return fields
 
 
 def grid_map(terrain: ElevationMap) -> Any:

@@ -6,6 +6,8 @@ A temporary name belongs to one writer, so two that write to one path at the sam
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
@@ -32,6 +34,19 @@ def give_name(temporary: Path, path: Path) -> None:
     except OSError:
         temporary.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def written(path: Path) -> Iterator[Path]:
+    """A temporary name to write to, which becomes `path` at the end, or goes. Raises LogError where that cannot be."""
+    temporary = temporary_name(path)
+    try:
+        yield temporary
+        give_name(temporary, path)
+    except OSError as error:
+        raise unwritable(path, error.strerror or str(error)) from error
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def unwritable(path: Path, reason: str) -> LogError:

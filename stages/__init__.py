@@ -22,6 +22,7 @@ from stages.data import (
     Transform,
     VoxelMap,
 )
+from stages.fuse import Fuse
 from stages.level import Level
 from stages.match import Match
 from stages.match_opencv import MatchOpenCV
@@ -43,6 +44,7 @@ __all__ = [
     "Disparity",
     "ElevationMap",
     "Enlarge",
+    "Fuse",
     "Halve",
     "Level",
     "Match",

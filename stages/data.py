@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stages.publish import check_rotation, publish, publish_image, publish_vector, read_only
+from stages.tiles import Tiles as Tiles
 
 Array = NDArray[Any]
 
@@ -336,7 +337,8 @@ class ElevationMap:
     """A 2.5-D terrain grid: row index grows with y, column index with x.
 
     layers: name -> (rows, cols) float32, NaN = unknown, all of one shape, among them "elevation" (m);
-    resolution: cell size, m; origin: (x, y) of the lower-left corner of cell [0, 0], m.
+    resolution: cell size, m; origin: (x, y) of the lower-left corner of cell [0, 0], m; level: for a map in another
+    frame, where the frame `level` of that stamp lies in it.
     """
 
     stamp: int
@@ -344,6 +346,7 @@ class ElevationMap:
     resolution: float
     origin: tuple[float, float]
     frame_id: str
+    level: Transform | None = None
     shape: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -150,3 +150,17 @@ def test_only_what_was_asked_for_is_wanted() -> None:
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"cannot write .*gone/out\.mcap: No such file"):
         McapSink().open(tmp_path / "gone" / "out.mcap", {}, {})
+
+
+def test_a_regional_map_s_frame_is_joined_to_the_frame_level(tmp_path: Path) -> None:
+    level = Transform("odom", "level", np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), np.array([3.0, 4.0, 0.5]))
+    region = ElevationMap(START, {"elevation": np.ones((3, 4), np.float32)}, 0.05, (-1.0, 2.0), "odom", level=level)
+    sink = McapSink()
+    sink.open(tmp_path / "out.mcap", {"regional_map": ElevationMap}, ABOUT)
+    sink.write(Record(START, {**items(START), "regional_map": region}))
+    sink.close({})
+    read = {topic: message for topic, _, message in iter_messages(tmp_path / "out.mcap")}
+    assert read["/nav/regional_map"].header.frame_id == "odom"
+    frames = {(item.header.frame_id, item.child_frame_id): item.transform for item in read["/tf"].transforms}
+    assert set(frames) == {("level", "left_optical"), ("odom", "level")}
+    assert (frames["odom", "level"].translation.x, frames["odom", "level"].translation.y) == (3.0, 4.0)

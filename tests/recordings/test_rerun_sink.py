@@ -230,6 +230,30 @@ def test_hazards_stand_on_the_ground_where_they_are(whole: Path) -> None:
     np.testing.assert_allclose(position, [[0.35, -1.25, ground + 0.03]], atol=1e-6)
 
 
+def test_a_regional_map_is_drawn_beside_the_frame_s_own(tmp_path: Path) -> None:
+    items = scene()
+    near, cells = items["elevation_map"], items["navigation_map"]
+    level = Transform("odom", LEVEL_FRAME, np.eye(3), [6.0, 0.0, 2.0])
+    layers = {name: layer + np.float32(2.0) for name, layer in near.layers.items()}
+    items["regional_map"] = replace(near, layers=layers, origin=(5.0, -1.5), frame_id="odom", level=level)
+    items["regional_navigation_map"] = replace(cells, origin=(5.0, -1.5), frame_id="odom")
+    sink = RerunSink()
+    sink.open(tmp_path / "run.rrd", dict.fromkeys(items, object), {})
+    sink.write(Record(START, items))
+    sink.close({"verdict": "COMPLETE"})
+    ground = near.layers["elevation"][2, 3]
+    for stream, place in (("navigation_map", (0.35, -1.25, 0)), ("regional_navigation_map", (5.35, -1.25, 2))):
+        position = rows(tmp_path / "run.rrd", f"/{stream}/hazards", "Points3D:positions")[0][2]
+        np.testing.assert_allclose(position, [np.add(place, (0, 0, ground + 0.03))], atol=1e-6)
+    assert len(rows(tmp_path / "run.rrd", "/regional_map/surface", "Mesh3D:vertex_positions")) == 1
+    names, spots = (
+        rows(tmp_path / "run.rrd", "/regional_map/relief/lines/distances", f"Points2D:{part}")[0][2]
+        for part in ("labels", "positions")
+    )
+    # 40 columns from x = 5: the rover, at x = 6, is 10 columns from the lower edge, and in the middle of 30 rows.
+    assert spots[names.index("rover")] == [15.0, 30.0]
+
+
 def test_the_camera_stands_where_the_cloud_was_seen_from(whole: Path) -> None:
     assert rows(whole, "/rectified/camera", "Transform3D:translation")[0][2] == [pytest.approx([0.0, 0.0, 0.9])]
 

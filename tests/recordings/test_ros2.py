@@ -7,7 +7,7 @@ import os
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from recordings.ros2 import (
     read_disparity,
     read_grid_map,
     read_occupancy_grid,
+    read_point_cloud,
     stamp_of,
     transform_message,
 )  # fmt: skip
@@ -348,3 +349,21 @@ def test_messages_of_real_recorders_decode() -> None:
     assert sum(1 for _ in iter_messages(talker)) == 20
     cdr = folder / "rosbag2_tests__resources__mcap__cdr_test__cdr_test_0.mcap"
     assert sum(1 for _ in iter_messages(cdr)) == 7
+
+
+def test_a_point_cloud_reads_back_as_it_was_whatever_its_padding_and_byte_order() -> None:
+    rng = np.random.default_rng(3)
+    points, colors = rng.normal(size=(7, 3)).astype(np.float32), rng.integers(0, 256, (7, 3), dtype=np.uint8)
+    points[2] = np.nan
+    sigma = rng.uniform(0.01, 0.2, 7).astype(np.float32)
+    message = point_cloud(PointCloud(5, points, colors, sigma, np.arange(7, dtype=np.int32), "level"))
+    padded = np.zeros((7, 28), np.uint8)
+    padded[:, :20] = message.data.reshape(7, 5, 4)[:, :, ::-1].reshape(7, 20)
+    other = replace(message, data=padded.reshape(-1), point_step=28, row_step=28 * 7, is_bigendian=True)
+    for sent in (message, other):
+        read = read_point_cloud(sent)
+        np.testing.assert_array_equal(np.column_stack([read[name] for name in "xyz"]), points)
+        np.testing.assert_array_equal(read["colors"], colors)
+        np.testing.assert_array_equal(read["sigma"], sigma)
+    with pytest.raises(ValueError, match="other fields than single float32"):
+        read_point_cloud(replace(message, fields=[replace(message.fields[0], datatype=8), *message.fields[1:]]))

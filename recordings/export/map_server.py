@@ -1,0 +1,48 @@
+"""PGM and YAML as nav2_map_server and ROS 1 map_server read them in trinary mode: first row largest y.
+
+Unknown is written as gray 205, an occupancy of 1 - 205/255 = 0.196. A reader takes what is below free_thresh for free,
+so any threshold above that (0.25 used to be Nav2's own) would turn unknown ground into free ground.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from recordings.export.mosaic import Mosaic
+from stages.data import Array, Cell
+
+FREE, OCCUPIED, UNKNOWN = 254, 0, 205
+OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
+
+
+def write_pgm(path: Path, mosaic: Mosaic, layer: str) -> None:
+    """Write the picture of a layer of `Cell` codes."""
+    rows, cols = mosaic.shape
+    with path.open("wb") as file:
+        file.write(f"P5\n{cols} {rows}\n255\n".encode())
+        for strip in mosaic.strips(layer):
+            file.write(_grays(strip).tobytes())
+
+
+def write_yaml(path: Path, picture: str, mosaic: Mosaic) -> None:
+    """Write the file that map_server is given. picture: name of the PGM beside it."""
+    x, y = mosaic.origin
+    path.write_text(
+        f"# frame_id: {mosaic.frame_id}\n"
+        f"image: {picture}\n"
+        "mode: trinary\n"
+        f"resolution: {mosaic.resolution:.12g}\n"
+        f"origin: [{x:.9f}, {y:.9f}, 0.0]\n"
+        "negate: 0\n"
+        f"occupied_thresh: {OCCUPIED_THRESH}\n"
+        f"free_thresh: {FREE_THRESH}\n"
+    )
+
+
+def _grays(cells: Array) -> Array:
+    grays = np.full(cells.shape, UNKNOWN, np.uint8)
+    grays[cells == Cell.FREE] = FREE
+    grays[cells == Cell.HAZARD] = OCCUPIED
+    return grays

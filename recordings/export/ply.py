@@ -1,0 +1,40 @@
+"""PLY, binary little-endian: points as vertices with colours and the standard deviation that the log gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from stages.data import Array
+
+COLOURS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+_NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
+
+
+def write_ply(path: Path, dtype: np.dtype[np.void], parts: Iterable[Array], comment: str) -> int:
+    """Write vertices, and return how many.
+
+    dtype: a property each field; parts: structured arrays (n,) of it; comment: one line, ASCII. The number of points
+    stands in the header, before the points, so it is filled in at the end.
+    """
+    with path.open("wb") as file:
+        place, count = _begin(file, dtype, comment), 0
+        for part in parts:
+            file.write(part.tobytes())
+            count += len(part)
+        file.seek(place)
+        file.write(f"{count:>10d}".encode())
+    return count
+
+
+def _begin(file: BinaryIO, dtype: np.dtype[np.void], comment: str) -> int:
+    """Write the header; returns where the number of points belongs."""
+    fields = [(name, _NAMES[dtype[name].str]) for name in dtype.names or ()]
+    file.write(f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex ".encode("ascii", "replace"))
+    place = file.tell()
+    properties = "".join(f"property {kind} {name}\n" for name, kind in fields)
+    file.write(f"{0:>10d}\n{properties}end_header\n".encode())
+    return place

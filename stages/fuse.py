@@ -1,0 +1,291 @@
+"""Fuse: local clouds into one regional elevation map in the pose's frame, by inverse variance.
+
+The trick is to resample nothing: a levelled cloud is turned to its heading in the pose's frame and shifted by less than
+a cell before it is binned, so that its cells are cells of the region. What moves a frame as a whole, the error of its
+tilt and of the pose's height, is a plane, found where the frame overlaps the map and taken off; so neighbouring frames
+join without a seam.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Tiles, Transform
+from stages.kernels.rigid import transform_points
+from stages.overlap import fit_plane
+from stages.stage import Stage, parameter
+from stages.voxelise import Voxelise
+
+# What is remembered of a cell, 28 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
+# best: the smallest standard deviation among them; below, above: from the height to the cell's extremes; first, last:
+# ms since the first frame; numbers stop at the largest of their type. hidden: 1 where nothing is known, but a frame
+# looked and could not see it.
+CELL = np.dtype(
+    [
+        ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u2"),
+        ("first", "u4"), ("last", "u4"), ("frames", "u2"), ("contradictions", "u1"),
+        ("hidden", "u1"),
+    ]
+)  # fmt: skip
+MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that no map ends where they still change
+_MS = 1_000_000
+# Beyond this the pose's frame does not have z up. An odometry that knows no tilt may differ by the slope of the ground.
+_LARGEST_LEAN = np.radians(30.0)
+
+
+@dataclass(eq=False)
+class Region:
+    """The map so far: its frame, the stamps of its first and last frame, ns, whether those tell what was hidden from
+    them, and its cells."""
+
+    frame_id: str = ""
+    epoch: int = 0
+    last: int = -1
+    hides: bool = False
+    cells: Tiles = field(default_factory=lambda: Tiles(CELL))
+
+
+@dataclass(frozen=True)
+class Fuse(Stage):
+    """Merges levelled clouds into a regional map, and gives the part of it around the rover.
+
+    The map that a frame gives is a square of `window` about the rover, its sides along the axes of the pose's frame. It
+    holds all that the frame changed, so the maps of a run, each laid over those before, are the whole region. Layers:
+    - elevation, minimum, maximum, m: means over frames, weighted by inverse variance;
+    - variance, m^2: of the elevation against what lies about it. Frames see a cell alike and err alike: the share
+      `shared` of the smallest variance stays, however many frames there are;
+    - count (points); first, last: when the evidence in the cell was gathered, s since the first frame of the run;
+      frames: how many it is from (at most 65535); contradictions: how often the height was contradicted;
+    - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere.
+
+    A frame contradicts a cell if it is off by more than `contradiction` standard deviations. Then the cell's evidence
+    loses half its weight, and as soon as the newer is as sure, the newer takes its place.
+
+    The plane that joins a frame to the map is limited by what is expected of its errors (`tilt_sigma`, `height_sigma`).
+    A small share of it is left in (`follow_tilt`, `follow_height`), so that in the long run the map follows gravity and
+    the pose and not the errors of its first frame.
+    """
+
+    resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
+    region: float = parameter(8.0, "horizontal range from the rover that a frame adds to the map", unit="m", low=0.1)
+    window: float = parameter(20.0, "width of the map that is given with each frame", unit="m", low=0.5)
+    tilt_sigma: float = parameter(0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0)
+    height_sigma: float = parameter(0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0)
+    alignment: float = parameter(
+        0.005, "standard deviation that errors of position add to a cell's height", unit="m", low=1e-4
+    )
+    follow_tilt: float = parameter(0.05, "share of a frame's own tilt that the map takes over", low=0.0, high=1.0)
+    follow_height: float = parameter(
+        0.003, "share of its own height; much less, for heights that are pulled lean the map", low=0.0, high=1.0
+    )
+    contradiction: float = parameter(3.0, "standard deviations that two heights of a cell may differ", low=1.0)
+    shared: float = parameter(0.3, "share of a cell's variance that is the same in all frames", low=0.0, high=1.0)
+
+    ordered: ClassVar[bool] = True
+    _map: Region = field(default_factory=Region, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        least = 2 * (self.region + MARGIN)
+        if self.window < least:
+            raise ValueError(
+                f"Fuse.window must be at least {least:g} m, not {self.window:g} m: it holds all that a frame changed "
+                f"(region, {self.region:g} m) and {MARGIN:g} m about it"
+            )
+
+    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> ElevationMap:
+        """The regional map around the rover, in the pose's frame, with the cloud, in frame `level`, fused in.
+
+        mount: how the camera sits on the frame whose pose is given; may be left out where that is the camera itself.
+        """
+        self._check(cloud, pose)
+        placed = placement(cloud, pose, mount)
+        local, row, col = local_cells(cloud, placed, self.resolution, self.region)
+        if self._map.last < 0:
+            self._map.frame_id, self._map.epoch = pose.frame_id, cloud.stamp
+        cells = self._map.cells.read(row, col, *local.shape)
+        known = np.isfinite(local.layers["elevation"]) & np.isfinite(local.layers["variance"])
+        seen = {name: local.layers[name][known].astype(np.float64) for name in local.layers}
+        seen["variance"] += self.alignment**2
+        x, y = _offsets(known, row, col, placed, self.resolution)
+        plane = self._plane(cells[known], seen, x, y)
+        rise = plane[0] + plane[1] * x + plane[2] * y
+        for height in ("elevation", "minimum", "maximum"):
+            seen[height] += rise
+        cells[known] = self._merged(cells[known], seen, (cloud.stamp - self._map.epoch) // _MS)
+        hidden = ~known & (local.layers.get("occluded", np.zeros(known.shape)) == 1)
+        cells["hidden"][hidden] = cells["frames"][hidden] == 0
+        self._map.cells.write(row, col, cells, known | hidden)
+        self._map.last, self._map.hides = cloud.stamp, "occluded" in local.layers
+        return self._around(cloud.stamp, _lifted(placed, plane))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the map so far, bytes."""
+        return self._map.cells.nbytes
+
+    def _check(self, cloud: PointCloud, pose: Pose) -> None:
+        if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
+            raise ValueError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
+        if self._map.last >= 0 and pose.frame_id != self._map.frame_id:
+            raise ValueError(
+                f"Fuse: the pose is in frame '{pose.frame_id}', the map in '{self._map.frame_id}'; give poses of one "
+                "frame"
+            )
+        if cloud.stamp <= self._map.last:
+            raise ValueError(f"Fuse: the cloud of {cloud.stamp} ns comes after that of {self._map.last} ns")
+
+    def _plane(self, cells: Array, seen: dict[str, Array], x: Array, y: Array) -> Array:
+        """What a frame has to rise to join the map: (3,) height at the rover, m, and slopes along x and y.
+
+        cells, seen: of the cells that the frame sees, at (x, y) from the rover.
+        """
+        both = cells["frames"] > 0
+        cells, x, y = cells[both], x[both], y[both]
+        off = cells["height"].astype(np.float64) - seen["elevation"][both]
+        variance = self._variance(cells) + seen["variance"][both]
+        expected = np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])
+        plane = fit_plane(x, y, off, variance, expected, self.resolution)
+        return np.asarray(plane * (1 - np.array([self.follow_height, self.follow_tilt, self.follow_tilt])))
+
+    def _variance(self, cells: Array) -> Array:
+        """Variance of the heights of known cells, m^2."""
+        return 1 / cells["weight"].astype(np.float64) + self.shared * cells["best"].astype(np.float64) ** 2
+
+    def _merged(self, cells: Array, seen: dict[str, Array], now: int) -> Array:
+        """The cells (n,) with what a frame saw in them at `now`, ms."""
+        cells = cells.copy()
+        height, variance = seen["elevation"], seen["variance"]
+        known = cells["frames"] > 0
+        have = np.full(len(cells), np.inf)
+        have[known] = self._variance(cells[known])
+        contradicted = known & (np.abs(height - cells["height"]) > self.contradiction * np.sqrt(have + variance))
+        cells["weight"][contradicted] /= 2
+        cells["best"][contradicted] *= np.float16(np.sqrt(2))
+        counted = _sum(cells["contradictions"][contradicted], 1)
+        have[contradicted] *= 2
+        new = ~known | (contradicted & (variance <= have))
+        cells[new] = np.zeros((), CELL)
+        cells["first"][new] = now
+        cells["contradictions"][contradicted] = counted
+
+        added = new | (known & ~contradicted)
+        weight = 1 / ((1 - self.shared) * variance[added] + 1e-12)
+        before = cells[added]
+        total = before["weight"] + weight
+        share = weight / total
+        middle = before["height"] + share * (height[added] - before["height"])
+        extremes = {
+            name: before[name] + share * (sign * (seen[extreme] - height)[added] - before[name])
+            for name, extreme, sign in (("below", "minimum", -1), ("above", "maximum", 1))
+        }
+        spread = np.sqrt(variance[added])
+        after = before.copy()
+        after["height"], after["weight"] = middle, total
+        after["below"], after["above"] = extremes["below"], extremes["above"]
+        after["best"] = np.where(before["frames"] > 0, np.minimum(before["best"], spread), spread)
+        after["count"] = _sum(before["count"], seen["count"][added])
+        after["last"] = now
+        after["frames"] = _sum(before["frames"], 1)
+        cells[added] = after
+        return cells
+
+    def _around(self, stamp: int, placed: Transform) -> ElevationMap:
+        """The map around the rover."""
+        half = int(np.ceil(self.window / 2 / self.resolution - 1e-9))
+        col, row = (int(np.floor(place / self.resolution)) - half for place in placed.translation[:2])
+        cells = self._map.cells.read(row, col, 2 * half, 2 * half)
+        known = cells["frames"] > 0
+        layers = {name: np.full(known.shape, np.nan, np.float32) for name in ("elevation", "minimum", "maximum")}
+        seen = cells[known]
+        layers["elevation"][known] = seen["height"]
+        layers["minimum"][known] = seen["height"] - seen["below"]
+        layers["maximum"][known] = seen["height"] + seen["above"]
+        layers["count"] = cells["count"].astype(np.float32)
+        layers["variance"] = np.full(known.shape, np.nan, np.float32)
+        layers["variance"][known] = self._variance(seen)
+        for name in ("first", "last"):
+            layers[name] = np.where(known, cells[name] / 1e3, np.nan).astype(np.float32)
+        for name in ("frames", "contradictions"):
+            layers[name] = cells[name].astype(np.float32)
+        if self._map.hides:
+            layers["occluded"] = np.where(known, 0, np.where(cells["hidden"] == 1, 1, np.nan)).astype(np.float32)
+        origin = (col * self.resolution, row * self.resolution)
+        return ElevationMap(stamp, layers, self.resolution, origin, self._map.frame_id, level=placed)
+
+
+def _sum(numbers: Array, more: Array | int) -> Array:
+    """Unsigned numbers with `more` added, or the largest of their type."""
+    most = np.iinfo(numbers.dtype).max
+    return np.asarray(np.minimum(numbers + np.asarray(more, np.float64), most).astype(numbers.dtype))
+
+
+def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> Transform:
+    """Frame `level` of a levelled cloud in the pose's frame: upright, turned by the pose's heading.
+
+    Pitch and roll of the pose are not used: which way is up, the inclinometer knows. Raises ValueError where nothing
+    tells how the frame whose pose it is sits to the camera, or where the pose's frame does not have z up.
+    """
+    assert cloud.sensor is not None
+    child = _child_from_camera(pose, cloud.sensor, mount)
+    camera = Rotation.from_quat(pose.quaternion).as_matrix() @ child.rotation
+    turned = camera @ cloud.sensor.rotation.T
+    lean = float(np.arccos(np.clip(turned[2, 2], -1.0, 1.0)))
+    if lean > _LARGEST_LEAN:
+        raise ValueError(
+            f"Fuse: z of the pose's frame '{pose.frame_id}' is {np.degrees(lean):.0f} degrees off the vertical of the "
+            "tilt; give a pose in a frame whose z points up"
+        )
+    yaw = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
+    rotation = Rotation.from_euler("z", yaw).as_matrix()
+    origin = cloud.sensor(child.inverse().translation)  # of the frame whose pose it is, in level
+    return Transform(pose.frame_id, LEVEL_FRAME, rotation, pose.position - rotation @ origin)
+
+
+def _child_from_camera(pose: Pose, sensor: Transform, mount: Mount | None) -> Transform:
+    """The camera in the frame whose pose is given."""
+    if pose.child_frame_id == sensor.child:
+        return Transform(sensor.child, sensor.child, np.eye(3), np.zeros(3))
+    base = mount.base_from_camera if mount is not None else None
+    if base is None or base.parent != pose.child_frame_id:
+        raise ValueError(
+            f"Fuse: the pose is that of '{pose.child_frame_id}', and nothing tells how the camera '{sensor.child}' "
+            "sits on it; record its static transform, or set base_frame of the source"
+        )
+    return base
+
+
+def local_cells(
+    cloud: PointCloud, placed: Transform, resolution: float, region: float
+) -> tuple[ElevationMap, int, int]:
+    """The elevation map of one cloud in the cells of the region, and the row and column there of its first cell.
+
+    cloud: in frame `level`, which is `placed` upright in the region's frame. The map's heights are in that frame.
+    """
+    cell = np.floor(placed.translation[:2] / resolution).astype(int)
+    rest = replace(placed, translation=np.append(placed.translation[:2] - cell * resolution, 0.0))
+    points = transform_points(cloud.points, rest.rotation, rest.translation)
+    sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
+    local = Voxelise(resolution=resolution, region=region)(replace(cloud, points=points, sensor=sensor))
+    col, row = (int(number) - extent // 2 for number, extent in zip(cell, local.shape[::-1], strict=True))
+    heights = ("elevation", "minimum", "maximum")
+    lifted = {name: local.layers[name] + np.float32(placed.translation[2]) for name in heights}
+    origin = (col * resolution, row * resolution)
+    return replace(local, layers={**local.layers, **lifted}, origin=origin, frame_id=placed.parent), row, col
+
+
+def _offsets(known: Array, row: int, col: int, placed: Transform, resolution: float) -> tuple[Array, Array]:
+    """x and y of the centres of the known cells from the rover, m."""
+    rows, cols = np.nonzero(known)
+    x, y = ((col + cols + 0.5) * resolution, (row + rows + 0.5) * resolution)
+    return x - placed.translation[0], y - placed.translation[1]
+
+
+def _lifted(placed: Transform, plane: Array) -> Transform:
+    """The placement with its plane (height, slopes) added: a rise, and the small rotation that makes the slopes."""
+    turn = Rotation.from_rotvec([plane[2], -plane[1], 0.0]).as_matrix()
+    return replace(placed, rotation=turn @ placed.rotation, translation=placed.translation + np.array([0, 0, plane[0]]))

@@ -1,0 +1,146 @@
+"""The regional map of simulated traverses: seams between neighbouring frames, errors against the truth, cost.
+
+A seam is what is left between two neighbouring frames where they overlap, cell by cell, once each is placed: by pose
+and tilt alone, and as `stages.Fuse` placed it (the transform odom <- level of the result log). The truth is the exact
+surface under the centres of the cells that a frame changed, carried into the pose's frame with that frame's own pose,
+so that what odometry loses on the way does not count; a plane per frame is the tilt's, and is taken off.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from recordings import McapSource, ros2
+from recordings.decode import transform_of
+from recordings.measures import without_plane
+from recordings.simulator import Simulation, raycast, traverse
+from stages.data import LEVEL_FRAME, Array, ElevationMap, Pose, Transform
+
+RUNS = ((11, 0.05), (12, 0.15), (13, 0.15))
+FRAMES = 8
+CELL, REACH = 0.05, 8.0
+COLUMNS = (
+    ("seed", 5), ("rocks k", 8), ("seam cm: placed", 16), ("worst", 6), ("fused", 6), ("worst", 6), ("RMSE cm", 8),
+    ("within 1, 2 sigma %", 20), ("contradicted %", 15), ("ms a frame: map", 16), ("navigation", 11),
+)  # fmt: skip
+
+
+def main() -> None:
+    """Print a row per traverse."""
+    print(f"\nregional map: {FRAMES} frames of 1280x960, inclinometer noise 0.3 degrees, slopes of 8 degrees (RMS)")
+    print(" ".join(f"{name:>{width}}" for name, width in COLUMNS))
+    for seed, abundance in RUNS:
+        simulation = Simulation(
+            frames=FRAMES, seed=seed, abundance=abundance, slope=np.radians(8), tilt_noise=np.radians(0.3)
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            cells = [str(seed), f"{abundance:g}", *_figures(simulation, Path(folder))]
+        print(" ".join(f"{cell:>{width}}" for cell, (_, width) in zip(cells, COLUMNS, strict=True)))
+
+
+def _figures(simulation: Simulation, folder: Path) -> list[str]:
+    log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
+    simulation.write(log)
+    command = [sys.executable, "-m", "flow.cli", "run", log, "-o", out, "--no-rrd", "--summary", summary]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    seconds = json.loads(summary.read_text())["seconds"]
+    frames = _frames(out)
+    seams = _seams(simulation, log, frames)
+    error, sigma, contradicted = _errors(simulation, [frame["/nav/regional_map"] for frame in frames.values()])
+    within = [100 * np.mean(np.abs(error) <= count * sigma) for count in (1, 2)]
+    return [
+        *(f"{100 * value:.2f}" for which in (0, 1) for value in (np.median(seams[:, which]), seams[:, which].max())),
+        f"{100 * np.sqrt(np.mean(error**2)):.2f}", f"{within[0]:.0f}, {within[1]:.0f}", f"{100 * contradicted:.1f}",
+        *(f"{1e3 * seconds[name] / FRAMES:.0f}" for name in ("regional_map", "regional_navigation_map")),
+    ]  # fmt: skip
+
+
+def _frames(out: Path) -> dict[int, dict[str, object]]:
+    """Stamp -> what a frame left: the points (N, 3), the map, and `level` in the map's frame."""
+    frames: dict[int, dict[str, object]] = {}
+    for topic, stamp, message in ros2.iter_messages(out, ["/nav/points", "/nav/regional_map", "/tf"]):
+        frame = frames.setdefault(stamp, {})
+        if topic == "/nav/points":
+            fields = ros2.read_point_cloud(message)
+            frame[topic] = np.column_stack([fields[name] for name in "xyz"])
+        elif topic == "/nav/regional_map":
+            frame[topic] = ros2.read_grid_map(message)
+        else:
+            placed = [transform_of(item) for item in message.transforms if item.child_frame_id == LEVEL_FRAME]
+            frame["level"] = placed[0]
+    return frames
+
+
+def _seams(simulation: Simulation, log: Path, frames: dict[int, dict[str, object]]) -> Array:
+    """NMAD of the height differences of each pair of neighbouring frames, placed by the pose alone and as fused."""
+    with McapSource().open(log) as opened:
+        poses = [item for _, stream, item in opened.events(["odometry"])]
+    seams, before = [], None
+    for stamp, frame in frames.items():
+        now = [_heights(frame["/nav/points"], placed) for placed in (_upright(poses, stamp), frame["level"])]
+        if before is not None:
+            seams.append([_nmad(one, other) for one, other in zip(before, now, strict=True)])
+        before = now
+    return np.array(seams)
+
+
+def _upright(poses: list[Pose], stamp: int) -> Transform:
+    """Frame `level` by the position and heading of the pose at `stamp`."""
+    later = next(place for place, pose in enumerate(poses) if pose.stamp >= stamp)
+    pose = poses[later - 1].interpolated(poses[later], stamp)
+    x, y, z, w = pose.quaternion
+    heading = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z))
+    c, s = np.cos(heading), np.sin(heading)
+    return Transform(pose.frame_id, LEVEL_FRAME, np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), pose.position)
+
+
+def _heights(points: Array, placed: Transform) -> tuple[Array, Array]:
+    """Numbers of the cells that hold points, and the mean heights in them."""
+    moved = placed(points[np.hypot(points[:, 0], points[:, 1]) <= REACH])
+    places = np.floor(moved[:, :2] / CELL).astype(np.int64) + 1_000_000
+    cells, which = np.unique(places[:, 1] * 2_000_000 + places[:, 0], return_inverse=True)
+    return cells, np.bincount(which, moved[:, 2]) / np.bincount(which)
+
+
+def _nmad(one: tuple[Array, Array], other: tuple[Array, Array]) -> float:
+    _, here, there = np.intersect1d(one[0], other[0], return_indices=True)
+    off = one[1][here] - other[1][there]
+    return float(1.4826 * np.median(np.abs(off - np.median(off))))
+
+
+def _errors(simulation: Simulation, maps: list[ElevationMap]) -> tuple[Array, Array, float]:
+    """Errors of the cells that each frame changed, less a plane, their standard deviations, and the share of cells that
+    were contradicted in the end."""
+    errors, sigmas = [], []
+    first, begin = simulation.base_at(simulation.begin), simulation.way(simulation.begin)
+    for terrain in maps:
+        layers, now = terrain.layers, simulation.base_at(terrain.stamp)
+        way = simulation.way(terrain.stamp) - begin
+        pose = traverse.odometry_pose(terrain.stamp, first, now, way, simulation.odometry_drift)
+        true = traverse.level_pose(now)
+        given = _upright([pose, pose], terrain.stamp)
+        rows, cols = terrain.shape
+        x, y = ((np.arange(n) + 0.5) * CELL + at for n, at in zip((cols, rows), terrain.origin, strict=True))
+        centres = np.stack([*np.meshgrid(x, y), np.zeros((rows, cols))], axis=-1).reshape(-1, 3)
+        world = true.after(given.inverse())(centres)
+        top, _ = raycast.tops_at(
+            simulation.terrain.scene, world[:, 0], world[:, 1], float(simulation.terrain.scene.ceiling)
+        )
+        height = (top - true.translation[2] + given.translation[2]).reshape(rows, cols)
+        fresh = np.isfinite(layers["last"]) & (layers["last"] >= np.nanmax(layers["last"]))
+        error = np.where(fresh, layers["elevation"] - height, np.nan)
+        errors.append(without_plane(x, y, error)[fresh])
+        sigmas.append(np.sqrt(layers["variance"][fresh]))
+    known = maps[-1].layers["frames"] > 0
+    contradicted = float(np.mean(maps[-1].layers["contradictions"][known] > 0))
+    return np.concatenate(errors), np.concatenate(sigmas), contradicted
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,247 @@
+"""Exported files, read by the programs they are for: GDAL, the rules of map_server, a PLY reader, PIL."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import rasterio
+import yaml
+from PIL import Image
+
+from recordings import ros2
+from recordings.errors import LogError
+from recordings.export.bundle import export
+from recordings.ros2 import Ros2Writer
+from stages.data import Array, Cell, ElevationMap, NavigationMap, PointCloud, Transform
+
+START = 1_700_000_000_000_000_000
+STEP = 0.1
+TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # level's x is the region's y
+LEVEL = Transform("odom", "level", TURN, np.array([2.0, -1.0, 0.5]))
+
+
+def ground(x: Array, y: Array) -> Array:
+    """Heights that no flip, turn or transposition leaves alone."""
+    return np.float32(0.2 * x - 0.05 * y + 0.01 * x * y)
+
+
+def window(
+    frame: int, corner: tuple[float, float], shape: tuple[int, int], rim: float = 0.0
+) -> tuple[ElevationMap, NavigationMap]:
+    """A window of the region: free west of x = 2, hazard east of it, unknown in a hole at (1.05, 3.05)."""
+    rows, cols = shape
+    x, y = np.meshgrid(corner[0] + (np.arange(cols) + 0.5) * STEP, corner[1] + (np.arange(rows) + 0.5) * STEP)
+    hole = (np.abs(x - 1.05) < 0.01) & (np.abs(y - 3.05) < 0.01)
+    elevation = np.where(hole, np.nan, ground(x, y) + rim).astype(np.float32)
+    layers = {
+        "elevation": elevation, "variance": np.where(hole, np.nan, 4e-4).astype(np.float32),
+        "last": np.full(shape, frame, np.float32),
+    }  # fmt: skip
+    cells = np.where(hole, Cell.UNKNOWN, np.where(x < 2, Cell.FREE, Cell.HAZARD)).astype(np.int8)
+    stamp = START + frame
+    return (
+        ElevationMap(stamp, layers, STEP, corner, "odom", level=LEVEL),
+        NavigationMap(stamp, cells, np.zeros(shape, np.uint8), STEP, corner, "odom"),
+    )
+
+
+def cloud(frame: int) -> PointCloud:
+    """Two points in the region's cell of (1.05, 2.05), the surer one green, and one in that of (0.45, 2.05)."""
+    places = np.array([[1.05, 2.05, 0.6], [1.06, 2.04, 0.6], [0.45, 2.05, 0.7]])
+    level = LEVEL.inverse()(places).astype(np.float32)
+    colors = np.array([[200, 10, 20], [10, 220, 30], [7, 8, 250]], np.uint8)
+    sigma = np.array([0.3, 0.1, 0.2], np.float32) + 0.01 * frame
+    return PointCloud(START + frame, level, colors, sigma, np.arange(3, dtype=np.int32), "level")
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    """A result log of two frames: windows of 30 x 40 cells, the second 1 m farther along x; and their own maps."""
+    path = tmp_path / "out.mcap"
+    with Ros2Writer(path) as writer:
+        for frame, corner in enumerate([(-1.0, 1.0), (0.0, 1.0)]):
+            terrain, navigation = window(frame, corner, (30, 40))
+            stamp = terrain.stamp
+            writer.write("/nav/points", ros2.point_cloud(cloud(frame)), stamp)
+            own = ElevationMap(stamp, terrain.layers, STEP, corner, "level")
+            writer.write("/nav/elevation_map", ros2.grid_map(own), stamp)
+            writer.write("/nav/navigation_map", ros2.occupancy_grid(navigation), stamp)
+            writer.write("/nav/regional_map", ros2.grid_map(terrain), stamp)
+            writer.write("/nav/regional_navigation_map", ros2.occupancy_grid(navigation), stamp)
+            writer.write("/tf", ros2.transform_message([(LEVEL, stamp)]), stamp)
+    return path
+
+
+def test_gdal_finds_every_height_at_its_place_and_nothing_in_the_hole(result: Path, tmp_path: Path) -> None:
+    export(result, tmp_path / "out")
+    with rasterio.open(tmp_path / "out" / "elevation.tif") as file:
+        assert file.bounds == pytest.approx((-1.0, 1.0, 4.0, 4.0))
+        assert (file.width, file.height, file.count, file.dtypes) == (50, 30, 1, ("float32",))
+        assert np.isnan(file.nodata)
+        assert file.crs.to_wkt().startswith("LOCAL_CS[\"roverflow: local frame 'odom', metres, z up")
+        assert file.tags()["AREA_OR_POINT"] == "Area"
+        heights = file.read(1)
+        for x, y in [(-0.95, 1.05), (3.95, 1.05), (-0.95, 3.95), (3.95, 3.95), (1.35, 2.85)]:
+            row, col = file.index(x, y)
+            assert heights[row, col] == pytest.approx(float(ground(x, y)), abs=1e-6)
+        assert heights[0, 0] == pytest.approx(float(ground(-0.95, 3.95)), abs=1e-6)  # north-west
+        assert [file.xy(row, col) for row, col in np.argwhere(np.isnan(heights))] == [pytest.approx((1.05, 3.05))]
+
+
+def test_every_layer_is_a_file_and_the_newer_window_lies_on_top(result: Path, tmp_path: Path) -> None:
+    files = export(result, tmp_path / "out")
+    names = {"elevation.tif", "variance.tif", "last.tif", "hillshade.png", "hillshade.pgw", "points.ply",
+             "navigation_map.pgm", "navigation_map.yaml"}  # fmt: skip
+    assert {file.name for file in files} == names == {file.name for file in (tmp_path / "out").iterdir()}
+    with rasterio.open(tmp_path / "out" / "last.tif") as file:
+        last = file.read(1)
+    assert np.all(last[:, :10] == 0)
+    assert np.all(last[:, 40:] == 1)
+    assert np.all(last[:, 15:35] == 1)
+    assert set(np.unique(last)) == {0, 1}
+
+
+def test_what_a_window_says_at_its_rim_gives_way_to_what_one_says_in_its_middle(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    with Ros2Writer(path) as writer:
+        for frame, (corner, wrong) in enumerate([((0.0, 0.0), 0.0), ((3.0, 0.0), 9.0)]):
+            terrain, _ = window(frame, corner, (60, 60), wrong)
+            writer.write("/nav/regional_map", ros2.grid_map(terrain), terrain.stamp)
+    export(path, tmp_path)
+    with rasterio.open(tmp_path / "elevation.tif") as file:
+        heights = file.read(1)
+        x = np.array([file.xy(30, col)[0] for col in range(file.width)])
+    off = heights[30] - ground(x, file.xy(30, 0)[1])
+    np.testing.assert_allclose(off, np.where(x < 4.5, 0.0, 9.0), atol=1e-5)
+
+
+def as_map_server_reads(yaml_file: Path) -> tuple[Array, float, list[float]]:
+    """Trinary mode of nav2_map_server and map_server: row-major from the lower left cell, -1, 0 or 100."""
+    about = yaml.safe_load(yaml_file.read_text())
+    assert about["mode"] == "trinary"
+    gray = np.asarray(Image.open(yaml_file.parent / about["image"])).astype(float)
+    occupancy = gray / 255 if about["negate"] else (255 - gray) / 255
+    cells = np.full(gray.shape, -1)
+    cells[occupancy > about["occupied_thresh"]] = 100
+    cells[occupancy < about["free_thresh"]] = 0
+    return cells[::-1], about["resolution"], about["origin"]
+
+
+def test_map_server_reads_free_hazard_and_unknown_where_they_are(result: Path, tmp_path: Path) -> None:
+    export(result, tmp_path / "out")
+    cells, resolution, origin = as_map_server_reads(tmp_path / "out" / "navigation_map.yaml")
+    assert (resolution, origin) == (STEP, pytest.approx([-1.0, 1.0, 0.0]))
+    x = origin[0] + (np.arange(cells.shape[1]) + 0.5) * resolution
+    expected = np.where(x < 2, 0, 100) * np.ones((30, 1), int)
+    expected[round((3.05 - origin[1]) / STEP - 0.5), round((1.05 - origin[0]) / STEP - 0.5)] = -1
+    np.testing.assert_array_equal(cells, expected)
+
+
+def test_a_ply_reader_finds_each_cell_with_its_surest_colour(result: Path, tmp_path: Path) -> None:
+    export(result, tmp_path / "out")
+    data = plyfile.PlyData.read(str(tmp_path / "out" / "points.ply"))
+    assert "local frame 'odom'" in data.comments[0]
+    points = data["vertex"].data
+    assert len(points) == 30 * 50 - 1
+    np.testing.assert_allclose(points["z"], ground(points["x"], points["y"]), atol=1e-6)
+    np.testing.assert_allclose(points["sigma"], 0.02, rtol=1e-5)
+    colours = {
+        (round(float(p["x"]), 2), round(float(p["y"]), 2)): (p["red"], p["green"], p["blue"])
+        for p in points
+        if p["red"] or p["green"] or p["blue"]
+    }
+    assert colours == {(1.05, 2.05): (10, 220, 30), (0.45, 2.05): (7, 8, 250)}
+
+
+def test_the_hillshade_is_lit_from_the_north_west_and_placed_by_its_world_file(tmp_path: Path) -> None:
+    x, y = np.meshgrid((np.arange(60) + 0.5) * STEP, (np.arange(40) + 0.5) * STEP)
+    mound = np.exp(-((x - 4) ** 2 + (y - 1) ** 2)).astype(np.float32)
+    mound[0, 0] = np.nan
+    path = tmp_path / "out.mcap"
+    with Ros2Writer(path) as writer:
+        writer.write(
+            "/nav/regional_map",
+            ros2.grid_map(ElevationMap(START, {"elevation": mound}, STEP, (0.0, 0.0), "odom")),
+            START,
+        )
+    export(path, tmp_path)
+    shade = np.asarray(Image.open(tmp_path / "hillshade.png"))
+    step_x, _, _, step_y, west, north = (float(line) for line in (tmp_path / "hillshade.pgw").read_text().split())
+
+    def at(px: float, py: float) -> int:
+        return int(shade[round((py - north) / step_y), round((px - west) / step_x)])
+
+    assert at(3.55, 1.45) > at(0.55, 3.55) > at(4.45, 0.55)
+    assert shade[-1, 0] == 0  # unknown
+    assert shade.min(where=np.isfinite(mound[::-1]), initial=255) >= 1
+
+
+def test_the_maps_and_points_of_every_frame_are_exported_on_request(result: Path, tmp_path: Path) -> None:
+    files = export(result, tmp_path / "out", frames=True)
+    folders = sorted({file.parent.name for file in files})
+    assert folders == [f"frame-{number:04d}-{START + number}" for number in (0, 1)]
+    with rasterio.open(tmp_path / "out" / folders[1] / "elevation.tif") as file:
+        assert file.bounds == pytest.approx((0.0, 1.0, 4.0, 4.0))
+        assert "local frame 'level'" in file.crs.to_wkt()
+    points = plyfile.PlyData.read(str(tmp_path / "out" / folders[1] / "points.ply"))["vertex"].data
+    sent = cloud(1)
+    np.testing.assert_array_equal(np.column_stack([points[name] for name in "xyz"]), sent.points)
+    np.testing.assert_array_equal(np.column_stack([points[name] for name in ("red", "green", "blue")]), sent.colors)
+    np.testing.assert_array_equal(points["sigma"], sent.sigma)
+    cells, _, _ = as_map_server_reads(tmp_path / "out" / folders[1] / "navigation_map.yaml")
+    assert (np.count_nonzero(cells == 0), np.count_nonzero(cells == 100)) == (30 * 20 - 1, 30 * 20)
+
+
+def test_a_map_far_from_its_frame_s_origin_keeps_its_place(tmp_path: Path) -> None:
+    """In a UTM frame float32 would be off by half a metre."""
+    corner = (500_000.3, 5_400_000.7)
+    layers = {"elevation": np.array([[1, 2], [3, np.nan]], np.float32)}
+    path = tmp_path / "out.mcap"
+    with Ros2Writer(path) as writer:
+        writer.write("/nav/regional_map", ros2.grid_map(ElevationMap(START, layers, STEP, corner, "map")), START)
+    export(path, tmp_path)
+    points = plyfile.PlyData.read(str(tmp_path / "points.ply"))["vertex"].data
+    centres = [
+        (corner[0] + 0.05, corner[1] + 0.05),
+        (corner[0] + 0.15, corner[1] + 0.05),
+        (corner[0] + 0.05, corner[1] + 0.15),
+    ]
+    np.testing.assert_allclose(np.column_stack([points["x"], points["y"]]), centres, atol=1e-6)
+    assert points["z"].tolist() == [1, 2, 3]
+    with rasterio.open(tmp_path / "elevation.tif") as file:
+        assert file.bounds == pytest.approx((*corner, corner[0] + 0.2, corner[1] + 0.2), abs=1e-6, rel=0)
+
+
+def test_a_log_without_a_regional_map_says_what_to_add(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    with Ros2Writer(path) as writer:
+        writer.write("/nav/points", ros2.point_cloud(cloud(0)), START)
+    with pytest.raises(LogError, match=r"holds no /nav/regional_map: .* had no pose, .* add --frames"):
+        export(path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    (points,) = export(path, tmp_path / "out", frames=True)
+    assert points.name == "points.ply"
+
+
+def test_maps_that_change_their_grid_on_the_way_are_not_mixed(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    with Ros2Writer(path) as writer:
+        for frame, frame_id in enumerate(("odom", "map")):
+            layers = {"elevation": np.zeros((3, 3), np.float32)}
+            writer.write(
+                "/nav/regional_map",
+                ros2.grid_map(ElevationMap(START + frame, layers, STEP, (0.0, 0.0), frame_id)),
+                START + frame,
+            )
+    with pytest.raises(LogError, match=r"the maps change on the way: elevation at 0\.1 m in 'map' after"):
+        export(path, tmp_path / "out")
+
+
+def test_a_file_that_cannot_be_written_is_named_and_nothing_half_is_left(result: Path, tmp_path: Path) -> None:
+    (tmp_path / "out" / "variance.tif").mkdir(parents=True)
+    with pytest.raises(LogError, match=r"cannot write .*variance\.tif: it is a folder"):
+        export(result, tmp_path / "out")
+    assert not list((tmp_path / "out").glob("*.partial"))

@@ -1,0 +1,347 @@
+"""The regional map: many frames on one grid, joined, weighted, and corrected by what came later."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stages import Fuse, Mount, PointCloud, Pose, Transform
+from stages.fuse import local_cells, placement
+from stages.tiles import Tiles
+
+SECOND = 1_000_000_000
+START = 1_700_000_000 * SECOND
+LOOKING = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+MOUNT = Mount(START, np.eye(3), Transform("base_link", "camera", LOOKING, np.array([0.4, 0.1, 1.0])))
+
+
+def rolling(x, y):
+    """Ground that is alike in no two places or directions."""
+    return 0.2 * np.sin(0.9 * x + 0.3) * np.cos(0.5 * y) + 0.03 * x - 0.02 * y
+
+
+def flat(x, y):
+    return np.zeros_like(x)
+
+
+def drive(frame, ground=rolling, sigma=0.02, tilt=(0.0, 0.0), at=None, noise=0.0):
+    """Cloud and pose of one frame: 2 to 7 m ahead, 100 degrees wide, 6 points a cell. tilt: errors of the levelling."""
+    rng = np.random.default_rng(frame)
+    x, y, yaw = at or (0.4 * frame - 3.03, 0.1 * frame + 0.521, 0.4 + 0.1 * frame)
+    base = np.array([x, y, float(ground(np.array(x), np.array(y)))])
+    reach, bearing = np.sqrt(rng.uniform(4, 49, 100_000)), rng.uniform(-0.87, 0.87, 100_000)
+    ahead = np.column_stack([reach * np.cos(bearing), reach * np.sin(bearing)])
+    world = ahead @ Rotation.from_euler("z", yaw).as_matrix()[:2, :2].T + base[:2]
+    heights = ground(world[:, 0], world[:, 1]) - base[2] + ahead @ tilt + noise * rng.normal(size=len(ahead))
+    sensor = replace(MOUNT.base_from_camera, parent="level")
+    count = len(ahead)
+    cloud = PointCloud(
+        START + frame * SECOND, np.column_stack([ahead, heights]).astype(np.float32),
+        np.zeros((count, 3), np.uint8), np.full(count, sigma, np.float32), np.arange(count, dtype=np.int32), "level",
+        sensor=sensor,
+    )  # fmt: skip
+    return cloud, Pose(cloud.stamp, base, Rotation.from_euler("z", yaw).as_quat(), "odom", "base_link")
+
+
+def cell(terrain, x, y, layer="elevation"):
+    col, row = (
+        int(np.floor((place - start) / terrain.resolution)) for place, start in zip((x, y), terrain.origin, strict=True)
+    )
+    return float(terrain.layers[layer][row, col])
+
+
+def centres(terrain):
+    rows, cols = terrain.shape
+    x, y = ((np.arange(n) + 0.5) * terrain.resolution + at for n, at in zip((cols, rows), terrain.origin, strict=True))
+    return np.meshgrid(x, y)
+
+
+def test_frames_at_any_heading_make_one_map_of_the_ground():
+    fuse = Fuse()
+    for frame in range(12):
+        cloud, pose = drive(frame)
+        terrain = fuse(cloud, pose, MOUNT)
+    assert (terrain.frame_id, terrain.stamp) == ("odom", START + 11 * SECOND)
+    error = terrain.layers["elevation"] - rolling(*centres(terrain))
+    known = np.isfinite(error)
+    assert known.sum() > 25_000
+    assert np.sqrt(np.mean(error[known] ** 2)) < 0.003
+    assert np.median(terrain.layers["count"][known]) > 16  # more than any frame alone has
+
+
+def test_a_rock_seen_from_two_headings_stands_where_it_is():
+    def with_rock(x, y):
+        return np.where(np.hypot(x - 1.0, y - 2.0) < 0.3, 0.25, 0.0)
+
+    fuse = Fuse()
+    for frame, at in enumerate([(-3.0, 2.0, 0.0), (1.0, -2.0, np.pi / 2), (4.0, 5.0, np.radians(-135))]):
+        cloud, pose = drive(frame, with_rock, at=at)
+        terrain = fuse(cloud, pose, MOUNT)
+    x, y = centres(terrain)
+    rock = terrain.layers["elevation"] > 0.125
+    assert rock.sum() * 0.05**2 == pytest.approx(np.pi * 0.3**2, rel=0.1)
+    assert (x[rock].mean(), y[rock].mean()) == (pytest.approx(1.0, abs=0.01), pytest.approx(2.0, abs=0.01))
+
+
+def heights(cloud, placed):
+    """Mean height in each cell of the square of 20 m about the origin, NaN where there is none."""
+    points = placed(cloud.points)
+    cells = (np.floor(points[:, :2] / 0.05).astype(int) + 200) @ (1, 400)
+    with np.errstate(invalid="ignore"):
+        return np.bincount(cells, points[:, 2], 160_000) / np.bincount(cells, minlength=160_000)
+
+
+def test_frames_with_errors_of_their_tilt_join_without_a_seam():
+    rng, fuse, seams, before = np.random.default_rng(3), Fuse(), [], None
+    for frame in range(12):
+        cloud, pose = drive(frame, tilt=tuple(rng.normal(0, np.radians(0.4), 2)), noise=0.01)
+        now = [heights(cloud, placed) for placed in (placement(cloud, pose, MOUNT), fuse(cloud, pose, MOUNT).level)]
+        if before is not None:
+            off = [one - other for one, other in zip(before, now, strict=True)]
+            seams.append([1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) for values in off])
+        before = now
+    raw, joined = np.median(seams, axis=0)
+    assert raw > 0.015
+    assert joined < 0.007  # 1 cm of noise in 6 points a cell, twice, is 0.6 cm
+    assert np.max(seams, axis=0)[1] < 0.008
+
+
+def test_the_tilt_error_of_the_first_frame_fades_and_does_not_swing_back():
+    fuse, lean, found = Fuse(), np.radians(0.6), []
+    for frame in range(61):
+        cloud, pose = drive(frame, flat, tilt=(lean if frame == 0 else 0.0, 0.0), at=(0.25 * frame, 0.0, 0.0))
+        placed = fuse(part(cloud, np.s_[::10]), pose, MOUNT).level
+        found.append(np.arcsin(placed.rotation[2, 0]) / lean)
+    assert 0.7 < found[1] < 1.0  # it joins the map much as that is
+    assert abs(found[40]) < 0.15
+    assert abs(found[60]) < 0.1
+    assert min(found) > -0.1
+    assert abs(placed.translation[2]) < 0.1
+
+
+def part(cloud, of):
+    """Some points of a cloud, by a slice."""
+    return replace(cloud, **{name: getattr(cloud, name)[of] for name in ("points", "colors", "sigma", "pixel")})
+
+
+def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(monkeypatch):
+    def hiding(*arguments):
+        local, row, col = local_cells(*arguments)
+        x, y = centres(local)
+        looked = np.hypot(x, y) < 3
+        occluded = np.where(np.isfinite(local.layers["elevation"]), 0, np.where(looked, 1, np.nan)).astype(np.float32)
+        return replace(local, layers={**local.layers, "occluded": occluded}), row, col
+
+    monkeypatch.setattr("stages.fuse.local_cells", hiding)
+    fuse = Fuse()
+    fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
+    terrain = fuse(*drive(1, flat, at=(0.0, 0.0, 1.2)), MOUNT)
+    assert [cell(terrain, *place, "occluded") for place in ((1.02, 0.02), (2.52, 0.02), (1.02, 2.22))] == [1, 0, 0]
+    assert np.isnan(cell(terrain, -5.0, 0.02, "occluded"))
+    assert np.isnan(cell(terrain, 1.02, 0.02))
+
+
+def test_a_mean_over_frames_is_weighted_by_inverse_variance():
+    fuse = Fuse(tilt_sigma=0.0, height_sigma=0.0)
+    clouds = [
+        drive(0, flat, at=(0.0, 0.0, 0.0)),
+        drive(1, lambda x, y: flat(x, y) + 0.01, sigma=0.04, at=(0.0, 0.0, 0.0)),
+    ]
+    clouds[1] = (clouds[1][0], replace(clouds[1][1], position=[0, 0, 0]))
+    clouds[1] = (replace(clouds[1][0], points=clouds[1][0].points + np.float32([0, 0, 0.01])), clouds[1][1])
+    local = [local_cells(cloud, placement(cloud, pose, MOUNT), 0.05, 8.0)[0].layers for cloud, pose in clouds]
+    for cloud, pose in clouds:
+        terrain = fuse(cloud, pose, MOUNT)
+    one, other = (layers["variance"].astype(float) + fuse.alignment**2 for layers in local)
+    share = (1 / other) / (1 / one + 1 / other)
+    elevation = terrain.layers["elevation"][40:360, 40:360]
+    both = np.isfinite(one) & np.isfinite(other)
+    assert both.sum() > 10_000
+    np.testing.assert_allclose(elevation[both], (0.01 * share)[both], atol=1e-6)
+    variance = (1 - fuse.shared) / (1 / one + 1 / other) + fuse.shared * np.minimum(one, other)
+    np.testing.assert_allclose(terrain.layers["variance"][40:360, 40:360][both], variance[both], rtol=2e-3)
+
+
+def test_many_frames_of_one_place_do_not_make_it_known_beyond_what_they_share():
+    fuse = Fuse()
+    for frame in range(40):
+        cloud, pose = drive(frame, at=(0.0, 0.0, 0.3))
+        terrain = fuse(cloud, pose, MOUNT)
+        if frame == 0:
+            single = terrain.layers["variance"]
+    known = (terrain.layers["frames"] > 35) & np.isfinite(single)
+    assert np.all(terrain.layers["variance"][known] >= 0.99 * fuse.shared * np.nanmin(single))
+    assert np.all(terrain.layers["variance"][known] <= single[known])
+
+
+def test_cells_know_when_and_by_how_many_frames_they_were_seen():
+    fuse = Fuse()
+    for frame in range(6):
+        cloud, pose = drive(frame, at=(1.0 * frame, 0.0, 0.0))
+        terrain = fuse(cloud, pose, MOUNT)
+    assert [cell(terrain, 5.52, 0.02, layer) for layer in ("first", "last", "frames")] == [0.0, 3.0, 4.0]
+    assert [cell(terrain, 8.52, 0.02, layer) for layer in ("first", "last", "frames")] == [2.0, 5.0, 4.0]
+    assert np.isnan(cell(terrain, 1.0, 0.02, "first"))
+    assert cell(terrain, 1.0, 0.02, "frames") == 0
+
+
+def with_box(x, y):
+    return np.where((np.abs(x - 4) < 0.4) & (np.abs(y) < 0.4), 0.5, 0.0)
+
+
+def test_newer_evidence_clears_what_is_gone_and_says_since_when():
+    fuse = Fuse()
+    for frame in range(10):
+        cloud, pose = drive(frame, with_box if frame < 5 else flat, at=(0.05 * frame, 0.0, 0.0))
+        terrain = fuse(cloud, pose, MOUNT)
+        if frame == 4:
+            assert cell(terrain, 4.02, 0.02) == pytest.approx(0.5, abs=1e-3)
+    assert np.nanmax(np.abs(terrain.layers["elevation"])) < 0.01
+    assert cell(terrain, 4.02, 0.02, "first") >= 5.0
+    assert cell(terrain, 4.02, 0.02, "contradictions") >= 1
+    assert cell(terrain, 3.02, 0.02, "contradictions") == 0
+    assert cell(terrain, 3.02, 0.02, "first") == 0.0
+
+
+def test_one_uncertain_frame_does_not_overturn_what_many_saw():
+    fuse = Fuse()
+    for frame in range(6):
+        cloud, pose = drive(frame, with_box, at=(0.05 * frame, 0.0, 0.0))
+        fuse(cloud, pose, MOUNT)
+    cloud, pose = drive(6, flat, at=(0.3, 0.0, 0.0), sigma=0.3)
+    terrain = fuse(cloud, pose, MOUNT)
+    assert cell(terrain, 4.02, 0.02) == pytest.approx(0.5, abs=1e-3)
+    assert cell(terrain, 4.02, 0.02, "last") == 5.0
+
+
+def test_the_windows_laid_over_each_other_are_the_whole_map():
+    fuse, whole = Fuse(region=7.0, window=17.0), {}
+    for frame in range(12):
+        cloud, pose = drive(frame, at=(1.5 * frame - 9, 0.3 * frame, 0.2))
+        terrain = fuse(cloud, pose, MOUNT)
+        row, col = (round(place / 0.05) for place in terrain.origin[::-1])
+        for name, layer in terrain.layers.items():
+            whole.setdefault(name, Tiles(np.dtype("f4"))).write(
+                row, col, np.nan_to_num(layer), np.ones(layer.shape, bool)
+            )
+    cells = fuse._map.cells.read(-400, -400, 900, 900)
+    assert (cells["frames"] > 0).sum() > 50_000
+    np.testing.assert_array_equal(whole["elevation"].read(-400, -400, 900, 900), cells["height"])
+    np.testing.assert_array_equal(whole["frames"].read(-400, -400, 900, 900), cells["frames"])
+
+
+def test_a_pose_of_the_camera_is_as_good_as_one_of_the_rover():
+    cloud, pose = drive(3)
+    base = Transform("odom", "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
+    camera = base.after(MOUNT.base_from_camera)
+    turn = Rotation.from_matrix(camera.rotation).as_quat()
+    seen = [Fuse()(cloud, pose, MOUNT), Fuse()(cloud, Pose(pose.stamp, camera.translation, turn, "odom", "camera"))]
+    np.testing.assert_allclose(seen[0].level.translation, seen[1].level.translation, atol=1e-9)
+    np.testing.assert_allclose(seen[0].layers["elevation"], seen[1].layers["elevation"], atol=1e-5)
+
+
+def test_roll_and_pitch_of_the_pose_do_not_tilt_the_map():
+    cloud, pose = drive(3)
+    tilted = Rotation.from_quat(pose.quaternion) * Rotation.from_euler("yx", [8, -5], degrees=True)
+    level = Transform("level", "base_link", Rotation.from_euler("yx", [8, -5], degrees=True).as_matrix(), np.zeros(3))
+    cloud = replace(cloud, sensor=level.after(MOUNT.base_from_camera))
+    placed = placement(cloud, replace(pose, quaternion=tilted.as_quat()), MOUNT)
+    np.testing.assert_allclose(placed.rotation, Rotation.from_quat(pose.quaternion).as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(placed.translation, pose.position, atol=1e-9)
+
+
+def test_equal_frames_give_equal_bits():
+    maps = []
+    for _ in range(2):
+        fuse = Fuse()
+        for frame in range(3):
+            cloud, pose = drive(frame, noise=0.01)
+            terrain = fuse(cloud, pose, MOUNT)
+        maps.append({name: layer.tobytes() for name, layer in terrain.layers.items()})
+    assert maps[0] == maps[1]
+
+
+def upside_down(pose):
+    return replace(
+        pose, quaternion=(Rotation.from_euler("x", 180, degrees=True) * Rotation.from_quat(pose.quaternion)).as_quat()
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda cloud, pose: (replace(cloud, frame_id="camera", sensor=None), pose), "it needs Level"),
+        (lambda cloud, pose: (cloud, replace(pose, frame_id="map")), "the pose is in frame 'map', the map in 'odom'"),
+        (lambda cloud, pose: (cloud, replace(pose, child_frame_id="mast")), "the pose is that of 'mast', and nothing"),
+        (lambda cloud, pose: (cloud, upside_down(pose)), "180 degrees off the vertical .* whose z points up"),
+        (lambda cloud, pose: (replace(cloud, stamp=START), pose), "comes after"),
+    ],
+)  # fmt: skip
+def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(change, sentence):
+    fuse = Fuse()
+    fuse(*drive(0), MOUNT)
+    before = fuse._map.cells.read(-300, -300, 600, 600)
+    with pytest.raises(ValueError, match=sentence):
+        fuse(*change(*drive(1)), MOUNT)
+    np.testing.assert_array_equal(fuse._map.cells.read(-300, -300, 600, 600), before)
+
+
+def test_an_empty_cloud_changes_nothing():
+    fuse = Fuse()
+    cloud, pose = drive(0)
+    assert np.isnan(fuse(part(cloud, np.s_[:0]), pose, MOUNT).layers["elevation"]).all()
+    assert np.isfinite(fuse(*drive(1), MOUNT).layers["elevation"]).any()
+
+
+def test_points_whose_error_is_not_known_do_not_enter_the_map():
+    fuse, (cloud, pose) = Fuse(), drive(0)
+    unsure = cloud.sigma.copy()
+    left = cloud.points[:, 1] > 0
+    unsure[left] = np.nan
+    terrain = fuse(replace(cloud, sigma=unsure), pose, MOUNT)
+    assert 0 < np.isfinite(terrain.layers["elevation"]).sum() < 0.6 * len(cloud.points) / 6
+    terrain = fuse(*drive(1), MOUNT)
+    known = np.isfinite(terrain.layers["elevation"])
+    assert np.abs(terrain.layers["elevation"] - rolling(*centres(terrain)))[known].max() < 0.03
+
+
+def test_a_window_that_cannot_hold_what_a_frame_changes_is_refused():
+    with pytest.raises(ValueError, match=r"Fuse\.window must be at least 19 m, not 15 m"):
+        Fuse(region=8.0, window=15.0)
+
+
+TRACK = """
+import sys
+import numpy as np
+from stages import Fuse, PointCloud, Pose, Transform
+fuse, step = Fuse(region=11.0, window=25.0), 8.0
+x, y = (axis.ravel() + 0.025 for axis in np.meshgrid(np.arange(-4, 4, 0.05), np.arange(-10, 10, 0.05)))
+points = np.column_stack([x, y, 0.1 * np.sin(x)]).astype(np.float32)
+n = len(points)
+sensor = Transform("level", "camera", np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0, 0, 1.0]))
+for frame in range(int(sys.argv[1]) // 8):
+    pose = Pose(frame + 1, [frame * step, 0.0, 0.0], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
+    cloud = PointCloud(frame + 1, points, np.zeros((n, 3), np.uint8), np.full(n, 0.02, np.float32),
+                       np.arange(n, dtype=np.int32), "level", sensor=sensor)
+    fuse(cloud, pose)
+cells = sum(int((tile["frames"] > 0).sum()) for tile in fuse._map.cells.tiles.values())
+with open("/proc/self/status") as status:
+    peak = next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
+print(cells, fuse.nbytes / 1e6, peak / 1024)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux, to tell the memory of a process")
+@pytest.mark.parametrize("metres", [160, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_kilometre_of_20_metres_width_fits_into_500_megabytes(metres):
+    done = subprocess.run([sys.executable, "-c", TRACK, str(metres)], capture_output=True, text=True, check=True)
+    cells, map_size, process_size = (float(value) for value in done.stdout.split())
+    assert cells == pytest.approx(metres * 20 / 0.05**2, rel=0.01)
+    assert map_size < 0.26 * metres + 2
+    assert process_size < 500 - 0.26 * (1000 - metres)

@@ -1,0 +1,43 @@
+"""The plane that joins a frame to the map: found in spite of what changed, and never larger than can be believed."""
+
+import numpy as np
+import pytest
+
+from stages.overlap import fit_plane
+
+EXPECTED = np.array([0.05, 0.005, 0.005])
+
+
+def differences(plane, count=4000, seed=1, noise=0.01):
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(1, 8, count), rng.uniform(-4, 4, count)
+    return x, y, plane[0] + plane[1] * x + plane[2] * y + noise * rng.normal(size=count)
+
+
+def test_a_plane_is_found_though_a_fifth_of_the_ground_has_changed():
+    plane = np.array([0.02, 0.006, -0.004])
+    x, y, off = differences(plane)
+    off[x > 6.5] -= 0.3
+    found = fit_plane(x, y, off, np.full(len(x), 1e-4), EXPECTED, 0.05)
+    np.testing.assert_allclose(np.column_stack([np.ones_like(x), x, y]) @ (found - plane), 0, atol=0.012)
+
+
+def test_without_an_overlap_there_is_no_plane():
+    nothing = np.empty(0)
+    np.testing.assert_array_equal(fit_plane(nothing, nothing, nothing, nothing, EXPECTED, 0.05), 0)
+
+
+def test_a_few_cells_do_not_tilt_a_frame():
+    x, y, off = differences(np.array([0.0, 0.2, 0.0]), count=3)
+    found = fit_plane(x, y, off, np.full(3, 1e-2), EXPECTED, 0.05)
+    assert np.abs(found[1:]).max() < 2e-4
+
+
+@pytest.mark.parametrize("fixed", [0, 1, 2])
+def test_what_is_known_exactly_stays(fixed):
+    expected = EXPECTED.copy()
+    expected[fixed] = 0
+    x, y, off = differences(np.array([0.02, 0.006, -0.004]))
+    found = fit_plane(x, y, off, np.full(len(x), 1e-4), expected, 0.05)
+    assert found[fixed] == 0
+    assert np.all(found[np.arange(3) != fixed] != 0)

@@ -1,0 +1,43 @@
+"""The grid without bounds: it is as if there were one large array, and costs only what was written."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.tiles import SIDE, Tiles
+
+DTYPE = np.dtype([("value", "f4"), ("mark", "u1")])
+places = st.integers(-3 * SIDE, 2 * SIDE)
+sizes = st.integers(1, 2 * SIDE)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(places, places, sizes, sizes, st.integers(0, 2**32 - 1)), max_size=4), places, places)
+def test_reads_are_those_of_one_large_array(writes, row, col):
+    model = np.zeros((12 * SIDE, 12 * SIDE), DTYPE)
+    tiles, half = Tiles(DTYPE), 6 * SIDE
+    for first_row, first_col, rows, cols, seed in writes:
+        rng = np.random.default_rng(seed)
+        block = np.zeros((rows, cols), DTYPE)
+        block["value"], block["mark"] = rng.normal(size=(rows, cols)), 1
+        changed = rng.random((rows, cols)) < 0.7
+        tiles.write(first_row, first_col, block, changed)
+        part = np.s_[first_row + half : first_row + half + rows, first_col + half : first_col + half + cols]
+        np.copyto(model[part], block, where=changed)
+    expected = model[row + half : row + half + 70, col + half : col + half + 90]
+    np.testing.assert_array_equal(tiles.read(row, col, 70, 90), expected)
+
+
+def test_a_block_that_was_read_is_a_copy():
+    tiles = Tiles(DTYPE)
+    tiles.write(0, 0, np.ones((2, 2), DTYPE), np.ones((2, 2), bool))
+    tiles.read(0, 0, 2, 2)["value"] = 7
+    assert tiles.read(0, 0, 2, 2)["value"].max() == 1
+
+
+def test_what_is_not_changed_costs_nothing():
+    tiles = Tiles(DTYPE)
+    changed = np.zeros((1, 100 * SIDE), bool)
+    changed[0, [0, -1]] = True
+    tiles.write(0, 0, np.ones(changed.shape, DTYPE), changed)
+    assert tiles.nbytes == 2 * SIDE * SIDE * DTYPE.itemsize

@@ -1,0 +1,89 @@
+"""The regional map from the command line: made where the log has a pose, exported whole."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from flow.cli import main
+from recordings import ros2
+from tests.conftest import FRAMES, rewrite
+
+SMALL = ("--set", "matched.disparities=64")
+REGIONAL = {"/nav/regional_map", "/nav/regional_navigation_map"}
+
+
+def roverflow(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The traverse, run through the default pipeline."""
+    out = tmp_path_factory.mktemp("regional") / "out.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd") == 0
+    return out
+
+
+def test_every_frame_gives_the_map_around_the_rover_in_the_pose_s_frame(result):
+    maps = {topic: [] for topic in REGIONAL}
+    for topic, _, message in ros2.iter_messages(result, REGIONAL):
+        maps[topic].append(message)
+    assert [len(messages) for messages in maps.values()] == [FRAMES, FRAMES]
+    assert {message.header.frame_id for messages in maps.values() for message in messages} == {"odom"}
+    terrain = ros2.read_grid_map(maps["/nav/regional_map"][-1])
+    assert terrain.layers["frames"].max() == FRAMES
+    cells = ros2.read_occupancy_grid(maps["/nav/regional_navigation_map"][-1])
+    assert (cells.cells.shape, cells.origin) == (terrain.shape, pytest.approx(terrain.origin))
+    assert np.count_nonzero(cells.cells == 0) > 2000
+
+
+def test_a_log_without_a_pose_is_run_without_a_regional_map(traverse, tmp_path, capsys):
+    log, out = (
+        rewrite(traverse, tmp_path / "log.mcap", lambda topic, _, data: None if topic == "/odometry" else data),
+        tmp_path / "out.mcap",
+    )
+    assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd") == 0
+    counts = Counter(topic for topic, _, _ in ros2.iter_messages(out))
+    assert not REGIONAL & set(counts)
+    assert counts["/nav/navigation_map"] == FRAMES
+    assert roverflow("export", out, tmp_path / "maps") == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "had no pose" in said
+    assert "--frames" in said
+    assert roverflow("export", out, tmp_path / "maps", "--frames") == 0
+    assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == FRAMES
+
+
+def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, capsys):
+    assert roverflow("export", result, tmp_path / "maps") == 0
+    assert f"{tmp_path / 'maps'}: 14 files" in capsys.readouterr().out
+    with rasterio.open(tmp_path / "maps" / "frames.tif") as file:
+        assert file.read(1).max() == FRAMES
+    with rasterio.open(tmp_path / "maps" / "elevation.tif") as file:
+        known = np.isfinite(file.read(1)).sum()
+        assert file.shape == cv2.imread(str(tmp_path / "maps" / "navigation_map.pgm"), cv2.IMREAD_UNCHANGED).shape
+    own = [
+        np.isfinite(ros2.read_grid_map(message).layers["elevation"]).sum()
+        for _, _, message in ros2.iter_messages(result, ["/nav/elevation_map"])
+    ]
+    assert max(own) < known < sum(own)
+
+
+@pytest.mark.parametrize(
+    ("where", "words"), [("file", "is a file; give the name of a folder"), ("gone", "cannot read")]
+)
+def test_an_export_that_cannot_be_done_is_one_sentence(result, tmp_path, where, words, capsys):
+    (tmp_path / "file").write_text("mine")
+    log = tmp_path / "gone.mcap" if where == "gone" else result
+    assert roverflow("export", log, tmp_path / "file" if where == "file" else tmp_path / "maps") == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert (tmp_path / "file").read_text() == "mine"
