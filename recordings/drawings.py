@@ -15,10 +15,11 @@ import numpy as np
 import rerun as rr
 
 from recordings import paint
-from recordings.desk import Panel, Place
+from recordings.desk import LEDGER, Panel, Place
 from stages.data import (
     LEVEL_FRAME,
     Array,
+    CameraMotion,
     Cell,
     Disparity,
     ElevationMap,
@@ -28,6 +29,7 @@ from stages.data import (
     Source,
     StereoFrame,
     Tilt,
+    TiltHealth,
 )
 
 DISPARITY_STEPS = 8  # disparities are kept to 1/8 px: four fifths of the size that 1/16 px takes
@@ -184,6 +186,26 @@ def draw_pose(canvas: Canvas, path: str, pose: Pose) -> None:
     arrow = rr.Arrows3D(origins=[pose.position], vectors=[0.4 * forward], colors=[AMBER])
     place = Place(Panel.TRAJECTORY, f"{path}/trajectory", f"{path} ({pose.frame_id})", pose.frame_id)
     canvas.log(place.path, arrow, place)
+
+
+@draws(CameraMotion)
+def draw_motion(canvas: Canvas, path: str, motion: CameraMotion) -> str:
+    """How many features the camera was tracked by."""
+    place = Place(Panel.FEATURES, path, path)
+    canvas.log(f"{path}/{rr.escape_entity_path_part('features tracked')}", rr.Scalars(float(motion.inliers)), place)
+    return f"{path}: {motion.lost}" if motion.lost else f"{path} {motion.inliers} features"
+
+
+@draws(TiltHealth)
+def draw_health(canvas: Canvas, path: str, health: TiltHealth) -> str:
+    """Tilt against the camera's own turns and against the ground in view, in degrees; what is wrong, in words."""
+    for name, angle in (("tilt off the camera's turn", health.turn), ("ground off level", health.ground)):
+        if np.isfinite(angle):
+            place = Place(Panel.HEALTH, path, path)
+            canvas.log(f"{path}/{rr.escape_entity_path_part(name)}", rr.Scalars(float(np.degrees(angle))), place)
+    level = rr.TextLogLevel.ERROR if health.fault else rr.TextLogLevel.INFO
+    canvas.recording.log(f"{LEDGER}/{path}", rr.TextLog(health.judgement, level=level))
+    return f"{path}: {health.fault}" if health.fault else ""
 
 
 @draws(ElevationMap)

@@ -22,7 +22,7 @@ from recordings.drawings import PICTURES, Canvas
 from recordings.errors import LogError
 from recordings.frame_record import FrameRecord, LossEntry
 from recordings.whole_file import give_name, temporary_name, unwritable
-from stages.data import Array, StereoFrame
+from stages.data import Array, Pose, StereoFrame
 
 RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well
 END = b"RRF2FOOT"  # the last magic number of a whole recording, before a checksum of 4 bytes
@@ -117,6 +117,8 @@ class RerunSink:
             level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
             text = f"{verdict}: {self._frames} frames{''.join(f', {drop}' for drop in drops)}"
             self._recording.log(LEDGER, rr.TextLog(text, level=level))
+            for stream, finding in dict(summary.get("findings", {})).items():
+                self._recording.log(LEDGER, rr.TextLog(f"{stream}: {finding}", level=rr.TextLogLevel.INFO))
             facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
             self._recording.log(SUMMARY, _document(verdict, self._about, facts), static=True)
             self._arrange()
@@ -148,7 +150,7 @@ class RerunSink:
         present = {stream: items[stream] for stream in self._streams if stream in items}
         captions = []
         for stream, item in present.items():
-            if isinstance(item, StereoFrame) and _drawn_later(stream, present):
+            if _drawn_later(stream, present):
                 continue
             for kinds, draw in PICTURES.items():
                 if len(kinds) == 1 and isinstance(item, kinds[0]):
@@ -190,10 +192,13 @@ def _last(items: Mapping[str, Any], kind: type) -> list[str]:
 
 
 def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
-    """Whether a later stereo stream has the very same pixels, as where the log was rectified already."""
+    """Whether a later stream has the very same images, as where the log was rectified already, or the very same pose,
+    as where the log has one."""
     later = islice(items.values(), list(items).index(stream) + 1, None)
     mine = items[stream]
-    return any(
+    if isinstance(mine, Pose):
+        return any(item is mine for item in later)
+    return isinstance(mine, StereoFrame) and any(
         isinstance(item, StereoFrame) and _same(item.left, mine.left) and _same(item.right, mine.right)
         for item in later
     )  # fmt: skip

@@ -5,6 +5,7 @@ from stages.clean import Clean
 from stages.data import (
     CameraImage,
     CameraModel,
+    CameraMotion,
     Cell,
     Disparity,
     ElevationMap,
@@ -17,25 +18,32 @@ from stages.data import (
     StereoCamera,
     StereoFrame,
     Tilt,
+    TiltHealth,
     Transform,
 )
 from stages.level import Level
+from stages.locate import Locate
 from stages.match import Match
 from stages.match_opencv import MatchOpenCV
+from stages.odometry import VisualOdometry
 from stages.rectify import Rectify
 from stages.refine import Refine
 from stages.reproject import Reproject
+from stages.tilt_check import CheckTilt
 from stages.voxelise import Voxelise
 
 __all__ = [
     "Binarise",
     "CameraImage",
     "CameraModel",
+    "CameraMotion",
     "Cell",
+    "CheckTilt",
     "Clean",
     "Disparity",
     "ElevationMap",
     "Level",
+    "Locate",
     "Match",
     "MatchOpenCV",
     "Mount",
@@ -50,6 +58,8 @@ __all__ = [
     "StereoCamera",
     "StereoFrame",
     "Tilt",
+    "TiltHealth",
     "Transform",
+    "VisualOdometry",
     "Voxelise",
 ]

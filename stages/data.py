@@ -260,6 +260,46 @@ class Mount:
 
 
 @dataclass(frozen=True, eq=False)
+class CameraMotion:
+    """How the camera moved, by the images alone: nothing but they constrains it, gravity neither.
+
+    camera: the camera in the camera of the frame that began its segment, None where the images do not tell; segment:
+    counts from 1, a new one begins wherever tracking was lost, and nothing ties it to the one before; covariance:
+    (6, 6) of `camera`, of position (m) and of a turn (rad) about the fixed axes, which grows from step to step; inliers:
+    features that agree on the last step; error: their root mean square reprojection error, px (NaN for none); lost:
+    what to say where tracking was lost at this frame, else empty.
+    """
+
+    stamp: int
+    segment: int
+    camera: Transform | None
+    covariance: Array
+    inliers: int = 0
+    error: float = float("nan")
+    lost: str = ""
+
+    def __post_init__(self) -> None:
+        publish_vector(self, "covariance", (6, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class TiltHealth:
+    """Whether the tilt can be believed, judged by the camera and the ground it sees.
+
+    turn: rad, between the tilt and the one before carried along by the camera's motion; ground: rad, between up and the
+    upward normal of the ground in view; both NaN where unknown. frames: how many frames the judgement rests on. fault:
+    what is wrong, in a word or two, empty where nothing is or nothing can be told; judgement: a sentence.
+    """
+
+    stamp: int
+    turn: float
+    ground: float
+    frames: int
+    fault: str
+    judgement: str
+
+
+@dataclass(frozen=True, eq=False)
 class Disparity:
     """A disparity image in the left rectified frame.
 
