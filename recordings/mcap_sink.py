@@ -39,8 +39,8 @@ _COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
 
 @dataclass
 class McapSink:
-    """Writes streams to /nav/<stream>, the frame's transforms to /tf, its losses to /nav/diagnostics, with what is known
-    of the tilt's health and at the end the findings of the run.
+    """Writes streams to /nav/<stream>, the frame's transforms to /tf, its losses to /nav/diagnostics; there too what is
+    known of the tilt's health, and at the end the findings of the run.
 
     results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each.
     """

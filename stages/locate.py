@@ -108,7 +108,8 @@ def _grown(covariance: Array, now: Transform, then: Transform, before: CameraMot
 
     covariance, then, now: in the world; the motions' own are in the axes of their segment's first camera.
     """
-    assert before.camera is not None and motion.camera is not None
+    assert before.camera is not None
+    assert motion.camera is not None
     step = _levered(before.covariance, motion.camera.translation - before.camera.translation)
     values, axes = np.linalg.eigh(motion.covariance - step)
     added = (axes * np.clip(values, 0, None)) @ axes.T  # two frames tracked from one keyframe may err the same way

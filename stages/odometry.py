@@ -80,16 +80,19 @@ class VisualOdometry(Stage):
         camera = before.camera.after(back)
         covariance = _grown(before, step, camera)
         far = step.flow > self.keep * seen.gray.shape[1]
-        if far or step.inliers < self.share * before.view.known:
-            # A keyframe that shows too little to be left from is no better than the old one.
-            if seen.known >= self.least:
-                memory.keyframe = _Keyframe(seen, camera, covariance)
+        few = step.inliers < self.share * before.view.known
+        # A keyframe that shows too little to go on from is no better than the old one.
+        if (far or few) and seen.known >= self.least:
+            memory.keyframe = _Keyframe(seen, camera, covariance)
         return CameraMotion(stamp, memory.segment, camera, covariance, step.inliers, step.error)
 
     def _begun(self, frame: StereoFrame, seen: View) -> CameraMotion:
-        """The first frame of a segment, or one that shows too little to begin one: the keyframe then stays."""
+        """The first frame of a segment, or one that shows too little to begin one: the keyframe then stays.
+
+        The log's first frame is where everything is counted from, whatever it shows.
+        """
         memory = self._memory
-        if seen.known < self.least:
+        if seen.known < self.least and memory.keyframe is not None:
             memory.blind += 1
             lost = f"only {seen.known} features with a disparity are in view, less than {self.least}"
             return CameraMotion(frame.stamp, memory.segment, None, np.zeros((6, 6)), lost=lost)
@@ -111,7 +114,8 @@ def _grown(before: _Keyframe, step: Step, camera: Transform) -> Array:
     # The camera is at -R' t of the keyframe; the step's turn and shift are in the camera's own axes.
     own[:3, :3], own[:3, 3:], own[3:, :3] = -_cross(step.translation), -np.eye(3), -np.eye(3)
     own = np.kron(np.eye(2), camera.rotation) @ own
-    return lever @ before.covariance @ lever.T + own @ step.covariance @ own.T  # type: ignore[no-any-return]
+    grown: Array = lever @ before.covariance @ lever.T + own @ step.covariance @ own.T
+    return grown
 
 
 def _cross(vector: Array) -> Array:

@@ -1,7 +1,7 @@
 """CheckTilt: can the tilt be believed? The camera and the ground it sees are asked, no truth is needed.
 
-Frames in which the rover has moved are kept, the last fifty of them, and `tilt_diagnosis` tries on them every fault that
-a tilt can have. A rover that stands still proves nothing and crowds nothing out.
+Frames between which the rover has moved are kept, the last fifty of them, and `tilt_diagnosis` tries on them every
+fault that a tilt can have. A rover that stands still proves nothing and crowds nothing out.
 """
 
 from __future__ import annotations

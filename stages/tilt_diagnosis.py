@@ -105,7 +105,8 @@ def diagnose(evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_off
     gain = sound.score(variance) - best.score(variance)
     before, after = (NOISE * np.sqrt(cause.misfit / free) for cause in (sound, best))
     if gain > MARGIN and best.size > 1:
-        rivals = [c for c in causes if c is not best and c.size > 1 and c.score(variance) < best.score(variance) + RIVAL]
+        near = best.score(variance) + RIVAL
+        rivals = [cause for cause in causes if cause is not best and cause.size > 1 and cause.score(variance) < near]
         return _named(best, rivals, n, float(before), float(after))
     return _passed(sound, axes, mount, offset, variance, n, float(before))
 
@@ -247,8 +248,8 @@ def _wild(evidence: Evidence) -> Diagnosis | None:
         return None
     sentence = (
         f"degrees are taken for radians: between frames up swings by {_deg(swing)} while the camera turns by "
-        f"{_deg(turn)} ({len(near)} pairs of frames); check the unit of source.pitch and source.roll (deg, not rad), or "
-        "the inclinometer's driver"
+        f"{_deg(turn)} ({len(near)} pairs of frames); check the unit of source.pitch and source.roll (deg, not rad), "
+        "or the inclinometer's driver"
     )
     return Diagnosis("degrees are taken for radians", sentence, True, swing)
 
