@@ -9,7 +9,7 @@ horizontal heading, y left.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from types import MappingProxyType
@@ -209,6 +209,17 @@ class Tilt:
     def interpolated(self, later: Tilt, stamp: int) -> Tilt:
         """The tilt at `stamp`, between this one and a later one, along the great circle."""
         return Tilt(stamp, _slerp(self.up, later.up, _share(self.stamp, later.stamp, stamp)), self.frame_id)
+
+    @staticmethod
+    def smoothed(samples: Sequence[Tilt], stamp: int) -> Tilt:
+        """The tilt at `stamp` by the straight line, in time, that fits three samples about it or more."""
+        seconds = (np.array([sample.stamp for sample in samples]) - stamp) / 1e9
+        line = np.column_stack([np.ones_like(seconds), seconds])
+        up = np.linalg.lstsq(line, np.array([sample.up for sample in samples]), rcond=None)[0][0]
+        length = float(np.linalg.norm(up))
+        if not length > 0.5:
+            raise ValueError("Tilt.smoothed: the samples point all ways")
+        return Tilt(stamp, up / length, samples[0].frame_id)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,7 @@ class _Memory:
     world: Transform | None = None
     covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     motion: CameraMotion | None = None
+    way: float = 0.0  # m driven in the segment
     visual: int = 0
 
 
@@ -42,7 +43,10 @@ class Locate(Stage):
     tilt_bias: float = parameter(
         np.deg2rad(0.1), "error of all tilts alike, which no filter lowers", unit="rad", low=0.0, high=0.2
     )
-    scale_error: float = parameter(0.005, "error of the stereo baseline and focal length, as a share", low=0.0)
+    scale_error: float = parameter(0.005, "error of all steps' length alike, as a share; half of it sideways", low=0.0)
+    turn_error: float = parameter(
+        np.deg2rad(0.015), "error of all steps' turn alike, per metre of way", unit="rad", low=0.0, high=0.1
+    )
     _memory: _Memory = field(default_factory=_Memory, init=False, repr=False, compare=False)
 
     ordered: ClassVar[bool] = True
@@ -77,9 +81,11 @@ class Locate(Stage):
         if before is None or before.camera is None or memory.world is None or motion.segment != before.segment:
             memory.world = level_transform(tilt, mount, camera.child, camera_height=0.0)
             memory.covariance = np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0])
+            memory.way = 0.0
             return
         world = memory.world.after(before.camera.inverse().after(camera))
         covariance = _grown(memory.covariance, world, memory.world, before, motion)
+        memory.way += float(np.linalg.norm(world.translation - memory.world.translation))
         # What the tilt says is where up is: the turns about the two level axes.
         up = world.rotation @ mount.camera_from_inclinometer @ tilt.up
         gain = covariance[:, 3:5] @ np.linalg.inv(covariance[3:5, 3:5] + self.tilt_noise**2 * np.eye(2))
@@ -93,14 +99,26 @@ class Locate(Stage):
         assert memory.world is not None
         base = mount.base_from_camera
         placed = memory.world if base is None else memory.world.after(base.inverse())
-        covariance = memory.covariance.copy()
-        covariance[:3, :3] += self.scale_error**2 * np.outer(placed.translation, placed.translation)
-        covariance[3, 3] += self.tilt_bias**2
-        covariance[4, 4] += self.tilt_bias**2
+        alike = self._alike(placed.translation, memory.way)
+        covariance = memory.covariance + alike.T @ alike
         return Pose(
             motion.stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),
             _frame_of(motion.segment), placed.child, covariance,
         )  # fmt: skip
+
+
+    def _alike(self, place: Array, way: float) -> Array:
+        """The errors (5, 6) of position and turn, one standard deviation each, that are the same in all steps: of their
+        length, of their direction, of their turn (which bends the way by half of it), and of up about both level axes."""
+        x, y, z = place
+        turned, bias = self.turn_error * way, self.tilt_bias
+        return np.array([
+            [self.scale_error * x, self.scale_error * y, self.scale_error * z, 0, 0, 0],
+            [-self.scale_error / 2 * y, self.scale_error / 2 * x, 0, 0, 0, 0],
+            [-turned / 2 * y, turned / 2 * x, 0, 0, 0, turned],
+            [0, -bias * z, bias * y, bias, 0, 0],
+            [bias * z, 0, -bias * x, 0, bias, 0],
+        ])  # fmt: skip
 
 
 def _grown(covariance: Array, now: Transform, then: Transform, before: CameraMotion, motion: CameraMotion) -> Array:

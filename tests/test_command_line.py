@@ -27,7 +27,8 @@ from tests.recordings.middlebury_scene import write_scene
 ROOT = Path(__file__).parent.parent
 SMALL = ("--set", "matched.disparities=64")
 RESULTS = {
-    "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/nav/pose", "/tf", "/nav/diagnostics",
+    "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/nav/pose", "/tf",
+    "/nav/diagnostics",
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Every fault that a tilt can have is named within fifty frames, and no sound log is accused: slow, so `make check-all`.
+"""Every fault of a tilt is named within fifty frames, and no sound log is accused: slow, so run by `make check-all`.
 
 The logs are simulated traverses of 50 frames at the rate and speed of the simulator's default; the inclinometer has a
 noise of 0.3 degrees a sample.
