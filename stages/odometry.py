@@ -37,6 +37,7 @@ class VisualOdometry(Stage):
     """Tracks the camera through the frames; it remembers, so it takes them in order."""
 
     least: int = parameter(40, "features that must agree on a motion", low=6)
+    worst: float = parameter(2.0, "root mean square reprojection error beyond which they do not", unit="px", low=0.1)
     fastest: float = parameter(5.0, "a motion between two frames beyond it is taken for a mistake", unit="m", low=0.0)
     keep: float = parameter(0.03, "a keyframe stays while features move less, in widths of the image", low=0.0)
     share: float = parameter(0.5, "and while this share of its features is still tracked", low=0.0, high=1.0)
@@ -56,7 +57,7 @@ class VisualOdometry(Stage):
         memory, seen = self._memory, view(frame, disparity)
         before = memory.keyframe
         step = step_between(before.view, seen, self.least) if before is not None else None
-        if before is not None and step is not None and np.linalg.norm(step.translation) <= self.fastest:
+        if before is not None and step is not None and self._likely(step):
             return self._followed(frame.stamp, before, step, seen)
         return self._begun(frame, seen)
 
@@ -73,6 +74,9 @@ class VisualOdometry(Stage):
         if memory.blind:
             parts.append(f"{memory.blind} {'frame shows' if memory.blind == 1 else 'frames show'} too little to track")
         return "; ".join(parts)
+
+    def _likely(self, step: Step) -> bool:
+        return step.error <= self.worst and float(np.linalg.norm(step.translation)) <= self.fastest
 
     def _followed(self, stamp: int, before: _Keyframe, step: Step, seen: View) -> CameraMotion:
         memory = self._memory

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.stage import Stage, parameter
-from stages.tilt_diagnosis import Diagnosis, Evidence, diagnose
+from stages.tilt_diagnosis import INCONSISTENT, Diagnosis, Evidence, diagnose
 
 MOVED = 0.05  # m, or
 TURNED = float(np.deg2rad(0.3))  # rad, by which a frame must differ from the one kept before
@@ -126,7 +126,9 @@ class CheckTilt(Stage):
         )  # fmt: skip
         memory.judged, memory.since = diagnose(evidence, self.least_angle, self.least_offset), 0
         if memory.judged.fault:
-            memory.fault, memory.faults = memory.judged, memory.faults + 1
+            memory.faults += 1
+            if memory.fault is None or memory.judged.fault != INCONSISTENT:  # as where a fault begins or ends
+                memory.fault = memory.judged
         if memory.judged.fault or memory.judged.clear:
             memory.judgements += 1
 

@@ -20,12 +20,14 @@ from stages.data import Array
 NOISE = float(np.deg2rad(0.2))  # of a tilt, against which the camera's own drift is weighed; the real one is estimated
 LEAST_NOISE = float(np.deg2rad(0.05))
 GROUND = float(np.deg2rad(8))  # standard deviation of the slope of all ground in view
+NOISIEST = float(np.deg2rad(2.0))  # beyond it tilt and camera do not agree, whatever the best explanation
 MARGIN = 25.0  # by how much a fault must fit better than none, in units of the noise's variance: five sigma
 RIVAL = 10.0  # and than other faults, or they are named with it
 SAME = 0.3  # difference of two rotations, as a matrix, below which they are one fault under two names
 HIDDEN = 0.33  # standard deviation of a fault, over the least that counts, beyond which a fault could go unseen
 PARAMETER = 4.0  # by how much a fault must fit better for each number that is fitted to it
 LEAST_FRAMES = 8
+INCONSISTENT = "inconsistent"  # the fault of a tilt that no single fault explains
 LONGEST = 0.6  # s, of time offsets that are tried
 SLOWEST = 1.5  # s between frames, beyond which no offset can be told
 WILD = 4.0  # how many times more than the camera the tilt must turn to have a wrong unit
@@ -96,6 +98,7 @@ def diagnose(evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_off
     axes = [
         _Cause(fault, remedy, fit.misfit(undo), fit.slope(undo), 1, undone=evidence.mount @ undo)
         for fault, remedy, undo in _exchanges()
+        if undo[2, 2] > 0 or fit.normal is not None  # a motion alone does not tell up from down
     ]
     causes = [*axes, *_scaled(fit), mount, *([offset] if offset else [])]
     # Noise is what the best explanation leaves; the ground has no say in that.
@@ -112,18 +115,22 @@ def diagnose(evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_off
 
 
 def _named(best: _Cause, rivals: list[_Cause], n: int, before: float, after: float) -> Diagnosis:
-    if after > np.deg2rad(2.0):
-        sentence = (
-            f"the tilt and the camera's own turns disagree by {_deg(before)} ({n} frames), and no single fault of the "
-            "inclinometer explains it; check its axes, its unit, its mount and its clock"
-        )
-        return Diagnosis("inconsistent", sentence, True, before)
+    if after > NOISIEST:
+        return _inconsistent(n, before)
     fault = " or ".join([best.fault, *(rival.fault for rival in rivals if not _same(best, rival))])
     sentence = (
         f"{fault}: undone, tilt and camera agree to {_deg(after)}, as they stand to {_deg(before)} ({n} frames); "
         f"{best.remedy}"
     )
     return Diagnosis(fault, sentence, True, after)
+
+
+def _inconsistent(n: int, residual: float) -> Diagnosis:
+    sentence = (
+        f"tilt and camera disagree by {_deg(residual)} ({n} frames), and no single fault of the inclinometer explains "
+        "it; check its axes, its unit, its mount, its clock, and whether it is shaken"
+    )
+    return Diagnosis(INCONSISTENT, sentence, True, residual)
 
 
 def _same(one: _Cause, other: _Cause) -> bool:
@@ -137,6 +144,8 @@ def _passed(
     sound: _Cause, axes: list[_Cause], mount: _Cause, offset: _Cause | None, variance: float, n: int, residual: float
 ) -> Diagnosis:
     """The verdict where no fault is found: that there is none, or that the motion cannot tell."""
+    if residual > NOISIEST:
+        return _inconsistent(n, residual)
     if sound.ground > MARGIN:
         slope = GROUND * np.sqrt(sound.ground)
         sentence = (
