@@ -125,8 +125,7 @@ class _Sampler:
     clock = "at"
     patience: int
 
-    @staticmethod
-    def output(kinds: dict[str, type]) -> type:
+    def output(self, kinds: dict[str, type]) -> type:
         """The type of the samples."""
         return kinds["stream"]
 
@@ -161,11 +160,11 @@ class Interpolate(_Sampler):
         """How far before a stamp samples are wanted, ns."""
         return self.smooth
 
-    @staticmethod
-    def output(kinds: dict[str, type]) -> type:
-        """The type of the samples; raises TypeError where they cannot be interpolated."""
-        if not hasattr(kinds["stream"], "interpolated"):
-            raise TypeError(f"a {kinds['stream'].__name__} cannot be interpolated")
+    def output(self, kinds: dict[str, type]) -> type:
+        """The type of the samples; raises TypeError where they cannot be interpolated, or not be smoothed."""
+        for method in ("interpolated", "smoothed") if self.smooth else ("interpolated",):
+            if not hasattr(kinds["stream"], method):
+                raise TypeError(f"a {kinds['stream'].__name__} cannot be {method}")
         return kinds["stream"]
 
     def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:

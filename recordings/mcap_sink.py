@@ -111,7 +111,7 @@ class McapSink:
 
 def _health(stream: str, health: TiltHealth) -> tuple[int, str, str, dict[str, str]]:
     """The diagnostic status of a tilt's health."""
-    angles = {"tilt off the camera's turn": health.turn, "ground off level": health.ground}
+    angles = {"tilt off turn": health.turn, "ground off level": health.ground}
     values = {name: f"{math.degrees(angle):.3f} deg" for name, angle in angles.items() if math.isfinite(angle)}
     values |= {"frames": str(health.frames), "fault": health.fault}
     return _WARN if health.fault else _OK, stream, health.judgement, values

@@ -106,10 +106,9 @@ class Locate(Stage):
             _frame_of(motion.segment), placed.child, covariance,
         )  # fmt: skip
 
-
     def _alike(self, place: Array, way: float) -> Array:
         """The errors (5, 6) of position and turn, one standard deviation each, that are the same in all steps: of their
-        length, of their direction, of their turn (which bends the way by half of it), and of up about both level axes."""
+        length, of their direction, of their turn (which bends the way by half of it), and of up about two axes."""
         x, y, z = place
         turned, bias = self.turn_error * way, self.tilt_bias
         return np.array([

@@ -192,7 +192,8 @@ def smoothing(readings, at, smooth, **rule):
 
 def test_smoothing_takes_all_samples_about_the_stamp_and_waits_for_them():
     noisy = [(10 * count, float(count) + (0.3 if count % 2 else -0.3)) for count in range(30)]
-    assert values(smoothing(noisy, [100, 205], 40)) == [(100, pytest.approx(9.967, abs=1e-3)), (205, pytest.approx(20.5))]
+    found = values(smoothing(noisy, [100, 205], 40))
+    assert found == [(100, pytest.approx(9.967, abs=1e-3)), (205, pytest.approx(20.5))]
 
 
 def test_smoothing_reaches_as_far_back_as_ahead_even_where_frames_follow_each_other_fast():
@@ -205,3 +206,9 @@ def test_smoothing_does_not_lag_at_either_end_of_the_stream_and_gaps_are_gaps():
     ramp = [(10 * count, float(count)) for count in range(8)]
     assert values(smoothing(ramp, [5, 12, 65], 50)) == [(5, 0.5), (12, pytest.approx(1.0)), (65, 6.5)]
     assert reasons(smoothing([(0, 0.0), (10, 1.0), (90, 9.0), (100, 10.0)], [50], 50)) == [Reason.UNALIGNED]
+
+
+def test_what_cannot_be_smoothed_is_refused_before_anything_runs():
+    with pytest.raises(TypeError, match="a Number cannot be smoothed"):
+        Interpolate(smooth=10).output({"stream": Number, "at": Number})
+    assert Interpolate(smooth=10).output({"stream": Reading, "at": Number}) is Reading

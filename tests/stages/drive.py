@@ -1,4 +1,4 @@
-"""A simulated drive as the camera and the inclinometer live through it, without its images: fast enough for statistics."""
+"""A simulated drive as camera and inclinometer live through it, without its images: fast enough for statistics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ SMOOTHED = 0.45  # of a sample's noise is left in the mean of those about a fram
 @lru_cache(maxsize=8)
 def simulation(seed: int, slope: float) -> Simulation:
     """A drive whose ground has this RMS slope, degrees."""
-    return Simulation(frames=FRAMES, seed=seed, slope=float(np.radians(slope)), relief_cells=512, relief_resolution=0.08)
+    tile = {"relief_cells": 512, "relief_resolution": 0.08}
+    return Simulation(frames=FRAMES, seed=seed, slope=float(np.radians(slope)), **tile)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,7 @@ def test_a_filled_disparity_is_no_place_in_space(drive):
 
 def test_disparities_of_another_size_are_refused(drive):
     frame, disparity = drive[0][0]
-    half = Disparity(0, *(layer[::2, ::2].copy() for layer in (disparity.pixels, disparity.source, disparity.confidence)))
+    layers = disparity.pixels, disparity.source, disparity.confidence
+    half = Disparity(0, *(layer[::2, ::2].copy() for layer in layers))
     with pytest.raises(ValueError, match="join the disparity with the rectified frame"):
         VisualOdometry()(frame, half)
