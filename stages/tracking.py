@@ -16,7 +16,7 @@ from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
 
 DETECTION_WIDTH = 640  # px; features are looked for in an image of at most about this width
-FEATURES = 700
+FEATURES = 1500
 ALIKE = 64  # largest Hamming distance of a pair, of 256 bits
 DISTINCT = 0.85  # largest ratio of the distance to that of the next best (Lowe, 2004)
 COARSE = 3.0  # px of the detection image, reprojection error of an inlier of RANSAC
