@@ -28,6 +28,7 @@ class Token:
 
 # How long, ns of log time, samples are kept for messages that are logged later than they are stamped.
 HISTORY = 10_000_000_000
+SMOOTHED = 3  # samples that smoothing needs; a line through two smooths nothing
 
 Answer = Token | Entry
 Answers = Iterable[Answer]
@@ -124,10 +125,14 @@ class _Sampler:
     clock = "at"
     patience: int
 
-    @staticmethod
-    def output(kinds: dict[str, type]) -> type:
+    def output(self, kinds: dict[str, type]) -> type:
         """The type of the samples."""
         return kinds["stream"]
+
+    @property
+    def reach(self) -> int:
+        """How far before a stamp samples are wanted, ns."""
+        return 0
 
     def start(self, name: str, inputs: dict[str, str]) -> SamplerState:
         """A running aligner; `inputs` maps ports to stream names."""
@@ -140,29 +145,50 @@ class _Sampler:
 
 @dataclass(frozen=True)
 class Interpolate(_Sampler):
-    """Interpolates `stream` at the stamps of `at`, through the earlier sample's `interpolated(later, stamp)`."""
+    """Interpolates `stream` at the stamps of `at`, through the earlier sample's `interpolated(later, stamp)`.
+
+    With `smooth`, all samples that near to the stamp take part, where there are three and more, through the type's
+    `smoothed(samples, stamp)`; as far on one side as on the other, so that nothing lags.
+    """
 
     max_gap: int = _parameter(200_000_000, "largest distance between the two neighbours")
     patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for the later neighbour")
+    smooth: int = _parameter(0, "how far from the stamp samples take part; 0: the two neighbours")
 
-    @staticmethod
-    def output(kinds: dict[str, type]) -> type:
-        """The type of the samples; raises TypeError where they cannot be interpolated."""
-        if not hasattr(kinds["stream"], "interpolated"):
-            raise TypeError(f"a {kinds['stream'].__name__} cannot be interpolated")
+    @property
+    def reach(self) -> int:
+        """How far before a stamp samples are wanted, ns."""
+        return self.smooth
+
+    def output(self, kinds: dict[str, type]) -> type:
+        """The type of the samples; raises TypeError where they cannot be interpolated, or not be smoothed."""
+        for method in ("interpolated", "smoothed") if self.smooth else ("interpolated",):
+            if not hasattr(kinds["stream"], method):
+                raise TypeError(f"a {kinds['stream'].__name__} cannot be {method}")
         return kinds["stream"]
 
     def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
         before, after = _neighbours(samples, stamp)
-        if before is not None and before.stamp == stamp:
-            return before.value
-        if after is None and not final:
+        exact = before is not None and before.stamp == stamp
+        if not final and (after is None or samples[-1].stamp < stamp + self.smooth) and (self.smooth or not exact):
             return None
+        if before is not None and exact and (after is None or not self.smooth):
+            return before.value
         if before is None or after is None:
             return f"no {name} sample {'before' if before is None else 'after'} it"
         if after.stamp - before.stamp > self.max_gap:
             return f"{name} has a gap of {_ms(after.stamp - before.stamp)}, more than {_ms(self.max_gap)}"
+        near = self._near(samples, stamp)
+        if len(near) >= SMOOTHED:
+            return joined(name, before, after, lambda a, _, at: a.smoothed(near, at), stamp)
         return joined(name, before, after, lambda a, b, at: a.interpolated(b, at), stamp)
+
+    def _near(self, samples: deque[Token], stamp: int) -> list[Any]:
+        """The samples that `smooth` allows, as far on one side of the stamp as on the other."""
+        if not self.smooth:
+            return []
+        width = min(self.smooth, stamp - samples[0].stamp, samples[-1].stamp - stamp)
+        return [sample.value for sample in samples if abs(sample.stamp - stamp) <= width]
 
 
 @dataclass(frozen=True)
@@ -249,7 +275,7 @@ class SamplerState:
     def _forget(self, log_time: int) -> None:
         """Drop the samples before the last one at or before every stamp to come, and those beyond `HISTORY`."""
         while len(self.samples) > 1 and (
-            (self.passed is not None and self.samples[1].stamp <= self.passed)
+            (self.passed is not None and self.samples[1].stamp <= self.passed - self.rule.reach)
             or (not self.wanted and self.arrivals[1] + HISTORY < log_time)
         ):
             self.samples.popleft(), self.arrivals.popleft()

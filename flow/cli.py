@@ -276,7 +276,7 @@ def _as_json(summary: dict[str, Any]) -> dict[str, Any]:
 def _report(summary: dict[str, Any]) -> None:
     rate = f"{summary['frames_per_second']:.2f} frames/s"
     _say(f"{summary['verdict']}: {summary['frames_out']} of {summary['frames_in']} frames whole, {rate}")
-    for stream, finding in summary["surveys"].items():
+    for stream, finding in [*summary["surveys"].items(), *summary["findings"].items()]:
         _say(f"  {stream}: {finding}")
     for reason, number in summary["drops"].items():
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)

@@ -18,7 +18,7 @@ from flow.engine import Engine
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.feeder import Event, Feeder
 from flow.graph import Graph, Sink
-from flow.ledger import Ledger, Verdict
+from flow.ledger import Ledger, Verdict, failure
 from flow.survey import surveyed
 
 
@@ -108,7 +108,7 @@ def run(
     """Run an opened log through `graph`; returns the summary.
 
     log: iterates over (log time, stream, item), has `missing` (stream -> why the log cannot provide it), and where
-    stages survey it `excerpts` (see flow.survey).
+    stages survey it `excerpts` (see flow.survey). Of a stage that has a `finding`, a sentence, it is read at the end.
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
     closed and readable by then.
@@ -119,16 +119,16 @@ def run(
         raise UsageError(str(error)) from None
     stop, ledger = stop or Stop(), Ledger()
     wall, cpu = time.perf_counter(), time.process_time()
-    findings = dict[str, str]()
+    surveys = dict[str, str]()
     with suppress(_StoppedError):
-        graph, findings = surveyed(graph, lambda *which: (_events(part, stop) for part in log.excerpts(*which)))
+        graph, surveys = surveyed(graph, lambda *which: (_events(part, stop) for part in log.excerpts(*which)))
     streams = graph.frame_streams
     used = {use: sink for use, sink in graph.sinks if use in outputs}
     wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
     sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
     feeder, engine, finished = Feeder(graph, ledger), None, False
     try:
-        if sinks.open(streams, {**(about or {}), "surveys": "\n".join(map(": ".join, findings.items()))}):
+        if sinks.open(streams, {**(about or {}), "surveys": "\n".join(map(": ".join, surveys.items()))}):
             engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
             try:
                 finished = _feed(feeder, log, engine, stop)
@@ -143,11 +143,23 @@ def run(
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
-            "surveys": findings,
+            "surveys": surveys,
+            "findings": _findings(graph),
             "outputs": [str(outputs[use]) for use in used],
         }
         sinks.close(summary)
     return summary
+
+
+def _findings(graph: Graph) -> dict[str, str]:
+    """What stages have to say at the end of a run (stream -> sentence): the `finding` of those that have one."""
+    said = dict[str, str]()
+    for node in graph.stages:
+        try:
+            said[node.name] = str(getattr(node.actor, "finding", ""))
+        except Exception as error:  # no reason to leave the outputs open
+            said[node.name] = failure(error)
+    return {name: sentence for name, sentence in said.items() if sentence}
 
 
 class _StoppedError(Exception):

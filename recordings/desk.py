@@ -43,6 +43,8 @@ class Panel(Enum):
     MAP = auto()
     REASON = auto()
     ANGLE = auto()
+    HEALTH = auto()
+    FEATURES = auto()
     STAGE = auto()
 
 
@@ -160,6 +162,13 @@ def _maps(drawn: Places) -> _Part | None:
     return _stack([_tabs([*reliefs, *layers], active=0), _tabs([*maps, *reasons], active=0)])
 
 
+def _series(drawn: Places, panel: Panel, title: str) -> _View | None:
+    """What hangs in a panel, over time."""
+    contents = [f"+ /{place.path}/**" for place in _at(drawn, panel)]
+    legend = rrb.PlotLegend("LeftTop")
+    return rrb.TimeSeriesView(origin="/", contents=contents, name=title, plot_legend=legend) if contents else None
+
+
 def _below(drawn: Places) -> _Part:
     """Stage times, queues and angles over time, and the ledger with the run's summary behind it."""
     plots: list[_Part] = []
@@ -168,10 +177,10 @@ def _below(drawn: Places) -> _Part:
         if any(place.path.startswith(f"{root}/") for place in _at(drawn, Panel.STAGE)):
             plots.append(rrb.TimeSeriesView(origin=root, name=title, plot_legend=rrb.PlotLegend("LeftTop")))
             shares.append(1.4)
-    angles = [f"+ /{place.path}/**" for place in _at(drawn, Panel.ANGLE)]
-    if angles:
-        legend = rrb.PlotLegend("LeftTop")
-        plots.append(rrb.TimeSeriesView(origin="/", contents=angles, name="tilt (degrees)", plot_legend=legend))
+    panels = ((Panel.ANGLE, "tilt (degrees)"), (Panel.HEALTH, "tilt check (degrees)"), (Panel.FEATURES, "odometry"))
+    angles = _tabs((_series(drawn, panel, title) for panel, title in panels), active=0)
+    if angles is not None:
+        plots.append(angles)
         shares.append(1.1)
     shown = rrb.TextLogColumns(
         timeline_columns=[TimelineColumn(CLOCK, visible=False), TimelineColumn(FRAME)],

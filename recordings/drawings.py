@@ -15,10 +15,11 @@ import numpy as np
 import rerun as rr
 
 from recordings import paint
-from recordings.desk import Panel, Place
+from recordings.desk import LEDGER, Panel, Place
 from stages.data import (
     LEVEL_FRAME,
     Array,
+    CameraMotion,
     Cell,
     Disparity,
     ElevationMap,
@@ -28,6 +29,7 @@ from stages.data import (
     Source,
     StereoFrame,
     Tilt,
+    TiltHealth,
     VoxelMap,
 )
 
@@ -66,6 +68,7 @@ class Canvas:
     jpeg_quality: int
     max_points: int
     hung: dict[tuple[Panel, str], Place] = field(default_factory=dict)
+    _said: dict[str, str] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
 
@@ -75,6 +78,12 @@ class Canvas:
         self._now[path] = type(archetype)
         for place in places:
             self.hung.setdefault((place.panel, place.path), place)
+
+    def say(self, path: str, text: str, level: rr.TextLogLevel) -> None:
+        """A line in the ledger, where it is not what `path` said last."""
+        if self._said.get(path) != text:
+            self._said[path] = text
+            self.recording.log(f"{LEDGER}/{path}", rr.TextLog(text, level=level))
 
     def photograph(self, path: str, pixels: Array, place: Place) -> None:
         """An image (H, W) gray or (H, W, 3) RGB, 8 or 16 bit, as JPEG."""
@@ -197,6 +206,25 @@ def draw_pose(canvas: Canvas, path: str, pose: Pose) -> None:
     arrow = rr.Arrows3D(origins=[pose.position], vectors=[0.4 * forward], colors=[AMBER])
     place = Place(Panel.TRAJECTORY, f"{path}/trajectory", f"{path} ({pose.frame_id})", pose.frame_id)
     canvas.log(place.path, arrow, place)
+
+
+@draws(CameraMotion)
+def draw_motion(canvas: Canvas, path: str, motion: CameraMotion) -> str:
+    """How many features the camera was tracked by."""
+    place = Place(Panel.FEATURES, path, path)
+    canvas.log(f"{path}/features", rr.Scalars(float(motion.inliers)), place)
+    return f"{path}: {motion.lost}" if motion.lost else f"{path} {motion.inliers} features"
+
+
+@draws(TiltHealth)
+def draw_health(canvas: Canvas, path: str, health: TiltHealth) -> str:
+    """Tilt against the camera's own turns and against the ground in view, in degrees; what is wrong, in words."""
+    for name, angle in (("tilt off turn", health.turn), ("ground off level", health.ground)):
+        if np.isfinite(angle):
+            place = Place(Panel.HEALTH, path, path)
+            canvas.log(f"{path}/{rr.escape_entity_path_part(name)}", rr.Scalars(float(np.degrees(angle))), place)
+    canvas.say(path, health.judgement, rr.TextLogLevel.ERROR if health.fault else rr.TextLogLevel.INFO)
+    return f"{path}: {health.fault}" if health.fault else ""
 
 
 @draws(ElevationMap)

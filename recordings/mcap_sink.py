@@ -6,6 +6,7 @@ differs between two equal runs goes in (no times of day, no durations): equal ru
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +24,7 @@ from recordings.ros2 import (
     point_cloud,
     transform_message,
 )
-from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, Transform
+from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
 
 _BUILDERS: dict[type, Callable[[Any], Any]] = {
     Disparity: disparity_image,
@@ -32,19 +33,20 @@ _BUILDERS: dict[type, Callable[[Any], Any]] = {
     NavigationMap: occupancy_grid,
     Pose: odometry,
 }
-_OK, _ERROR = 0, 2  # levels of diagnostic_msgs/DiagnosticStatus
+_OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/DiagnosticStatus
 _COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
 
 
 @dataclass
 class McapSink:
-    """Writes streams to /nav/<stream>, the frame's transforms to /tf, its losses to /nav/diagnostics.
+    """Writes streams to /nav/<stream>, the frame's transforms to /tf, its losses to /nav/diagnostics; there too what is
+    known of the tilt's health, and at the end the findings of the run.
 
     results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each.
     """
 
     results: tuple[str, ...] = (
-        "disparity", "points", "elevation_map", "navigation_map", "regional_map", "regional_navigation_map",
+        "disparity", "points", "elevation_map", "navigation_map", "pose", "regional_map", "regional_navigation_map",
     )  # fmt: skip
 
     suffix = ".mcap"
@@ -55,7 +57,7 @@ class McapSink:
     def wants(self, stream: str, kind: type) -> bool:
         """Whether a stream of data of type `kind` is to be written. Raises LogError where it is but cannot be."""
         if stream not in self.results:
-            return False
+            return issubclass(kind, TiltHealth)
         if kind not in _BUILDERS:
             known = ", ".join(builder.__name__ for builder in _BUILDERS)
             raise LogError(
@@ -79,7 +81,8 @@ class McapSink:
         transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)
-        writer.write("/nav/diagnostics", diagnostics(stamp, _statuses(record.entries)), stamp)
+        health = [_health(name, item) for name, item in record.items.items() if isinstance(item, TiltHealth)]
+        writer.write("/nav/diagnostics", diagnostics(stamp, [*_statuses(record.entries), *health]), stamp)
         self._last_stamp = stamp
 
     def close(self, summary: Mapping[str, Any]) -> None:
@@ -88,12 +91,14 @@ class McapSink:
         if writer.closed:  # a write failed, which was told then
             return
         entries = list(summary.get("entries", ()))
-        if entries:
-            latest = max(max(entry.stamp for entry in entries), 0)
+        findings = [(_OK, stream, text, {"finding": text}) for stream, text in summary.get("findings", {}).items()]
+        if entries or (findings and self._last_stamp is not None):
+            latest = max([0, *(entry.stamp for entry in entries)])
             stamp = latest if self._last_stamp is None else self._last_stamp
-            writer.write("/nav/diagnostics", diagnostics(stamp, _statuses(entries)), stamp)
+            lost = _statuses(entries) if entries else []
+            writer.write("/nav/diagnostics", diagnostics(stamp, [*lost, *findings]), stamp)
         counts = {name: str(summary[name]) for name in _COUNTS if name in summary}
-        for group in ("drops", "messages"):
+        for group in ("drops", "messages", "findings"):
             counts |= {f"{group}.{name}": str(count) for name, count in summary.get(group, {}).items()}
         writer.metadata("roverflow.run", counts)
         writer.close()
@@ -110,6 +115,14 @@ def _transforms(items: Iterable[Any]) -> Iterator[Transform]:
         known = item.sensor if isinstance(item, PointCloud) else getattr(item, "level", None)
         if known is not None:
             yield known
+
+
+def _health(stream: str, health: TiltHealth) -> tuple[int, str, str, dict[str, str]]:
+    """The diagnostic status of a tilt's health."""
+    angles = {"tilt off turn": health.turn, "ground off level": health.ground}
+    values = {name: f"{math.degrees(angle):.3f} deg" for name, angle in angles.items() if math.isfinite(angle)}
+    values |= {"frames": str(health.frames), "fault": health.fault}
+    return _WARN if health.fault else _OK, stream, health.judgement, values
 
 
 def _statuses(entries: Iterable[LossEntry]) -> list[tuple[int, str, str, dict[str, str]]]:

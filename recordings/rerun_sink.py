@@ -22,7 +22,7 @@ from recordings.drawings import PICTURES, Canvas
 from recordings.errors import LogError
 from recordings.frame_record import FrameRecord, LossEntry
 from recordings.whole_file import give_name, temporary_name, unwritable
-from stages.data import Array, ElevationMap, StereoFrame
+from stages.data import Array, ElevationMap, Pose, StereoFrame
 
 RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well
 END = b"RRF2FOOT"  # the last magic number of a whole recording, before a checksum of 4 bytes
@@ -117,6 +117,8 @@ class RerunSink:
             level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
             text = f"{verdict}: {self._frames} frames{''.join(f', {drop}' for drop in drops)}"
             self._recording.log(LEDGER, rr.TextLog(text, level=level))
+            for stream, finding in dict(summary.get("findings", {})).items():
+                self._recording.log(LEDGER, rr.TextLog(f"{stream}: {finding}", level=rr.TextLogLevel.INFO))
             facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
             self._recording.log(SUMMARY, _document(verdict, self._about, facts), static=True)
             self._arrange()
@@ -199,8 +201,10 @@ def _together(items: Mapping[str, Any], kinds: tuple[type, ...]) -> Iterator[lis
 
 def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
     """Whether a later stream shows the same: stereo with the very same pixels, as where the log was rectified already,
-    or an elevation map of the same heights with layers added."""
+    an elevation map of the same heights with layers added, or the very same pose, as where the log has one."""
     mine, later = items[stream], islice(items.values(), list(items).index(stream) + 1, None)
+    if isinstance(mine, Pose):
+        return any(item is mine for item in later)
     if isinstance(mine, StereoFrame):
         frames = (item for item in later if isinstance(item, StereoFrame))
         return any(_same(item.left, mine.left) and _same(item.right, mine.right) for item in frames)

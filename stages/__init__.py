@@ -7,6 +7,7 @@ from stages.crosscheck import CrossCheck
 from stages.data import (
     CameraImage,
     CameraModel,
+    CameraMotion,
     Cell,
     Disparity,
     ElevationMap,
@@ -19,17 +20,21 @@ from stages.data import (
     StereoCamera,
     StereoFrame,
     Tilt,
+    TiltHealth,
     Transform,
     VoxelMap,
 )
 from stages.fuse import Fuse
 from stages.level import Level
+from stages.locate import Locate
 from stages.match import Match
 from stages.match_opencv import MatchOpenCV
+from stages.odometry import VisualOdometry
 from stages.rectify import Rectify
 from stages.refine import Refine
 from stages.reproject import Reproject
 from stages.scale import Enlarge, Halve, Swap
+from stages.tilt_check import CheckTilt
 from stages.voxelise import Voxelise
 from stages.voxels import Voxels
 
@@ -38,7 +43,9 @@ __all__ = [
     "Binarise",
     "CameraImage",
     "CameraModel",
+    "CameraMotion",
     "Cell",
+    "CheckTilt",
     "Clean",
     "CrossCheck",
     "Disparity",
@@ -47,6 +54,7 @@ __all__ = [
     "Fuse",
     "Halve",
     "Level",
+    "Locate",
     "Match",
     "MatchOpenCV",
     "Mount",
@@ -62,7 +70,9 @@ __all__ = [
     "StereoFrame",
     "Swap",
     "Tilt",
+    "TiltHealth",
     "Transform",
+    "VisualOdometry",
     "VoxelMap",
     "Voxelise",
     "Voxels",

@@ -9,7 +9,7 @@ horizontal heading, y left.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from types import MappingProxyType
@@ -215,6 +215,17 @@ class Tilt:
         """The tilt at `stamp`, between this one and a later one, along the great circle."""
         return Tilt(stamp, _slerp(self.up, later.up, _share(self.stamp, later.stamp, stamp)), self.frame_id)
 
+    @staticmethod
+    def smoothed(samples: Sequence[Tilt], stamp: int) -> Tilt:
+        """The tilt at `stamp` by the straight line, in time, that fits three samples about it or more."""
+        seconds = (np.array([sample.stamp for sample in samples]) - stamp) / 1e9
+        line = np.column_stack([np.ones_like(seconds), seconds])
+        up = np.linalg.lstsq(line, np.array([sample.up for sample in samples]), rcond=None)[0][0]
+        length = float(np.linalg.norm(up))
+        if not length > 0.5:
+            raise ValueError("Tilt.smoothed: the samples point all ways")
+        return Tilt(stamp, up / length, samples[0].frame_id)
+
 
 @dataclass(frozen=True, eq=False)
 class Pose:
@@ -262,6 +273,46 @@ class Mount:
     def __post_init__(self) -> None:
         publish_vector(self, "camera_from_inclinometer", (3, 3))
         check_rotation(self.camera_from_inclinometer, "Mount.camera_from_inclinometer")
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMotion:
+    """How the camera moved, by the images alone: nothing but they constrains it, gravity neither.
+
+    camera: the camera in the camera of the frame that began its segment, None where the images do not tell; segment:
+    counts from 1, a new one begins wherever tracking was lost, and nothing ties it to the one before; covariance:
+    (6, 6) of `camera`, of position (m) and of a turn (rad) about the fixed axes, which grows from step to step;
+    inliers: features that agree on the last step; error: their root mean square reprojection error, px (NaN for none);
+    lost: what to say where tracking was lost at this frame, else empty.
+    """
+
+    stamp: int
+    segment: int
+    camera: Transform | None
+    covariance: Array
+    inliers: int = 0
+    error: float = float("nan")
+    lost: str = ""
+
+    def __post_init__(self) -> None:
+        publish_vector(self, "covariance", (6, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class TiltHealth:
+    """Whether the tilt can be believed, judged by the camera and the ground it sees.
+
+    turn: rad, between the tilt and the one before carried along by the camera's motion; ground: rad, between up and the
+    upward normal of the ground in view; both NaN where unknown. frames: how many frames the judgement rests on. fault:
+    what is wrong, in a word or two, empty where nothing is or nothing can be told; judgement: a sentence.
+    """
+
+    stamp: int
+    turn: float
+    ground: float
+    frames: int
+    fault: str
+    judgement: str
 
 
 @dataclass(frozen=True, eq=False)

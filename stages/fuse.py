@@ -48,6 +48,10 @@ class Region:
     hides: bool = False
     cells: Tiles = field(default_factory=lambda: Tiles(CELL))
 
+    def begin(self, frame_id: str, stamp: int) -> None:
+        """Start anew, in another frame: nothing joins the two."""
+        self.frame_id, self.epoch, self.cells = frame_id, stamp, Tiles(CELL)
+
 
 @dataclass(frozen=True)
 class Fuse(Stage):
@@ -58,12 +62,14 @@ class Fuse(Stage):
     - elevation, minimum, maximum, m: means over frames, weighted by inverse variance;
     - variance, m^2: of the elevation against what lies about it. Frames see a cell alike and err alike: the share
       `shared` of the smallest variance stays, however many frames there are;
-    - count (points); first, last: when the evidence in the cell was gathered, s since the first frame of the run;
+    - count (points); first, last: when the evidence in the cell was gathered, s since the map's first frame;
       frames: how many it is from (at most 65535); contradictions: how often the height was contradicted;
     - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere.
 
     A frame contradicts a cell if it is off by more than `contradiction` standard deviations. Then the cell's evidence
     loses half its weight, and as soon as the newer is as sure, the newer takes its place.
+
+    Where the pose is in another frame than before, as after visual odometry lost its way, the map begins anew.
 
     The plane that joins a frame to the map is limited by what is expected of its errors (`tilt_sigma`, `height_sigma`).
     A small share of it is left in (`follow_tilt`, `follow_height`), so that in the long run the map follows gravity and
@@ -105,8 +111,8 @@ class Fuse(Stage):
         self._check(cloud, pose)
         placed = placement(cloud, pose, mount)
         local, row, col = local_cells(cloud, placed, self.resolution, self.region)
-        if self._map.last < 0:
-            self._map.frame_id, self._map.epoch = pose.frame_id, cloud.stamp
+        if pose.frame_id != self._map.frame_id:
+            self._map.begin(pose.frame_id, cloud.stamp)
         cells = self._map.cells.read(row, col, *local.shape)
         known = np.isfinite(local.layers["elevation"]) & np.isfinite(local.layers["variance"])
         seen = {name: local.layers[name][known].astype(np.float64) for name in local.layers}
@@ -131,11 +137,6 @@ class Fuse(Stage):
     def _check(self, cloud: PointCloud, pose: Pose) -> None:
         if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
             raise ValueError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
-        if self._map.last >= 0 and pose.frame_id != self._map.frame_id:
-            raise ValueError(
-                f"Fuse: the pose is in frame '{pose.frame_id}', the map in '{self._map.frame_id}'; give poses of one "
-                "frame"
-            )
         if cloud.stamp <= self._map.last:
             raise ValueError(f"Fuse: the cloud of {cloud.stamp} ns comes after that of {self._map.last} ns")
 

@@ -21,13 +21,16 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from flow.cli import main
+from recordings.ros2 import iter_messages
+from recordings.simulator import Simulation
+from recordings.simulator.traverse import level_pose
 from tests.conftest import FRAMES, rewrite
 from tests.recordings.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
 SMALL = ("--set", "disparities=64")
 RESULTS = {
-    "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/nav/regional_map",
+    "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/nav/pose", "/nav/regional_map",
     "/nav/regional_navigation_map", "/tf", "/nav/diagnostics",
 }  # fmt: skip
 
@@ -66,6 +69,31 @@ def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
     assert summary["surveys"]["rectified"].endswith("too little to correct")
     assert summary["seconds"]["matched"] > 0
     assert set(summary["seconds"]) >= {"rectified", "disparity", "points", "elevation_map", "navigation_map"}
+
+
+def test_a_log_without_a_pose_gets_one_that_says_it_is_visual(traverse, tmp_path, capsys):
+    poses = ("/odometry", "/tf")
+    log = rewrite(traverse, tmp_path / "log.mcap", lambda topic, _, data: None if topic in poses else data)
+    out, summary = tmp_path / "out.mcap", tmp_path / "out.json"
+    assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd", "--summary", summary) == 0
+    poses = [message for topic, _, message in iter_messages(out) if topic == "/nav/pose"]
+    assert [(pose.header.frame_id, pose.child_frame_id) for pose in poses] == [("visual_odom", "base_link")] * FRAMES
+    simulation = Simulation(frames=FRAMES, width=320, height=240)
+    start = level_pose(simulation.base_at(simulation.stamp(0))).inverse()
+    for index, pose in enumerate(poses):
+        true = start.after(simulation.base_at(simulation.stamp(index))).translation
+        place = pose.pose.pose.position
+        assert np.linalg.norm([place.x - true[0], place.y - true[1], place.z - true[2]]) < 0.03
+    findings = json.loads(summary.read_text())["findings"]
+    assert findings["pose"] == f"the log has no pose; {FRAMES} by visual odometry, in visual_odom"
+    assert f"pose: {findings['pose']}" in capsys.readouterr().out
+
+
+def test_the_logs_own_pose_is_kept_and_the_tilt_judged_all_the_same(result):
+    poses = [message for topic, _, message in iter_messages(result) if topic == "/nav/pose"]
+    assert {pose.header.frame_id for pose in poses} == {"odom"}
+    findings = json.loads(result.with_suffix(".json").read_text())["findings"]
+    assert findings == {"health": f"too few frames to judge the tilt ({FRAMES})"}
 
 
 def test_a_pipeline_without_a_recording_writes_and_lists_none(traverse, tmp_path, capsys):

@@ -14,7 +14,7 @@ from flow.cli import main
 from recordings import ros2
 from tests.conftest import FRAMES, rewrite
 
-SMALL = ("--set", "matched.disparities=64")
+SMALL = ("--set", "disparities=64")
 REGIONAL = {"/nav/regional_map", "/nav/regional_navigation_map"}
 
 
@@ -43,19 +43,24 @@ def test_every_frame_gives_the_map_around_the_rover_in_the_pose_s_frame(result):
     assert np.count_nonzero(cells.cells == 0) > 2000
 
 
-def test_a_log_without_a_pose_is_run_without_a_regional_map(traverse, tmp_path, capsys):
-    log, out = (
-        rewrite(traverse, tmp_path / "log.mcap", lambda topic, _, data: None if topic == "/odometry" else data),
-        tmp_path / "out.mcap",
-    )
+def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tmp_path, capsys):
+    log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
+    rewrite(traverse, log, lambda topic, _, data: None if topic == "/odometry" else data)
     assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd") == 0
+    regional = [message for _, _, message in ros2.iter_messages(out, ["/nav/regional_map"])]
+    assert [message.header.frame_id for message in regional] == ["visual_odom"] * FRAMES
+    assert ros2.read_grid_map(regional[-1]).layers["frames"].max() == FRAMES
+
+
+def test_a_pipeline_that_fuses_nothing_has_its_frames_exported(traverse, tmp_path, capsys):
+    out = tmp_path / "out.mcap"
+    assert roverflow("run", traverse, "-p", "paper", *SMALL, "-o", out, "--no-rrd") == 0
     counts = Counter(topic for topic, _, _ in ros2.iter_messages(out))
     assert not REGIONAL & set(counts)
-    assert counts["/nav/navigation_map"] == FRAMES
     assert roverflow("export", out, tmp_path / "maps") == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "had no pose" in said
+    assert "the pipeline fuses nothing" in said
     assert "--frames" in said
     assert roverflow("export", out, tmp_path / "maps", "--frames") == 0
     assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == FRAMES
@@ -63,7 +68,9 @@ def test_a_log_without_a_pose_is_run_without_a_regional_map(traverse, tmp_path, 
 
 def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, capsys):
     assert roverflow("export", result, tmp_path / "maps") == 0
-    assert f"{tmp_path / 'maps'}: 14 files" in capsys.readouterr().out
+    files = sorted(path.name for path in (tmp_path / "maps").iterdir())
+    assert f"{tmp_path / 'maps'}: {len(files)} files" in capsys.readouterr().out
+    assert {"elevation.tif", "hillshade.png", "navigation_map.pgm", "navigation_map.yaml", "points.ply"} <= set(files)
     with rasterio.open(tmp_path / "maps" / "frames.tif") as file:
         assert file.read(1).max() == FRAMES
     with rasterio.open(tmp_path / "maps" / "elevation.tif") as file:

@@ -7,6 +7,7 @@ frames gave, in memory that grows with the ground seen and not with the rectangl
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -59,32 +60,48 @@ def _messages(result: Path, *topics: str) -> Iterator[tuple[int, dict[str, Any]]
         yield stamp, frame
 
 
-def _export_region(result: Path, out: Path) -> list[Path]:
-    terrain: Mosaic | None = None
+@dataclass(eq=False)
+class _Region:
+    """The regional map in one frame of reference, as far as it has been read."""
+
+    terrain: Mosaic
     navigation: Mosaic | None = None
-    colours, last = Tiles(_COLOUR), 0
+    colours: Tiles = field(default_factory=lambda: Tiles(_COLOUR))
+    last: int = 0
+
+    def write(self, out: Path) -> list[Path]:
+        about = f"roverflow: local frame '{self.terrain.frame_id}', metres, z up; up to {self.last} ns"
+        files = _write_maps(out, self.terrain, self.navigation, about)
+        return [*files, _write(out / "points.ply", _write_cells, self.terrain, self.colours, about)]
+
+
+def _export_region(result: Path, out: Path) -> list[Path]:
+    """The regional map in `out`; where it began anew in further frames of reference, a folder for each in `out`."""
+    regions: dict[str, _Region] = {}
     for stamp, frame in _messages(result, *REGION, POINTS):
         if REGION[0] in frame:
             given = _read(ros2.read_grid_map, frame[REGION[0]], result)
-            terrain, last = terrain or _terrain_mosaic(given, RIM), stamp
-            _lay_terrain(terrain, given)
+            region = regions.setdefault(given.frame_id, _Region(_terrain_mosaic(given, RIM)))
+            region.last = stamp
+            _lay_terrain(region.terrain, given)
             if POINTS in frame and "level" in frame:
                 points = _read(ros2.read_point_cloud, frame[POINTS], result)
-                _colour(colours, points, frame["level"], given.resolution)
-        if REGION[1] in frame:
-            cells = _read(ros2.read_occupancy_grid, frame[REGION[1]], result)
-            navigation = navigation or _navigation_mosaic(cells, RIM)
-            _lay_navigation(navigation, cells)
-    if terrain is None:
+                _colour(region.colours, points, frame["level"], given.resolution)
+            if REGION[1] in frame:
+                cells = _read(ros2.read_occupancy_grid, frame[REGION[1]], result)
+                region.navigation = region.navigation or _navigation_mosaic(cells, RIM)
+                _lay_navigation(region.navigation, cells)
+    if not regions:
         raise LogError(
             f"{result} holds no {REGION[0]}: the log it was made from had no pose, or the pipeline fuses nothing; add "
             "--frames to export the maps of every frame"
         )
-    if not terrain.close():
+    known = {name: region for name, region in regions.items() if region.terrain.close()}
+    if not known:
         raise LogError(f"no cell of {REGION[0]} in {result} is known: there is nothing to export")
-    about = f"roverflow: local frame '{terrain.frame_id}', metres, z up; up to {last} ns"
-    files = _write_maps(out, terrain, navigation, about)
-    return [*files, _write(out / "points.ply", _write_cells, terrain, colours, about)]
+    if len(known) == 1:
+        return next(iter(known.values())).write(out)
+    return [file for name, region in known.items() for file in region.write(out / name.replace("/", "-"))]
 
 
 def _export_frames(result: Path, out: Path) -> list[Path]:

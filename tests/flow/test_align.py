@@ -1,6 +1,7 @@
 """Alignment joins clocks as the stamps say, gives up in bounded time, and accounts for every message."""
 
 from collections import Counter
+from dataclasses import dataclass
 
 import pytest
 from hypothesis import given
@@ -165,3 +166,49 @@ def test_absence_passes_through_chained_aligners_with_one_entry():
     lost = Absent(Entry("level", 5, "level", Reason.FAILED, "broken"))
     answers = [*aligner.push("stream", 5, Token(5, lost)), *aligner.push("at", 5, Token(5, None)), *aligner.end()]
     assert reasons(answers) == [Reason.UNALIGNED]
+
+
+@dataclass(frozen=True)
+class Reading(Number):
+    """A number that can be averaged."""
+
+    def interpolated(self, later, stamp):
+        share = (stamp - self.stamp) / (later.stamp - self.stamp)
+        return Reading(stamp, (1 - share) * self.value + share * later.value)
+
+    @staticmethod
+    def smoothed(samples, stamp):
+        return Reading(stamp, sum(sample.value for sample in samples) / len(samples))
+
+
+def smoothing(readings, at, smooth, **rule):
+    aligner = Interpolate(smooth=smooth, max_gap=40, **rule).start("tilt", {"stream": "level", "at": "stereo"})
+    events = sorted([*((stamp, "stream", value) for stamp, value in readings), *((stamp, "at", 0.0) for stamp in at)])
+    answers = []
+    for stamp, port, value in events:
+        answers += [*aligner.tick(stamp), *aligner.push(port, stamp, Token(stamp, Reading(stamp, value)))]
+    return [*answers, *aligner.end()]
+
+
+def test_smoothing_takes_all_samples_about_the_stamp_and_waits_for_them():
+    noisy = [(10 * count, float(count) + (0.3 if count % 2 else -0.3)) for count in range(30)]
+    found = values(smoothing(noisy, [100, 205], 40))
+    assert found == [(100, pytest.approx(9.967, abs=1e-3)), (205, pytest.approx(20.5))]
+
+
+def test_smoothing_reaches_as_far_back_as_ahead_even_where_frames_follow_each_other_fast():
+    ramp = [(10 * count, float(count)) for count in range(30)]
+    found = values(smoothing(ramp, [100, 110, 120, 130], 50))
+    assert found == [(stamp, pytest.approx(stamp / 10)) for stamp in (100, 110, 120, 130)]
+
+
+def test_smoothing_does_not_lag_at_either_end_of_the_stream_and_gaps_are_gaps():
+    ramp = [(10 * count, float(count)) for count in range(8)]
+    assert values(smoothing(ramp, [5, 12, 65], 50)) == [(5, 0.5), (12, pytest.approx(1.0)), (65, 6.5)]
+    assert reasons(smoothing([(0, 0.0), (10, 1.0), (90, 9.0), (100, 10.0)], [50], 50)) == [Reason.UNALIGNED]
+
+
+def test_what_cannot_be_smoothed_is_refused_before_anything_runs():
+    with pytest.raises(TypeError, match="a Number cannot be smoothed"):
+        Interpolate(smooth=10).output({"stream": Number, "at": Number})
+    assert Interpolate(smooth=10).output({"stream": Reading, "at": Number}) is Reading

@@ -80,6 +80,13 @@ class Total:
         self.seen.append(couple.value)
         return Couple(couple.stamp, sum(self.seen))
 
+    @property
+    def finding(self) -> str:
+        """The sum of all; it breaks down at 12."""
+        if sum(self.seen) == 12:
+            raise RuntimeError("unlucky")
+        return f"the sum is {sum(self.seen)}" if self.seen else ""
+
 
 @dataclass(frozen=True)
 class Either:

@@ -226,18 +226,28 @@ def test_a_log_without_a_regional_map_says_what_to_add(tmp_path: Path) -> None:
     assert points.name == "points.ply"
 
 
-def test_maps_that_change_their_grid_on_the_way_are_not_mixed(tmp_path: Path) -> None:
-    path = tmp_path / "out.mcap"
+def regional_log(path: Path, *maps: tuple[str, float]) -> Path:
+    """A result log of regional maps 3 x 3 cells, all of one height, in frames of reference, with cells of a size."""
     with Ros2Writer(path) as writer:
-        for frame, frame_id in enumerate(("odom", "map")):
-            layers = {"elevation": np.zeros((3, 3), np.float32)}
-            writer.write(
-                "/nav/regional_map",
-                ros2.grid_map(ElevationMap(START + frame, layers, STEP, (0.0, 0.0), frame_id)),
-                START + frame,
-            )
-    with pytest.raises(LogError, match=r"the maps change on the way: elevation at 0\.1 m in 'map' after"):
+        for number, (frame_id, size) in enumerate(maps):
+            layers = {"elevation": np.full((3, 3), number, np.float32)}
+            terrain = ElevationMap(START + number, layers, size, (0.0, 0.0), frame_id)
+            writer.write("/nav/regional_map", ros2.grid_map(terrain), START + number)
+    return path
+
+
+def test_maps_that_change_their_grid_on_the_way_are_not_mixed(tmp_path: Path) -> None:
+    path = regional_log(tmp_path / "out.mcap", ("odom", STEP), ("odom", 2 * STEP))
+    with pytest.raises(LogError, match=r"the maps change on the way: elevation at 0\.2 m in 'odom' after"):
         export(path, tmp_path / "out")
+
+
+def test_a_region_that_began_anew_in_another_frame_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    names = ("visual_odom", "visual_odom/2")
+    export(regional_log(tmp_path / "out.mcap", *((name, STEP) for name in names)), tmp_path / "out")
+    for number, folder in enumerate(("visual_odom", "visual_odom-2")):
+        with rasterio.open(tmp_path / "out" / folder / "elevation.tif") as file:
+            assert np.unique(file.read(1)[np.isfinite(file.read(1))]) == [number]
 
 
 def test_a_file_that_cannot_be_written_is_named_and_nothing_half_is_left(result: Path, tmp_path: Path) -> None:

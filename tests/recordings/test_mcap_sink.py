@@ -21,6 +21,7 @@ from stages.data import (
     NavigationMap,
     PointCloud,
     StereoCamera,
+    TiltHealth,
     Transform,
 )  # fmt: skip
 
@@ -164,3 +165,20 @@ def test_a_regional_map_s_frame_is_joined_to_the_frame_level(tmp_path: Path) -> 
     frames = {(item.header.frame_id, item.child_frame_id): item.transform for item in read["/tf"].transforms}
     assert set(frames) == {("level", "left_optical"), ("odom", "level")}
     assert (frames["odom", "level"].translation.x, frames["odom", "level"].translation.y) == (3.0, 4.0)
+
+
+def test_the_tilts_health_and_what_the_run_found_are_in_the_diagnostics(tmp_path: Path) -> None:
+    sink, path = McapSink(), tmp_path / "out.mcap"
+    assert sink.wants("health", TiltHealth)
+    sink.open(path, STREAMS, ABOUT)
+    fault = TiltHealth(START, 0.05, float("nan"), 40, "the sign of pitch is flipped", "turn it round")
+    sink.write(Record(START, {"health": fault}))
+    sink.close(SUMMARY | {"findings": {"health": "turn it round", "pose": "visual"}, "entries": []})
+    frame, end = [message.status for topic, _, message in iter_messages(path) if topic == "/nav/diagnostics"]
+    assert [(status.level, status.name) for status in frame] == [(0, "roverflow"), (1, "health")]
+    assert frame[1].message == "turn it round"
+    values = {value.key: value.value for value in frame[1].values}
+    assert values == {"tilt off turn": "2.865 deg", "frames": "40", "fault": "the sign of pitch is flipped"}
+    assert [(status.level, status.name, status.message) for status in end] == [
+        (0, "health", "turn it round"), (0, "pose", "visual"),
+    ]  # fmt: skip

@@ -22,6 +22,7 @@ from recordings.rerun_sink import RerunSink
 from stages.data import (
     LEVEL_FRAME,
     Array,
+    CameraMotion,
     Cell,
     Disparity,
     ElevationMap,
@@ -34,6 +35,7 @@ from stages.data import (
     StereoCamera,
     StereoFrame,
     Tilt,
+    TiltHealth,
     Transform,
 )
 
@@ -43,7 +45,7 @@ WIDTH, HEIGHT = 64, 48
 STREAMS: dict[str, type] = {
     "stereo": StereoFrame, "tilt": Tilt, "pose": Pose, "rectified": StereoFrame, "matched": Disparity,
     "disparity": Disparity, "cloud": PointCloud, "points": PointCloud, "elevation_map": ElevationMap,
-    "navigation_map": NavigationMap,
+    "navigation_map": NavigationMap, "motion": CameraMotion, "health": TiltHealth,
 }  # fmt: skip
 
 
@@ -94,6 +96,8 @@ def scene(stamp: int = START) -> dict[str, Any]:
         "rectified": frame, "matched": matched, "disparity": replace(matched, segments=segments), "cloud": cloud,
         "points": replace(cloud, frame_id=LEVEL_FRAME, sensor=sensor), "elevation_map": terrain,
         "navigation_map": NavigationMap(stamp, cells, reason, 0.1, (0.0, -1.5), LEVEL_FRAME),
+        "motion": CameraMotion(stamp, 1, Transform("start", "camera", np.eye(3), np.zeros(3)), np.eye(6), 321, 0.4),
+        "health": TiltHealth(stamp, 0.01, 0.05, 50, "the sign of pitch is flipped", "turn it round"),
     }  # fmt: skip
 
 
@@ -409,3 +413,23 @@ def test_two_sinks_on_one_path_do_not_mix(tmp_path: Path) -> None:
         sink.close({"verdict": "COMPLETE"})
         assert b"RRF2FOOT" in path.read_bytes()[-20:]
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_tilt_check_is_a_plot_and_says_once_what_is_wrong(whole: Path, tmp_path: Path) -> None:
+    (_, _, turn), *_ = rows(whole, "/health/" + rr.escape_entity_path_part("tilt off turn"), "Scalars:scalars")
+    assert turn[0] == pytest.approx(np.degrees(0.01))
+    assert rows(whole, "/motion/features", "Scalars:scalars")[0][2] == [321.0]
+    path = record_of(
+        tmp_path / "run.rrd", [Record(START, scene()), Record(START + STEP, scene(START + STEP))],
+        {"verdict": "COMPLETE", "findings": {"health": "the sign of pitch is flipped"}},
+    )  # fmt: skip
+    assert [value for *_, value in rows(path, "/ledger/health", "TextLog:text")] == [["turn it round"]]
+    assert rows(path, "/ledger", "TextLog:text")[-1][2] == ["health: the sign of pitch is flipped"]
+
+
+def test_the_logs_own_pose_is_drawn_once(tmp_path: Path) -> None:
+    sink, items = RerunSink(), scene()
+    sink.open(tmp_path / "run.rrd", {"logged": Pose, "pose": Pose}, {})
+    sink.write(Record(START, {"logged": items["pose"], "pose": items["pose"]}))
+    sink.close({"verdict": "COMPLETE"})
+    assert [path for path in entities(tmp_path / "run.rrd") if "trajectory" in path] == ["/pose/trajectory"]

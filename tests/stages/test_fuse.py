@@ -277,7 +277,6 @@ def upside_down(pose):
     ("change", "sentence"),
     [
         (lambda cloud, pose: (replace(cloud, frame_id="camera", sensor=None), pose), "it needs Level"),
-        (lambda cloud, pose: (cloud, replace(pose, frame_id="map")), "the pose is in frame 'map', the map in 'odom'"),
         (lambda cloud, pose: (cloud, replace(pose, child_frame_id="mast")), "the pose is that of 'mast', and nothing"),
         (lambda cloud, pose: (cloud, upside_down(pose)), "180 degrees off the vertical .* whose z points up"),
         (lambda cloud, pose: (replace(cloud, stamp=START), pose), "comes after"),
@@ -290,6 +289,17 @@ def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(c
     with pytest.raises(ValueError, match=sentence):
         fuse(*change(*drive(1)), MOUNT)
     np.testing.assert_array_equal(fuse._map.cells.read(-300, -300, 600, 600), before)
+
+
+def test_a_pose_in_another_frame_begins_the_map_anew():
+    fuse, fresh = Fuse(), Fuse()
+    fuse(*drive(0), MOUNT)
+    cloud, pose = drive(1)
+    lost = replace(pose, frame_id="visual_odom/2")
+    begun, expected = fuse(cloud, lost, MOUNT), fresh(cloud, lost, MOUNT)
+    assert begun.frame_id == "visual_odom/2"
+    for name, layer in expected.layers.items():
+        np.testing.assert_array_equal(begun.layers[name], layer)
 
 
 def test_an_empty_cloud_changes_nothing():

@@ -1,0 +1,148 @@
+"""Locate: the rover's pose as its log tells it, or else by visual odometry with gravity as a constraint.
+
+The images turn and move the camera from frame to frame, the tilt says where up is. A tilt of some tenths of a degree is
+noisier than a step of the images, but it does not drift: so the pose is carried along by the images and drawn towards
+the tilt by as much as their variances say (a Kalman filter of the six errors of a pose). Heading and position have
+nothing but the images to go by, and their covariance grows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
+from stages.level import level_transform
+from stages.stage import Stage, parameter
+
+VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once
+
+
+@dataclass
+class _Memory:
+    """The camera in its segment's world (z up), the covariance (6, 6) of its position and turn about the world's axes,
+    and the motion it was told last."""
+
+    world: Transform | None = None
+    covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    motion: CameraMotion | None = None
+    way: float = 0.0  # m driven in the segment
+    visual: int = 0
+
+
+@dataclass(frozen=True)
+class Locate(Stage):
+    """Where the rover is; it remembers, so it takes frames in order."""
+
+    tilt_noise: float = parameter(
+        np.deg2rad(0.3), "standard deviation of a tilt", unit="rad", low=1e-5, high=float(np.deg2rad(10))
+    )
+    tilt_bias: float = parameter(
+        np.deg2rad(0.1), "error of all tilts alike, which no filter lowers", unit="rad", low=0.0, high=0.2
+    )
+    scale_error: float = parameter(0.005, "error of all steps' length alike, as a share; half of it sideways", low=0.0)
+    turn_error: float = parameter(
+        np.deg2rad(0.015), "error of all steps' turn alike, per metre of way", unit="rad", low=0.0, high=0.1
+    )
+    _memory: _Memory = field(default_factory=_Memory, init=False, repr=False, compare=False)
+
+    ordered: ClassVar[bool] = True
+
+    def __call__(self, motion: CameraMotion, tilt: Tilt, mount: Mount, logged: Pose | None = None) -> Pose:
+        """`logged` where it is connected; else the pose of base_link, or of the camera where base_link is unknown.
+
+        Its frame is `visual_odom`: z up, origin and heading those of the first frame, and "visual_odom/2" and so on for
+        what came after tracking was lost. Raises ValueError where the images do not tell the motion.
+        """
+        if logged is not None:
+            return logged
+        if motion.camera is None:
+            raise ValueError(f"Locate: no pose can be told from the images: {motion.lost}")
+        self._follow(motion, motion.camera, tilt, mount)
+        return self._pose(motion, mount)
+
+    @property
+    def finding(self) -> str:
+        """That poses are visual, and in which frames; empty where the log has them."""
+        memory = self._memory
+        if not memory.visual or memory.motion is None:
+            return ""
+        last = memory.motion.segment
+        frames = VISUAL_FRAME if last < 2 else f"{VISUAL_FRAME} to {_frame_of(last)}"
+        return f"the log has no pose; {memory.visual} by visual odometry, in {frames}"
+
+    def _follow(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> None:
+        memory = self._memory
+        before = memory.motion
+        memory.motion, memory.visual = motion, memory.visual + 1
+        if before is None or before.camera is None or memory.world is None or motion.segment != before.segment:
+            memory.world = level_transform(tilt, mount, camera.child, camera_height=0.0)
+            memory.covariance = np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0])
+            memory.way = 0.0
+            return
+        world = memory.world.after(before.camera.inverse().after(camera))
+        covariance = _grown(memory.covariance, world, memory.world, before, motion)
+        memory.way += float(np.linalg.norm(world.translation - memory.world.translation))
+        # What the tilt says is where up is: the turns about the two level axes.
+        up = world.rotation @ mount.camera_from_inclinometer @ tilt.up
+        gain = covariance[:, 3:5] @ np.linalg.inv(covariance[3:5, 3:5] + self.tilt_noise**2 * np.eye(2))
+        change = gain @ np.array([up[1], -up[0]])  # the turn that brings up to z
+        turn = np.asarray(Rotation.from_rotvec(change[3:]).as_matrix())
+        memory.covariance = covariance - gain @ covariance[3:5]
+        memory.world = Transform(world.parent, world.child, turn @ world.rotation, world.translation + change[:3])
+
+    def _pose(self, motion: CameraMotion, mount: Mount) -> Pose:
+        memory = self._memory
+        assert memory.world is not None
+        base = mount.base_from_camera
+        placed = memory.world if base is None else memory.world.after(base.inverse())
+        alike = self._alike(placed.translation, memory.way)
+        covariance = memory.covariance + alike.T @ alike
+        return Pose(
+            motion.stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),
+            _frame_of(motion.segment), placed.child, covariance,
+        )  # fmt: skip
+
+    def _alike(self, place: Array, way: float) -> Array:
+        """The errors (5, 6) of position and turn, one standard deviation each, that are the same in all steps: of their
+        length, of their direction, of their turn (which bends the way by half of it), and of up about two axes."""
+        x, y, z = place
+        turned, bias = self.turn_error * way, self.tilt_bias
+        return np.array([
+            [self.scale_error * x, self.scale_error * y, self.scale_error * z, 0, 0, 0],
+            [-self.scale_error / 2 * y, self.scale_error / 2 * x, 0, 0, 0, 0],
+            [-turned / 2 * y, turned / 2 * x, 0, 0, 0, turned],
+            [0, -bias * z, bias * y, bias, 0, 0],
+            [bias * z, 0, -bias * x, 0, bias, 0],
+        ])  # fmt: skip
+
+
+def _grown(covariance: Array, now: Transform, then: Transform, before: CameraMotion, motion: CameraMotion) -> Array:
+    """The covariance after the step from one motion to the next: the way levers the turns, and the step adds its own.
+
+    covariance, then, now: in the world; the motions' own are in the axes of their segment's first camera.
+    """
+    assert before.camera is not None
+    assert motion.camera is not None
+    step = _levered(before.covariance, motion.camera.translation - before.camera.translation)
+    values, axes = np.linalg.eigh(motion.covariance - step)
+    added = (axes * np.clip(values, 0, None)) @ axes.T  # two frames tracked from one keyframe may err the same way
+    turned = np.kron(np.eye(2), now.rotation @ motion.camera.rotation.T)
+    grown: Array = _levered(covariance, now.translation - then.translation) + turned @ added @ turned.T
+    return grown
+
+
+def _levered(covariance: Array, way: Array) -> Array:
+    """The covariance (6, 6) of position and turn, after a way whose direction the turn decides."""
+    x, y, z = way
+    lever = np.eye(6)
+    lever[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    levered: Array = lever @ covariance @ lever.T
+    return levered
+
+
+def _frame_of(segment: int) -> str:
+    return VISUAL_FRAME if segment < 2 else f"{VISUAL_FRAME}/{segment}"

@@ -1,0 +1,132 @@
+"""Visual odometry: the camera's own motion from one stereo frame to the next (see `tracking`).
+
+Each frame is tracked from a keyframe, which stays as long as it shares enough with what is seen: a rover that stands
+still does not drift. Where tracking is lost a new segment begins, and says so; poses of different segments have nothing
+to do with each other, and nothing is made up to join them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
+from stages.stage import Stage, parameter
+from stages.tracking import Step, View, step_between, view
+
+
+@dataclass
+class _Keyframe:
+    view: View
+    camera: Transform
+    covariance: Array
+
+
+@dataclass
+class _Memory:
+    keyframe: _Keyframe | None = None
+    segment: int = 0
+    losses: int = 0
+    blind: int = 0
+
+
+@dataclass(frozen=True)
+class VisualOdometry(Stage):
+    """Tracks the camera through the frames; it remembers, so it takes them in order."""
+
+    least: int = parameter(40, "features that must agree on a motion", low=6)
+    worst: float = parameter(2.0, "root mean square reprojection error beyond which they do not", unit="px", low=0.1)
+    fastest: float = parameter(5.0, "a motion between two frames beyond it is taken for a mistake", unit="m", low=0.0)
+    keep: float = parameter(0.03, "a keyframe stays while features move less, in widths of the image", low=0.0)
+    share: float = parameter(0.5, "and while this share of its features is still tracked", low=0.0, high=1.0)
+    _memory: _Memory = field(default_factory=_Memory, init=False, repr=False, compare=False)
+
+    ordered: ClassVar[bool] = True
+
+    def __call__(self, frame: StereoFrame, disparity: Disparity) -> CameraMotion:
+        """The camera's motion since its segment began; without `camera` where the frame shows too little to track."""
+        if frame.camera.raw is not None:
+            raise ValueError("VisualOdometry: the stereo frame is not rectified; put Rectify before it")
+        if disparity.pixels.shape != frame.left.shape[:2]:
+            raise ValueError(
+                f"VisualOdometry: the disparity is {disparity.pixels.shape}, the left image {frame.left.shape[:2]}; "
+                "join the disparity with the rectified frame it was made from"
+            )
+        memory, seen = self._memory, view(frame, disparity)
+        before = memory.keyframe
+        step = step_between(before.view, seen, self.least) if before is not None else None
+        if before is not None and step is not None and self._likely(step):
+            return self._followed(frame.stamp, before, step, seen)
+        return self._begun(frame, seen)
+
+    @property
+    def finding(self) -> str:
+        """What to say of the whole run: where tracking was lost; empty where it never was."""
+        memory = self._memory
+        parts = []
+        if memory.losses:
+            parts.append(
+                f"tracking was lost {_times(memory.losses)}, so the motion is in {memory.losses + 1} segments that "
+                "nothing joins"
+            )
+        if memory.blind:
+            parts.append(f"{memory.blind} {'frame shows' if memory.blind == 1 else 'frames show'} too little to track")
+        return "; ".join(parts)
+
+    def _likely(self, step: Step) -> bool:
+        return step.error <= self.worst and float(np.linalg.norm(step.translation)) <= self.fastest
+
+    def _followed(self, stamp: int, before: _Keyframe, step: Step, seen: View) -> CameraMotion:
+        memory = self._memory
+        back = Transform(before.camera.child, before.camera.child, step.rotation.T, -step.rotation.T @ step.translation)
+        camera = before.camera.after(back)
+        covariance = _grown(before, step, camera)
+        far = step.flow > self.keep * seen.gray.shape[1]
+        few = step.inliers < self.share * before.view.known
+        # A keyframe that shows too little to go on from is no better than the old one.
+        if (far or few) and seen.known >= self.least:
+            memory.keyframe = _Keyframe(seen, camera, covariance)
+        return CameraMotion(stamp, memory.segment, camera, covariance, step.inliers, step.error)
+
+    def _begun(self, frame: StereoFrame, seen: View) -> CameraMotion:
+        """The first frame of a segment, or one that shows too little to begin one: the keyframe then stays.
+
+        The log's first frame is where everything is counted from, whatever it shows.
+        """
+        memory = self._memory
+        if seen.known < self.least and memory.keyframe is not None:
+            memory.blind += 1
+            lost = f"only {seen.known} features with a disparity are in view, less than {self.least}"
+            return CameraMotion(frame.stamp, memory.segment, None, np.zeros((6, 6)), lost=lost)
+        lost = ""
+        if memory.keyframe is not None:
+            memory.losses += 1
+            lost = f"less than {self.least} features agree with the frame before; segment {memory.segment + 1} begins"
+        memory.segment += 1
+        camera = Transform(f"{frame.camera.frame_id}/start", frame.camera.frame_id, np.eye(3), np.zeros(3))
+        memory.keyframe = _Keyframe(seen, camera, np.zeros((6, 6)))
+        return CameraMotion(frame.stamp, memory.segment, camera, np.zeros((6, 6)), lost=lost)
+
+
+def _grown(before: _Keyframe, step: Step, camera: Transform) -> Array:
+    """The covariance (6, 6) of the camera in its segment, position then turn: the keyframe's, which the way to here
+    levers, and the step's."""
+    lever, own = np.eye(6), np.zeros((6, 6))
+    lever[:3, 3:] = -_cross(camera.translation - before.camera.translation)
+    # The camera is at -R' t of the keyframe; the step's turn and shift are in the camera's own axes.
+    own[:3, :3], own[:3, 3:], own[3:, :3] = -_cross(step.translation), -np.eye(3), -np.eye(3)
+    own = np.kron(np.eye(2), camera.rotation) @ own
+    grown: Array = lever @ before.covariance @ lever.T + own @ step.covariance @ own.T
+    return grown
+
+
+def _cross(vector: Array) -> Array:
+    """The matrix of the cross product with a vector."""
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"

@@ -1,0 +1,163 @@
+"""CheckTilt: can the tilt be believed? The camera and the ground it sees are asked, no truth is needed.
+
+Frames between which the rover has moved are kept, the last fifty of them, and `tilt_diagnosis` tries on them every
+fault that a tilt can have. A rover that stands still proves nothing and crowds nothing out.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stages.data import Array, CameraMotion, Mount, PointCloud, Tilt, TiltHealth, Transform
+from stages.stage import Stage, parameter
+from stages.tilt_diagnosis import INCONSISTENT, Diagnosis, Evidence, diagnose
+
+MOVED = 0.05  # m, or
+TURNED = float(np.deg2rad(0.3))  # rad, by which a frame must differ from the one kept before
+GROUND_FROM, GROUND_TO = 0.5, 8.0  # m of depth, of the ground that a plane is laid through
+GROUND_POINTS = 4000
+GROUND_ROUNDS = 6
+GROUND_NOISE = 0.03  # m
+
+
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    stamp: int
+    segment: int
+    camera: Transform
+    drift: float
+    up: Array
+    mount: Array
+    ground: Array
+
+
+@dataclass
+class _Memory:
+    """The frames that count, the last frame of all, and what was judged of them."""
+
+    kept: deque[_Sight] = field(default_factory=deque)
+    last: _Sight | None = None
+    since: int = 0  # frames kept since the last judgement
+    judged: Diagnosis = field(default_factory=lambda: Diagnosis("", "no frames to judge the tilt yet", False, np.nan))
+    fault: Diagnosis | None = None
+    faults: int = 0
+    clear: int = 0
+    judgements: int = 0
+
+
+@dataclass(frozen=True)
+class CheckTilt(Stage):
+    """Judges the tilt; it remembers, so it takes frames in order."""
+
+    window: int = parameter(50, "frames that a judgement rests on at most", low=10)
+    interval: int = parameter(5, "frames after which the tilt is judged again", low=1)
+    least_angle: float = parameter(
+        np.deg2rad(2.0), "least error of the mount that is called a fault", unit="rad", low=1e-3, high=0.5
+    )
+    least_offset: float = parameter(0.08, "least error of the tilt's stamps that is", unit="s", low=0.01, high=1.0)
+    _memory: _Memory = field(default_factory=_Memory, init=False, repr=False, compare=False)
+
+    ordered: ClassVar[bool] = True
+
+    def __call__(self, motion: CameraMotion, tilt: Tilt, mount: Mount, cloud: PointCloud | None = None) -> TiltHealth:
+        """The tilt's health so far. `cloud`, of the same camera, shows the ground; without it only motion counts."""
+        memory = self._memory
+        ground = _ground_normal(cloud) if cloud is not None else np.full(3, np.nan)
+        up = mount.camera_from_inclinometer @ tilt.up
+        turn = np.nan
+        if motion.camera is not None:
+            drift = max(float(np.trace(motion.covariance[3:, 3:])) / 3, 0.0)
+            sight = _Sight(
+                motion.stamp, motion.segment, motion.camera, drift, tilt.up, mount.camera_from_inclinometer, ground
+            )  # fmt: skip
+            turn = self._residual(sight)
+            memory.last = sight
+            self._keep(sight)
+        judged = memory.judged
+        slope = _angle(up, ground) if np.isfinite(ground).all() else np.nan
+        return TiltHealth(motion.stamp, turn, slope, len(memory.kept), judged.fault, judged.sentence)
+
+    @property
+    def finding(self) -> str:
+        """What to say of the whole run."""
+        memory = self._memory
+        if memory.since:
+            self._judge()
+        if memory.fault is None:
+            return memory.judged.sentence
+        where = "" if memory.faults == memory.judgements else f" ({memory.faults} of {memory.judgements} judgements)"
+        return memory.fault.sentence + where
+
+    def _residual(self, sight: _Sight) -> float:
+        """By how much up differs from the last frame's, carried along by the camera; NaN in a new segment."""
+        last = self._memory.last
+        if last is None or last.segment != sight.segment:
+            return float("nan")
+        carried = sight.camera.rotation.T @ last.camera.rotation @ last.mount @ last.up
+        return _angle(sight.mount @ sight.up, carried)
+
+    def _keep(self, sight: _Sight) -> None:
+        memory = self._memory
+        before = memory.kept[-1] if memory.kept else None
+        if before is not None and before.segment == sight.segment:
+            step = before.camera.inverse().after(sight.camera)
+            if np.linalg.norm(step.translation) < MOVED and Rotation.from_matrix(step.rotation).magnitude() < TURNED:
+                return
+        if before is not None and not np.array_equal(before.mount, sight.mount):
+            memory.kept.clear()  # what was seen speaks of another mount
+        memory.kept.append(sight)
+        if len(memory.kept) > self.window:
+            memory.kept.popleft()
+        memory.since += 1
+        if memory.since >= self.interval:
+            self._judge()
+
+    def _judge(self) -> None:
+        memory, kept = self._memory, self._memory.kept
+        evidence = Evidence(
+            np.array([sight.stamp for sight in kept]), np.array([sight.segment for sight in kept]),
+            np.array([sight.camera.rotation for sight in kept]), np.array([sight.drift for sight in kept]),
+            np.array([sight.up for sight in kept]), kept[-1].mount, np.array([sight.ground for sight in kept]),
+        )  # fmt: skip
+        memory.judged, memory.since = diagnose(evidence, self.least_angle, self.least_offset), 0
+        if memory.judged.fault:
+            memory.faults += 1
+            if memory.fault is None or memory.judged.fault != INCONSISTENT:  # as where a fault begins or ends
+                memory.fault = memory.judged
+        if memory.judged.fault or memory.judged.clear:
+            memory.judgements += 1
+
+
+def _ground_normal(cloud: PointCloud) -> Array:
+    """The upward normal (3,), in the camera, of the plane through most of the ground in view; NaN where there is none.
+
+    Least squares with Tukey's weights, so that rocks do not tilt it.
+    """
+    some = cloud.points[:: -(-len(cloud.points) // GROUND_POINTS) or 1].astype(np.float64)
+    if cloud.sensor is not None:
+        some = cloud.sensor.inverse()(some)
+    some = some[(some[:, 2] > GROUND_FROM) & (some[:, 2] < GROUND_TO)]
+    if len(some) < GROUND_POINTS // 20:
+        return np.full(3, np.nan)
+    weights = np.ones(len(some))
+    for _ in range(GROUND_ROUNDS):
+        centre = weights @ some / weights.sum()
+        spread = (some - centre) * np.sqrt(weights)[:, None]
+        values, axes = np.linalg.eigh(spread.T @ spread / weights.sum())
+        normal = axes[:, 0]
+        distance = (some - centre) @ normal
+        scale = max(1.4826 * float(np.median(np.abs(distance))), GROUND_NOISE)
+        weights = np.square(np.clip(1 - np.square(distance / (4.685 * scale)), 0, None)) + 1e-9
+    if values[1] < 4 * values[0]:  # a heap of points rather than a plane
+        return np.full(3, np.nan)
+    towards: Array = normal * (-np.sign(normal @ centre) or 1.0)
+    return towards
+
+
+def _angle(one: Array, other: Array) -> float:
+    return float(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))

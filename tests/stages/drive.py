@@ -1,0 +1,96 @@
+"""A simulated drive as camera and inclinometer live through it, without its images: fast enough for statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from recordings.simulator import Simulation
+from stages.data import Array, CameraMotion, Transform
+from stages.tilt_diagnosis import Evidence
+
+FRAMES = 50
+SMOOTHED = 0.45  # of a sample's noise is left in the mean of those about a frame
+
+
+@lru_cache(maxsize=8)
+def simulation(seed: int, slope: float) -> Simulation:
+    """A drive whose ground has this RMS slope, degrees."""
+    tile = {"relief_cells": 512, "relief_resolution": 0.08}
+    return Simulation(frames=FRAMES, seed=seed, slope=float(np.radians(slope)), **tile)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One drive. noise: of an inclinometer sample, degrees; odometry: of the camera's turn, degrees a frame."""
+
+    seed: int
+    slope: float = 4.0
+    noise: float = 0.3
+    odometry: float = 0.01
+
+    @property
+    def truth(self) -> Simulation:
+        return simulation(self.seed, self.slope)
+
+    def stamps(self, frames: int = FRAMES) -> list[int]:
+        return [self.truth.stamp(frame) for frame in range(frames)]
+
+    def cameras(self, frames: int = FRAMES) -> list[Transform]:
+        """world <- camera."""
+        return [self.truth.base_at(stamp).after(self.truth.mounts[0]) for stamp in self.stamps(frames)]
+
+    @property
+    def mount(self) -> Array:
+        """camera <- inclinometer."""
+        return self.truth.mounts[0].rotation.T @ self.truth.mounts[2].rotation  # type: ignore[no-any-return]
+
+    def ups(self, frames: int = FRAMES, late: float = 0.0) -> Array:
+        """What the inclinometer says at the frames, its stamps `late` by so many seconds."""
+        rng, spread = np.random.default_rng([self.seed, 1]), np.radians(self.noise) * SMOOTHED
+        found = []
+        for stamp in self.stamps(frames):
+            turned = self.truth.base_at(stamp - round(late * 1e9)).rotation @ self.truth.mounts[2].rotation
+            wobble = Rotation.from_rotvec([*rng.normal(0, spread, 2), 0.0]).as_matrix()
+            found.append(turned.T @ wobble.T[:, 2])
+        return np.array(found)
+
+    def turns(self, frames: int = FRAMES) -> Array:
+        """How the images say that the camera turned since the first frame, (n, 3, 3)."""
+        rng, cameras = np.random.default_rng([self.seed, 2]), self.cameras(frames)
+        drift, turns = Rotation.identity(), []
+        for camera in cameras:
+            turns.append(drift.as_matrix() @ cameras[0].rotation.T @ camera.rotation)
+            drift = drift * Rotation.from_rotvec(rng.normal(0, np.radians(self.odometry), 3))
+        return np.array(turns)
+
+    def ground(self, frames: int = FRAMES) -> Array:
+        """The normal of the ground in view, which slopes by some degrees, in the camera."""
+        rng = np.random.default_rng([self.seed, 3])
+        normals = np.array([camera.rotation[2] for camera in self.cameras(frames)]) + rng.normal(0, 0.05, (frames, 3))
+        return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
+
+    def evidence(
+        self, frames: int = FRAMES, change: Callable[[Array], Array] | None = None, late: float = 0.0,
+        turned: Array | None = None,
+    ) -> Evidence:  # fmt: skip
+        """What the check of the tilt sees, of a tilt with a fault."""
+        ups = self.ups(frames, late)
+        ups = np.array([change(up) for up in ups]) if change else ups
+        mount = self.mount if turned is None else self.mount @ turned
+        drift = np.arange(frames) * np.radians(self.odometry) ** 2
+        stamps = np.array(self.stamps(frames))
+        return Evidence(stamps, np.ones(frames, int), self.turns(frames), drift, ups, mount, self.ground(frames))
+
+
+def motions(cameras: list[Transform], stamps: list[int], segment: int = 1) -> list[CameraMotion]:
+    """The exact motion of a camera, since the first."""
+    start = cameras[0].inverse()
+    return [
+        CameraMotion(stamp, segment, start.after(camera), np.eye(6) * 1e-9 * count, 100, 0.3)
+        for count, (stamp, camera) in enumerate(zip(stamps, cameras, strict=True))
+    ]

@@ -1,0 +1,114 @@
+"""Locate makes poses that stand upright by the tilt and go by the images, and labels them as visual."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recordings.simulator.traverse import level_pose
+from stages import Locate, Mount, Pose, Tilt, Transform
+from stages.data import Array
+from tests.stages.drive import FRAMES, Drive, motions
+
+DRIVE = Drive(2, 6.0)
+
+
+def mount_of(drive: Drive, based: bool = True) -> Mount:
+    return Mount(0, drive.mount, drive.truth.mounts[0] if based else None)
+
+
+def located(drive: Drive, stage: Locate, based: bool = True) -> list[Pose]:
+    mount, ups = mount_of(drive, based), drive.ups()
+    given = motions(drive.cameras(), drive.stamps())
+    return [stage(motion, Tilt(motion.stamp, up), mount) for motion, up in zip(given, ups, strict=True)]
+
+
+def errors(drive: Drive, poses: list[Pose]) -> tuple[Array, Array]:
+    """Of positions, m, and turns, degrees, (n, 3) each, against the truth since the first frame."""
+    start = level_pose(drive.truth.base_at(drive.stamps()[0])).inverse()
+    places, turns = [], []
+    for pose in poses:
+        true = start.after(drive.truth.base_at(pose.stamp))
+        places.append(pose.position - true.translation)
+        turns.append((Rotation.from_quat(pose.quaternion) * Rotation.from_matrix(true.rotation).inv()).as_rotvec())
+    return np.array(places), np.degrees(turns)
+
+
+def test_poses_of_base_link_follow_the_drive_and_say_that_they_are_visual():
+    stage = Locate()
+    poses = located(DRIVE, stage)
+    places, turns = errors(DRIVE, poses)
+    assert {(pose.frame_id, pose.child_frame_id) for pose in poses} == {("visual_odom", "base_link")}
+    np.testing.assert_allclose(poses[0].position, 0, atol=1e-12)
+    assert np.linalg.norm(places[-1]) < 0.05  # of 12 m; the first tilt's noise is all that errs here
+    assert np.abs(turns[:, 2]).max() < 0.1
+    assert stage.finding == f"the log has no pose; {FRAMES} by visual odometry, in visual_odom"
+
+
+def test_the_tilt_is_smoothed_along_the_images():
+    """Roll and pitch get better than any single tilt, and the tilt keeps them from drifting."""
+    _, turns = errors(DRIVE, located(DRIVE, Locate(tilt_noise=float(np.radians(0.15)))))
+    assert np.sqrt(np.mean(np.square(turns[20:, :2]))) < 0.4 * 0.3 * 0.45
+    tilted = Drive(2, 6.0, noise=0.0)
+    mount, given = mount_of(tilted), motions(tilted.cameras(), tilted.stamps())
+    leaning = np.radians(0.1)  # the images lean over by 0.1 degrees a frame
+    stage, leans = Locate(), []
+    for count, (motion, up) in enumerate(zip(given, tilted.ups(), strict=True)):
+        assert motion.camera is not None
+        lean = Rotation.from_rotvec([0, 0, leaning * count]).as_matrix()
+        wrong = Transform(motion.camera.parent, motion.camera.child, lean @ motion.camera.rotation, np.zeros(3))
+        told = replace(motion, camera=wrong, covariance=np.eye(6) * leaning**2 * count)
+        pose = stage(told, Tilt(motion.stamp, up), mount)
+        z = Rotation.from_quat(pose.quaternion).as_matrix()[2]
+        leans.append(np.degrees(np.arccos(np.clip(z @ tilted.truth.base_at(motion.stamp).rotation[2], -1, 1))))
+    assert max(leans) < 1.0  # 5 degrees without the tilt
+
+
+def test_the_stated_covariance_covers_the_errors_and_grows():
+    for seed in (2, 3, 4):
+        drive = Drive(seed, 6.0)
+        poses = located(drive, Locate(tilt_noise=float(np.radians(0.15))))
+        places, turns = errors(drive, poses)
+        spread = np.array([np.sqrt(np.diag(pose.covariance)) for pose in poses[1:]])
+        found = np.abs(np.hstack([places, np.radians(turns)]))[1:]
+        assert np.mean(found < 2 * spread + 1e-6) > 0.9
+        assert spread[-1, 0] > spread[5, 0]
+        assert spread[-1, 5] > spread[5, 5]
+
+
+def test_the_logs_own_pose_goes_through_untouched():
+    pose = Pose(7, [1, 2, 3], [0, 0, 0, 1], "odom", "base_link")
+    motion = motions(DRIVE.cameras(1), DRIVE.stamps(1))[0]
+    stage = Locate()
+    given = (Tilt(7, DRIVE.ups(1)[0]), mount_of(DRIVE))
+    assert stage(motion, *given, pose) is pose
+    assert stage(replace(motion, camera=None, lost="dark"), *given, pose) is pose
+    assert stage.finding == ""
+
+
+def test_after_a_lost_track_the_poses_are_in_a_frame_of_their_own():
+    cameras, stamps, ups = DRIVE.cameras(6), DRIVE.stamps(6), DRIVE.ups(6)
+    given = [*motions(cameras[:3], stamps[:3]), *motions(cameras[3:], stamps[3:], segment=2)]
+    stage = Locate()
+    poses = [stage(motion, Tilt(motion.stamp, up), mount_of(DRIVE)) for motion, up in zip(given, ups, strict=True)]
+    assert [pose.frame_id for pose in poses] == ["visual_odom"] * 3 + ["visual_odom/2"] * 3
+    np.testing.assert_allclose(poses[3].position, 0, atol=1e-12)
+    assert stage.finding.endswith("in visual_odom to visual_odom/2")
+
+
+def test_without_base_link_it_is_the_cameras_pose():
+    poses = located(DRIVE, Locate(), based=False)
+    assert poses[0].child_frame_id == DRIVE.truth.mounts[0].child
+    first, last = (DRIVE.cameras()[frame].translation for frame in (0, -1))
+    assert abs(np.linalg.norm(poses[-1].position) - np.linalg.norm(last - first)) < 0.05
+    axis = Rotation.from_quat(poses[0].quaternion).as_matrix()[:, 2]
+    assert abs(axis[1]) < 1e-9  # the optical axis is the heading
+
+
+def test_no_pose_is_made_up_where_the_images_show_none():
+    motion = replace(motions(DRIVE.cameras(1), DRIVE.stamps(1))[0], camera=None, lost="only 3 features are in view")
+    with pytest.raises(ValueError, match="no pose can be told from the images: only 3 features are in view"):
+        Locate()(motion, Tilt(0, DRIVE.ups(1)[0]), mount_of(DRIVE))

@@ -1,0 +1,142 @@
+"""Visual odometry follows the camera as the truth has it, says where it lost it, and never makes a motion up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recordings.simulator import Simulation
+from recordings.simulator.log import true_disparity
+from stages import CameraMotion, Disparity, StereoFrame, Transform, VisualOdometry
+
+FRAMES = 5
+Input = tuple[StereoFrame, Disparity]
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[list[Input], list[Transform]]:
+    """Frames of a drive with their true disparities, and where the camera truly was (world <- camera)."""
+    simulation = Simulation(frames=FRAMES, width=320, height=240, relief_cells=512, seed=5)
+    inputs, cameras = [], []
+    for index in range(FRAMES):
+        truth, stamp = simulation.frame(index), simulation.stamp(index)
+        disparity = replace(true_disparity(simulation, stamp, truth), camera=simulation.camera)
+        inputs.append((StereoFrame(stamp, *truth.images, simulation.camera), disparity))
+        cameras.append(truth.base.after(simulation.mounts[0]))
+    return inputs, cameras
+
+
+def camera_of(motion: CameraMotion) -> Transform:
+    assert motion.camera is not None
+    return motion.camera
+
+
+def blank(given: Input) -> Input:
+    """The frame as a lens cap shows it."""
+    frame, disparity = given
+    return replace(frame, left=np.zeros_like(frame.left), right=np.zeros_like(frame.right)), disparity
+
+
+def test_the_camera_is_followed_to_a_fraction_of_a_degree_and_a_hundredth_of_the_way(drive):
+    inputs, cameras = drive
+    odometry = VisualOdometry()
+    motions = [odometry(*given) for given in inputs]
+    true = cameras[0].inverse().after(cameras[-1])
+    found = camera_of(motions[-1])
+    way = np.linalg.norm(true.translation)
+    assert way > 0.85
+    assert np.degrees(Rotation.from_matrix(found.rotation.T @ true.rotation).magnitude()) < 0.15
+    assert np.linalg.norm(found.translation - true.translation) < 0.01 * way + 0.005
+    assert {motion.segment for motion in motions} == {1}
+    assert found.child == inputs[0][0].camera.frame_id
+    assert odometry.finding == ""
+
+
+def test_what_it_says_of_its_error_grows_and_holds(drive):
+    inputs, cameras = drive
+    odometry = VisualOdometry()
+    spreads = []
+    for given, camera in zip(inputs, cameras, strict=True):
+        motion = odometry(*given)
+        spreads.append(np.sqrt(np.diag(motion.covariance)))
+        true = cameras[0].inverse().after(camera)
+        error = camera_of(motion).translation - true.translation
+        assert np.all(np.abs(error) <= 4 * spreads[-1][:3] + 1e-9)
+    assert np.all(np.diff(spreads, axis=0) > 0)
+
+
+def test_a_rover_that_stands_still_does_not_drift(drive):
+    inputs, _ = drive
+    frame, disparity = inputs[0]
+    odometry, rng = VisualOdometry(), np.random.default_rng(0)
+    for count in range(8):
+        noise = rng.integers(-3, 4, frame.left.shape)
+        seen = replace(frame, stamp=frame.stamp + count, left=np.clip(frame.left + noise, 0, 255).astype(np.uint8))
+        motion = odometry(seen, disparity)
+    assert np.linalg.norm(camera_of(motion).translation) < 0.004
+    assert np.degrees(Rotation.from_matrix(camera_of(motion).rotation).magnitude()) < 0.05
+
+
+def test_tracking_that_is_lost_begins_a_segment_and_says_so(drive):
+    inputs, _ = drive
+    odometry = VisualOdometry()
+    odometry(*inputs[0])
+    frame, disparity = inputs[1]
+    elsewhere = replace(frame, left=frame.left[:, ::-1].copy(), right=frame.right[:, ::-1].copy())
+    mirrored = replace(disparity, pixels=disparity.pixels[:, ::-1].copy(), source=disparity.source[:, ::-1].copy())
+    motion = odometry(elsewhere, mirrored)
+    assert motion.segment == 2
+    assert "segment 2 begins" in motion.lost
+    np.testing.assert_array_equal(camera_of(motion).translation, 0)
+    assert odometry.finding.startswith("tracking was lost once, so the motion is in 2 segments")
+
+
+def test_features_that_agree_only_roughly_are_no_track(drive):
+    """An image turned by half a turn looks as if the camera had rolled, but for its principal point."""
+    inputs, _ = drive
+    odometry = VisualOdometry()
+    odometry(*inputs[0])
+    frame, disparity = inputs[1]
+    turned = replace(frame, left=frame.left[::-1, ::-1].copy(), right=frame.right[::-1, ::-1].copy())
+    assert "segment 2 begins" in odometry(turned, disparity).lost
+
+
+def test_a_blind_frame_has_no_motion_and_the_next_goes_on_from_the_last_that_saw(drive):
+    inputs, cameras = drive
+    odometry = VisualOdometry()
+    odometry(*inputs[0])
+    blind = odometry(*blank(inputs[1]))
+    assert blind.camera is None
+    assert "features with a disparity are in view" in blind.lost
+    after = odometry(*inputs[2])
+    assert after.segment == 1
+    true = cameras[0].inverse().after(cameras[2])
+    assert np.linalg.norm(camera_of(after).translation - true.translation) < 0.02
+    assert odometry.finding == "1 frame shows too little to track"
+
+
+def test_where_everything_is_counted_from_needs_no_features(drive):
+    motion = VisualOdometry()(*blank(drive[0][0]))
+    np.testing.assert_array_equal(camera_of(motion).rotation, np.eye(3))
+
+
+def test_a_filled_disparity_is_no_place_in_space(drive):
+    frame, disparity = drive[0][0]
+    odometry = VisualOdometry()
+    odometry(frame, disparity)
+    filled = replace(disparity, source=np.full_like(disparity.source, 3))
+    assert VisualOdometry()(frame, filled).inliers == 0
+    unknown = VisualOdometry()
+    unknown(frame, filled)
+    assert "segment 2 begins" in unknown(*drive[0][1]).lost
+
+
+def test_disparities_of_another_size_are_refused(drive):
+    frame, disparity = drive[0][0]
+    layers = disparity.pixels, disparity.source, disparity.confidence
+    half = Disparity(0, *(layer[::2, ::2].copy() for layer in layers))
+    with pytest.raises(ValueError, match="join the disparity with the rectified frame"):
+        VisualOdometry()(frame, half)

@@ -1,0 +1,92 @@
+"""CheckTilt gathers evidence frame by frame, takes the ground's slope from the cloud, and keeps what counts."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stages import CheckTilt, Mount, PointCloud, Tilt, TiltHealth, Transform
+from stages.data import Array
+from tests.stages.drive import FRAMES, Drive, motions
+from tests.tilt_faults import flipped
+
+DRIVE = Drive(2, 8.0)
+
+
+def checked(ups: Array, stage: CheckTilt, repeats: int = 1) -> list[TiltHealth]:
+    found = []
+    for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), ups, strict=True):
+        for _ in range(repeats):
+            found.append(stage(motion, Tilt(motion.stamp, up), Mount(0, DRIVE.mount)))
+    return found
+
+
+def ground(slope: float, rocks: int = 0) -> PointCloud:
+    """Ground in view of a camera that looks along it from 1 m, sloping up ahead by so many degrees."""
+    rng = np.random.default_rng(0)
+    x, z = rng.uniform(-3, 3, 9000), rng.uniform(1, 10, 9000)
+    points = np.column_stack([x, np.ones_like(x), z]) + rng.normal(0, 0.01, (9000, 3))
+    points[:rocks, 1] -= rng.uniform(0.1, 0.5, rocks)
+    points = points @ Rotation.from_euler("x", slope, degrees=True).as_matrix().T
+    return PointCloud(
+        0, points.astype(np.float32), np.zeros((9000, 3), np.uint8), np.ones(9000, np.float32),
+        np.arange(9000, dtype=np.int32), "camera",
+    )  # fmt: skip
+
+
+def test_a_sound_tilt_comes_to_be_called_sound():
+    stage = CheckTilt()
+    found = checked(DRIVE.ups(), stage)
+    assert found[0].judgement == "no frames to judge the tilt yet"
+    assert np.isnan(found[0].turn)
+    assert 0.05 < np.degrees(np.sqrt(np.nanmean(np.square([health.turn for health in found])))) < 0.4
+    assert found[-1].frames == FRAMES
+    assert {health.fault for health in found} == {""}
+    assert stage.finding.startswith("tilt and camera agree to 0.")
+
+
+def test_a_flipped_sign_is_found_long_before_the_fiftieth_frame_and_told_at_the_end():
+    stage = CheckTilt()
+    found = checked(np.array([flipped(0)(up) for up in DRIVE.ups()]), stage)
+    first = next(count for count, health in enumerate(found) if health.fault)
+    assert first < 30
+    assert "the sign of pitch is flipped" in stage.finding
+
+
+def test_frames_that_stand_still_crowd_nothing_out():
+    moving, halting = CheckTilt(), CheckTilt()
+    checked(DRIVE.ups(), moving)
+    assert checked(DRIVE.ups(), halting, repeats=4)[-1].frames == FRAMES
+    assert halting.finding == moving.finding
+
+
+def test_what_the_log_mends_halfway_is_still_told_at_the_end():
+    ups = DRIVE.ups()
+    ups[:25] = [flipped(0)(up) for up in ups[:25]]
+    stage = CheckTilt(window=20)
+    checked(ups, stage)
+    assert "the sign of pitch is flipped" in stage.finding
+    assert "judgements)" in stage.finding
+
+
+def test_the_ground_in_view_is_measured_whatever_lies_on_it_and_whatever_frame_the_cloud_is_in():
+    motion, tilt = motions(DRIVE.cameras(1), [0])[0], Tilt(0, np.array([0, -1.0, 0]), "camera")
+    mount = Mount(0, np.eye(3))
+    for slope in (0.0, 8.0, -15.0):
+        cloud = ground(slope, rocks=1500)
+        health = CheckTilt()(motion, tilt, mount, cloud)
+        assert abs(np.degrees(health.ground) - abs(slope)) < 0.5
+        sensor = Transform("level", "camera", Rotation.from_euler("y", 40, degrees=True).as_matrix(), np.ones(3))
+        moved = PointCloud(
+            0, sensor(cloud.points).astype(np.float32), cloud.colors, cloud.sigma, cloud.pixel, "level", sensor=sensor
+        )  # fmt: skip
+        assert abs(CheckTilt()(motion, tilt, mount, moved).ground - health.ground) < 1e-3
+
+
+def test_an_empty_cloud_has_no_ground():
+    motion, nothing = motions(DRIVE.cameras(1), [0])[0], np.zeros((0, 3), np.float32)
+    empty = PointCloud(
+        0, nothing, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32), "camera"
+    )  # fmt: skip
+    health = CheckTilt()(motion, Tilt(0, np.array([0, -1.0, 0])), Mount(0, np.eye(3)), empty)
+    assert np.isnan(health.ground)

@@ -1,0 +1,124 @@
+"""Each fault of a tilt is named, with little noise and much; a sound tilt is not accused, and little motion says so."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from stages.data import Array
+from stages.tilt_diagnosis import Evidence, diagnose
+from tests.stages.drive import Drive
+from tests.tilt_faults import degrees_as_radians, exchanged, flipped, radians_as_degrees
+
+DRIVES = [Drive(seed, slope, noise) for seed, slope in ((1, 4.0), (2, 8.0), (3, 5.0)) for noise in (0.3, 0.1)]
+
+
+def about(axis: str, degrees: float) -> Array:
+    return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (flipped(0), "the sign of pitch is flipped"),
+        (flipped(1), "the sign of roll is flipped"),
+        (lambda up: up * [-1, -1, 1], "the signs of pitch and roll are flipped"),
+        (flipped(2), "the sign of up is flipped"),
+        (exchanged, "pitch and roll are exchanged"),
+        (lambda up: np.array([up[1], -up[0], up[2]]), "pitch and roll are exchanged and the sign of"),
+        (degrees_as_radians, "degrees are taken for radians"),
+        (radians_as_degrees, "radians are taken for degrees"),
+    ],
+)
+def test_wrong_signs_axes_and_units_are_named(drive, change, name):
+    found = diagnose(drive.evidence(change=change))
+    assert found.fault.startswith(name), found.sentence
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+@pytest.mark.parametrize("turned", [about("x", 5), about("y", -5), about("z", 5), about("z", -5), about("x", 90)])
+def test_a_wrong_mount_is_named_and_the_sentence_has_the_right_one(drive, turned):
+    found = diagnose(drive.evidence(turned=turned))
+    assert found.fault.startswith("the mount of the inclinometer is wrong by"), found.sentence
+    numbers = re.search(r"camera_from_inclinometer to \[(.*)\]", found.sentence)
+    assert numbers is not None
+    mended = Rotation.from_quat([float(number) for number in numbers[1].split(",")])
+    assert np.degrees((mended.inv() * Rotation.from_matrix(drive.mount)).magnitude()) < 2.5
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+@pytest.mark.parametrize("late", [0.2, -0.2])
+def test_a_time_offset_is_named_with_its_size(drive, late):
+    found = diagnose(drive.evidence(late=late))
+    size = re.fullmatch(r"the tilt's stamps are (\d+) ms (late|early)", found.fault)
+    assert size is not None, found.sentence
+    assert size[2] == ("late" if late > 0 else "early")
+    assert abs(int(size[1]) - 200) < 50
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(10, 49), slope=st.sampled_from([2.0, 4.0, 8.0]), noise=st.sampled_from([0.03, 0.1, 0.3, 0.6]),
+    frames=st.integers(3, 50), odometry=st.sampled_from([0.0, 0.01, 0.05]),
+)  # fmt: skip
+def test_a_sound_tilt_is_never_accused(seed, slope, noise, frames, odometry):
+    assert diagnose(Drive(seed, slope, noise, odometry).evidence(frames)).fault == ""
+
+
+def test_a_sound_tilt_on_rolling_ground_is_called_sound():
+    found = diagnose(Drive(2, 8.0).evidence())
+    assert found.clear
+    assert found.sentence.startswith("tilt and camera agree to 0.")
+
+
+def still(drive: Drive, frames: int) -> Evidence:
+    """The first frame over and over, but for the noise."""
+    moving = drive.evidence(frames)
+    noise = np.random.default_rng(0).normal(0, 0.003, (frames, 3))
+    ups = moving.ups[0] + noise
+    return replace(
+        moving, cameras=np.repeat(np.eye(3)[None], frames, axis=0), ground=np.repeat(moving.ground[:1], frames, axis=0),
+        ups=ups / np.linalg.norm(ups, axis=1)[:, None],
+    )  # fmt: skip
+
+
+def test_without_motion_nothing_is_guessed():
+    found = diagnose(still(Drive(1), 50))
+    assert (found.fault, found.clear) == ("", False)
+    assert found.sentence.startswith("not enough motion in 50 frames to rule out exchanged or flipped axes")
+    assert not diagnose(Drive(1).evidence(4)).clear
+
+
+def test_without_motion_the_ground_still_tells_up_from_down():
+    evidence = still(Drive(1), 20)
+    upside_down = diagnose(replace(evidence, ups=-evidence.ups))
+    assert "up" in upside_down.fault, upside_down
+    aside = diagnose(replace(evidence, ups=evidence.ups @ about("x", 90).T))
+    assert aside.fault == "up is off the ground" or "mount" in aside.fault, aside
+
+
+def test_a_lost_track_in_the_middle_does_not_matter():
+    drive = Drive(2, 8.0)
+    for change, fault in ((None, ""), (flipped(0), "the sign of pitch is flipped")):
+        whole = drive.evidence(change=change)
+        cameras = whole.cameras.copy()
+        cameras[25:] = cameras[25].T @ cameras[25:]
+        drift = np.concatenate([whole.drift[:25], whole.drift[25:] - whole.drift[25]])
+        found = diagnose(replace(whole, cameras=cameras, drift=drift, segments=np.repeat([1, 2], 25)))
+        assert found.fault == fault, found.sentence
+
+
+def test_garbage_is_called_inconsistent_and_no_fault_is_made_up():
+    drive = Drive(2, 4.0)
+    walk = np.cumsum(np.random.default_rng(1).normal(0, 0.03, (50, 3)), axis=0)
+    ups = drive.ups() + walk
+    found = diagnose(replace(drive.evidence(), ups=ups / np.linalg.norm(ups, axis=1)[:, None]))
+    assert found.fault == "inconsistent"
+    assert "no single fault of the inclinometer explains it" in found.sentence

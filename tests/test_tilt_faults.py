@@ -1,0 +1,85 @@
+"""Every fault of a tilt is named within fifty frames, no sound log is accused, and visual poses drift by less than a
+hundredth of the way: slow, so run by `make check-all`.
+
+The logs are simulated traverses of 50 frames at the rate and speed of the simulator's default; the inclinometer has a
+noise of 0.3 degrees a sample.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flow.cli import main
+from recordings.ros2 import iter_messages, stamp_of
+from recordings.simulator import Simulation
+from recordings.simulator.traverse import level_pose
+from tests.tilt_faults import FAULTS, PIPELINE
+
+SLOPES = {21: 4.0, 22: 6.0, 23: 3.0}  # seed -> RMS slope over 1 m, degrees
+
+
+@pytest.fixture(scope="module", params=SLOPES)
+def simulation(request: pytest.FixtureRequest) -> Simulation:
+    rocks = 0.05 if request.param % 2 else 0.15
+    return Simulation(
+        frames=50, width=320, height=240, seed=request.param, slope=float(np.radians(SLOPES[request.param])),
+        abundance=rocks, tilt_noise=float(np.radians(0.3)), map_half_width=1.0,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def log(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("tilt") / "log.mcap"
+    simulation.write(path)
+    return path
+
+
+def judged(log: Path, folder: Path) -> str:
+    """What a run says of the tilt."""
+    pipeline, summary = folder / "check.yaml", folder / "summary.json"
+    pipeline.write_text(PIPELINE)
+    arguments = ["-p", pipeline, "-o", folder / "out.mcap", "--no-rrd", "--summary", summary]
+    main(["run", *map(str, [log, *arguments])])
+    return str(json.loads(summary.read_text())["findings"]["health"])
+
+
+@pytest.mark.slow
+def test_a_sound_log_is_not_accused(log: Path, tmp_path: Path) -> None:
+    found = judged(log, tmp_path)
+    assert found.startswith(("tilt and camera agree to 0.", "not enough motion in 50 frames to rule out a wrong mount"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_named(log: Path, tmp_path: Path, fault: str) -> None:
+    plant, name = FAULTS[fault]
+    found = judged(plant(log, tmp_path / "faulty.mcap"), tmp_path)
+    assert name in found.split(":")[0], found
+    assert " or " not in found.split(":")[0], found
+
+
+@pytest.mark.slow
+def test_visual_poses_drift_by_less_than_a_hundredth_of_the_way(
+    log: Path, simulation: Simulation, tmp_path: Path
+) -> None:
+    judged(log, tmp_path)
+    start, way, before = level_pose(simulation.base_at(simulation.stamp(0))).inverse(), 0.0, np.zeros(3)
+    for _, _, pose in iter_messages(tmp_path / "out.mcap", ["/nav/pose"]):
+        true = start.after(simulation.base_at(stamp_of(pose.header)))
+        way, before = way + float(np.linalg.norm(true.translation - before)), true.translation
+        place, turn = pose.pose.pose.position, pose.pose.pose.orientation
+        error = np.array([place.x, place.y, place.z]) - true.translation
+        x, y, z, w = turn.x, turn.y, turn.z, turn.w
+        heading = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z))
+        off = heading - np.arctan2(true.rotation[1, 0], true.rotation[0, 0])
+        assert pose.header.frame_id == "visual_odom"
+        assert np.linalg.norm(error) < 0.01 * way + 0.02
+        assert abs(np.degrees(np.arctan2(np.sin(off), np.cos(off)))) < 0.1 + 0.1 * way  # the images are small
+    assert way > 12
+    print(
+        f"seed {simulation.seed}: {100 * np.linalg.norm(error) / way:.2f} % of {way:.1f} m, {np.degrees(off):+.2f} deg"
+    )
