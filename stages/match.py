@@ -11,10 +11,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
-from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
+from stages.data import Array, Disparity, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.prior import prior_costs
 from stages.kernels.semiglobal import Rule, lanes_for, match
@@ -95,15 +94,16 @@ class Match(Stage):
         search = self._search(frame.camera)
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
         guide = None if prior is None else self._guide(prior, search)
-        found = match(left, right, self._rule(search), guide, self.threads, self.memory << 20)
-        nothing = _blank(left)
-        if prior is not None:
-            nothing |= prior.pixels > search.stop + BEYOND
-            if search.start > self.minimum:
-                nothing |= prior.pixels < search.start - BEYOND
-        unknown = np.nonzero(nothing | _blank_partner(right, found.pixels))
-        found.pixels[unknown], found.source[unknown], found.confidence[unknown] = np.nan, Source.UNKNOWN, 0
+        excluded = None if prior is None else self._excluded(prior, search)
+        found = match(left, right, self._rule(search), guide, excluded, self.threads, self.memory << 20)
         return Disparity(frame.stamp, found.pixels, found.source, found.confidence, camera=frame.camera)
+
+    def _excluded(self, prior: Disparity, search: range) -> Array:
+        """Where the prior shows that the match is not in the range, (H, W) bool."""
+        excluded: Array = prior.pixels > search.stop + BEYOND
+        if search.start > self.minimum:
+            excluded |= prior.pixels < search.start - BEYOND
+        return excluded
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
         height, width = frame.left.shape[:2]
@@ -148,19 +148,3 @@ class Match(Stage):
 
     def _guide(self, prior: Disparity, search: range) -> tuple[Array, Array]:
         return prior_costs(prior.pixels, search.start, lanes_for(len(search)), self.prior_weight, self.prior_reach)
-
-
-def _blank(image: Array) -> Array:
-    """Where the census window of a pixel shows one gray value only, (H, W) bool: nothing can be matched there, and what
-    the paths carry into it (a burnt-out sky, say) is no measurement."""
-    return cv2.morphologyEx(image, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) == 0  # type: ignore[no-any-return]
-
-
-def _blank_partner(right: Array, pixels: Array) -> Array:
-    """Whether the partner of each pixel is blank, (H, W) bool: a match with it has no evidence."""
-    blank = _blank(right)
-    if not blank.any():
-        return blank
-    columns = np.arange(right.shape[1], dtype=np.float32)
-    partner = np.clip(np.rint(columns - np.nan_to_num(pixels)), 0, right.shape[1] - 1).astype(np.intp)
-    return np.take_along_axis(blank, partner, axis=1)

@@ -94,25 +94,26 @@ def lanes_for(disparities: int) -> int:
 
 
 def match(
-    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, threads: int, memory: int
-) -> Matches:
+    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, excluded: Array | None, threads: int,
+    memory: int,
+) -> Matches:  # fmt: skip
     """Disparities of a rectified pair of gray images.
 
-    left, right: (H, W) uint8; prior: of `prior.prior_costs`, or None; threads: more than 2 have nothing to do; memory:
-    bytes that the sums of paths may take.
+    left, right: (H, W) uint8; prior: of `prior.prior_costs`, or None; excluded: (H, W) bool, pixels that have no match
+    in the range, or None; threads: more than 2 have nothing to do; memory: bytes that the sums of paths may take.
     """
     height, columns = left.shape
     width = Width(lanes_for(rule.disparities))
     pixels, evidence = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
     with pairs(threads) as both:
         _sweep_all(left, right, rule, width, prior, memory, pixels, evidence, both)
+        blank, partner = both(lambda: blank_windows(left), lambda: blank_windows(right))
+        blank = blank if excluded is None else blank | excluded
+        parts = slice(height // 2), slice(height // 2, height)
+        both(*(functools.partial(_drop_blank, blank[at], partner[at], pixels[at], evidence[at]) for at in parts))
         drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, both)
         confidence, source = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
-        middle = height // 2
-        both(
-            lambda: _grade(evidence[:middle], rule.calibration, confidence[:middle], source[:middle]),
-            lambda: _grade(evidence[middle:], rule.calibration, confidence[middle:], source[middle:]),
-        )
+        both(*(functools.partial(_grade, evidence[at], rule.calibration, confidence[at], source[at]) for at in parts))
     return Matches(pixels, source, confidence, evidence)
 
 
@@ -129,6 +130,22 @@ def _sweep_all(
         upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
         both(upper.arrive, lower.arrive)
         both(lambda: upper.cross(lower), lambda: lower.cross(upper))
+
+
+def blank_windows(image: Array) -> Array:
+    """Where the census window of a pixel shows one gray value only, (H, W) bool: nothing can be matched there, and what
+    the paths carry into it (a burnt-out sky, say) is no measurement."""
+    return cv2.morphologyEx(image, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) == 0  # type: ignore[no-any-return]
+
+
+@kernel
+def _drop_blank(blank, partner, pixels, evidence):  # type: ignore[no-untyped-def]
+    """Forget matches of pixels that are blank, or whose partner is."""
+    last = pixels.shape[1] - 1
+    for y in range(pixels.shape[0]):
+        for x in range(pixels.shape[1]):
+            if evidence[y, x] > 0 and (blank[y, x] or partner[y, min(max(round(x - pixels[y, x]), 0), last)]):
+                pixels[y, x], evidence[y, x] = np.nan, 0
 
 
 @kernel
