@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import cv2
-import numpy as np
 
 from stages.data import Array, Disparity, StereoCamera, StereoFrame
-from stages.stage import Stage
+from stages.kernels.doubling import doubled
+from stages.stage import Stage, parameter
 
 
 @dataclass(frozen=True)
@@ -41,21 +41,19 @@ class Enlarge(Stage):
     Source and confidence are those of the nearest pixel.
     """
 
+    threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
+
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         height, width = frame.left.shape[:2]
         small = disparity.pixels.shape
         if small != ((height + 1) // 2, (width + 1) // 2):
             raise ValueError(f"Enlarge: the disparity has shape {small}, which is not half of {(height, width)}")
-        size = 2 * small[1], 2 * small[0]
-        smooth = cv2.resize(disparity.pixels, size, interpolation=cv2.INTER_LINEAR)
-        nearest = cv2.resize(disparity.pixels, size, interpolation=cv2.INTER_NEAREST)
-        with np.errstate(invalid="ignore"):
-            pixels = np.where(np.abs(smooth - nearest) < 1, smooth, nearest)  # NaN beside NaN, and no value between
+        pixels = doubled(disparity.pixels, height, width, self.threads)
         source, confidence = (
-            cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST)[:height, :width]
+            cv2.resize(layer, (2 * small[1], 2 * small[0]), interpolation=cv2.INTER_NEAREST)[:height, :width]
             for layer in (disparity.source, disparity.confidence)
         )
-        return Disparity(frame.stamp, 2 * pixels[:height, :width], source, confidence, camera=frame.camera)
+        return Disparity(frame.stamp, pixels, source, confidence, camera=frame.camera)
 
 
 @dataclass(frozen=True)

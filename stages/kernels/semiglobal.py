@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -31,8 +29,10 @@ from stages.kernels.prior import add_prior
 from stages.kernels.selection import find_winners, fit_row
 from stages.kernels.speckles import drop_speckles
 from stages.kernels.vectors import Width, lanes_in
+from stages.kernels.workspace import Workspace, Workspaces
 
 NO_PRIOR = np.zeros((0, 0), np.int32), np.zeros(1, np.uint8)
+_workspaces = Workspaces()
 
 
 class Rule(NamedTuple):
@@ -205,7 +205,7 @@ def _sweep(  # type: ignore[no-untyped-def]
 
 
 def _halves(
-    pair: Pair, rule: Rule, space: _Workspace, width: Width, memory: int, pixels: Array, evidence: Array
+    pair: Pair, rule: Rule, space: Workspace, width: Width, memory: int, pixels: Array, evidence: Array
 ) -> list[_Half]:
     """Both halves of the image, in bands whose sums take no more than `memory` bytes together."""
     height, columns = pixels.shape
@@ -225,7 +225,7 @@ class _Half:
     """The rows from one end of the image to its middle, and the sweep that begins at that end."""
 
     def __init__(
-        self, rows: range, band: int, space: _Workspace, sweep: Callable[..., None], columns: int, disparities: int
+        self, rows: range, band: int, space: Workspace, sweep: Callable[..., None], columns: int, disparities: int
     ) -> None:
         """rows: from the end inwards; band: how many at a time."""
         lanes = lanes_for(disparities)
@@ -267,48 +267,3 @@ class _Half:
     def _sweep(self, rows: range, paths: Array, sums: Array, final: bool) -> None:
         first, last = rows[0], rows[-1]
         self.sweep(self.scratch, paths, first, last + rows.step, rows.step, sums, min(first, last), final)
-
-
-class _Workspace:
-    """Memory of one call, kept for the next: the kernel hands out fresh pages slowly."""
-
-    def __init__(self) -> None:
-        self.whole = np.empty(0, np.uint8)
-        self.used = 0
-
-    def reserve(self, size: int) -> None:
-        """Have `size` bytes ready; what was handed out before is free again."""
-        if self.whole.size < size:
-            self.whole = np.empty(0, np.uint8)  # the old memory goes before the new comes
-            self.whole = np.empty(size, np.uint8)
-        self.used = 0
-
-    def bytes(self, size: int) -> Array:
-        """Bytes with arbitrary content, on a 64-byte boundary of the workspace."""
-        start = self.used + -(self.whole.ctypes.data + self.used) % 64
-        self.used = start + size
-        if self.used > self.whole.size:
-            raise MemoryError("the matcher's workspace is too small")
-        return self.whole[start : self.used]
-
-
-class _Workspaces:
-    """As many workspaces as calls run at once."""
-
-    def __init__(self) -> None:
-        self.idle: list[_Workspace] = []
-        self.lock = threading.Lock()
-
-    @contextmanager
-    def one(self) -> Iterator[_Workspace]:
-        """A workspace for one call; one that another call has left, where there is any."""
-        with self.lock:
-            space = self.idle.pop() if self.idle else _Workspace()
-        try:
-            yield space
-        finally:
-            with self.lock:
-                self.idle.append(space)
-
-
-_workspaces = _Workspaces()

@@ -16,8 +16,10 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel, kernel
 from stages.kernels.halves import AtOnce, in_turn, pairs
+from stages.kernels.workspace import Workspaces
 
 F32 = np.float32
+_workspaces = Workspaces()
 LEAST_CELL = 8  # px; where grid cells are smaller, the centres settle at full resolution
 
 
@@ -35,17 +37,21 @@ def superpixels(
     step = math.sqrt(height * width / count)
     grid = max(1, round(height / step)), max(1, round(width / step))
     smallest = int(0.25 * height * width / count)
-    with pairs(threads) as both:
-        colour = _colour_planes(image, both)
+    with pairs(threads) as both, _workspaces.one() as space:
+        space.reserve(28 * height * width + 4096)
+        colour = _colour_planes(image, space.array((3, height, width), np.float32), both)
         scale = 2 if min(height // grid[0], width // grid[1]) >= LEAST_CELL and min(height, width) > 1 else 1
-        small = colour if scale == 1 else _colour_planes(_halved(image), both)
+        small = colour
+        if scale == 2:
+            half = _halved(image)
+            small = _colour_planes(half, space.array((3, *half.shape[:2]), np.float32), both)
         centres = _grid_centres(small, *grid)
         for _ in range(iterations - 1):
             _move(small, centres, grid, compactness / step * scale, both)
         if scale == 2:
             centres[:, 3:] = centres[:, 3:] * 2 + F32(0.5)
         labels = _labels(colour, centres, grid, compactness / step, both)[0]
-        total = connect(labels, smallest, both)
+        total = connect(labels, smallest, space.array((3, height * width), np.int32), both)
     return labels, total
 
 
@@ -69,9 +75,8 @@ def _labels(colour: Array, centres: Array, grid: tuple[int, int], weight: float,
     return labels, upper + lower
 
 
-def _colour_planes(image: Array, both: AtOnce = in_turn) -> Array:
-    """The image as (3, H, W) float32 CIELAB planes (L in 0..100); a gray image has a = b = 0."""
-    planes = np.zeros((3, *image.shape[:2]), np.float32)
+def _colour_planes(image: Array, planes: Array, both: AtOnce = in_turn) -> Array:
+    """`planes`, (3, H, W) float32, with the image in CIELAB (L in 0..100); a gray image has a = b = 0."""
     middle = image.shape[0] // 2
     both(
         lambda: _fill_colour_planes(image[:middle], planes[:, :middle]),
@@ -91,6 +96,7 @@ def _fill_colour_planes(image: Array, planes: Array) -> None:
     if image.size == 0:
         return
     channels = [image] if image.ndim == 2 else cv2.split(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
+    planes[len(channels) :] = 0
     for plane, channel, scale in zip(planes, channels, (100 / 255, 1.0, 1.0), strict=False):
         np.multiply(channel, F32(scale), out=plane)
 
@@ -147,20 +153,22 @@ def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, la
                     sums[k, 5] += 1
 
 
-def connect(labels: Array, smallest: int, both: AtOnce = in_turn) -> int:
+def connect(labels: Array, smallest: int, scratch: Array, both: AtOnce = in_turn) -> int:
     """Number the 4-connected components of `labels` (H, W) int32 in scan order, in place; returns how many.
 
-    One of fewer than `smallest` pixels joins the component left of its first pixel, or above it at the left border.
+    scratch: (3, H * W) int32, to work in. One of fewer than `smallest` pixels joins the component left of its first
+    pixel, or above it at the left border.
     """
     height, width = labels.shape
     middle = height // 2
-    runs = np.empty((height, width), np.int32)  # of each run of equal labels in a row: where it ends
-    parent = np.empty(labels.size, np.int32)  # of each run, at its first pixel: a run of its component before it
+    runs = scratch[0].reshape(height, width)  # of each run of equal labels in a row: where it ends
+    parent = scratch[1]  # of each run, at its first pixel: a run of its component before it
     both(
         lambda: _join_runs(labels, 0, middle, runs, parent),
         lambda: _join_runs(labels, middle, height, runs, parent),
     )
-    return int(_number(labels, middle, smallest, runs, parent, np.zeros(labels.size, np.int32)))
+    scratch[2] = 0
+    return int(_number(labels, middle, smallest, runs, parent, scratch[2]))
 
 
 @kernel

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from stages import CrossCheck, Disparity, Enlarge, Halve, Match, Source, StereoCamera, StereoFrame, Swap
 from stages.kernels.contradiction import contradicted, contradicted_reference
+from stages.kernels.doubling import doubled, doubled_reference
 
 
 def slope_frame(height=97, width=131):
@@ -105,3 +106,12 @@ def test_what_the_prior_shows_nearer_than_the_range_is_unknown():
     found = Match(disparities=13, speckle_size=0)(frame, prior)
     assert np.isnan(found.pixels[truth > 15.5]).all()
     assert np.isfinite(found.pixels[(truth < 11) & (np.arange(131) > 30)]).mean() > 0.9
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.booleans(), st.booleans(), st.integers(0, 99))
+def test_doubling_is_its_reference_at_any_size(rows, columns, odd_rows, odd_columns, seed):
+    rng = np.random.default_rng(seed)
+    small = rng.choice(np.array([3, 3.5, 20, np.nan], np.float32), (rows, columns))
+    size = 2 * rows - odd_rows, 2 * columns - odd_columns
+    for threads in (1, 2):
+        np.testing.assert_allclose(doubled(small, *size, threads), doubled_reference(small, *size), rtol=1e-6)

@@ -69,7 +69,7 @@ def test_two_threads_give_the_same_labels(photo):
 def test_components_are_numbered_as_a_flood_fill_does(height, width, kinds, smallest, seed):
     labels = np.random.default_rng(seed).integers(0, kinds, (height, width), dtype=np.int32)
     expected, total = slic.connect_reference(labels, smallest)
-    assert slic.connect(labels, smallest) == total
+    assert slic.connect(labels, smallest, np.empty((3, labels.size), np.int32)) == total
     assert np.array_equal(labels, expected)
 
 
@@ -82,7 +82,7 @@ def test_an_edge_of_the_image_is_an_edge_of_segments():
 
 def test_assignment_is_the_nearest_of_nine_centres(photo):
     image = photo[:90, :131]
-    colour, rows, cols = slic._colour_planes(image), 6, 9
+    colour, rows, cols = slic._colour_planes(image, np.empty((3, *image.shape[:2]), np.float32)), 6, 9
     centres = slic._grid_centres(colour, rows, cols)
     labels, sums = slic._labels(colour, centres, (rows, cols), 0.4**0.5, in_turn)
     expected = slic.assign_reference(colour, centres, rows, cols, 0.4)
