@@ -30,6 +30,8 @@ class Panel(Enum):
 
     LEFT = auto()
     RIGHT = auto()
+    LEFT_DERIVED = auto()  # images that no camera took so: half as large, say
+    RIGHT_DERIVED = auto()
     DISPARITY = auto()
     SUPERPIXELS = auto()
     SOURCE = auto()
@@ -96,16 +98,19 @@ def _pictures(drawn: Places, *panels: Panel) -> list[_View]:
 
 
 def _images(drawn: Places) -> _Part | None:
-    """Two columns: left and right image; first and last disparity; superpixels and where each disparity comes from.
+    """Two columns: left and right image; last disparity but one and last; superpixels and where each disparity comes
+    from.
 
-    Of several stereo streams the last (the rectified one) is on top, the others are tabs behind it.
+    Of several stereo streams the last that a camera took so (the rectified one) is on top, of other streams the last;
+    the others are tabs.
     """
+    left, right = _pictures(drawn, Panel.LEFT), _pictures(drawn, Panel.RIGHT)
     disparities = _pictures(drawn, Panel.DISPARITY)
     parts = [
-        _tabs(_pictures(drawn, Panel.LEFT)),
-        _tabs(_pictures(drawn, Panel.RIGHT)),
-        _tabs(disparities[:1]),
-        _tabs(disparities[1:]),
+        _tabs([*_pictures(drawn, Panel.LEFT_DERIVED), *left]),
+        _tabs([*_pictures(drawn, Panel.RIGHT_DERIVED), *right]),
+        _tabs(disparities[:-1]),
+        _tabs(disparities[-1:]),
         _tabs(_superpixels(drawn)),
         _tabs(_pictures(drawn, Panel.SOURCE)),
     ]

@@ -27,6 +27,7 @@ from stages.data import (
     PointCloud,
     Pose,
     Source,
+    StereoCamera,
     StereoFrame,
     Tilt,
     TiltHealth,
@@ -61,13 +62,15 @@ def draws(*kinds: type) -> Callable[[Draw], Draw]:
 class Canvas:
     """Where pictures go: one recording, whose clocks stand at one frame.
 
-    hung: every place that ever had a picture, in the order of hanging; the desk is made from it.
+    hung: every place that ever had a picture, in the order of hanging; the desk is made from it; camera: of the first
+    frame, by which a pair at half size, say, is told from the pair itself.
     """
 
     recording: rr.RecordingStream
     jpeg_quality: int
     max_points: int
     hung: dict[tuple[Panel, str], Place] = field(default_factory=dict)
+    camera: StereoCamera | None = None
     _said: dict[str, str] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
@@ -130,11 +133,19 @@ class Canvas:
         self._before, self._now = self._now, {}
 
 
+def same_view(one: StereoCamera, other: StereoCamera) -> bool:
+    """Whether both cameras see alike, rectified or not: a pair at half size, say, does not."""
+    return all(getattr(one, name) == getattr(other, name) for name in ("width", "height", "cx", "cx_right"))
+
+
 @draws(StereoFrame)
 def draw_stereo(canvas: Canvas, path: str, frame: StereoFrame) -> None:
     """Both images."""
-    canvas.photograph(f"{path}/left", frame.left, Place(Panel.LEFT, f"{path}/left", f"{path}: left"))
-    canvas.photograph(f"{path}/right", frame.right, Place(Panel.RIGHT, f"{path}/right", f"{path}: right"))
+    canvas.camera = canvas.camera or frame.camera
+    own = same_view(frame.camera, canvas.camera)
+    left, right = (Panel.LEFT, Panel.RIGHT) if own else (Panel.LEFT_DERIVED, Panel.RIGHT_DERIVED)
+    canvas.photograph(f"{path}/left", frame.left, Place(left, f"{path}/left", f"{path}: left"))
+    canvas.photograph(f"{path}/right", frame.right, Place(right, f"{path}/right", f"{path}: right"))
 
 
 @draws(Disparity)

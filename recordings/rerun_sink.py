@@ -18,7 +18,7 @@ import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
 from recordings.desk import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, Place, desk
-from recordings.drawings import PICTURES, Canvas
+from recordings.drawings import PICTURES, Canvas, same_view
 from recordings.errors import LogError
 from recordings.frame_record import FrameRecord, LossEntry
 from recordings.whole_file import give_name, temporary_name, unwritable
@@ -189,14 +189,22 @@ class RerunSink:
 def _together(items: Mapping[str, Any], kinds: tuple[type, ...]) -> Iterator[list[str]]:
     """The streams that a picture of several types is drawn from: the last of each type, for every frame of reference.
 
-    A type that names no frame goes with every one.
+    A type that names no frame goes with every one. Of stereo frames it is the last as the camera took it.
     """
     frames = {getattr(item, "frame_id", None): None for item in items.values() if isinstance(item, kinds)}
     for frame in [frame for frame in frames if frame is not None] or [None]:
         fitting = {stream: item for stream, item in items.items() if getattr(item, "frame_id", frame) == frame}
-        chosen = [[stream for stream, item in fitting.items() if isinstance(item, kind)][-1:] for kind in kinds]
+        chosen = [_one_of(kind, fitting) for kind in kinds]
         if all(chosen):
             yield [stream for streams in chosen for stream in streams]
+
+
+def _one_of(kind: type, items: Mapping[str, Any]) -> list[str]:
+    """The stream of this type to draw, if there is one."""
+    streams = [stream for stream, item in items.items() if isinstance(item, kind)]
+    if kind is StereoFrame:  # as the camera took it: not at half size, say
+        streams = [stream for stream in streams if same_view(items[stream].camera, items[streams[0]].camera)]
+    return streams[-1:]
 
 
 def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
