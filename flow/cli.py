@@ -10,6 +10,7 @@ import json
 import logging
 import math
 import os
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -388,6 +389,8 @@ def _export(options: argparse.Namespace) -> int:
 
     if options.folder.exists() and not options.folder.is_dir():
         raise UsageError(f"{options.folder} is a file; give the name of a folder")
+    if options.folder.exists() and any(options.folder.iterdir()):
+        raise UsageError(f"{options.folder} is not empty, and maps of two runs must not mix; choose another folder")
     files = export(options.result, options.folder, options.frames)
     size = sum(file.stat().st_size for file in files)
     _say(f"{options.folder}: {len(files)} files ({size / 1e6:.1f} MB)")
@@ -395,6 +398,7 @@ def _export(options: argparse.Namespace) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
+    from recordings.export.bundle import export
     from recordings.pictures import draw
     from recordings.score_table import format_score
     from recordings.scoring import score
@@ -409,8 +413,10 @@ def _demo(options: argparse.Namespace) -> int:
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     _report(summary)
     _say(f"\n{format_score(score(out, log))}")
-    pictures = draw(out, folder / "pictures")
-    _say(f"\n{len(pictures)} pictures in {folder / 'pictures'}; the timeline: rerun {rrd}")
+    shutil.rmtree(folder / "maps", ignore_errors=True)
+    pictures, maps = draw(out, folder / "pictures"), export(out, folder / "maps")
+    _say(f"\n{len(pictures)} pictures in {folder / 'pictures'}, {len(maps)} files of the map in {folder / 'maps'}")
+    _say(f"the timeline: rerun {rrd}")
     return _exit_code_of(summary)
 
 

@@ -76,7 +76,8 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """A checked pipeline. nodes: in an order in which every stream comes before its use."""
+    """A checked pipeline. nodes: in an order in which every stream comes before its use; left_out: the optional streams
+    that a log cannot have, and why."""
 
     name: str
     text: str
@@ -85,6 +86,7 @@ class Graph:
     nodes: tuple[Node, ...]
     sinks: tuple[tuple[str, Sink], ...]
     kinds: Mapping[str, type] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def clock(self) -> str:
@@ -132,7 +134,8 @@ class Graph:
                 raise PipelineError(needed[0])
         if all(node.aligns for node in kept):
             raise PipelineError(f"nothing of the pipeline {self.name} is left to do: {next(iter(gone.values()))}")
-        return replace(self, nodes=tuple(kept))
+        made = {node.name for node in self.nodes}
+        return replace(self, nodes=tuple(kept), left_out={name: why for name, why in gone.items() if name in made})
 
 
 def is_aligner(kind: type) -> bool:

@@ -152,8 +152,8 @@ def run(
 
 
 def _findings(graph: Graph) -> dict[str, str]:
-    """What stages have to say at the end of a run (stream -> sentence): the `finding` of those that have one."""
-    said = dict[str, str]()
+    """What there is to say at the end of a run (stream -> sentence): what was left out, the `finding` of stages."""
+    said = {name: f"left out: {why}" for name, why in graph.left_out.items()}
     for node in graph.stages:
         try:
             said[node.name] = str(getattr(node.actor, "finding", ""))

@@ -116,20 +116,24 @@ def read_disparity(message: Any) -> NDArray[np.float32]:
 
 
 def point_cloud(cloud: PointCloud) -> Any:
-    """sensor_msgs/PointCloud2: x, y, z, rgb (PCL's packing, 0x00RRGGBB in the bits of a float32), sigma."""
+    """sensor_msgs/PointCloud2: x, y, z, rgb (PCL's packing, 0x00RRGGBB in the bits of a float32), sigma, and source
+    (the codes of `Source`, as float32) where not all points are measured."""
     count = len(cloud.points)
-    packed = np.zeros((count, 5), np.dtype("<f4"))
+    names = ("x", "y", "z", "rgb", "sigma") + (() if cloud.source is None else ("source",))
+    packed = np.zeros((count, len(names)), np.dtype("<f4"))
     packed[:, :3] = cloud.points
     red, green, blue = (cloud.colors[:, channel].astype(np.uint32) for channel in range(3))
     packed.view(np.dtype("<u4"))[:, 3] = red << 16 | green << 8 | blue
     packed[:, 4] = cloud.sigma
+    if cloud.source is not None:
+        packed[:, 5] = cloud.source
     fields = [
         make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=FLOAT32, count=1)
-        for place, name in enumerate(("x", "y", "z", "rgb", "sigma"))
+        for place, name in enumerate(names)
     ]
     return make(
         "sensor_msgs/msg/PointCloud2", header=header(cloud.stamp, cloud.frame_id), height=1, width=count,
-        fields=fields, is_bigendian=False, point_step=20, row_step=20 * count,
+        fields=fields, is_bigendian=False, point_step=4 * len(names), row_step=4 * len(names) * count,
         data=packed.view(np.uint8).reshape(-1), is_dense=bool(np.isfinite(cloud.points).all()),
     )  # fmt: skip
 

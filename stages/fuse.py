@@ -20,19 +20,21 @@ from stages.overlap import fit_plane
 from stages.stage import Stage, parameter
 from stages.voxelise import Voxelise
 
-# What is remembered of a cell, 28 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
+# What is remembered of a cell, 30 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
 # best: the smallest standard deviation among them; below, above: from the height to the cell's extremes; first, last:
 # ms since the first frame; numbers stop at the largest of their type. hidden: 1 where nothing is known, but a frame
-# looked and could not see it.
+# looked and could not see it; doubt: by how much the newest frame contradicts it, where that is not settled.
 CELL = np.dtype(
     [
         ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u2"),
         ("first", "u4"), ("last", "u4"), ("frames", "u2"), ("contradictions", "u1"),
-        ("hidden", "u1"),
+        ("hidden", "u1"), ("doubt", "f2"),
     ]
 )  # fmt: skip
 MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that no map ends where they still change
 _MS = 1_000_000
+LARGEST_JUMP = 5.0  # standard deviations, from one frame to the next, of what joins them to the map
+PATIENCE = 3  # frames in succession that do not join the map begin a new one
 # Beyond this the pose's frame does not have z up. An odometry that knows no tilt may differ by the slope of the ground.
 _LARGEST_LEAN = np.radians(30.0)
 
@@ -40,7 +42,7 @@ _LARGEST_LEAN = np.radians(30.0)
 @dataclass(eq=False)
 class Region:
     """The map so far: its frame, the stamps of its first and last frame, ns, whether those tell what was hidden from
-    them, and its cells."""
+    them, its cells, the plane that joined the last frame, and how many in succession did not join."""
 
     frame_id: str = ""
     epoch: int = 0
@@ -48,9 +50,12 @@ class Region:
     hides: bool = False
     cells: Tiles = field(default_factory=lambda: Tiles(CELL))
 
+    plane: Array = field(default_factory=lambda: np.zeros(3))
+    refused: int = 0
+
     def begin(self, frame_id: str, stamp: int) -> None:
-        """Start anew, in another frame: nothing joins the two."""
-        self.frame_id, self.epoch, self.cells = frame_id, stamp, Tiles(CELL)
+        """Start anew: nothing joins the two."""
+        self.frame_id, self.epoch, self.cells, self.plane = frame_id, stamp, Tiles(CELL), np.zeros(3)
 
 
 @dataclass(frozen=True)
@@ -67,13 +72,15 @@ class Fuse(Stage):
     - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere.
 
     A frame contradicts a cell if it is off by more than `contradiction` standard deviations. Then the cell's evidence
-    loses half its weight, and as soon as the newer is as sure, the newer takes its place.
+    loses half its weight, and as soon as the newer is as sure, the newer takes its place; until then the cell is stated
+    to be as unsure as the two differ.
 
     Where the pose is in another frame than before, as after visual odometry lost its way, the map begins anew.
 
-    The plane that joins a frame to the map is limited by what is expected of its errors (`tilt_sigma`, `height_sigma`).
-    A small share of it is left in (`follow_tilt`, `follow_height`), so that in the long run the map follows gravity and
-    the pose and not the errors of its first frame.
+    A frame that lies off the map unlike those before, by more than five times what is expected of its errors
+    (`tilt_sigma`, `height_sigma`), is refused; with the third in succession the map begins anew. Of the plane that
+    joins a frame a small share is left in (`follow_tilt`, `follow_height`), so that in the long run the map follows
+    gravity and the pose and not the errors of its first frame.
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
@@ -119,6 +126,10 @@ class Fuse(Stage):
         seen["variance"] += self.alignment**2
         x, y = _offsets(known, row, col, placed, self.resolution)
         plane = self._plane(cells[known], seen, x, y)
+        if self._jumped(plane):
+            self._map.begin(pose.frame_id, cloud.stamp)
+            cells, plane = self._map.cells.read(row, col, *local.shape), np.zeros(3)
+        self._map.plane, self._map.refused = plane, 0
         rise = plane[0] + plane[1] * x + plane[2] * y
         for height in ("elevation", "minimum", "maximum"):
             seen[height] += rise
@@ -153,6 +164,19 @@ class Fuse(Stage):
         plane = fit_plane(x, y, off, variance, expected, self.resolution)
         return np.asarray(plane * (1 - np.array([self.follow_height, self.follow_tilt, self.follow_tilt])))
 
+    def _jumped(self, plane: Array) -> bool:
+        """Whether frame after frame does not join the map; raises ValueError for the first of them."""
+        change = np.abs(plane - self._map.plane)
+        if np.all(change <= LARGEST_JUMP * np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])):
+            return False
+        self._map.refused += 1
+        if self._map.refused < PATIENCE:
+            raise ValueError(
+                f"Fuse: the frame lies {change[0]:.2f} m and {np.degrees(change[1:].max()):.1f} degrees off the map, "
+                "unlike those before; its pose or its tilt has jumped, and it is left out of the regional map"
+            )
+        return True
+
     def _variance(self, cells: Array) -> Array:
         """Variance of the heights of known cells, m^2."""
         return 1 / cells["weight"].astype(np.float64) + self.shared * cells["best"].astype(np.float64) ** 2
@@ -170,6 +194,8 @@ class Fuse(Stage):
         counted = _sum(cells["contradictions"][contradicted], 1)
         have[contradicted] *= 2
         new = ~known | (contradicted & (variance <= have))
+        unsettled = contradicted & ~new  # until it is settled which is right, nobody may rely on the cell
+        cells["doubt"][unsettled] = np.abs(height - cells["height"])[unsettled]
         cells[new] = np.zeros((), CELL)
         cells["first"][new] = now
         cells["contradictions"][contradicted] = counted
@@ -190,7 +216,7 @@ class Fuse(Stage):
         after["below"], after["above"] = extremes["below"], extremes["above"]
         after["best"] = np.where(before["frames"] > 0, np.minimum(before["best"], spread), spread)
         after["count"] = _sum(before["count"], seen["count"][added])
-        after["last"] = now
+        after["last"], after["doubt"] = now, 0
         after["frames"] = _sum(before["frames"], 1)
         cells[added] = after
         return cells
@@ -208,7 +234,7 @@ class Fuse(Stage):
         layers["maximum"][known] = seen["height"] + seen["above"]
         layers["count"] = cells["count"].astype(np.float32)
         layers["variance"] = np.full(known.shape, np.nan, np.float32)
-        layers["variance"][known] = self._variance(seen)
+        layers["variance"][known] = self._variance(seen) + np.square(seen["doubt"].astype(np.float64))
         for name in ("first", "last"):
             layers[name] = np.where(known, cells[name] / 1e3, np.nan).astype(np.float32)
         for name in ("frames", "contradictions"):

@@ -66,13 +66,13 @@ class Locate(Stage):
 
     @property
     def finding(self) -> str:
-        """That poses are visual, and in which frames; empty where the log has them."""
+        """That poses are visual, and in which frames; empty where poses are given."""
         memory = self._memory
         if not memory.visual or memory.motion is None:
             return ""
         last = memory.motion.segment
         frames = VISUAL_FRAME if last < 2 else f"{VISUAL_FRAME} to {_frame_of(last)}"
-        return f"the log has no pose; {memory.visual} by visual odometry, in {frames}"
+        return f"no pose is given; {memory.visual} by visual odometry, in {frames}"
 
     def _follow(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> None:
         memory = self._memory

@@ -84,12 +84,13 @@ def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("where", "words"), [("file", "is a file; give the name of a folder"), ("gone", "cannot read")]
+    ("where", "words"),
+    [("file", "is a file; give the name of a folder"), ("gone", "cannot read"), ("", "is not empty")],
 )
 def test_an_export_that_cannot_be_done_is_one_sentence(result, tmp_path, where, words, capsys):
     (tmp_path / "file").write_text("mine")
     log = tmp_path / "gone.mcap" if where == "gone" else result
-    assert roverflow("export", log, tmp_path / "file" if where == "file" else tmp_path / "maps") == 2
+    assert roverflow("export", log, tmp_path / where if where != "gone" else tmp_path / "maps") == 2
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1

@@ -24,7 +24,7 @@ from recordings.export.mosaic import RIM, Mosaic
 from recordings.export.ply import COLOURS, write_ply
 from recordings.paint import hillshade
 from recordings.whole_file import written
-from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Tiles, Transform
+from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Source, Tiles, Transform
 
 REGION = ("/nav/regional_map", "/nav/regional_navigation_map")
 FRAME = ("/nav/elevation_map", "/nav/navigation_map")
@@ -202,19 +202,22 @@ def _vertex(place: list[tuple[str, str]], coloured: bool, sure: bool) -> np.dtyp
 
 
 def _write_points(path: Path, points: dict[str, Array], about: str) -> None:
-    """All points of a frame."""
-    dtype = _vertex(_POINTS, "colors" in points, "sigma" in points)
+    """All points of a frame; `source` tells which are measured (1), of a plane (2) and filled (3)."""
+    place = [*_POINTS, *([("source", "u1")] if "source" in points else [])]
+    dtype = _vertex(place, "colors" in points, "sigma" in points)
     vertices = np.empty(len(points["x"]), dtype)
-    for name in ("x", "y", "z", "sigma"):
+    for name in ("x", "y", "z", "source", "sigma"):
         if name in points:
             vertices[name] = points[name]
-    for place, (name, _) in enumerate(COLOURS if "colors" in points else []):
-        vertices[name] = points["colors"][:, place]
+    for channel, (name, _) in enumerate(COLOURS if "colors" in points else []):
+        vertices[name] = points["colors"][:, channel]
     write_ply(path, dtype, [vertices], about)
 
 
 def _colour(colours: Tiles, points: dict[str, Array], level: Transform, resolution: float) -> None:
     """Keep, for every cell, the colour of the point in it whose depth is known best."""
+    if "source" in points:  # a guess colours nothing
+        points = {name: values[points["source"] != Source.FILLED] for name, values in points.items()}
     if "colors" not in points or "sigma" not in points or not len(points["x"]):
         return
     x, y, _ = level(np.column_stack([points["x"], points["y"], points["z"]])).T

@@ -261,6 +261,7 @@ def test_what_is_optional_is_left_out_where_the_log_lacks_it(tmp_path):
     summary = run(pipeline, Log(traverse(3), missing={"level": "no level"}), {use: Path("unused")})
     assert summary["verdict"] == "COMPLETE"
     assert "raised" not in sink.streams
+    assert "left out: no level" in summary["findings"].values()
     assert len(sink.values("sum")) == 3
 
 

@@ -48,6 +48,7 @@ from stages.data import (
     NavigationMap,
     PointCloud,
     Pose,
+    Source,
     StereoCamera,
     Transform,
 )  # fmt: skip
@@ -367,3 +368,12 @@ def test_a_point_cloud_reads_back_as_it_was_whatever_its_padding_and_byte_order(
         np.testing.assert_array_equal(read["sigma"], sigma)
     with pytest.raises(ValueError, match="other fields than single float32"):
         read_point_cloud(replace(message, fields=[replace(message.fields[0], datatype=8), *message.fields[1:]]))
+
+
+def test_a_point_cloud_tells_which_points_are_filled() -> None:
+    points = np.arange(9, dtype=np.float32).reshape(3, 3)
+    source = np.array([Source.MEASURED, Source.FILLED, Source.PLANE], np.uint8)
+    black, index = np.zeros((3, 3), np.uint8), np.arange(3, dtype=np.int32)
+    cloud = PointCloud(1, points, black, np.ones(3, np.float32), index, "level", source=source)
+    assert read_point_cloud(point_cloud(cloud))["source"].tolist() == source.tolist()
+    assert "source" not in read_point_cloud(point_cloud(replace(cloud, source=None)))

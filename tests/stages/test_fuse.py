@@ -291,6 +291,39 @@ def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(c
     np.testing.assert_array_equal(fuse._map.cells.read(-300, -300, 600, 600), before)
 
 
+def test_an_obstacle_that_appears_is_never_stated_to_be_flat_ground():
+    fuse = Fuse()
+    for frame in range(16):
+        ground, sigma = (with_box, 0.05) if frame >= 10 else (flat, 0.01)
+        cloud, pose = drive(frame, ground, at=(0.0, 0.0, 0.0), sigma=sigma)
+        terrain = fuse(cloud, pose, MOUNT)
+        height, variance = (cell(terrain, 4.02, 0.02, name) for name in ("elevation", "variance"))
+        if frame >= 10:
+            assert height + np.sqrt(variance) > 0.45
+    assert height == pytest.approx(0.5, abs=0.02)
+    assert variance < 0.05**2
+
+
+@pytest.mark.parametrize("jump", [np.array([0, 0, 0.6]), np.array([0, 0, -0.4])])
+def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jump):
+    fuse = Fuse()
+    for frame in range(5):
+        terrain = fuse(*drive(frame), MOUNT)
+    for frame in (5, 6):
+        cloud, pose = drive(frame)
+        with pytest.raises(ValueError, match=r"lies 0\.[46]. m and .* off the map .* left out of the regional map"):
+            fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
+    again = fuse(*drive(7), MOUNT)  # it was a slip: the map goes on
+    assert again.layers["frames"].max() > terrain.layers["frames"].max()
+    for frame in (8, 9, 10):
+        cloud, pose = drive(frame)
+        try:
+            anew = fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
+        except ValueError:
+            assert frame < 10
+    assert anew.layers["frames"].max() == 1
+
+
 def test_a_pose_in_another_frame_begins_the_map_anew():
     fuse, fresh = Fuse(), Fuse()
     fuse(*drive(0), MOUNT)

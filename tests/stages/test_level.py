@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Tilt, Transform
+from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Source, Tilt, Transform
 from stages.kernels.rigid import transform_points, transform_points_reference
 from stages.level import Level, level_transform
 from tests.stages.terrain_scene import HEIGHT, UP, level_from_camera
@@ -118,13 +118,19 @@ def test_a_heading_straight_down_a_wrong_mount_and_a_second_levelling_are_refuse
         Level()(once, Tilt(0, UP), BARE)
 
 
-def test_only_place_changes_and_an_empty_cloud_stays_empty() -> None:
+def test_only_place_changes() -> None:
     cloud = cloud_of(scattered())
     level = Level()(cloud, Tilt(0, UP), BARE)
     for name in ("colors", "sigma", "pixel"):
         np.testing.assert_array_equal(getattr(level, name), getattr(cloud, name))
     assert (level.stamp, level.shape) == (cloud.stamp, cloud.shape)
-    assert len(Level()(cloud_of(np.zeros((0, 3))), Tilt(0, UP), BARE).points) == 0
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), scattered()])
+def test_a_frame_that_measured_nothing_is_no_whole_frame(points: Array) -> None:
+    cloud = replace(cloud_of(points), source=np.full(len(points), Source.FILLED, np.uint8))
+    with pytest.raises(ValueError, match="no measured point of the frame is left"):
+        Level()(cloud, Tilt(0, UP), BARE)
 
 
 def test_kernel_equals_the_plain_reference() -> None:

@@ -45,7 +45,7 @@ def test_poses_of_base_link_follow_the_drive_and_say_that_they_are_visual():
     np.testing.assert_allclose(poses[0].position, 0, atol=1e-12)
     assert np.linalg.norm(places[-1]) < 0.05  # of 12 m; the first tilt's noise is all that errs here
     assert np.abs(turns[:, 2]).max() < 0.1
-    assert stage.finding == f"the log has no pose; {FRAMES} by visual odometry, in visual_odom"
+    assert stage.finding == f"no pose is given; {FRAMES} by visual odometry, in visual_odom"
 
 
 def test_the_tilt_is_smoothed_along_the_images():
