@@ -1,4 +1,4 @@
-"""Keeps freed memory in the process: images are allocated and freed in every stage of every frame, and fresh pages from
+"""Keeps freed memory in the process: every stage of every frame allocates and frees large arrays, and fresh pages from
 the operating system cost a tenth of the time."""
 
 from __future__ import annotations

@@ -19,7 +19,8 @@ from stages.stage import Stage, parameter
 class CrossCheck(Stage):
     """The disparity without the pixels that the right image's disparity contradicts.
 
-    `backward` is the disparity of the swapped frame (stages.Swap). Where it is unknown it contradicts nothing.
+    `backward` is the disparity of the swapped frame (stages.Swap). Where it is unknown it contradicts nothing. It
+    must have been searched over the same range: what it could not find it takes for something else.
     """
 
     tolerance: float = parameter(1.0, "largest difference that is no contradiction", unit="px", low=0)
@@ -31,7 +32,8 @@ class CrossCheck(Stage):
                 f"CrossCheck: the disparities have shapes {disparity.pixels.shape} and {backward.pixels.shape}; "
                 "match the swapped frame at the same size"
             )
-        wrong = contradicted(disparity.pixels, backward.pixels, self.tolerance, self.threads)
+        seen = np.where(backward.source == Source.UNKNOWN, np.float32(np.nan), backward.pixels)
+        wrong = contradicted(disparity.pixels, seen, self.tolerance, self.threads)
         return replace(
             disparity,
             pixels=np.where(wrong, np.float32(np.nan), disparity.pixels),

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.data import Array, Disparity, StereoCamera, StereoFrame
+from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.prior import prior_costs
 from stages.kernels.semiglobal import Rule, lanes_for, match
@@ -53,7 +53,7 @@ class Match(Stage):
 
     Penalties count in units of the matching cost: census bits that differ, or with the gradient 1.5 units for each.
     Colour is converted to gray. `prior`, an earlier or coarser result of the same size, draws the search towards it; it
-    is no evidence, and where it is unknown it says nothing. What it shows to lie nearer than the search range, or with
+    is no evidence, and where it is unknown it says nothing. What it measured nearer than the search range, or with
     `farthest` beyond it, stays unknown; without a prior some of that is taken for something within the range.
 
     The confidence is the probability that the disparity is right within 1 px, as far as the lead of the best sum of
@@ -99,10 +99,11 @@ class Match(Stage):
         return Disparity(frame.stamp, found.pixels, found.source, found.confidence, camera=frame.camera)
 
     def _excluded(self, prior: Disparity, search: range) -> Array:
-        """Where the prior shows that the match is not in the range, (H, W) bool."""
+        """Where a measurement of the prior shows that the match is not in the range, (H, W) bool."""
         excluded: Array = prior.pixels > search.stop + BEYOND
         if search.start > self.minimum:
             excluded |= prior.pixels < search.start - BEYOND
+        excluded &= prior.source == Source.MEASURED
         return excluded
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:

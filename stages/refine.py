@@ -92,7 +92,8 @@ class Refine(Stage):
         matches = trusted_matches(
             disparity.pixels, disparity.source, disparity.confidence, self.trusted, self.threads
         )
-        matches[_burnt_out(image, guide, self.burnt_out)] = np.nan
+        if frame.left.dtype == np.uint8:  # of more bits nothing tells where the sensor ends
+            matches[_burnt_out(image, guide, self.burnt_out)] = np.nan
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
         labels, count = superpixels(image, self._count(matches.size), self.compactness, threads=self.threads)
         weights = np.where(np.isnan(matches), F32(0), disparity.confidence)
@@ -127,7 +128,8 @@ class Refine(Stage):
         )
         # Every other pixel of every other row is plenty for a surface.
         few = np.s_[::2, ::2]
-        sparse, regions = (np.ascontiguousarray(layer[few]) for layer in (pixels, labels))
+        sparse, regions = (layer[few].copy() for layer in (pixels, labels))
+        sparse[weights[few] == 0] = np.nan  # what the first planes filled is no evidence for the second
         planes = fit_planes(
             sparse, group[regions], groups, self.inlier_distance, self.hypotheses, seed + 1,
             np.ascontiguousarray(weights[few]), self.threads,

@@ -64,7 +64,7 @@ def _name(matches, confidence, agreed, kinds, refined, moved, tables, others, so
                 source[y, x], worth[y, x] = UNKNOWN, F32(0)
             elif abs(d - match) <= moved:
                 source[y, x] = MEASURED
-                step = np.int64(np.rint(confidence[y, x] * F32(255)))
+                step = np.int64(np.rint(min(max(confidence[y, x], F32(0)), F32(1)) * F32(255)))
                 worth[y, x] = tables[0 if agreed[y, x] else 1, step]
             elif match == match:
                 source[y, x], worth[y, x] = PLANE, replaced
