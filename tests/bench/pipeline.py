@@ -25,7 +25,7 @@ def main() -> None:
         for size, disparities in SIZES.items():
             log = Path(folder) / f"{size}.mcap"
             _roverflow("simulate", log, "--frames", FRAMES, "--size", size)
-            for pipeline in ("rover", "paper"):
+            for pipeline in ("rover", "fast", "paper"):
                 _bench(log, pipeline, size, disparities, cores)
 
 
@@ -46,3 +46,7 @@ def _bench(log: Path, pipeline: str, size: str, disparities: int, cores: int) ->
 
 def _roverflow(*arguments: object) -> None:
     subprocess.run([sys.executable, "-m", "flow.cli", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
+
+
+if __name__ == "__main__":
+    main()

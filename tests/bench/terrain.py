@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -21,6 +22,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flow.align import Token
 from flow.pipeline import load
 from recordings.simulator import log, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
@@ -29,6 +31,7 @@ from stages.data import Array, Cell, Disparity, Mount, Source, StereoFrame, Tilt
 
 SLOPE, TILT_NOISE = np.radians(5.0), np.radians(0.3)
 RUNS = {"rover": "rover", "paper": "paper", "rover, true disparity and tilt": "rover"}
+TILT_SAMPLES = 10  # before and after a frame, from which a pipeline takes what it smooths over
 TERRAIN_STREAMS = ("cloud", "cleaned", "points", "cells", "elevation_map", "navigation_map")
 
 
@@ -41,7 +44,7 @@ class Run:
 
 
 def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any], dict[str, Any], TrueGround]]:
-    """What the pipelines take of each frame, what is true of it in its place, and its true map."""
+    """What the pipelines take of each frame but its tilt, what is true of it in its place, and its true map."""
     left, _, inclinometer = simulation.mounts
     camera_from_inclinometer = left.rotation.T @ inclinometer.rotation
     for index in range(0, simulation.frames, stride):
@@ -49,7 +52,6 @@ def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any]
         base_from_camera = Transform("base_link", simulation.camera.frame_id, left.rotation, left.translation)
         given = {
             "stereo": StereoFrame(stamp, *truth.images, simulation.camera),
-            "tilt": measured_tilt(simulation, stamp),
             "mounting": Mount(stamp, camera_from_inclinometer, base_from_camera),
         }
         up = (truth.base.rotation @ inclinometer.rotation)[2]
@@ -61,18 +63,21 @@ def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any]
         yield given, exact, ground
 
 
-def measured_tilt(simulation: Simulation, stamp: int) -> Tilt:
-    """The tilt as the pipelines get it: interpolated between the inclinometer's samples before and after."""
-    number = int(np.floor((stamp - simulation.begin) * 1e-9 * simulation.tilt_rate + 1e-9))
-    samples = []
-    for sample in (number, number + 1):
+def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
+    """The tilt as the pipeline's own aligner makes it of the inclinometer's samples about a frame."""
+    number = int((stamp - simulation.begin) * 1e-9 * simulation.tilt_rate)
+    samples: deque[Token] = deque()
+    for sample in range(max(number - TILT_SAMPLES, 0), number + TILT_SAMPLES + 1):
         at = simulation.begin + round(sample / simulation.tilt_rate * 1e9)
         random = np.random.default_rng([simulation.seed, 4, sample])
         base, mount = simulation.base_at(at), simulation.mounts[2]
         reading = traverse.inclinometer_reading(base, mount, simulation.tilt_noise, random)
         up = Rotation.from_quat(reading).as_matrix()[2]
-        samples.append(Tilt(at, up / np.linalg.norm(up)))
-    return samples[0].interpolated(samples[1], stamp)
+        samples.append(Token(at, Tilt(at, up / np.linalg.norm(up))))
+    aligner = next(node.actor for node in nodes(pipeline) if node.name == "tilt")
+    tilt = aligner.choose("inclinometer", stamp, samples, True)
+    assert isinstance(tilt, Tilt), tilt
+    return tilt
 
 
 def seen_by_both(simulation: Simulation, stamp: int, truth: FrameTruth) -> Disparity:
@@ -91,11 +96,14 @@ def nodes(pipeline: str) -> list[Any]:
 
 
 def through(pipeline: str, streams: dict[str, Any]) -> tuple[dict[str, Any], float]:
-    """All streams of a pipeline for one frame, those given left alone, and the processor seconds of terrain stages."""
+    """What a frame's navigation map takes beyond the streams given, and the processor seconds of terrain stages."""
+    wanted, steps = {"navigation_map"}, []
+    for node in reversed(nodes(pipeline)):
+        if node.name in wanted and node.name not in streams:
+            wanted.update(node.inputs.values())
+            steps.append(node)
     streams, seconds = dict(streams), 0.0
-    for node in nodes(pipeline):
-        if node.aligns or node.name in streams or (node.name == "matched" and "disparity" in streams):
-            continue
+    for node in reversed(steps):
         start = time.thread_time()
         streams[node.name] = node.actor(**{port: streams[stream] for port, stream in node.inputs.items()})
         seconds += (time.thread_time() - start) * (node.name in TERRAIN_STREAMS)
@@ -108,7 +116,8 @@ def score(simulations: Sequence[Simulation], stride: int, runs: dict[str, str]) 
     for simulation in simulations:
         for given, exact, ground in frames(simulation, stride):
             for name, pipeline in runs.items():
-                streams, seconds = through(pipeline, given | exact if "true" in name else given)
+                measured = {"tilt": measured_tilt(pipeline, simulation, given["stereo"].stamp)}
+                streams, seconds = through(pipeline, given | (exact if "true" in name else measured))
                 layers: dict[str, Array] = dict(streams["elevation_map"].layers)
                 found[name].tally.add(ground, layers, streams["navigation_map"].cells)
                 found[name].seconds.append(seconds)
