@@ -38,6 +38,8 @@ DISPARITY_STEPS = 8  # disparities are kept to 1/8 px: four fifths of the size t
 LIFT = 0.03  # m; hazards float that far above the ground, so that the surface does not swallow them
 LINE_SPACING = 2  # m, between the lines across a map
 FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # from OpenCV 4.12 on; else it tries all filters on every row
+    FAST_PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 AMBER: paint.Rgb = (255, 210, 60)
 TEXT: paint.Rgb = (225, 228, 235)
 THUMBNAIL = 0.25  # size of the image in the camera's frustum
@@ -151,7 +153,8 @@ def draw_stereo(canvas: Canvas, path: str, frame: StereoFrame) -> None:
 @draws(Disparity)
 def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     """The disparities (hover reads them in px), where each comes from, and the superpixels' edges."""
-    steps = np.nan_to_num(disparity.pixels * DISPARITY_STEPS + 0.5).clip(0, 65535).astype(np.uint16)
+    steps = np.minimum(np.fmax(disparity.pixels * np.float32(DISPARITY_STEPS) + np.float32(0.5), 0), 65535)
+    steps = steps.astype(np.uint16)  # of NaN, fmax has made 0
     _, blob = cv2.imencode(".png", steps, FAST_PNG)
     limit = paint.disparity_limit(disparity.pixels)
     image = rr.EncodedDepthImage(
@@ -160,17 +163,19 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     )  # fmt: skip
     canvas.log(f"{path}/pixels", image, Place(Panel.DISPARITY, f"{path}/pixels", path))
     canvas.scale(f"{path}/pixels/scale", steps.shape, 0.0, limit, "px", cv2.COLORMAP_TURBO)
-    source = Place(Panel.SOURCE, f"{path}/source", f"{path}: source")
-    canvas.labels(f"{path}/source", disparity.source, paint.SOURCES, source)
+    percent = 100.0 * np.bincount(disparity.source.ravel(), minlength=len(Source)) / disparity.source.size
+    made = [kind for kind in (Source.PLANE, Source.FILLED) if percent[kind]]
+    if made:  # else it is measured wherever it is known
+        source = Place(Panel.SOURCE, f"{path}/source", f"{path}: source")
+        canvas.labels(f"{path}/source", disparity.source, paint.SOURCES, source)
     if disparity.segments is not None:
         edges = paint.segment_edges(disparity.segments).astype(np.uint8) * 255
         _, blob = cv2.imencode(".png", edges, [*FAST_PNG, cv2.IMWRITE_PNG_BILEVEL, 1])
         overlay = rr.EncodedImage(contents=blob.tobytes(), media_type="image/png", opacity=0.4, draw_order=10.0)
         place = Place(Panel.SUPERPIXELS, f"{path}/superpixels", f"{path}: superpixels")
         canvas.log(place.path, overlay, place)
-    percent = 100.0 * np.bincount(disparity.source.ravel(), minlength=len(Source)) / disparity.source.size
-    made = (f"{percent[kind]:.0f} % {kind.name.lower()}" for kind in (Source.PLANE, Source.FILLED) if percent[kind])
-    return f"{path} {', '.join([f'{100.0 - percent[Source.UNKNOWN]:.0f} % known', *made])}"
+    shares = (f"{percent[kind]:.0f} % {kind.name.lower()}" for kind in made)
+    return f"{path} {', '.join([f'{100.0 - percent[Source.UNKNOWN]:.0f} % known', *shares])}"
 
 
 @draws(PointCloud)
@@ -240,7 +245,8 @@ def draw_health(canvas: Canvas, path: str, health: TiltHealth) -> str:
 
 @draws(ElevationMap)
 def draw_terrain(canvas: Canvas, path: str, terrain: ElevationMap) -> str:
-    """Shaded relief, every layer with its values (hover reads them), and the surface in space."""
+    """Shaded relief, the surface in space, and of a frame's own map every layer with its values (hover reads them);
+    those of the region are in the result log."""
     terrain = paint.terrain_ahead(terrain)
     elevation, where = terrain.layers["elevation"], _frame_suffix(terrain.frame_id)
     low, high = paint.elevation_limits(elevation)
@@ -249,7 +255,7 @@ def draw_terrain(canvas: Canvas, path: str, terrain: ElevationMap) -> str:
     canvas.log(relief, rr.Image(paint.birds_eye(rgb)), Place(Panel.RELIEF, relief, f"relief{where}"))
     canvas.scale(f"{relief}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
     _lines_ahead(canvas, f"{relief}/lines", terrain.shape, terrain)
-    for name, layer in terrain.layers.items():
+    for name, layer in terrain.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
         start, end = paint.value_limits(layer)
         image = rr.DepthImage(
             paint.birds_eye(layer.astype(np.float16)), meter=1.0, colormap=rr.components.Colormap.Turbo,
