@@ -175,6 +175,18 @@ def test_variance_is_that_of_the_mean_when_errors_are_independent(slope: float) 
     np.testing.assert_allclose(correlated, grid.layers["variance"][full] * 25, rtol=1e-4)
 
 
+def test_a_few_points_that_share_one_error_are_as_sure_as_one_of_them_and_no_less() -> None:
+    shared = replace(PURE, correlated=10.0)
+    stated = []
+    for n in (1, 5, 10, 40):
+        places = np.linspace(-0.02, 0.02, n)[:, None] + np.array([[4.025, 0.025, 0.0]])
+        variance = shared(cloud_of(places, sigma=0.02)).layers["variance"]
+        assert np.isfinite(variance).sum() == 1
+        stated.append(float(variance[np.isfinite(variance)][0]))
+    np.testing.assert_allclose(stated[1:3], stated[0], rtol=0.05)
+    assert stated[3] == pytest.approx(stated[2] / 4, rel=0.02)
+
+
 def test_kernel_equals_the_plain_reference() -> None:
     points = scattered(9, 5000).astype(np.float32)
     points[3] = np.nan
