@@ -24,7 +24,8 @@ from stages.voxelise import Voxelise
 # What is remembered of a cell, 30 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
 # best: the smallest standard deviation among them; below, above: from the height to the cell's extremes; first, last:
 # ms since the first frame; numbers stop at the largest of their type. hidden: 1 where nothing is known, but a frame
-# looked and could not see it; doubt: by how much the newest frame contradicts it, where that is not settled.
+# looked and could not see it, and then height is what it must lie below; doubt: by how much the newest frame
+# contradicts it, where that is not settled.
 CELL = np.dtype(
     [
         ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u2"),
@@ -72,7 +73,8 @@ class Fuse(Stage):
       share `shared` of the smallest variance stays, however many frames there are;
     - count (points); first, last: when the evidence in the cell was gathered, s since the map's first frame;
       frames: how many it is from (at most 65535); contradictions: how often the height was contradicted;
-    - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere.
+    - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere; and
+      ceiling, m: the lowest line of sight over the hidden ones.
 
     A frame contradicts a cell if it is off by more than `contradiction` standard deviations. Then the cell's evidence
     loses half its weight, and as soon as the newer is as sure, the newer takes its place; until then the cell is stated
@@ -136,14 +138,15 @@ class Fuse(Stage):
             self._map.begin(pose.frame_id, cloud.stamp)
             cells, plane = self._map.cells.read(row, col, *local.shape), np.zeros(3)
         self._map.plane, self._map.refused = plane, 0
-        rise = plane[0] + plane[1] * x + plane[2] * y
         for height in ("elevation", "minimum", "maximum"):
-            seen[height] += rise
+            seen[height] += plane @ [np.ones_like(x), x, y]
         cells[known] = self._merged(cells[known], seen, (cloud.stamp - self._map.epoch) // _MS)
-        hidden = ~known & (local.layers.get("occluded", np.zeros(known.shape)) == 1)
-        cells["hidden"][hidden] = cells["frames"][hidden] == 0
+        ceiling = local.layers.get("ceiling", np.full(known.shape, np.nan))
+        hidden = ~known & np.isfinite(ceiling) & (cells["frames"] == 0)
+        x, y = _offsets(hidden, row, col, placed, self.resolution)
+        cells[hidden] = _below(cells[hidden], ceiling[hidden] + plane @ [np.ones_like(x), x, y])
         self._map.cells.write(row, col, cells, known | hidden)
-        self._map.last, self._map.hides = cloud.stamp, "occluded" in local.layers
+        self._map.last, self._map.hides = cloud.stamp, "ceiling" in local.layers
         return self._around(cloud.stamp, _lifted(placed, plane))
 
     @property
@@ -251,7 +254,9 @@ class Fuse(Stage):
         for name in ("frames", "contradictions"):
             layers[name] = cells[name].astype(np.float32)
         if self._map.hides:
-            layers["occluded"] = np.where(known, 0, np.where(cells["hidden"] == 1, 1, np.nan)).astype(np.float32)
+            hidden = cells["hidden"] == 1
+            layers["occluded"] = np.where(known, 0, np.where(hidden, 1, np.nan)).astype(np.float32)
+            layers["ceiling"] = np.where(hidden, cells["height"], np.nan).astype(np.float32)
         origin = (col * self.resolution, row * self.resolution)
         return ElevationMap(stamp, layers, self.resolution, origin, self._map.frame_id, level=placed)
 
@@ -260,6 +265,14 @@ def _sum(numbers: Array, more: Array | int) -> Array:
     """Unsigned numbers with `more` added, or the largest of their type."""
     most = np.iinfo(numbers.dtype).max
     return np.asarray(np.minimum(numbers + np.asarray(more, np.float64), most).astype(numbers.dtype))
+
+
+def _below(cells: Array, ceiling: Array) -> Array:
+    """Hidden cells (n,) that lie below the heights `ceiling`, too."""
+    cells = cells.copy()
+    cells["height"] = np.where(cells["hidden"] == 1, np.minimum(cells["height"], ceiling), ceiling)
+    cells["hidden"] = 1
+    return cells
 
 
 def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> Transform:
@@ -310,7 +323,7 @@ def local_cells(
     sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
     local = Voxelise(resolution=resolution, region=region)(replace(cloud, points=points, sensor=sensor))
     col, row = (int(number) - extent // 2 for number, extent in zip(cell, local.shape[::-1], strict=True))
-    heights = ("elevation", "minimum", "maximum")
+    heights = [name for name in ("elevation", "minimum", "maximum", "ceiling") if name in local.layers]
     lifted = {name: local.layers[name] + np.float32(placed.translation[2]) for name in heights}
     origin = (col * resolution, row * resolution)
     return replace(local, layers={**local.layers, **lifted}, origin=origin, frame_id=placed.parent), row, col

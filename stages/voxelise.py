@@ -14,7 +14,7 @@ import numpy as np
 from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Source
 from stages.kernels.grid import FIGURES, cell_percentile, cell_statistics
 from stages.kernels.neighbours import lie_of_cells
-from stages.kernels.occlusion import hidden_cells
+from stages.kernels.occlusion import lowest_sight
 from stages.stage import Stage, parameter
 
 
@@ -29,6 +29,7 @@ class Voxelise(Stage):
       nor many cells average it out: (tilt_sigma * range)^2;
     - occluded: 1 in empty cells between measured ground and measured ground, or behind it, as the camera looks: hidden,
       or not matched; 0 in measured cells; NaN in cells never looked at; absent where the camera is not known;
+    - ceiling, m: in occluded cells, the lowest line of sight over them, below which what is hidden lies;
     - filled, m: mean of points of source FILLED, in cells without measured ones; only where the cloud has such points;
     - percentile_P for each P in `percentiles`, m.
 
@@ -68,7 +69,9 @@ class Voxelise(Stage):
         figures = cell_statistics(measured.points, measured.sigma, *grid)
         layers = self._layers(figures, measured, origin)
         if cloud.sensor is not None and cloud.shape is not None:
-            layers["occluded"] = _occluded(measured, layers["count"] > 0, grid)
+            ceiling = np.where(layers["count"] > 0, np.nan, _ceiling(measured, grid))
+            layers["ceiling"] = ceiling
+            layers["occluded"] = np.where(layers["count"] > 0, 0.0, np.where(np.isfinite(ceiling), 1.0, np.nan))
         if guessed is not None:
             layers["filled"] = _filled(cell_statistics(guessed.points, guessed.sigma, *grid), layers["count"] > 0)
         for value in self.percentiles:
@@ -129,13 +132,12 @@ def _lever(cloud: PointCloud, height: Array, x: Array, y: Array, east: Array, no
         return np.asarray(np.where(depth > 0, (dz - east * dx - north * dy) / depth, 1.0))
 
 
-def _occluded(cloud: PointCloud, known: Array, grid: tuple[float, tuple[float, float], int, float]) -> Array:
-    """The layer `occluded`."""
+def _ceiling(cloud: PointCloud, grid: tuple[float, tuple[float, float], int, float]) -> Array:
+    """The lowest line of sight over each cell, m, NaN where none jumps over it."""
     assert cloud.sensor is not None
     assert cloud.shape is not None
-    x, y = (float(value) for value in cloud.sensor.translation[:2])
-    hidden = hidden_cells(cloud.points, cloud.pixel, cloud.shape[1], (x, y), *grid)
-    return np.where(known, 0.0, np.where(hidden, 1.0, np.nan))
+    x, y, z = (float(value) for value in cloud.sensor.translation)
+    return lowest_sight(cloud.points, cloud.pixel, cloud.shape[1], (x, y, z), *grid)
 
 
 def _filled(figures: Array, known: Array) -> Array:

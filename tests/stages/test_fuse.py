@@ -135,9 +135,11 @@ def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(
         local, row, col = local_cells(*arguments)
         x, y = centres(local)
         looked = np.hypot(x, y) < 3
-        occluded = np.where(np.isfinite(local.layers["elevation"]), 0, np.where(looked, 1, np.nan)).astype(np.float32)
-        return replace(local, layers={**local.layers, "occluded": occluded}), row, col
+        known = np.isfinite(local.layers["elevation"])
+        ceiling = np.where(~known & looked, next(heights), np.nan).astype(np.float32)
+        return replace(local, layers={**local.layers, "ceiling": ceiling}), row, col
 
+    heights = iter((-0.2, -0.1))
     monkeypatch.setattr("stages.fuse.local_cells", hiding)
     fuse = Fuse()
     fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
@@ -145,6 +147,8 @@ def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(
     assert [cell(terrain, *place, "occluded") for place in ((1.02, 0.02), (2.52, 0.02), (1.02, 2.22))] == [1, 0, 0]
     assert np.isnan(cell(terrain, -5.0, 0.02, "occluded"))
     assert np.isnan(cell(terrain, 1.02, 0.02))
+    assert cell(terrain, 1.02, 0.02, "ceiling") == pytest.approx(-0.2, abs=0.01)  # the lower of the two
+    assert np.isnan(cell(terrain, 2.52, 0.02, "ceiling"))
 
 
 def test_a_mean_over_frames_is_weighted_by_inverse_variance():
