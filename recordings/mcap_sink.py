@@ -22,6 +22,7 @@ from recordings.ros2 import (
     occupancy_grid,
     odometry,
     point_cloud,
+    reason_map,
     transform_message,
 )
 from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
@@ -42,7 +43,8 @@ class McapSink:
     """Writes streams to /nav/<stream>, the frame's transforms to /tf, its losses to /nav/diagnostics; there too what is
     known of the tilt's health, and at the end the findings of the run.
 
-    results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each.
+    results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each; the reasons of a
+    NavigationMap go to /nav/<stream>/reason.
     """
 
     results: tuple[str, ...] = (
@@ -78,6 +80,8 @@ class McapSink:
             data = record.items.get(stream)
             if data is not None:
                 writer.write(f"/nav/{stream}", _BUILDERS[type(data)](data), stamp)
+            if isinstance(data, NavigationMap):  # OccupancyGrid has no room for why
+                writer.write(f"/nav/{stream}/reason", reason_map(data), stamp)
         transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)

@@ -8,7 +8,7 @@ x and y, runs its first index along -x, and stores column-major.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +34,10 @@ from stages.data import (
 __all__ = [
     "TYPES", "Ros2Writer", "camera_info", "diagnostics", "disparity_image", "grid_map", "header", "image", "imu",
     "iter_messages", "make", "occupancy_grid", "odometry", "point_cloud", "read_disparity", "read_grid_map",
-    "read_occupancy_grid", "read_point_cloud", "stamp_of", "transform_message",
+    "read_occupancy_grid", "read_point_cloud", "reason_map", "stamp_of", "transform_message",
 ]  # fmt: skip
 
-REASON_UNTOLD = 255  # in a map read back: a hazard, of which OccupancyGrid cannot say why
+REASON_UNTOLD = 255  # in a map read back: a hazard, of which an OccupancyGrid alone cannot say why
 FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32
 
 _IMAGE_ENCODINGS = {
@@ -158,8 +158,18 @@ def read_point_cloud(message: Any) -> dict[str, Array]:
 
 def grid_map(terrain: ElevationMap) -> Any:
     """grid_map_msgs/GridMap: cell (0, 0) at the corner of largest x and y, first index along -x, column-major."""
-    rows, cols = terrain.shape
-    length_x, length_y = cols * terrain.resolution, rows * terrain.resolution
+    return _grid_map(terrain, terrain.layers, ["elevation"])
+
+
+def reason_map(navigation: NavigationMap) -> Any:
+    """grid_map_msgs/GridMap of one layer, "reason": why each cell of an OccupancyGrid has its state, codes of `Reason`."""
+    return _grid_map(navigation, {"reason": navigation.reason.astype(np.float32)}, [])
+
+
+def _grid_map(grid: ElevationMap | NavigationMap, layers: Mapping[str, Array], basic: list[str]) -> Any:
+    """The GridMap of some layers (rows, cols) on the cells of `grid`."""
+    rows, cols = next(iter(layers.values())).shape
+    length_x, length_y = cols * grid.resolution, rows * grid.resolution
     dimension = "std_msgs/msg/MultiArrayDimension"
     layout = make(
         "std_msgs/msg/MultiArrayLayout",
@@ -172,16 +182,16 @@ def grid_map(terrain: ElevationMap) -> Any:
     # The grid map's matrix is layer[::-1, ::-1].T; its column-major order is the row-major order of layer[::-1, ::-1].
     data = [
         make("std_msgs/msg/Float32MultiArray", layout=layout, data=np.ascontiguousarray(layer[::-1, ::-1]).reshape(-1))
-        for layer in terrain.layers.values()
+        for layer in layers.values()
     ]
-    centre = (terrain.origin[0] + length_x / 2, terrain.origin[1] + length_y / 2, 0.0)
+    centre = (grid.origin[0] + length_x / 2, grid.origin[1] + length_y / 2, 0.0)
     info = make(
-        "grid_map_msgs/msg/GridMapInfo", resolution=float(terrain.resolution), length_x=length_x, length_y=length_y,
+        "grid_map_msgs/msg/GridMapInfo", resolution=float(grid.resolution), length_x=length_x, length_y=length_y,
         pose=_pose(centre, (0.0, 0.0, 0.0, 1.0)),
     )  # fmt: skip
     return make(
-        "grid_map_msgs/msg/GridMap", header=header(terrain.stamp, terrain.frame_id), info=info,
-        layers=list(terrain.layers), basic_layers=["elevation"], data=data, outer_start_index=0, inner_start_index=0,
+        "grid_map_msgs/msg/GridMap", header=header(grid.stamp, grid.frame_id), info=info, layers=list(layers),
+        basic_layers=basic, data=data, outer_start_index=0, inner_start_index=0,
     )  # fmt: skip
 
 
@@ -190,7 +200,16 @@ def read_grid_map(message: Any) -> ElevationMap:
 
     A map that was moved in its circular buffer (start indices) is unrolled.
     """
-    info, layers = message.info, {}
+    info, centre = message.info, message.info.pose.position
+    return ElevationMap(
+        stamp_of(message.header), _layers(message), float(info.resolution),
+        (centre.x - info.length_x / 2, centre.y - info.length_y / 2), message.header.frame_id,
+    )  # fmt: skip
+
+
+def _layers(message: Any) -> dict[str, Array]:
+    """The layers of a GridMap, (rows, cols) float32 each."""
+    layers = {}
     for name, array in zip(message.layers, message.data, strict=True):
         outer, inner = array.layout.dim
         if outer.label != "column_index":
@@ -199,11 +218,7 @@ def read_grid_map(message: Any) -> ElevationMap:
         # outer_start_index counts along the matrix' first index (-x), inner_start_index along its second (-y).
         unrolled = np.roll(stored, (-message.inner_start_index, -message.outer_start_index), axis=(0, 1))
         layers[name] = np.ascontiguousarray(unrolled[::-1, ::-1])
-    centre = info.pose.position
-    return ElevationMap(
-        stamp_of(message.header), layers, float(info.resolution),
-        (centre.x - info.length_x / 2, centre.y - info.length_y / 2), message.header.frame_id,
-    )  # fmt: skip
+    return layers
 
 
 def occupancy_grid(navigation: NavigationMap) -> Any:
@@ -218,13 +233,16 @@ def occupancy_grid(navigation: NavigationMap) -> Any:
     return make("nav_msgs/msg/OccupancyGrid", header=stamped, info=info, data=data)
 
 
-def read_occupancy_grid(message: Any) -> NavigationMap:
-    """The NavigationMap of an OccupancyGrid. Its reasons are lost on the way: a hazard's is `REASON_UNTOLD`."""
+def read_occupancy_grid(message: Any, reasons: Any = None) -> NavigationMap:
+    """The NavigationMap of an OccupancyGrid and, where given, of its `reason_map`; an OccupancyGrid alone cannot say
+    why a cell is a hazard: `REASON_UNTOLD`."""
     info = message.info
     cells = np.asarray(message.data, np.int8).reshape(info.height, info.width)
     reason = np.full(cells.shape, REASON_UNTOLD, np.uint8)
     reason[cells == Cell.FREE] = Reason.CLEAR
     reason[cells == Cell.UNKNOWN] = Reason.UNOBSERVED
+    if reasons is not None:
+        reason = _layers(reasons)["reason"].astype(np.uint8)
     resolution = float(str(np.float32(info.resolution)))  # the message holds float32: 0.05 stays 0.05
     origin = (float(info.origin.position.x), float(info.origin.position.y))
     return NavigationMap(stamp_of(message.header), cells, reason, resolution, origin, message.header.frame_id)

@@ -31,7 +31,8 @@ ROOT = Path(__file__).parent.parent
 SMALL = ("--set", "disparities=64")
 RESULTS = {
     "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/nav/pose", "/nav/regional_map",
-    "/nav/regional_navigation_map", "/tf", "/nav/diagnostics",
+    "/nav/regional_navigation_map", "/tf", "/nav/diagnostics", "/nav/navigation_map/reason",
+    "/nav/regional_navigation_map/reason",
 }  # fmt: skip
 
 

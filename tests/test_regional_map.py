@@ -12,6 +12,7 @@ import rasterio
 
 from flow.cli import main
 from recordings import ros2
+from stages.data import Cell, Reason
 from tests.conftest import FRAMES, rewrite
 
 SMALL = ("--set", "disparities=64")
@@ -41,6 +42,23 @@ def test_every_frame_gives_the_map_around_the_rover_in_the_pose_s_frame(result):
     cells = ros2.read_occupancy_grid(maps["/nav/regional_navigation_map"][-1])
     assert (cells.cells.shape, cells.origin) == (terrain.shape, pytest.approx(terrain.origin))
     assert np.count_nonzero(cells.cells == 0) > 2000
+
+
+@pytest.mark.parametrize("stream", ["navigation_map", "regional_navigation_map"])
+def test_a_result_log_says_why_each_cell_is_a_hazard_or_unknown(result, stream):
+    grids, reasons = (
+        [message for _, _, message in ros2.iter_messages(result, [topic])]
+        for topic in (f"/nav/{stream}", f"/nav/{stream}/reason")
+    )
+    assert len(grids) == len(reasons) == FRAMES
+    told = {Cell.FREE: {Reason.CLEAR}, Cell.UNKNOWN: {Reason.UNOBSERVED, Reason.OCCLUDED, Reason.UNSURE}}
+    told[Cell.HAZARD] = set(Reason) - told[Cell.FREE] - told[Cell.UNKNOWN] - {Reason.ELEVATION}
+    for grid, reason in zip(grids, reasons, strict=True):
+        navigation = ros2.read_occupancy_grid(grid, reason)
+        assert reason.info.pose.position.x == pytest.approx(navigation.origin[0] + reason.info.length_x / 2)
+        for state, why in told.items():
+            assert set(np.unique(navigation.reason[navigation.cells == state]).tolist()) <= {*why}
+        assert Reason.STEP in navigation.reason
 
 
 def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tmp_path, capsys):

@@ -87,7 +87,8 @@ def write(path: Path, seconds: float = 0.1) -> Path:
 def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path: Path) -> None:
     read = list(iter_messages(write(tmp_path / "out.mcap")))
     topics = [(topic, stamp - START) for topic, stamp, _ in read]
-    frame = ["/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/tf", "/nav/diagnostics"]
+    results = [f"/nav/{name}" for name in ("disparity", "points", "elevation_map", "navigation_map")]
+    frame = [*results, "/nav/navigation_map/reason", "/tf", "/nav/diagnostics"]
     second = [topic for topic in frame if topic != "/nav/elevation_map"]
     assert topics == [(t, 0) for t in frame] + [(t, 100) for t in second] + [("/nav/diagnostics", 100)]
     first = {topic: message for topic, stamp, message in read if stamp == START}
@@ -95,9 +96,9 @@ def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path: Path) -> N
     np.testing.assert_array_equal(read_disparity(first["/nav/disparity"]), sent["disparity"].pixels)
     elevation = read_grid_map(first["/nav/elevation_map"]).layers["elevation"]
     np.testing.assert_array_equal(elevation, sent["elevation_map"].layers["elevation"])
-    np.testing.assert_array_equal(
-        read_occupancy_grid(first["/nav/navigation_map"]).cells, sent["navigation_map"].cells
-    )  # fmt: skip
+    navigation = read_occupancy_grid(first["/nav/navigation_map"], first["/nav/navigation_map/reason"])
+    np.testing.assert_array_equal(navigation.cells, sent["navigation_map"].cells)
+    np.testing.assert_array_equal(navigation.reason, sent["navigation_map"].reason)
     moved = first["/tf"].transforms[0]
     assert (moved.header.frame_id, moved.child_frame_id, moved.transform.translation.z) == (
         "level",
