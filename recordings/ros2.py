@@ -162,7 +162,7 @@ def grid_map(terrain: ElevationMap) -> Any:
 
 
 def reason_map(navigation: NavigationMap) -> Any:
-    """grid_map_msgs/GridMap of one layer, "reason": why each cell of an OccupancyGrid has its state, codes of `Reason`."""
+    """grid_map_msgs/GridMap with one layer, "reason": why each cell has the state that its OccupancyGrid tells."""
     return _grid_map(navigation, {"reason": navigation.reason.astype(np.float32)}, [])
 
 
