@@ -1,24 +1,23 @@
-"""Error measures over arrays: elevation, hazards, rocks, tilt. Pure functions, no files.
+"""Error measures over arrays: heights, angles, grids laid over each other. Pure functions, no files.
 
-What is summed over frames comes in two steps: `..._counts` of one frame, which add up, and `..._measures` of the sum,
-so that a log of any length takes the memory of one frame and every pixel or cell, not every frame, counts the same.
-NaN is "unknown" and never takes part in an error; shares of an empty set are NaN, because there is nothing to say.
+What is summed over frames is kept as sums, so that a log of any length takes the memory of one frame and every cell,
+not every frame, counts the same. NaN is "unknown" and never takes part in an error; shares of an empty set are NaN,
+because there is nothing to say.
 """
 
 from __future__ import annotations
 
-from typing import Any, SupportsFloat
+from typing import SupportsFloat
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stages.data import Array, Cell
+from stages.data import Array
 
 CLOSE = 0.05  # m, the height error that the Lunar Autonomy Challenge accepts
 NMAD_SCALE = 1.4826  # makes the median deviation of a normal distribution its standard deviation
 NMAD_BIN = 1e-5  # m, to which errors are rounded for their median
 NMAD_REACH = 1.0  # m, beyond which errors are one bin
-ROCK_OUTLINE = 1.25  # a rock reaches this many mean radii from its centre: rocks are longer than they are wide
 
 
 def share(part: SupportsFloat, whole: SupportsFloat) -> float:
@@ -94,37 +93,6 @@ def _middles(counts: Array) -> tuple[int, int]:
     return int(low), int(high)
 
 
-class RingErrors:
-    """Height errors by distance, raw and levelled (less the best plane of each map), of any number of maps."""
-
-    def __init__(self, rings: tuple[tuple[float, float], ...]) -> None:
-        self.rings = {ring: (HeightErrors(), HeightErrors()) for ring in rings}
-
-    def add(self, x: Array, y: Array, counted: Array, error: Array) -> None:
-        """Count one map. x: (cols,), y: (rows,) cell centres, m; counted, error: (rows, cols), error m, NaN = unknown.
-
-        The plane is that of the errors at the counted cells.
-        """
-        radius, error = np.hypot(x[None, :], y[:, None]), np.where(counted, error, np.nan)
-        levelled = without_plane(x, y, error)
-        for limits, parts in self.rings.items():
-            cells = counted & in_ring(radius, *limits)
-            for errors, values in zip(parts, (error, levelled), strict=True):
-                errors.add(values[cells])
-
-    def measures(self) -> dict[str, Any]:
-        """Ring ("0-4 m") -> seen (cells counted), completeness (share of them known), raw and levelled measures."""
-        return {
-            f"{low:g}-{high:g} m": {
-                "seen": raw.seen,
-                "completeness": share(raw.cells, raw.seen),
-                "raw": raw.measures(),
-                "levelled": levelled.measures(),
-            }
-            for (low, high), (raw, levelled) in self.rings.items()
-        }
-
-
 def without_plane(x: Array, y: Array, error: Array) -> Array:
     """Errors less their least-squares plane over (x, y): what is left when tilt and offset are forgiven.
 
@@ -138,92 +106,6 @@ def without_plane(x: Array, y: Array, error: Array) -> Array:
     design = np.column_stack([east.ravel(), north.ravel(), np.ones(east.size)])
     plane = np.linalg.lstsq(design[known.ravel()], error[known].astype(np.float64), rcond=None)[0]
     return np.asarray(error - (design @ plane).reshape(error.shape))
-
-
-def hazard_counts(cells: Array, truth: Array, seen: Array, counted: Array, rock: Array | None) -> dict[str, float]:
-    """Sums for `hazard_measures` over one frame; all (rows, cols).
-
-    cells, truth: `Cell` codes, any code but free and hazard being unknown; seen: bool, cells that both cameras see;
-    counted: bool, those of them that are near enough to ask for; rock: bool, cells on a high rock (None: not told).
-    """
-    free, told = cells == Cell.FREE, cells == Cell.HAZARD
-    hazard, safe = truth == Cell.HAZARD, truth == Cell.FREE
-    masks = {
-        "cells": counted,
-        "unknown": counted & ~free & ~told,
-        "hazards": counted & hazard,
-        "hazards_told": counted & hazard & told,
-        "hazards_free": counted & hazard & free,
-        "safe": counted & safe,
-        "safe_told": counted & safe & told,
-        "free": free,
-        "free_hazard": free & hazard,
-        "free_unseen": free & ~seen,
-        "free_unseen_hazard": free & ~seen & hazard,
-        "free_asked": free if rock is not None else np.zeros(1),
-        "free_on_rock": free & rock if rock is not None else np.zeros(1),
-    }
-    return {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}
-
-
-def hazard_measures(counts: dict[str, float]) -> dict[str, Any]:
-    """How well a map finds the hazards and how far it can be trusted, of added `hazard_counts`.
-
-    Over the counted cells: cells (how many), unknown (share), recall (of true hazards, called hazard), false_safe (of
-    true hazards, called free), false_alarm (of truly free cells, called hazard). Over all cells that the map calls
-    free, wherever they lie: free (how many), free_hazard (share that are true hazards), free_on_rock (share on a high
-    rock), free_unseen (those that the cameras did not both see: cells, share of all free ones, hazards among them).
-    """
-    return {
-        "cells": counts["cells"],
-        "unknown": share(counts["unknown"], counts["cells"]),
-        "recall": share(counts["hazards_told"], counts["hazards"]),
-        "false_safe": share(counts["hazards_free"], counts["hazards"]),
-        "false_alarm": share(counts["safe_told"], counts["safe"]),
-        "free": counts["free"],
-        "free_hazard": share(counts["free_hazard"], counts["free"]),
-        "free_on_rock": share(counts["free_on_rock"], counts["free_asked"]),
-        "free_unseen": {
-            "cells": counts["free_unseen"], "share": share(counts["free_unseen"], counts["free"]),
-            "hazards": counts["free_unseen_hazard"],
-        },
-    }  # fmt: skip
-
-
-def on_rocks(rocks: Array, hazard: Array, x: Array, y: Array) -> Array:
-    """Mask (rows, cols) of the cells on a rock: true hazard cells whose centre is within a rock's outline.
-
-    rocks: (N, 3) x, y, mean diameter, m; hazard: (rows, cols) bool; x, y: (cols,) and (rows,) cell centres, m. The
-    outline is a circle about the longest rocks (`ROCK_OUTLINE`); of it, the true hazards are the rock itself.
-    """
-    mask = np.zeros(hazard.shape, bool)
-    for at_x, at_y, diameter in np.asarray(rocks, np.float64):
-        reach = ROCK_OUTLINE * diameter / 2
-        columns = slice(*np.searchsorted(x, [at_x - reach, at_x + reach]))
-        lines = slice(*np.searchsorted(y, [at_y - reach, at_y + reach]))
-        mask[lines, columns] |= np.hypot(x[None, columns] - at_x, y[lines, None] - at_y) <= reach
-    return mask & hazard
-
-
-def rocks_found(
-    rocks: Array, cells: Array, visible: Array, x: Array, y: Array, resolution: float
-) -> tuple[Array, Array]:
-    """Which rocks could be seen, and which of them the map calls a hazard; two bool (N,).
-
-    rocks: (N, 3) x, y, diameter, m; cells: (rows, cols) `Cell` codes; visible: (rows, cols) bool; x, y: (cols,) and
-    (rows,) cell centres, m. A rock can be seen if a visible cell's centre lies within its radius (or half a cell's
-    diagonal, for rocks smaller than a cell); it is found if a hazard cell lies within its radius and one cell more.
-    """
-    seen, found = np.zeros(len(rocks), bool), np.zeros(len(rocks), bool)
-    for index, (at_x, at_y, diameter) in enumerate(np.asarray(rocks, np.float64)):
-        reach = diameter / 2 + resolution
-        columns = slice(*np.searchsorted(x, [at_x - reach, at_x + reach]))
-        lines = slice(*np.searchsorted(y, [at_y - reach, at_y + reach]))
-        distance = np.hypot(x[None, columns] - at_x, y[lines, None] - at_y)
-        own = max(diameter / 2, resolution / np.sqrt(2))
-        seen[index] = bool(np.any(visible[lines, columns] & (distance <= own)))
-        found[index] = bool(np.any((cells[lines, columns] == Cell.HAZARD) & (distance <= reach)))
-    return seen, seen & found
 
 
 def angle_between(first: ArrayLike, second: ArrayLike) -> float:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from recordings.measures import share
-from recordings.scoring import HIGH_ROCK, NEAR, Score
+from recordings.scoring import Score
 from recordings.stereo_measures import CROP_STEP, REGIONS, THRESHOLDS
 from recordings.terrain_measures import format_terrain
 
@@ -16,10 +15,6 @@ def format_score(found: Score) -> str:
     parts = [_frame_lines(found)]
     if found.disparity is not None:
         parts.append(_disparity_lines(found.disparity))
-    if found.elevation is not None:
-        parts.append(_elevation_lines(found.elevation, found.unseen))
-    if found.navigation is not None:
-        parts.append(_navigation_lines(found.navigation, found.rocks))
     if found.terrain is not None:
         parts.append(format_terrain(found.terrain))
     parts.append(_tilt_lines(found))
@@ -69,42 +64,6 @@ def _region_line(name: str, m: dict[str, float]) -> str:
 def _known_line(name: str, m: dict[str, float]) -> str:
     bad = "".join(f"{_percent(m[f'bad_{limit:g}_known']):>8}" for limit in THRESHOLDS)
     return f"               {f'{name}, of the known':<33} |{bad} |"
-
-
-def _elevation_lines(rings: dict[str, Any], unseen: float) -> list[str]:
-    lines = [
-        "elevation    in cells that both cameras see, by distance from base_link; errors of the known in cm",
-        "               distance      cells    known |   RMSE    MAE   bias   NMAD  within 5 cm",
-    ]
-    levelled = ["               the same with the best plane of each frame's errors removed"]
-    for kind, title in (("raw", []), ("levelled", levelled)):
-        lines += title
-        for name, ring in rings.items():
-            h = ring[kind]
-            errors = "".join(f"{_number(100 * h[key], 2):>7}" for key in ("rmse", "mae", "bias", "nmad"))
-            known, close = _percent(share(h["cells"], ring["seen"])), _percent(h["within_5cm"])
-            lines.append(f"               {name:<8} {ring['seen']:10d} {known:>8} |{errors} {close:>12}")
-    return [*lines, f"             {_percent(unseen)} of all elevations given lie in cells that not both cameras see"]
-
-
-def _navigation_lines(n: dict[str, Any], rocks: dict[str, float] | None) -> list[str]:
-    unseen, high = n["free_unseen"], f"{HIGH_ROCK:g} m or higher"
-    told = f"not both cameras see ({unseen['cells']:.0f} cells, {unseen['hazards']:.0f} of them true hazards)"
-    lines = [
-        f"navigation   in the {n['cells']:.0f} cells within {NEAR:g} m that both cameras see",
-        f"               {_percent(n['recall']):>7} of true hazard cells found",
-        f"               {_percent(n['false_safe']):>7} of true hazard cells called free",
-        f"               {_percent(n['false_alarm']):>7} of truly free cells called hazard",
-        f"               {_percent(n['unknown']):>7} of all cells left unknown",
-        f"             of the {n['free']:.0f} cells called free anywhere on the map",
-        f"               {_percent(n['free_on_rock']):>7} lie on a rock {high}",
-        f"               {_percent(n['free_hazard']):>7} are true hazards, by rock or slope",
-        f"               {_percent(unseen['share']):>7} lie where {told}",
-    ]
-    if rocks is not None:
-        counts = f"{rocks['found']:.0f} of {rocks['seen']:.0f} ({_percent(rocks['recall'])})"
-        lines.append(f"             rocks {high} seen within {NEAR:g} m: {counts} found")
-    return lines
 
 
 def _tilt_lines(found: Score) -> list[str]:

@@ -30,9 +30,6 @@ TRUTHS = (
     "/truth/tilt",
 )  # fmt: skip
 PATIENCE = 5_000_000_000  # ns of log time after which no log adds to a frame any more
-RINGS = ((0.0, 4.0), (4.0, 8.0), (0.0, 8.0))  # m from base_link, the outer border not included
-NEAR = 8.0  # m from base_link, within which cells and rocks are asked for
-HIGH_ROCK = 0.2  # m
 
 
 @dataclass(frozen=True)
@@ -43,10 +40,6 @@ class Score:
     it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without truth;
     disparity: `StereoErrors.measures`, cropped by the truth's max_disparity (the data set's range where it has one,
     else the frame's largest), rounded up to 16;
-    elevation: "0-4 m", "4-8 m", "0-8 m" (borders belong outside) -> seen (cells that both cameras see), completeness
-    (share of them known), raw and levelled (less the best plane of each frame) `HeightErrors.measures`;
-    unseen: share of all elevations given in cells that the cameras did not both see;
-    navigation: `measures.hazard_measures` within 8 m; rocks: seen, found, recall of those 0.2 m or higher;
     terrain: `terrain_measures.TerrainTally.measures`;
     tilt: frames, mean, max; untilted: why -> frames with a true tilt whose own could not be scored;
     per_frame: the main figures of each frame. None where the truth has no such topics (tilt: where no frame has both).
@@ -57,10 +50,6 @@ class Score:
     missing: dict[str, list[int]]
     unmatched: dict[str, int]
     disparity: dict[str, Any] | None = None
-    elevation: dict[str, Any] | None = None
-    unseen: float = math.nan
-    navigation: dict[str, Any] | None = None
-    rocks: dict[str, float] | None = None
     terrain: dict[str, Any] | None = None
     tilt: dict[str, float] | None = None
     untilted: dict[str, int] = field(default_factory=dict)
@@ -104,29 +93,6 @@ def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dic
         yield stamp, waiting.pop(stamp)
 
 
-@dataclass(frozen=True)
-class _Ground:
-    """The true map of a frame; arrays (rows, cols), x and y (cols,) and (rows,) cell centres, m.
-
-    seen: cells that both cameras see; counted: those of them nearer to base_link than `NEAR`.
-    """
-
-    map: ElevationMap
-    x: Array
-    y: Array
-    seen: Array
-    counted: Array
-
-    @classmethod
-    def of(cls, message: Any) -> _Ground:
-        true = ros2.read_grid_map(message)
-        x, y = (
-            (np.arange(n) + 0.5) * true.resolution + at for n, at in zip(true.shape[::-1], true.origin, strict=True)
-        )
-        seen = true.layers["visible"] > 0.5
-        return cls(true, x, y, seen, seen & measures.in_ring(np.hypot(x[None, :], y[:, None]), 0.0, NEAR))
-
-
 class _Tally:
     """Sums up frames; of a frame it keeps one row of figures, whatever the size of its images and maps."""
 
@@ -138,10 +104,6 @@ class _Tally:
         self.unmatched: dict[str, int] = {}
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
-        self.heights: measures.RingErrors | None = None
-        self.values = self.values_unseen = 0
-        self.hazards: dict[str, float] = {}
-        self.rocks: dict[str, float] = {}
         self.terrain: terrain_measures.TerrainTally | None = None
         self.tilts: list[float] = []
         self.untilted: dict[str, int] = {}
@@ -162,12 +124,8 @@ class _Tally:
         row: dict[str, float] = {"stamp": stamp}
         if "/truth/disparity" in frame:
             row |= self._add_disparity(stamp, frame)
-        if "/truth/elevation_map" in frame:
-            ground = _Ground.of(frame["/truth/elevation_map"])
-            row |= self._add_elevation(stamp, frame, ground)
-            if "/truth/navigation_map" in frame:
-                row |= self._add_navigation(stamp, frame, ground)
-                self._add_terrain(stamp, frame, ground)
+        if {"/truth/elevation_map", "/truth/navigation_map"} <= frame.keys():
+            row |= self._add_terrain(stamp, frame)
         if "/truth/tilt" in frame:
             row |= self._add_tilt(frame)
         self.per_frame.append(row)
@@ -198,61 +156,27 @@ class _Tally:
             )
         return np.asarray(mask.data).reshape(mask.height, mask.step)[:, : mask.width]
 
-    def _add_elevation(self, stamp: int, frame: dict[str, Any], ground: _Ground) -> dict[str, float]:
-        elevation = np.full(ground.map.shape, np.nan, np.float32)
-        if "/nav/elevation_map" in frame:
-            given = ros2.read_grid_map(frame["/nav/elevation_map"])
-            elevation = self._aligned(self.result, stamp, given, given.layers["elevation"], ground.map, np.nan)
-        known = np.isfinite(elevation)
-        self.values += int(known.sum())
-        self.values_unseen += int((known & ~ground.seen).sum())
-        error = elevation.astype(np.float64) - ground.map.layers["elevation"]
-        self.heights = self.heights or measures.RingErrors(RINGS)
-        self.heights.add(ground.x, ground.y, ground.counted, error)
-        error = error[known & ground.counted]
-        return {
-            "elevation_completeness": measures.share(error.size, ground.counted.sum()),
-            "elevation_rmse": measures.share(np.square(error).sum(), error.size) ** 0.5,
-            "elevation_bias": measures.share(error.sum(), error.size),
-        }
-
-    def _add_navigation(self, stamp: int, frame: dict[str, Any], ground: _Ground) -> dict[str, float]:
-        true = self._cells(self.truth, stamp, frame["/truth/navigation_map"], ground)
-        cells = np.full(true.shape, np.int8(Cell.UNKNOWN))
-        if "/nav/navigation_map" in frame:
-            cells = self._cells(self.result, stamp, frame["/nav/navigation_map"], ground)
-        rocks = _high_rocks(frame["/truth/rocks"]) if "/truth/rocks" in frame else None
-        rock = None if rocks is None else measures.on_rocks(rocks, true == Cell.HAZARD, ground.x, ground.y)
-        counts = measures.hazard_counts(cells, true, ground.seen, ground.counted, rock)
-        self.hazards = measures.added(self.hazards, counts)
-        row = {"free": counts["free"], "free_unseen": counts["free_unseen"]}
-        if rocks is not None:
-            near = rocks[measures.in_ring(np.hypot(rocks[:, 0], rocks[:, 1]), 0.0, NEAR)]
-            seen, found = measures.rocks_found(near, cells, ground.counted, ground.x, ground.y, ground.map.resolution)
-            row |= {"rocks_seen": float(seen.sum()), "rocks_found": float(found.sum())}
-            self.rocks = measures.added(self.rocks, {name: row[f"rocks_{name}"] for name in ("seen", "found")})
-        return row
-
-    def _add_terrain(self, stamp: int, frame: dict[str, Any], ground: _Ground) -> None:
-        hazard = self._cells(self.truth, stamp, frame["/truth/navigation_map"], ground) == Cell.HAZARD
-        rocks = _rocks(frame["/truth/rocks"]) if "/truth/rocks" in frame else np.zeros((0, 0))
-        truth = terrain_measures.TrueGround.of(ground.map, hazard, rocks)
-        if truth is None:
-            return
+    def _add_terrain(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
+        true = ros2.read_grid_map(frame["/truth/elevation_map"])
+        hazard = self._cells(self.truth, stamp, frame["/truth/navigation_map"], true) == Cell.HAZARD
+        rocks = _rocks(frame["/truth/rocks"]) if "/truth/rocks" in frame else np.zeros((0, 6))
+        ground = terrain_measures.TrueGround.of(true, hazard, rocks)
+        if ground is None:
+            raise LogError(f"{self.truth}: /truth at {stamp} ns lacks what maps are scored with; make the truth again")
         layers: dict[str, Array] = {}
         if "/nav/elevation_map" in frame:
             given = ros2.read_grid_map(frame["/nav/elevation_map"])
             wanted = given.layers.keys() & {"elevation", "variance", "common_variance"}
-            layers = {name: self._aligned(self.result, stamp, given, given.layers[name], ground.map, np.nan)
+            layers = {name: self._aligned(self.result, stamp, given, given.layers[name], true, np.nan)
                       for name in sorted(wanted)}  # fmt: skip
         message = frame.get("/nav/navigation_map")
-        cells = None if message is None else self._cells(self.result, stamp, message, ground)
+        cells = None if message is None else self._cells(self.result, stamp, message, true)
         self.terrain = self.terrain or terrain_measures.TerrainTally()
-        self.terrain.add(truth, layers, cells)
+        return self.terrain.add(ground, layers, cells)
 
-    def _cells(self, log: Path, stamp: int, message: Any, ground: _Ground) -> Array:
+    def _cells(self, log: Path, stamp: int, message: Any, true: ElevationMap) -> Array:
         grid = ros2.read_occupancy_grid(message)
-        return self._aligned(log, stamp, grid, grid.cells, ground.map, Cell.UNKNOWN)
+        return self._aligned(log, stamp, grid, grid.cells, true, Cell.UNKNOWN)
 
     def _aligned(
         self, log: Path, stamp: int, grid: Any, values: Array, onto: ElevationMap, missing: float
@@ -299,11 +223,6 @@ class _Tally:
             missing={topic: stamps for topic, stamps in self.missing.items() if stamps},
             unmatched=self.unmatched,
             disparity=self.disparity.measures() if self.disparity else None,
-            elevation=self.heights.measures() if self.heights else None,
-            unseen=measures.share(self.values_unseen, self.values),
-            navigation=measures.hazard_measures(self.hazards) if self.hazards else None,
-            rocks=self.rocks | {"recall": measures.share(self.rocks["found"], self.rocks["seen"])}
-            if self.rocks else None,
             terrain=self.terrain.measures() if self.terrain else None,
             tilt={"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)} if tilts else None,
             untilted=self.untilted,
@@ -323,12 +242,6 @@ def _rocks(message: Any) -> Array:
     names = [name for name in ("x", "y", "diameter", "height", "pixels", "shown") if name in offsets]
     columns = (np.ascontiguousarray(rows[:, offsets[name] : offsets[name] + 4]).view("<f4")[:, 0] for name in names)
     return np.column_stack(list(columns))
-
-
-def _high_rocks(message: Any) -> Array:
-    """x, y, diameter (N, 3) m of the rocks of /truth/rocks that are hazards."""
-    rocks = _rocks(message)
-    return np.asarray(rocks[rocks[:, 3] >= np.float32(HIGH_ROCK), :3])
 
 
 def _without_nan(value: Any) -> Any:

@@ -76,19 +76,29 @@ class TerrainTally:
 
     def add(
         self, truth: TrueGround, layers: dict[str, Array], cells: Array | None, tilts: Array | None = None
-    ) -> None:
-        """Count one frame. layers: of the elevation map, on the truth's grid, or empty; cells: `Cell` codes or None.
+    ) -> dict[str, float]:
+        """Count one frame, and give its main figures.
 
-        tilts: (N, 2) slopes along x and y by which other errors of the tilt would lean the map, against its own. A
-        frame has a single tilt, and with it all cells are off together: thirty frames say little about whether the
-        intervals with the tilt's hold. Where `tilts` are given, those are counted for each instead of for the one.
+        layers: of the elevation map, on the truth's grid, or empty; cells: `Cell` codes or None; tilts: (N, 2) slopes
+        along x and y by which other errors of the tilt would lean the map, against its own. A frame has a single tilt,
+        and with it all cells are off together: thirty frames say little about whether the intervals with the tilt's
+        hold. Where `tilts` are given, those are counted for each instead of for the one.
         """
         unknown = np.full(truth.seen.shape, np.nan)
         elevation = layers.get("elevation", unknown).astype(np.float64)
         self._add_heights(truth, layers, elevation, np.zeros((1, 2)) if tilts is None else tilts)
         cells = np.full(truth.seen.shape, np.int8(Cell.UNKNOWN)) if cells is None else cells
-        self.counts = added(self.counts, _hazards(truth, cells))
-        self.counts = added(self.counts, _rocks(truth, cells))
+        hazards, rocks = _hazards(truth, cells), _rocks(truth, cells)
+        self.counts = added(added(self.counts, hazards), rocks)
+        error = (elevation - truth.mean)[truth.seen & np.isfinite(elevation)]
+        return {
+            "elevation_completeness": share(error.size, hazards["seen"]),
+            "elevation_rmse": share(np.square(error).sum(), error.size) ** 0.5,
+            "elevation_bias": share(error.sum(), error.size),
+            "false_alarm": share(hazards["safe_told"], hazards["safe"]),
+            "false_safe": share(hazards["hazards_free"], hazards["hazards"]),
+            **{f"rocks_{name}": rocks.get(f"{name}_{HIGH_ROCK:g}", 0.0) for name in ("in_view", "found")},
+        }
 
     def _add_heights(self, truth: TrueGround, layers: dict[str, Array], elevation: Array, tilts: Array) -> None:
         known = np.isfinite(elevation)
@@ -160,6 +170,8 @@ class TerrainTally:
                 "free_on_rock": part("free_on_rock", "free"),
                 "false_alarm": part("safe_told", "safe"),
                 "unknown": part("unknown", "seen"),
+                "free_hazard": part("free_hazard", "free"),
+                "free_unseen": part("free_unseen", "free"),
                 "by_slope": {f"{low:g}-{high:g} deg": part(f"safe_told_{low:g}", f"safe_{low:g}")
                              for low, high in pairwise(SLOPES)},
             },
@@ -175,7 +187,8 @@ def _intervals(name: str, error: Array, variance: Array) -> dict[str, float]:
 
 def _hazards(truth: TrueGround, cells: Array) -> dict[str, float]:
     """Sums over one frame, of seen cells: hazards, told, called free; the same of those on a rock; safe ones, told to
-    be hazards, also by slope; unknown ones. And of all cells called free, wherever they are, those on a rock."""
+    be hazards, also by slope; unknown ones. And of all cells called free, wherever they are, those on a rock, those
+    that are hazards, and those that are not in view."""
     free, told, seen = cells == Cell.FREE, cells == Cell.HAZARD, truth.seen
     on_rock = truth.rock >= np.float32(HIGH_ROCK)
     safe = seen & ~truth.hazard
@@ -192,6 +205,8 @@ def _hazards(truth: TrueGround, cells: Array) -> dict[str, float]:
         "safe_told": safe & told,
         "free": free,
         "free_on_rock": free & on_rock,
+        "free_hazard": free & truth.hazard,
+        "free_unseen": free & ~truth.in_view,
     }
     for low, high in pairwise(SLOPES):
         inside = safe & (truth.slope >= np.radians(low)) & (truth.slope < np.radians(high))
@@ -225,32 +240,62 @@ def _summed(masks: dict[str, Array]) -> dict[str, float]:
     return {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}
 
 
+ROWS = (
+    "DEM RMSE 0-8 m, tilt and all, cm",
+    "levelled RMSE 0-4 m; 4-8 m, cm",
+    "seen cells known; of these within 5 cm, %",
+    "values where nothing could be seen, of values; of all cells, %",
+    "levelled errors within 1; 2 stated random sigmas, %",
+    "raw errors within 1; 2 stated sigmas in all, %",
+    "rocks in view found: 0.2 m; 0.3 m and higher",
+    "rocks of which anything shows found: the same",
+    "free cells on a rock; rock cells called free, %",
+    "false alarms; in the worst 5 degrees of slope to 15, %",
+    "hazard cells (rock or over 20 degrees) found; called free, %",
+    "seen cells left unknown; free cells where nothing could be seen, %",
+)
+
+
+def terrain_figures(found: dict[str, Any]) -> list[str]:
+    """What stands in each of the `ROWS`."""
+    heights, hazards, intervals, rocks = (found[name] for name in ("heights", "hazards", "intervals", "rocks"))
+    near, far, all_ = (heights[ring] for ring in ("0-4 m", "4-8 m", "0-8 m"))
+    worst = [value for name, value in hazards["by_slope"].items() if name != "15-20 deg" and not np.isnan(value)]
+    return [
+        _cm(all_["raw"]["rmse"]),
+        f"{_cm(near['levelled']['rmse'])}; {_cm(far['levelled']['rmse'])}",
+        _percents(all_["completeness"], all_["levelled"]["within_5cm"]),
+        _percents(found["made_up"]["of_values"], found["made_up"]["of_cells"]),
+        _percents(*intervals["random"].values()),
+        _percents(*intervals["total"].values()),
+        "; ".join(f"{rock['found']:.0f} of {rock['in_view']:.0f}" for rock in rocks.values()),
+        "; ".join(f"{rock['glimpsed_found']:.0f} of {rock['glimpsed']:.0f}" for rock in rocks.values()),
+        _percents(hazards["free_on_rock"], hazards["rock_false_safe"]),
+        _percents(hazards["false_alarm"], max(worst, default=np.nan)),
+        _percents(hazards["recall"], hazards["false_safe"]),
+        _percents(hazards["unknown"], hazards["free_unseen"]),
+    ]
+
+
 def format_terrain(found: dict[str, Any]) -> list[str]:
     """The measures as lines for a terminal, at most 100 columns wide."""
-    heights, hazards, rocks, intervals = (found[name] for name in ("heights", "hazards", "rocks", "intervals"))
-    lines = ["terrain      in cells that a pixel of both cameras hits, by distance from base_link",
-             "               distance       known | levelled RMSE   bias  within 5 cm"]  # fmt: skip
-    for name, ring in heights.items():
-        level = ring["levelled"]
-        lines.append(f"               at {name:<8} {_percent(ring['completeness']):>8} | {_cm(level['rmse']):>13}"
-                     f" {_cm(level['bias']):>6} {_percent(level['within_5cm']):>12}")  # fmt: skip
-    made_up, random, total = found["made_up"], intervals["random"], intervals["total"]
-    on_rocks = _percent(hazards["rock_recall"]), _percent(hazards["rock_false_safe"])
-    held = [_percent(interval[k]) for interval in (random, total) for k in ("1", "2")]
-    lines += [
-        f"             {_percent(made_up['of_values'])} of all values lie where no camera could see",
-        f"             {held[0]} and {held[1]} of levelled errors within 1 and 2 stated sigmas,",
-        f"             {held[2]} and {held[3]} of raw ones within those with the tilt's",
+    lines = [
+        "terrain      in cells that a pixel of both cameras hits, by distance from base_link; errors in cm",
+        "               distance      cells    known |   RMSE    MAE   bias   NMAD  within 5 cm",
     ]
-    for name, rock in rocks.items():
-        found_of = f"{rock['found']:.0f} of {rock['in_view']:.0f} in view found"
-        glimpsed = f"{rock['glimpsed_found']:.0f} of {rock['glimpsed']:.0f}"
-        lines.append(f"             rocks of {name} and higher: {found_of}, {glimpsed} of which anything shows")
-    slopes = ", ".join(f"{name} {_percent(value)}" for name, value in hazards["by_slope"].items())
+    levelled = ["               levelled: the same less the best plane of each frame's errors"]
+    for kind, title in (("raw", []), ("levelled", levelled)):
+        lines += title
+        for name, ring in found["heights"].items():
+            h = ring[kind]
+            errors = "".join(f"{_cm(h[key]):>7}" for key in ("rmse", "mae", "bias", "nmad"))
+            known, close = _percent(share(h["cells"], ring["seen"])), _percent(h["within_5cm"])
+            lines.append(f"               {name:<8} {ring['seen']:10d} {known:>8} |{errors} {close:>12}")
+    slopes = found["hazards"]["by_slope"].items()
     return [
         *lines,
-        f"             cells on rocks: {on_rocks[0]} hazard, {on_rocks[1]} free",
-        f"             false alarms by slope: {slopes}",
+        *(f"             {label:66} {value:>17}" for label, value in zip(ROWS, terrain_figures(found), strict=True)),
+        "             false alarms by slope: " + ", ".join(f"{name} {_percent(value)}" for name, value in slopes),
     ]
 
 
@@ -258,5 +303,9 @@ def _percent(value: float) -> str:
     return "-" if np.isnan(value) else f"{100 * value:.2f}%"
 
 
+def _percents(*values: float) -> str:
+    return "; ".join("-" if np.isnan(value) else f"{100 * value:.2f}" for value in values)
+
+
 def _cm(value: float) -> str:
-    return "-" if np.isnan(value) else f"{100 * value + 0.0:.2f}"
+    return "-" if np.isnan(value) else f"{round(100 * value, 2) + 0.0:.2f}"  # never -0.00

@@ -28,7 +28,7 @@ from flow.align import Token
 from flow.pipeline import load
 from recordings.simulator import log, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
-from recordings.terrain_measures import TerrainTally, TrueGround, format_terrain
+from recordings.terrain_measures import ROWS, TerrainTally, TrueGround, format_terrain, terrain_figures
 from stages.data import Array, Cell, Disparity, Mount, Source, StereoFrame, Tilt, Transform
 
 SLOPE, TILT_NOISE = np.radians(5.0), np.radians(0.3)
@@ -149,44 +149,7 @@ def score(simulations: Sequence[Simulation], stride: int, runs: dict[str, str]) 
 
 def figures(run: Run) -> list[str]:
     """The table's column of one run."""
-    found = run.tally.measures()
-    heights, hazards, intervals, rocks = (found[name] for name in ("heights", "hazards", "intervals", "rocks"))
-    near, far, all_ = (heights[ring] for ring in ("0-4 m", "4-8 m", "0-8 m"))
-
-    def percent(value: float) -> str:
-        return "-" if np.isnan(value) else f"{100 * value:.2f}"
-
-    worst = [value for name, value in hazards["by_slope"].items() if name != "15-20 deg" and not np.isnan(value)]
-    return [
-        f"{100 * all_['raw']['rmse']:.2f}",
-        f"{100 * near['levelled']['rmse']:.2f}; {100 * far['levelled']['rmse']:.2f}",
-        f"{percent(all_['completeness'])}; {percent(all_['levelled']['within_5cm'])}",
-        f"{percent(found['made_up']['of_values'])}; {percent(found['made_up']['of_cells'])}",
-        "; ".join(percent(intervals["random"][k]) for k in ("1", "2")),
-        "; ".join(percent(intervals["total"][k]) for k in ("1", "2")),
-        "; ".join(f"{rock['found']:.0f} of {rock['in_view']:.0f}" for rock in rocks.values()),
-        "; ".join(f"{rock['glimpsed_found']:.0f} of {rock['glimpsed']:.0f}" for rock in rocks.values()),
-        f"{percent(hazards['free_on_rock'])}; {percent(hazards['rock_false_safe'])}",
-        f"{percent(hazards['false_alarm'])}; {percent(max(worst, default=np.nan))}",
-        f"{percent(hazards['recall'])}; {percent(hazards['false_safe'])}",
-        f"{1e3 * float(np.median(run.seconds)):.0f}",
-    ]
-
-
-ROWS = (
-    "DEM RMSE 0-8 m, tilt and all, cm",
-    "levelled RMSE 0-4 m; 4-8 m, cm",
-    "seen cells known; of these within 5 cm, %",
-    "values where nothing could be seen, of values; of all cells, %",
-    "levelled errors within 1; 2 stated random sigmas, %",
-    "raw errors within 1; 2 stated sigmas in all, %",
-    "rocks in view found: 0.2 m; 0.3 m and higher",
-    "rocks of which anything shows found: the same",
-    "free cells on a rock; rock cells called free, %",
-    "false alarms; in the worst 5 degrees of slope to 15, %",
-    "hazard cells (rock or over 20 degrees) found; called free, %",
-    "disparity to navigation map, ms on one core",
-)
+    return [*terrain_figures(run.tally.measures()), f"{1e3 * float(np.median(run.seconds)):.0f}"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -211,10 +174,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found = score(simulations, options.stride, runs)
         count = len(next(iter(found.values())).seconds)
         print(f"\nrocks k = {rocks}, {count} frames of 1280x960, seeds {', '.join(map(str, options.seeds))}")
-        columns = [list(ROWS), *(figures(run) for run in found.values())]
-        print(f"{'':62}" + "".join(f"{name.split(',')[-1].strip():>26}" for name in found))
+        columns = [[*ROWS, "disparity to navigation map, ms on one core"], *(figures(run) for run in found.values())]
+        print(f"{'':66}" + "".join(f"{name.split(',')[-1].strip():>26}" for name in found))
         for label, *cells in zip(*columns, strict=True):
-            print(f"{label:62}" + "".join(f"{cell:>26}" for cell in cells), flush=True)
+            print(f"{label:66}" + "".join(f"{cell:>26}" for cell in cells), flush=True)
         if options.rings:
             for name, run in found.items():
                 print("\n".join(["", name, *format_terrain(run.tally.measures())]))

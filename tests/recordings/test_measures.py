@@ -67,14 +67,6 @@ def test_a_cell_on_the_border_of_two_rings_is_in_the_outer_one_only():
     radius = np.array([0.0, 3.999, 4.0, 7.999, 8.0])
     assert measures.in_ring(radius, 0.0, 4.0).tolist() == [True, True, False, False, False]
     assert measures.in_ring(radius, 4.0, 8.0).tolist() == [False, False, True, True, False]
-    rings = measures.RingErrors(((0.0, 4.0), (4.0, 8.0), (0.0, 8.0)))
-    error = np.array([[0.01, 0.02, NAN, 0.04, 0.05]])
-    rings.add(radius, np.zeros(1), np.array([[True, True, True, True, False]]), error)
-    found = rings.measures()
-    assert [found[name]["seen"] for name in ("0-4 m", "4-8 m", "0-8 m")] == [2, 2, 4]
-    assert [found[name]["completeness"] for name in ("0-4 m", "4-8 m", "0-8 m")] == [1, 0.5, 0.75]
-    assert found["4-8 m"]["raw"]["bias"] == pytest.approx(0.04)
-    assert found["0-8 m"]["levelled"]["cells"] == 0  # no plane through the three known cells
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-2, 2))
@@ -91,50 +83,6 @@ def test_a_plane_through_three_cells_proves_nothing():
     error = np.full((3, 3), NAN)
     error[0, 0] = error[1, 1] = error[0, 2] = 1.0
     assert np.isnan(measures.without_plane(np.arange(3.0), np.arange(3.0), error)).all()
-
-
-def test_hazard_shares_by_hand():
-    truth = np.array([100, 100, 100, 100, 0, 0, 0, 0, 0, 100], np.int8)
-    cells = np.array([100, 0, 0, -1, 100, 0, 0, 55, 0, 0], np.int8)  # 55 is neither free nor a hazard
-    seen = np.array([True] * 9 + [False])
-    rock = np.array([False, True] + [False] * 8)
-    counted = seen & (np.arange(10) != 8)
-    found = measures.hazard_measures(measures.hazard_counts(cells, truth, seen, counted, rock))
-    assert found == {
-        "cells": 8,
-        "unknown": 2 / 8,
-        "recall": 0.25,
-        "false_safe": 0.5,
-        "false_alarm": 0.25,
-        "free": 6,
-        "free_hazard": 0.5,
-        "free_on_rock": pytest.approx(1 / 6),
-        "free_unseen": {"cells": 1, "share": pytest.approx(1 / 6), "hazards": 1},
-    }
-    untold = measures.hazard_measures(measures.hazard_counts(cells, truth, seen, counted, None))
-    assert np.isnan(untold["free_on_rock"])
-    assert untold["free_hazard"] == 0.5
-
-
-def test_cells_on_a_rock_are_the_hazards_within_its_outline():
-    x = y = (np.arange(10) + 0.5) * 0.1
-    hazard = np.zeros((10, 10), bool)
-    hazard[2, [2, 4, 5, 9]] = True  # 0.0, 0.2, 0.3 and 0.7 m from the rock's centre
-    rock = measures.on_rocks(np.array([[0.25, 0.25, 0.4]]), hazard, x, y)  # reaches 1.25 x 0.2 = 0.25 m
-    assert np.argwhere(rock).tolist() == [[2, 2], [2, 4]]
-
-
-def test_a_rock_counts_only_if_it_can_be_seen_and_is_found_within_a_cell_of_its_rim():
-    x = y = (np.arange(40) + 0.5) * 0.1
-    visible = np.ones((40, 40), bool)
-    visible[:, 20:] = False
-    cells = np.zeros((40, 40), np.int8)
-    cells[10, 13] = 100  # centre (1.35, 1.05)
-    cells[35, 35] = 100
-    rocks = np.array([[1.05, 1.05, 0.42], [0.5, 3.0, 0.4], [3.55, 3.55, 0.4], [1.05, 1.05, 0.36]])
-    seen, found = measures.rocks_found(rocks, cells, visible, x, y, 0.1)
-    assert seen.tolist() == [True, True, False, True]
-    assert found.tolist() == [True, False, False, False]  # reaches 0.31, 0.30, -, 0.28 for a hazard 0.30 away
 
 
 def test_the_angle_between_nearly_equal_directions_keeps_its_digits():

@@ -16,6 +16,7 @@ from recordings import ros2, scoring
 from recordings.errors import LogError
 from recordings.score_table import format_score
 from recordings.simulator import Simulation, log
+from recordings.terrain_measures import ROWS, format_terrain
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
 
 SMALL = Simulation(
@@ -70,7 +71,8 @@ class Run:
         )  # fmt: skip
         terrain, navigation = log.truth_maps(SMALL, stamp, frame)
         inside = slice(self.crop, 320 - self.crop), slice(self.crop, 320 - 2 * self.crop)
-        layer = np.ascontiguousarray(self.elevation(terrain.layers["elevation"].copy())[inside])
+        mean = np.where(np.isnan(terrain.layers["mean"]), terrain.layers["elevation"], terrain.layers["mean"])
+        layer = np.ascontiguousarray(self.elevation(mean)[inside])
         cells = np.ascontiguousarray(self.cells(navigation.cells.copy())[inside])
         origin = (-8 + self.crop * 0.05, -8 + self.crop * 0.05)
         level_from_camera = frame.level.inverse().after(frame.base.after(SMALL.mounts[0]))
@@ -109,16 +111,17 @@ def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
     assert counts["nonocc"] == found.disparity["pixels"]
     assert counts["occluded"] == sum((frame.seen == 128).sum() for frame in frames)
     assert counts["all"] == counts["nonocc"] + counts["occluded"]
+    heights, hazards, rocks = (found.terrain[name] for name in ("heights", "hazards", "rocks"))
     for ring in ("0-4 m", "4-8 m", "0-8 m"):
-        assert found.elevation[ring]["raw"]["rmse"] == 0
-        assert found.elevation[ring]["completeness"] == found.elevation[ring]["raw"]["within_5cm"] == 1
-    assert found.elevation["0-8 m"]["raw"]["cells"] > 5000
-    assert found.elevation["0-8 m"]["seen"] == found.elevation["0-4 m"]["seen"] + found.elevation["4-8 m"]["seen"]
-    assert found.navigation["recall"] == 1
-    assert found.navigation["false_safe"] == found.navigation["false_alarm"] == found.navigation["unknown"] == 0
-    assert found.navigation["free_hazard"] == found.navigation["free_on_rock"] == 0
-    assert found.rocks["seen"] > 5
-    assert found.rocks["recall"] == 1
+        assert heights[ring]["raw"]["rmse"] == 0
+        assert heights[ring]["completeness"] == heights[ring]["raw"]["within_5cm"] == 1
+    assert heights["0-8 m"]["raw"]["cells"] > 5000
+    assert heights["0-8 m"]["seen"] == heights["0-4 m"]["seen"] + heights["4-8 m"]["seen"]
+    assert hazards["recall"] == 1
+    assert hazards["false_safe"] == hazards["false_alarm"] == hazards["unknown"] == 0
+    assert hazards["free_hazard"] == hazards["free_on_rock"] == 0
+    assert rocks["0.2 m"]["in_view"] > 5
+    assert rocks["0.2 m"]["recall"] == rocks["0.3 m"]["recall"] == 1
     assert found.tilt["frames"] == 2
     assert found.tilt["max"] < 1e-6
     assert found.untilted == {}
@@ -151,7 +154,7 @@ def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth
 
 def test_a_raised_map_is_biased_and_level(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, elevation=lambda layer: layer + np.float32(0.06))
-    ring = found.elevation["4-8 m"]
+    ring = found.terrain["heights"]["4-8 m"]
     assert (ring["raw"]["bias"], ring["raw"]["rmse"]) == pytest.approx((0.06, 0.06), abs=1e-6)
     assert ring["raw"]["within_5cm"] == 0
     assert ring["raw"]["nmad"] < 1e-6
@@ -160,70 +163,45 @@ def test_a_raised_map_is_biased_and_level(tmp_path, truth, frames):
 
 def test_a_tilted_map_is_worse_far_off_and_perfect_once_levelled(tmp_path, truth, frames):
     slope = ((np.arange(320) + 0.5) * 0.05 - 8).astype(np.float32)[None, :] * np.float32(0.01)
-    found = scored(tmp_path, truth, frames, elevation=lambda layer: layer + slope).elevation
+    found = scored(tmp_path, truth, frames, elevation=lambda layer: layer + slope).terrain["heights"]
     assert 0.04 < found["4-8 m"]["raw"]["rmse"] < 0.08
     assert found["0-4 m"]["raw"]["rmse"] < 0.04
     assert found["0-8 m"]["levelled"]["rmse"] < 1e-6
 
 
-def test_values_where_nobody_saw_the_ground_are_counted(tmp_path, truth, frames):
-    seen = [log.truth_maps(SMALL, 0, frame)[0].layers["visible"] > 0.5 for frame in frames]
-    found = scored(tmp_path, truth, frames)
-    assert found.unseen == pytest.approx(1 - np.mean(seen))
+def test_values_where_nobody_could_see_the_ground_are_made_up(tmp_path, truth, frames):
+    x = (np.arange(320) + 0.5) * 0.05 - 8
+    near = np.hypot(x[None, :], x[:, None]) < 8
+    in_view = [log.truth_maps(SMALL, 0, frame)[0].layers["in_view"][near] > 0.5 for frame in frames]
+    found = scored(tmp_path, truth, frames).terrain["made_up"]
+    assert found["of_values"] == found["of_cells"] == pytest.approx(1 - np.mean(in_view))
 
 
 def test_a_smaller_map_is_compared_by_place_and_loses_completeness(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, crop=40)
-    assert found.elevation["0-8 m"]["raw"]["rmse"] == 0
-    assert found.elevation["0-4 m"]["completeness"] == 1
-    assert 0.05 < found.elevation["4-8 m"]["completeness"] < 0.9
-    assert found.navigation["false_safe"] == found.navigation["false_alarm"] == 0
-    assert 0.05 < found.navigation["unknown"] < 0.9
+    found = scored(tmp_path, truth, frames, crop=40).terrain
+    assert found["heights"]["0-8 m"]["raw"]["rmse"] == 0
+    assert found["heights"]["0-4 m"]["completeness"] == 1
+    assert 0.05 < found["heights"]["4-8 m"]["completeness"] < 0.9
+    assert found["hazards"]["false_safe"] == found["hazards"]["false_alarm"] == 0
+    assert 0.05 < found["hazards"]["unknown"] < 0.9
 
 
 def test_a_map_that_calls_everything_free_finds_no_rock(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, cells=np.zeros_like)
-    assert found.navigation["recall"] == found.rocks["found"] == 0
-    assert found.navigation["false_safe"] == 1
-    blind = scored(tmp_path, truth, frames, cells=lambda cells: np.full_like(cells, Cell.UNKNOWN))
-    assert blind.navigation["unknown"] == 1
-    assert blind.navigation["false_safe"] == 0
-    assert blind.rocks["recall"] == 0
+    found = scored(tmp_path, truth, frames, cells=np.zeros_like).terrain
+    assert found["hazards"]["recall"] == found["rocks"]["0.2 m"]["found"] == 0
+    assert found["hazards"]["false_safe"] == 1
+    blind = scored(tmp_path, truth, frames, cells=lambda cells: np.full_like(cells, Cell.UNKNOWN)).terrain
+    assert blind["hazards"]["unknown"] == 1
+    assert blind["hazards"]["false_safe"] == 0
+    assert blind["rocks"]["0.2 m"]["recall"] == 0
 
 
-def test_cells_called_free_on_rocks_are_a_share_of_all_free_cells(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, cells=np.zeros_like).navigation
-    reasons = np.stack([log.truth_maps(SMALL, 0, frame)[1].reason for frame in frames])
-    assert found["free"] == reasons.size
-    assert found["free_hazard"] == np.mean(reasons != Reason.CLEAR)
-    # The truth lists rocks within 10 m; their cells farther off, in the map's corners, are hazards only.
-    x = (np.arange(320) + 0.5) * 0.05 - 8
-    within = np.hypot(x[None, :], x[:, None]) < 9
-    assert found["free_on_rock"] > 0.99 * np.sum((reasons == Reason.STEP) & within) / reasons.size
-    assert found["free_on_rock"] <= np.mean(reasons != Reason.CLEAR)
-
-
-def test_calling_unseen_cells_free_is_told(tmp_path, truth, frames):
+def test_cells_called_free_on_rocks_or_out_of_view_are_a_share_of_all_free_cells(tmp_path, truth, frames):
     maps = [log.truth_maps(SMALL, 0, frame) for frame in frames]
-    seen = np.stack([terrain.layers["visible"] > 0.5 for terrain, _ in maps])
-    cells = np.stack([navigation.cells for _, navigation in maps])
-
-    def guess(value):
-        """The true cells where something was seen, `value` elsewhere."""
-        turn = iter(np.where(seen, cells, np.int8(value)))
-        return scored(tmp_path, truth, frames, cells=lambda _: next(turn)).navigation
-
-    honest, bold = guess(Cell.UNKNOWN), guess(Cell.FREE)
-    told = {"recall", "false_safe", "false_alarm", "unknown", "cells"}
-    assert {name: honest[name] for name in told} == {name: bold[name] for name in told}
-    assert honest["free_unseen"] == {"cells": 0, "share": 0, "hazards": 0}
-    assert honest["free_hazard"] == 0
-    free = np.sum(seen & (cells == Cell.FREE)) + np.sum(~seen)
-    assert bold["free"] == free
-    assert bold["free_unseen"] == {
-        "cells": np.sum(~seen), "share": np.sum(~seen) / free, "hazards": np.sum(~seen & (cells == Cell.HAZARD)),
-    }  # fmt: skip
-    assert bold["free_unseen"]["hazards"] > 1000
+    found = scored(tmp_path, truth, frames, cells=np.zeros_like).terrain["hazards"]
+    assert found["free_hazard"] == np.mean([navigation.cells == Cell.HAZARD for _, navigation in maps])
+    assert found["free_on_rock"] == np.mean([navigation.reason == Reason.STEP for _, navigation in maps])
+    assert found["free_unseen"] == np.mean([terrain.layers["in_view"] < 0.5 for terrain, _ in maps])
 
 
 def test_disparities_where_one_camera_sees_are_told(tmp_path, truth, frames):
@@ -247,15 +225,15 @@ def test_disparities_where_one_camera_sees_are_told(tmp_path, truth, frames):
 def test_leaving_out_a_bad_frame_scores_as_saying_unknown(tmp_path, truth, frames):
     silent = scored(tmp_path, truth, frames, skipped=(1,))
     honest = scored(tmp_path, truth, frames, blind=(1,))
-    assert (silent.disparity, silent.elevation, silent.navigation, silent.rocks, silent.unseen) == (
-        honest.disparity, honest.elevation, honest.navigation, honest.rocks, honest.unseen
-    )  # fmt: skip
+    assert silent.disparity == honest.disparity
+    assert format_terrain(silent.terrain) == format_terrain(honest.terrain)
     known, seen = np.sum(frames[0].seen == 255), sum(np.sum(frame.seen == 255) for frame in frames)
     assert silent.disparity["density"] == known / seen
     assert silent.disparity["bad_2"] == pytest.approx(1 - known / seen)
-    assert 0.3 < silent.elevation["0-8 m"]["completeness"] < 0.7
-    assert silent.navigation["unknown"] == pytest.approx(1 - silent.elevation["0-8 m"]["completeness"])
-    assert 0 < silent.rocks["found"] < silent.rocks["seen"]
+    heights, hazards, rocks = (silent.terrain[name] for name in ("heights", "hazards", "rocks"))
+    assert 0.3 < heights["0-8 m"]["completeness"] < 0.7
+    assert hazards["unknown"] == pytest.approx(1 - heights["0-8 m"]["completeness"])
+    assert 0 < rocks["0.2 m"]["found"] < rocks["0.2 m"]["in_view"]
     assert silent.missing == {topic: [SMALL.stamp(1)] for topic in scoring.RESULTS}
     assert honest.missing == {}
 
@@ -282,8 +260,9 @@ def test_a_frame_without_results_is_missing_by_its_stamp(tmp_path, truth, frames
     assert found.missing == {topic: [SMALL.stamp(0)] for topic in scoring.RESULTS}
     partial = scored(tmp_path, truth, frames, only=("/nav/disparity",))
     assert partial.missing.keys() == {"/nav/elevation_map", "/nav/navigation_map"}
-    assert partial.elevation["0-8 m"]["completeness"] == partial.navigation["recall"] == partial.rocks["found"] == 0
-    assert partial.navigation["unknown"] == partial.disparity["density"] == 1
+    assert partial.terrain["heights"]["0-8 m"]["completeness"] == partial.terrain["hazards"]["recall"] == 0
+    assert partial.terrain["rocks"]["0.2 m"]["found"] == 0
+    assert partial.terrain["hazards"]["unknown"] == partial.disparity["density"] == 1
 
 
 def test_results_at_stamps_without_truth_are_reported_and_never_compared(tmp_path, truth, frames):
@@ -314,10 +293,11 @@ def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
         ["|", "2.00", "2.00", "2.00", "0.00"], ["|", "0.00", "0.00", "0.00", "0.00"]
     ]  # fmt: skip
     assert max(map(len, table.splitlines())) <= 100
+    assert all(label in table for label in ROWS)
     read = json.loads(found.to_json())
-    assert read["elevation"]["0-4 m"]["raw"]["bias"] == pytest.approx(0.02, abs=1e-6)
+    assert read["terrain"]["heights"]["0-4 m"]["raw"]["bias"] == pytest.approx(0.02, abs=1e-6)
     assert read["per_frame"][0]["stamp"] == SMALL.stamp(0)
     empty = scored(tmp_path, truth, frames, elevation=lambda layer: np.full_like(layer, np.nan))
-    assert json.loads(empty.to_json())["elevation"]["0-4 m"]["raw"]["rmse"] is None
+    assert json.loads(empty.to_json())["terrain"]["heights"]["0-4 m"]["raw"]["rmse"] is None
     assert "nan" not in format_score(empty)
     assert " 0.00% |      -      -      -      -            -" in format_score(empty)

@@ -138,7 +138,7 @@ def test_frames_add_up_and_the_table_prints() -> None:
     assert found["heights"]["0-8 m"]["raw"]["bias"] == pytest.approx(0.05)
     assert found["intervals"]["total"] == {"1": 0.5, "2": 0.5}
     text = "\n".join(format_terrain(found))
-    assert "2 of 2 in view found" in text
+    assert text.count("2 of 2; 0 of 0") == 2  # rocks of 0.2 m, in view and glimpsed; none of 0.3 m
     assert all(len(line) <= 100 for line in text.splitlines())
 
 
