@@ -11,7 +11,9 @@ import pytest
 
 from flow.cli import main
 from recordings.simulator.simulation import Simulation
-from tests.bench.terrain import SLOPE, TILT_NOISE, nodes, tilt_errors
+from tests.bench.terrain import RUNS, SLOPE, TILT_NOISE, Run, nodes, score, tilt_errors
+
+COMPARED = {name: pipeline for name, pipeline in RUNS.items() if pipeline == "rover"}
 
 
 @pytest.mark.parametrize("pipeline", ["rover", "fast", "paper"])
@@ -23,35 +25,69 @@ def test_the_tilt_is_as_far_off_as_its_pipeline_states(pipeline: str) -> None:
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(stated, rel=0.12)
 
 
+def check(found: dict[str, Run], alarms: float, known: float) -> None:
+    """What maps must be, on frames of any traverse: of `rover`, and of the same stages given true disparity and tilt.
+
+    alarms: how many of the truly safe cells may be called hazards, on ground of any slope to 15 degrees; known: how
+    many of the cells that a pixel of both cameras hits must have a value. The aim is 0.97, which is not reached.
+    """
+    true, rover = (found[name].tally.measures() for name in ("rover, true disparity and tilt", "rover"))
+    heights, intervals, rocks, hazards = (rover[name] for name in ("heights", "intervals", "rocks", "hazards"))
+    assert true["heights"]["0-8 m"]["raw"]["rmse"] <= 0.01
+    assert heights["0-4 m"]["levelled"]["rmse"] <= 0.02
+    assert heights["4-8 m"]["levelled"]["rmse"] <= 0.04
+    assert heights["0-8 m"]["completeness"] >= known
+    assert heights["0-8 m"]["levelled"]["within_5cm"] >= 0.95
+    assert rover["made_up"]["of_cells"] <= 0.01
+    for interval in (intervals["random"], intervals["total"]):
+        assert 0.61 <= interval["1"] <= 0.75
+        assert 0.91 <= interval["2"] <= 0.99
+    assert rocks["0.2 m"]["found"] >= 0.98 * rocks["0.2 m"]["in_view"]
+    assert rocks["0.3 m"]["found"] == rocks["0.3 m"]["in_view"]
+    assert hazards["free_on_rock"] <= 0.002
+    assert hazards["rock_false_safe"] <= 0.01
+    assert hazards["false_safe"] <= 0.1  # nothing is asked; most are within 2 degrees of the limit
+    assert hazards["false_alarm"] <= alarms
+    for low in (0, 5, 10):
+        share = hazards["by_slope"][f"{low}-{low + 5} deg"]
+        assert np.isnan(share) or share <= alarms
+
+
+def traverse_of(seed: int, abundance: float) -> Simulation:
+    return Simulation(
+        frames=30, seed=seed, abundance=abundance, slope=float(SLOPE), tilt_noise=float(TILT_NOISE), threads=1
+    )
+
+
+def test_two_frames_have_maps_one_would_drive_on() -> None:
+    found = score([traverse_of(12, 0.15)], 15, COMPARED)
+    assert found["rover"].tally.measures()["rocks"]["0.2 m"]["in_view"] >= 1
+    check(found, alarms=0.08, known=0.91)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("abundance", "alarms"), [(0.05, 0.03), (0.15, 0.08)])
+def test_three_traverses_have_maps_one_would_drive_on(abundance: float, alarms: float) -> None:
+    check(score([traverse_of(seed, abundance) for seed in (11, 12, 13)], 10, COMPARED), alarms, known=0.93)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 13])
-def test_terrain_is_within_centimetres_of_the_truth_and_better_than_the_papers(tmp_path: Path, seed: int) -> None:
+def test_the_default_beats_the_paper_from_log_to_score(tmp_path: Path, seed: int) -> None:
     log = tmp_path / "log.mcap"
     assert main(["simulate", str(log), "--frames", "4", "--size", "960x720", "--seed", str(seed)]) == 0
-    scores: dict[str, dict[str, Any]] = {}
+    scores: dict[str, Any] = {}
     for pipeline in ("rover", "paper"):
-        out, score = tmp_path / f"{pipeline}.mcap", tmp_path / f"{pipeline}.json"
+        out, table = tmp_path / f"{pipeline}.mcap", tmp_path / f"{pipeline}.json"
         assert main(["run", str(log), "-p", pipeline, "-o", str(out), "--no-rrd"]) == 0
-        assert main(["score", str(out), "--truth", str(log), "--json", str(score)]) == 0
-        scores[pipeline] = json.loads(score.read_text())
-    rover, paper = scores["rover"], scores["paper"]
-    heights, hazards, rocks = (rover["terrain"][name] for name in ("heights", "hazards", "rocks"))
-    assert heights["0-4 m"]["levelled"]["rmse"] < 0.01
-    assert heights["4-8 m"]["levelled"]["rmse"] < 0.02
-    assert heights["0-8 m"]["completeness"] > 0.85
-    assert heights["0-8 m"]["levelled"]["within_5cm"] > 0.98
-    assert rover["terrain"]["made_up"]["of_cells"] < 0.01
-    random, total = (rover["terrain"]["intervals"][name] for name in ("random", "total"))
-    assert 0.61 < random["1"] < 0.80
-    assert 0.90 < random["2"] < 0.99
-    assert total["2"] > 0.90
-    assert rocks["0.2 m"]["recall"] in (None, 1.0)
-    assert hazards["free_on_rock"] < 0.002
-    assert hazards["rock_false_safe"] < 0.05
-    assert hazards["false_alarm"] < 0.05
-    assert rover["disparity"]["bad_1_known"] < 0.75 * paper["disparity"]["bad_1_known"]
-    theirs = paper["terrain"]
-    assert heights["4-8 m"]["levelled"]["rmse"] < theirs["heights"]["4-8 m"]["levelled"]["rmse"]
-    assert heights["0-8 m"]["completeness"] > theirs["heights"]["0-8 m"]["completeness"]
-    assert hazards["rock_false_safe"] < 0.1 * theirs["hazards"]["rock_false_safe"]
-    assert rocks["0.2 m"]["found"] > theirs["rocks"]["0.2 m"]["found"]
+        assert main(["score", str(out), "--truth", str(log), "--json", str(table)]) == 0
+        scores[pipeline] = json.loads(table.read_text())
+    ours, theirs = (scores[name]["terrain"] for name in ("rover", "paper"))
+    assert scores["rover"]["disparity"]["bad_1_known"] < 0.75 * scores["paper"]["disparity"]["bad_1_known"]
+    far = [found["heights"]["4-8 m"]["levelled"]["rmse"] for found in (ours, theirs)]
+    assert far[0] < 0.02 < 0.2 * far[1]
+    assert ours["heights"]["0-8 m"]["completeness"] > theirs["heights"]["0-8 m"]["completeness"]
+    assert ours["hazards"]["free_on_rock"] < 0.002
+    assert ours["hazards"]["rock_false_safe"] < 0.1 * theirs["hazards"]["rock_false_safe"]
+    assert ours["rocks"]["0.2 m"]["found"] > theirs["rocks"]["0.2 m"]["found"]
+    assert ours["rocks"]["0.2 m"]["recall"] == 1.0
