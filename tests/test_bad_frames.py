@@ -1,0 +1,156 @@
+"""What a run makes of frames that no map can be made of: it names and skips them, and leaves the others alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flow.cli import main
+from recordings import ros2
+from recordings.ros2 import TYPES
+from tests.conftest import FRAMES, rewrite
+
+BAD = 1  # the frame that is made bad
+MAPS = ("/nav/elevation_map", "/nav/navigation_map", "/nav/regional_map")
+Change = Callable[[str, int, bytes], bytes | None]
+
+
+def roverflow(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+def edited(schema: str, raw: bytes, /, **fields: Any) -> bytes:
+    message = TYPES.deserialize_cdr(raw, schema)
+    for name, value in fields.items():
+        setattr(message, name, value)
+    return bytes(TYPES.serialize_cdr(message, schema))
+
+
+def tilts_about(stamp: int, log: Path) -> set[int]:
+    """Numbers of the inclinometer's messages within 0.3 s of a stamp."""
+    stamps = [ros2.stamp_of(message.header) for _, _, message in ros2.iter_messages(log, ["/imu/inclinometer"])]
+    return {number for number, at in enumerate(stamps) if abs(at - stamp) < 300_000_000}
+
+
+def images(paint: Callable[[int, int], np.ndarray]) -> Callable[[int, Path], Change]:
+    """The images of the bad frame painted over."""
+
+    def change(topic: str, index: int, data: bytes) -> bytes:
+        if not topic.endswith("image_rect_color") or index != BAD:
+            return data
+        message: Any = TYPES.deserialize_cdr(data, "sensor_msgs/msg/Image")
+        picture = np.repeat(paint(message.height, message.width)[:, :, None], 3, axis=2)
+        return edited("sensor_msgs/msg/Image", data, data=np.ascontiguousarray(picture, np.uint8).reshape(-1))
+
+    return lambda stamp, log: change
+
+
+def clear_sky(height: int, width: int) -> np.ndarray:
+    return np.broadcast_to(np.linspace(180, 235, height)[:, None], (height, width))
+
+
+def grainy_sky(height: int, width: int) -> np.ndarray:
+    return 200 + np.random.default_rng(0).integers(-3, 4, (height, width))
+
+
+def no_tilt(stamp: int, log: Path) -> Change:
+    gone = tilts_about(stamp, log)
+    return lambda topic, index, data: None if topic == "/imu/inclinometer" and index in gone else data
+
+
+def senseless_tilt(stamp: int, log: Path) -> Change:
+    gone, nothing = tilts_about(stamp, log), ros2.make("geometry_msgs/msg/Quaternion", x=np.nan, y=0.0, z=0.0, w=1.0)
+
+    def change(topic: str, index: int, data: bytes) -> bytes:
+        if topic != "/imu/inclinometer" or index not in gone:
+            return data
+        return edited("sensor_msgs/msg/Imu", data, orientation=nothing)
+
+    return change
+
+
+CASES: dict[str, tuple[Callable[[int, Path], Change], tuple[str, ...]]] = {
+    "clear sky": (images(clear_sky), ("1 failed", "no measured point of the frame is left")),
+    "grainy sky": (images(grainy_sky), ("1 failed", "no measured point of the frame is left")),
+    "burnt out": (images(lambda h, w: np.full((h, w), 255)), ("1 failed", "no measured point of the frame is left")),
+    "tilt gap": (no_tilt, ("1 unaligned", "inclinometer has a gap of 650.0 ms, more than 200.0 ms")),
+    "NaN tilt": (senseless_tilt, ("12 unreadable", "the quaternion of the inclinometer is not a rotation", "a gap of")),
+}
+
+
+def maps_of(out: Path) -> dict[str, dict[int, Any]]:
+    """Topic -> stamp -> map."""
+    found: dict[str, dict[int, Any]] = {topic: {} for topic in MAPS}
+    for topic, stamp, message in ros2.iter_messages(out, MAPS):
+        grid = ros2.read_occupancy_grid(message) if "navigation" in topic else ros2.read_grid_map(message)
+        found[topic][stamp] = grid
+    return found
+
+
+@pytest.fixture(scope="module")
+def sound(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[int, Any]]:
+    """The maps of the log as it is."""
+    out = tmp_path_factory.mktemp("sound") / "out.mcap"
+    assert roverflow("run", traverse, "--set", "disparities=64", "-o", out, "--no-rrd") == 0
+    return maps_of(out)
+
+
+@pytest.mark.parametrize("case", list(CASES))
+def test_a_bad_frame_is_named_and_skipped_and_the_map_stays_sound(
+    case: str, traverse: Path, sound: dict[str, dict[int, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make, words = CASES[case]
+    stamps = sorted(sound["/nav/elevation_map"])
+    log, out = rewrite(traverse, tmp_path / "log.mcap", make(stamps[BAD], traverse)), tmp_path / "out.mcap"
+    capsys.readouterr()
+    assert roverflow("run", log, "--set", "disparities=64", "-o", out, "--no-rrd") == 3
+    said = capsys.readouterr()
+    assert "INCOMPLETE" in said.out
+    assert all(word in said.out for word in words)
+    assert str(stamps[BAD]) in said.out
+    assert "Traceback" not in said.out + said.err
+    maps, left = maps_of(out), [stamp for number, stamp in enumerate(stamps) if number != BAD]
+    assert all(list(found) == left for found in maps.values())
+    for stamp in left:
+        mine, whole = (found["/nav/elevation_map"][stamp].layers for found in (maps, sound))
+        assert all(np.array_equal(mine[name], whole[name], equal_nan=True) for name in whole)
+        mine, whole = (found["/nav/navigation_map"][stamp].cells for found in (maps, sound))
+        np.testing.assert_array_equal(mine, whole)
+    regional, whole = (found["/nav/regional_map"][left[-1]].layers["elevation"] for found in (maps, sound))
+    both = np.isfinite(regional) & np.isfinite(whole)
+    assert both.sum() > 5000
+    assert np.median(np.abs(regional - whole)[both]) < 0.005
+    losses = [message for _, stamp, message in ros2.iter_messages(out, ["/nav/diagnostics"]) if stamp == stamps[BAD]]
+    assert max(status.level for message in losses for status in message.status) >= 1
+
+
+def test_a_run_whose_every_cloud_is_empty_leaves_no_map_and_says_so(traverse: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+    out, nothing = tmp_path / "out.mcap", ("--set", "cleaned.region=0.1 m", "--set", "cleaned.margin=0 m")
+    assert roverflow("run", traverse, "--set", "disparities=64", *nothing, "-o", out, "--no-rrd") == 3
+    said = capsys.readouterr()
+    assert "INCOMPLETE: 0 of" in said.out
+    assert f"{FRAMES} failed, first: points" in said.out
+    assert "Traceback" not in said.out + said.err
+    counts = Counter(topic for topic, _, _ in ros2.iter_messages(out))
+    assert counts["/nav/disparity"] == FRAMES
+    assert not counts.keys() & set(MAPS)
+
+
+def test_a_baseline_of_zero_that_no_transform_mends_is_one_sentence(traverse: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+    def change(topic: str, index: int, data: bytes) -> bytes | None:
+        if topic != "/stereo/right/camera_info":
+            return None if topic == "/tf_static" else data
+        message: Any = TYPES.deserialize_cdr(data, "sensor_msgs/msg/CameraInfo")
+        return edited("sensor_msgs/msg/CameraInfo", data, p=np.where(np.arange(12) == 3, 0.0, message.p))
+
+    log = rewrite(traverse, tmp_path / "log.mcap", change)
+    assert roverflow("run", log, "-o", tmp_path / "out.mcap", "--no-rrd") == 2
+    said = capsys.readouterr().err
+    assert "does not tell the baseline" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out.mcap").exists()
