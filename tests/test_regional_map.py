@@ -13,6 +13,7 @@ import rasterio
 from flow.cli import main
 from recordings import ros2
 from stages.data import Cell, Reason
+from tests.bench.regional import RUNS, region, shares_within, traverse_of
 from tests.conftest import FRAMES, rewrite
 
 SMALL = ("--set", "disparities=64")
@@ -99,6 +100,22 @@ def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, capsys):
         for _, _, message in ros2.iter_messages(result, ["/nav/elevation_map"])
     ]
     assert max(own) < known < sum(own)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_neighbouring_frames_join_without_a_seam_and_what_is_stated_of_the_heights_holds(tmp_path):
+    regions = []
+    for seed, abundance in RUNS:
+        (tmp_path / str(seed)).mkdir()
+        regions.append(region(traverse_of(seed, abundance), tmp_path / str(seed)))
+    for found in regions:
+        placed, fused = found.seams.T
+        assert fused.max() <= 0.02
+        assert np.median(fused) < 0.5 * np.median(placed)
+    one, two = shares_within(regions)
+    assert 0.61 <= one <= 0.75
+    assert 0.91 <= two <= 0.99
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,42 +34,67 @@ COLUMNS = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Region:
+    """What the regional map of a traverse is like. seams: (frames - 1, 2) m, placed and fused; errors: (n,) m, of cells
+    that frames changed; sigmas: (n,) m, stated for them; contradicted: share of cells; seconds: by stream."""
+
+    seams: Array
+    errors: Array
+    sigmas: Array
+    contradicted: float
+    seconds: dict[str, float]
+
+    def row(self) -> list[str]:
+        """The figures of the table."""
+        seams = [figure for which in self.seams.T for figure in (np.median(which), which.max())]
+        return [
+            *(f"{100 * value:.2f}" for value in seams),
+            f"{100 * np.sqrt(np.mean(self.errors**2)):.2f}", within([self]), f"{100 * self.contradicted:.1f}",
+            *(f"{1e3 * self.seconds[name] / FRAMES:.0f}" for name in ("regional_map", "regional_navigation_map")),
+        ]  # fmt: skip
+
+
 def main() -> None:
     """Print a row per traverse, and how well the stated sigmas hold over all."""
     print(f"\nregional map: {FRAMES} frames of 1280x960, inclinometer noise 0.3 degrees, slopes of 8 degrees (RMS)")
     print(" ".join(f"{name:>{width}}" for name, width in COLUMNS))
-    pooled = []
+    regions = []
     for seed, abundance in RUNS:
-        simulation = Simulation(
-            frames=FRAMES, seed=seed, abundance=abundance, slope=np.radians(8), tilt_noise=np.radians(0.3)
-        )
         with tempfile.TemporaryDirectory() as folder:
-            figures, sigmas = _figures(simulation, Path(folder))
-        pooled.append(sigmas)
-        cells = [str(seed), f"{abundance:g}", *figures]
+            regions.append(region(traverse_of(seed, abundance), Path(folder)))
+        cells = [str(seed), f"{abundance:g}", *regions[-1].row()]
         print(" ".join(f"{cell:>{width}}" for cell, (_, width) in zip(cells, COLUMNS, strict=True)), flush=True)
-    print(f"within 1, 2 sigma, all: {_within(np.concatenate(pooled))} %")
+    print(f"within 1, 2 sigma, all cells: {within(regions)} %")
 
 
-def _figures(simulation: Simulation, folder: Path) -> tuple[list[str], Array]:
-    """The row of one traverse, and the errors of its cells in stated sigmas."""
+def traverse_of(seed: int, abundance: float) -> Simulation:
+    """A traverse as the table has them."""
+    return Simulation(
+        frames=FRAMES, seed=seed, abundance=abundance, slope=np.radians(8), tilt_noise=np.radians(0.3)
+    )  # fmt: skip
+
+
+def region(simulation: Simulation, folder: Path) -> Region:
+    """The regional map of a traverse, by the command line's default pipeline."""
     log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
     simulation.write(log)
     command = [sys.executable, "-m", "flow.cli", "run", log, "-o", out, "--no-rrd", "--summary", summary]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    seconds = json.loads(summary.read_text())["seconds"]
     frames = _frames(out)
-    seams = _seams(simulation, log, frames)
-    error, sigma, contradicted = _errors(simulation, [frame["/nav/regional_map"] for frame in frames.values()])
-    return [
-        *(f"{100 * value:.2f}" for which in (0, 1) for value in (np.median(seams[:, which]), seams[:, which].max())),
-        f"{100 * np.sqrt(np.mean(error**2)):.2f}", _within(error / sigma), f"{100 * contradicted:.1f}",
-        *(f"{1e3 * seconds[name] / FRAMES:.0f}" for name in ("regional_map", "regional_navigation_map")),
-    ], error / sigma  # fmt: skip
+    errors = _errors(simulation, [frame["/nav/regional_map"] for frame in frames.values()])
+    return Region(_seams(simulation, log, frames), *errors, json.loads(summary.read_text())["seconds"])
 
 
-def _within(sigmas: Array) -> str:
-    return ", ".join(f"{100 * np.mean(np.abs(sigmas) <= count):.1f}" for count in (1, 2))
+def shares_within(regions: list[Region]) -> tuple[float, float]:
+    """Shares of the cells of all regions that are within one and two stated standard deviations."""
+    sigmas = np.concatenate([np.abs(found.errors) / found.sigmas for found in regions])
+    return float(np.mean(sigmas <= 1)), float(np.mean(sigmas <= 2))
+
+
+def within(regions: list[Region]) -> str:
+    """The same, in percent."""
+    return ", ".join(f"{100 * share:.1f}" for share in shares_within(regions))
 
 
 def _frames(out: Path) -> dict[int, dict[str, object]]:
