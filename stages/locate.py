@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.level import level_transform
-from stages.stage import Stage, parameter
+from stages.stage import Finding, Severity, Stage, parameter
 
 VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once
 
@@ -64,15 +64,16 @@ class Locate(Stage):
         self._follow(motion, motion.camera, tilt, mount)
         return self._pose(motion, mount)
 
-    @property
-    def finding(self) -> str:
-        """That poses are visual, and in which frames; empty where poses are given."""
+    def finding(self) -> Finding | None:
+        """That poses are visual, and in which frames, a warning for several; None where poses are given."""
         memory = self._memory
         if not memory.visual or memory.motion is None:
-            return ""
-        last = memory.motion.segment
-        frames = VISUAL_FRAME if last < 2 else f"{VISUAL_FRAME} to {_frame_of(last)}"
-        return f"no pose is given; {memory.visual} by visual odometry, in {frames}"
+            return None
+        said, last = f"no pose is given; {memory.visual} by visual odometry, in {VISUAL_FRAME}", memory.motion.segment
+        if last < 2:
+            return Finding(said)
+        parted = f"{said} to {_frame_of(last)}, which nothing joins: tracking was lost between them"
+        return Finding(parted, Severity.WARNING)
 
     def _follow(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> None:
         memory = self._memory

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
-from stages.stage import Stage, parameter
+from stages.stage import Finding, Stage, parameter
 from stages.tracking import Step, View, step_between, view
 
 
@@ -61,9 +61,8 @@ class VisualOdometry(Stage):
             return self._followed(frame.stamp, before, step, seen)
         return self._begun(frame, seen)
 
-    @property
-    def finding(self) -> str:
-        """What to say of the whole run: where tracking was lost; empty where it never was."""
+    def finding(self) -> Finding | None:
+        """What to say of the whole run: where tracking was lost; None where it never was."""
         memory = self._memory
         parts = []
         if memory.losses:
@@ -73,7 +72,7 @@ class VisualOdometry(Stage):
             )
         if memory.blind:
             parts.append(f"{memory.blind} {'frame shows' if memory.blind == 1 else 'frames show'} too little to track")
-        return "; ".join(parts)
+        return Finding("; ".join(parts)) if parts else None
 
     def _likely(self, step: Step) -> bool:
         return step.error <= self.worst and float(np.linalg.norm(step.translation)) <= self.fastest

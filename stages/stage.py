@@ -1,4 +1,4 @@
-"""What every stage shares: parameters that carry their unit, range and meaning, checked when the stage is made."""
+"""What every stage shares: parameters that carry their unit, range and meaning, and what it may say of a whole run."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from enum import StrEnum
 from typing import Any
 
 
@@ -40,3 +41,18 @@ class Stage:
             if (low is not None and not value >= low) or (high is not None and not value <= high):
                 bounds = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
                 raise ValueError(f"{where} must be {bounds}{f' {unit}' if unit else ''}, not {value}")
+
+
+class Severity(StrEnum):
+    """How much a finding matters: a WARNING is printed last and stands out, for results may be wrong."""
+
+    NOTE = "note"
+    WARNING = "warning"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a stage's `finding()` says of a whole run, or its `survey` of a log, in one sentence."""
+
+    sentence: str
+    severity: Severity = Severity.NOTE

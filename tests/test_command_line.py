@@ -66,7 +66,7 @@ def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
     summary = json.loads(result.with_suffix(".json").read_text())
     assert (summary["verdict"], summary["frames_in"], summary["frames_out"]) == ("COMPLETE", FRAMES, FRAMES)
     assert summary["drops"] == {}
-    assert summary["surveys"]["rectified"].endswith("too little to correct")
+    assert summary["surveys"]["rectified"]["sentence"].endswith("too little to correct")
     assert summary["seconds"]["matched"] > 0
     assert set(summary["seconds"]) >= {"rectified", "disparity", "points", "elevation_map", "navigation_map"}
 
@@ -85,15 +85,15 @@ def test_a_log_without_a_pose_gets_one_that_says_it_is_visual(traverse, tmp_path
         place = pose.pose.pose.position
         assert np.linalg.norm([place.x - true[0], place.y - true[1], place.z - true[2]]) < 0.03
     findings = json.loads(summary.read_text())["findings"]
-    assert findings["pose"] == f"no pose is given; {FRAMES} by visual odometry, in visual_odom"
-    assert f"pose: {findings['pose']}" in capsys.readouterr().out
+    assert findings["pose"]["sentence"] == f"no pose is given; {FRAMES} by visual odometry, in visual_odom"
+    assert f"pose: {findings['pose']['sentence']}" in capsys.readouterr().out
 
 
 def test_the_logs_own_pose_is_kept_and_the_tilt_judged_all_the_same(result):
     poses = [message for topic, _, message in iter_messages(result) if topic == "/nav/pose"]
     assert {pose.header.frame_id for pose in poses} == {"odom"}
     findings = json.loads(result.with_suffix(".json").read_text())["findings"]
-    assert findings == {"health": f"too few frames to judge the tilt ({FRAMES})"}
+    assert findings == {"health": {"severity": "note", "sentence": f"too few frames to judge the tilt ({FRAMES})"}}
 
 
 def test_a_pipeline_without_a_recording_writes_and_lists_none(traverse, tmp_path, capsys):
@@ -114,7 +114,8 @@ def test_a_row_offset_is_measured_once_for_the_log_reported_and_corrected(traver
     log = rewrite(traverse, tmp_path / "displaced.mcap", displaced)
     whole, part = tmp_path / "whole.mcap", tmp_path / "part.mcap"
     assert roverflow("run", log, *SMALL, "--no-rrd", "-o", whole, "--summary", tmp_path / "whole.json") == 0
-    (finding,) = json.loads((tmp_path / "whole.json").read_text())["surveys"].values()
+    (survey,) = json.loads((tmp_path / "whole.json").read_text())["surveys"].values()
+    finding = survey["sentence"]
     assert f"rectified: {finding}" in capsys.readouterr().out
     assert float(re.search(r"rows differ by (\S+) px at the centre", finding)[1]) == pytest.approx(-2, abs=0.1)
     assert "; corrected, as row_offset=[" in finding

@@ -71,13 +71,18 @@ def test_a_stage_that_remembers_sees_the_frames_in_order(tmp_path):
 
 def test_what_a_stage_found_is_said_at_the_end_to_the_user_and_to_the_sinks(tmp_path):
     sink, summary = replayed(graph(tmp_path), traverse(5))
-    assert summary["findings"] == sink.summary["findings"] == {"total": "the sum is 20.0"}
+    said = {"total": {"severity": "note", "sentence": "the sum is 20.0"}}
+    assert summary["findings"] == sink.summary["findings"] == said
+    warned = replayed(graph(tmp_path), traverse(6))[1]
+    assert warned["findings"] == {"total": {"severity": "warning", "sentence": "the sum is 30.0"}}
+    assert warned["verdict"] == "COMPLETE"  # for nothing was lost
     assert replayed(graph(tmp_path), [])[1]["findings"] == {}
 
 
 def test_a_finding_that_breaks_down_costs_the_run_nothing(tmp_path):
     _, summary = replayed(graph(tmp_path), traverse(4))
-    assert (summary["verdict"], summary["findings"]) == ("COMPLETE", {"total": "RuntimeError: unlucky"})
+    said = {"total": {"severity": "warning", "sentence": "RuntimeError: unlucky"}}
+    assert (summary["verdict"], summary["findings"]) == ("COMPLETE", said)
 
 
 def test_a_sink_is_never_entered_twice_at_once(tmp_path):
@@ -261,7 +266,7 @@ def test_what_is_optional_is_left_out_where_the_log_lacks_it(tmp_path):
     summary = run(pipeline, Log(traverse(3), missing={"level": "no level"}), {use: Path("unused")})
     assert summary["verdict"] == "COMPLETE"
     assert "raised" not in sink.streams
-    assert "left out: no level" in summary["findings"].values()
+    assert {"severity": "note", "sentence": "left out: no level"} in summary["findings"].values()
     assert len(sink.values("sum")) == 3
 
 
