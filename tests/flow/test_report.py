@@ -4,8 +4,8 @@ from pathlib import Path
 
 from flow.report import report
 from flow.run import run
-from tests.flow.test_engine import graph
-from tests.flow.toys import Log, traverse
+from tests.flow.test_engine import graph, traverse
+from tests.flow.toys import Log
 
 
 def printed(folder, frames, capsys):
