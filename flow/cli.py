@@ -187,22 +187,24 @@ def _graph(options: argparse.Namespace) -> int:
 def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("out", type=Path, metavar="OUT.mcap")
     sub.add_argument("--frames", type=count, help="stereo frames (default 12)")
-    sub.add_argument("--seed", type=int, help="another seed, another terrain")
+    sub.add_argument("--seed", type=int, help="another seed, another terrain (1)")
     sub.add_argument("--size", type=size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
-    sub.add_argument("--rocks", type=float, metavar="K", help="share of the ground covered by rocks (Golombek's k)")
-    sub.add_argument("--slope", type=float, metavar="DEG", help="RMS slope of the terrain")
-    sub.add_argument("--tilt-noise", type=float, metavar="DEG", help="inclinometer noise, one sigma")
+    sub.add_argument("--rocks", type=float, metavar="K", help="share of ground under rocks (Golombek's k, 0.1)")
+    sub.add_argument("--slope", type=float, metavar="DEG", help="RMS slope of the terrain (4)")
+    sub.add_argument("--tilt-noise", type=float, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
+    scale = "by how much odometry overstates the way (1); 0, with --odometry-turn 0, is exact"
+    sub.add_argument("--odometry-scale", type=float, metavar="PERCENT", help=scale)
+    turn = "drift of odometry's heading, one sigma after 1 m; it grows with the root of the way (0.2)"
+    sub.add_argument("--odometry-turn", type=float, metavar="DEG", help=turn)
 
 
 def _simulate(options: argparse.Namespace) -> int:
     check_outputs([options.out], [])
-    settings = {
-        "frames": options.frames,
-        "seed": options.seed,
-        "abundance": options.rocks,
-        "slope": None if options.slope is None else math.radians(options.slope),
-        "tilt_noise": None if options.tilt_noise is None else math.radians(options.tilt_noise),
-    }
+    settings = {"frames": options.frames, "seed": options.seed, "abundance": options.rocks}
+    for name in ("slope", "tilt_noise", "odometry_turn"):
+        degrees = getattr(options, name)
+        settings[name] = None if degrees is None else math.radians(degrees)
+    settings["odometry_scale"] = None if options.odometry_scale is None else options.odometry_scale / 100
     width, height = options.size
     simulate(options.out, width=width, height=height, **{k: v for k, v in settings.items() if v is not None})
     return COMPLETE

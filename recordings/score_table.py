@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from recordings.measures import share
+from recordings.pose_measures import format_pose
 from recordings.scoring import HIGH_ROCK, NEAR, Score
 from recordings.stereo_measures import CROP_STEP, REGIONS, THRESHOLDS
 from recordings.terrain_measures import format_terrain
@@ -22,7 +23,7 @@ def format_score(found: Score) -> str:
         parts.append(_navigation_lines(found.navigation, found.rocks))
     if found.terrain is not None:
         parts.append(format_terrain(found.terrain))
-    parts.append(_tilt_lines(found))
+    parts.append([*_tilt_lines(found), *(format_pose(found.pose) if found.pose is not None else [])])
     return "\n\n".join("\n".join(lines) for lines in parts if lines)
 
 
