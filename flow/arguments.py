@@ -23,6 +23,17 @@ def count(text: str) -> int:
     return value
 
 
+def magnitude(text: str) -> float:
+    """A number of at least 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number of at least 0, not '{text}'")
+    return value
+
+
 def seconds(text: str) -> float:
     """Seconds after a log's first message."""
     try:

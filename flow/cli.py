@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from flow.arguments import check_outputs, count, seconds, size
+from flow.arguments import check_outputs, count, magnitude, seconds, size
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.replay import as_json, product_version, replay
 from flow.report import report, say
@@ -44,8 +44,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _sentence(error: Exception) -> str:
     if isinstance(error, RoverflowError) or _is_log_error(error):
         return str(error)
-    if isinstance(error, OSError) and error.filename:
-        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'the output'}: {error.strerror}"
+    if "cannot cache function" in str(error):  # numba, whose own words name neither the reason nor the remedy
+        return "there is no folder to keep compiled kernels in; set NUMBA_CACHE_DIR to one that can be written"
     return f"internal failure, {type(error).__name__}: {error} (--debug shows where)"
 
 
@@ -189,13 +191,13 @@ def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--frames", type=count, help="stereo frames (default 12)")
     sub.add_argument("--seed", type=int, help="another seed, another terrain (1)")
     sub.add_argument("--size", type=size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
-    sub.add_argument("--rocks", type=float, metavar="K", help="share of ground under rocks (Golombek's k, 0.1)")
-    sub.add_argument("--slope", type=float, metavar="DEG", help="RMS slope of the terrain (4)")
-    sub.add_argument("--tilt-noise", type=float, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
+    sub.add_argument("--rocks", type=magnitude, metavar="K", help="share of ground under rocks (Golombek's k, 0.1)")
+    sub.add_argument("--slope", type=magnitude, metavar="DEG", help="RMS slope of the terrain (4)")
+    sub.add_argument("--tilt-noise", type=magnitude, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
     scale = "by how much odometry overstates the way (1); 0, with --odometry-turn 0, is exact"
     sub.add_argument("--odometry-scale", type=float, metavar="PERCENT", help=scale)
     turn = "drift of odometry's heading, one sigma after 1 m; it grows with the root of the way (0.2)"
-    sub.add_argument("--odometry-turn", type=float, metavar="DEG", help=turn)
+    sub.add_argument("--odometry-turn", type=magnitude, metavar="DEG", help=turn)
 
 
 def _simulate(options: argparse.Namespace) -> int:
