@@ -10,6 +10,7 @@ import json
 import logging
 import math
 import os
+import shlex
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -342,7 +343,7 @@ def _demo(options: argparse.Namespace) -> int:
     shutil.rmtree(folder / "maps", ignore_errors=True)
     pictures, maps = draw(out, folder / "pictures"), export(out, folder / "maps")
     say(f"\n{len(pictures)} pictures in {folder / 'pictures'}, {len(maps)} files of the map in {folder / 'maps'}")
-    say(f"the timeline: rerun {rrd}")
+    say(f"the timeline: rerun {shlex.quote(str(rrd))}")
     return _exit_code_of(summary)
 
 
