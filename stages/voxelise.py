@@ -102,12 +102,13 @@ class Voxelise(Stage):
 
     def _reached(self, figures: Array, cloud: PointCloud, grid: Grid) -> Array:
         """The figures of `cell_statistics`, with those of empty cells that lie within the reach of points."""
-        if cloud.sensor is None or self.reach == 0:
+        sensor = cloud.sensor
+        if sensor is None or self.reach == 0:
             return figures
         if cloud.source is not None:
             cloud = cloud.only(cloud.source == Source.MEASURED)
         least = FINEST * self.resolution
-        points, sigma = laid_along_sight(cloud.points, cloud.sigma, cloud.sensor, self.reach, least)
+        points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.reach, least)
         near = cell_statistics(points, sigma, *grid)
         reached = (figures[:, :, 0] == 0) & (near[:, :, 0] >= WITNESSES)
         near[:, :, SUMS] /= len(PLACES)
