@@ -74,16 +74,23 @@ class TerrainTally:
         self.heights = {ring: (HeightErrors(), HeightErrors()) for ring in RINGS}
         self.counts: dict[str, float] = {}
 
-    def add(self, truth: TrueGround, layers: dict[str, Array], cells: Array | None) -> None:
-        """Count one frame. layers: of the elevation map, on the truth's grid, or empty; cells: `Cell` codes or None."""
+    def add(
+        self, truth: TrueGround, layers: dict[str, Array], cells: Array | None, tilts: Array | None = None
+    ) -> None:
+        """Count one frame. layers: of the elevation map, on the truth's grid, or empty; cells: `Cell` codes or None.
+
+        tilts: (N, 2) slopes along x and y by which other errors of the tilt would lean the map, against its own. A
+        frame has a single tilt, and with it all cells are off together: thirty frames say little about whether the
+        intervals with the tilt's hold. Where `tilts` are given, those are counted for each instead of for the one.
+        """
         unknown = np.full(truth.seen.shape, np.nan)
         elevation = layers.get("elevation", unknown).astype(np.float64)
-        self._add_heights(truth, layers, elevation)
+        self._add_heights(truth, layers, elevation, np.zeros((1, 2)) if tilts is None else tilts)
         cells = np.full(truth.seen.shape, np.int8(Cell.UNKNOWN)) if cells is None else cells
         self.counts = added(self.counts, _hazards(truth, cells))
         self.counts = added(self.counts, _rocks(truth, cells))
 
-    def _add_heights(self, truth: TrueGround, layers: dict[str, Array], elevation: Array) -> None:
+    def _add_heights(self, truth: TrueGround, layers: dict[str, Array], elevation: Array, tilts: Array) -> None:
         known = np.isfinite(elevation)
         error = np.where(truth.seen, elevation - truth.mean, np.nan)
         levelled = without_plane(truth.x, truth.y, error)
@@ -99,14 +106,14 @@ class TerrainTally:
             "between_pixels": known & within & truth.in_view & ~truth.seen,
             "cells": within,
         }
+        self.counts = added(self.counts, _summed(counts))
         if "variance" in layers:
             variance = layers["variance"].astype(np.float64)
             common = layers.get("common_variance", np.zeros_like(variance))
-            for name, off, stated in (("random", levelled, variance), ("total", error, variance + common)):
-                judged = np.isfinite(off) & np.isfinite(stated)
-                sigmas = np.abs(off[judged]) / np.sqrt(np.maximum(stated[judged], 1e-18))
-                counts |= {f"{name}_judged": judged, f"{name}_in_1": sigmas <= 1, f"{name}_in_2": sigmas <= 2}
-        self.counts = added(self.counts, _summed(counts))
+            self.counts = added(self.counts, _intervals("random", levelled, variance))
+            for east, north in tilts:
+                lean = east * truth.x[None, :] + north * truth.y[:, None]
+                self.counts = added(self.counts, _intervals("total", error + lean, variance + common))
 
     def measures(self) -> dict[str, Any]:
         """All figures; shares 0 to 1, lengths m, NaN where there was nothing to measure.
@@ -157,6 +164,13 @@ class TerrainTally:
                              for low, high in pairwise(SLOPES)},
             },
         }  # fmt: skip
+
+
+def _intervals(name: str, error: Array, variance: Array) -> dict[str, float]:
+    """How many errors of one frame are known, and within one and two standard deviations."""
+    judged = np.isfinite(error) & np.isfinite(variance)
+    sigmas = np.abs(error[judged]) / np.sqrt(np.maximum(variance[judged], 1e-18))
+    return _summed({f"{name}_judged": judged, f"{name}_in_1": sigmas <= 1, f"{name}_in_2": sigmas <= 2})
 
 
 def _hazards(truth: TrueGround, cells: Array) -> dict[str, float]:

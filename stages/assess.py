@@ -43,7 +43,9 @@ class Assess(Stage):
     - slope, rad: of the ground under the footprint;
     - steepness, rad: of all that is no obstacle, under a wheel;
     - roughness, m: root mean square of the same off its plane under the footprint;
-    - support: share of the cells within a wheel's reach that are known.
+    - support: share of the cells within a wheel's reach that are known;
+    - drop, m: how far below the ground about it a hidden cell lies at least, by the line of sight that passes over it,
+      NaN in others; where the map says below what hidden cells lie (layer `ceiling`).
     """
 
     footprint: float = parameter(1.0, "width and length of the rover: the window of slope and roughness", unit="m",
@@ -78,6 +80,8 @@ class Assess(Stage):
             "roughness": np.where(observed, roughness, np.nan),
             "support": np.where(observed, support, np.nan),
         }
+        if "ceiling" in elevation.layers:
+            layers["drop"] = np.where(observed, np.nan, ground - elevation.layers["ceiling"])
         added = {name: layer.astype(np.float32) for name, layer in layers.items()}
         return replace(elevation, layers={**elevation.layers, **added})
 

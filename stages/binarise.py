@@ -34,7 +34,16 @@ class Binarise(Stage):
       knows where a rock ends (0.25 px of disparity are 7 cm at 8 m).
     Other cells are unknown where they have no points (OCCLUDED where the map says so, else UNOBSERVED), and UNSURE
     where so few cells lie about them that the ground is not determined or a step not ruled out, or where the layer
-    `variance`, if the map has it, does not say that the height is known to `max_sigma`. The rest is free (CLEAR).
+    `variance`, if the map has it, does not say that the height is known to `max_sigma`, or at a brink, or where a wheel
+    might stand too steeply. The rest is free (CLEAR).
+
+    A brink is a cell within `brink` of hidden ground that falls away: that lies, within `fall_reach` through what is
+    hidden, at least `fall` below the ground about it (layer `drop`, if the map has it). Behind a bump one sees the
+    ground go on where it was; behind the edge of a cliff or ditch, lower, or not at all.
+
+    The plane under a wheel rests on few cells: near the limit, steepness is off by 2 degrees (RMS, simulated ground).
+    So a spot is UNSURE if it would be too steep were the difference of its steepness from the footprint's slope larger
+    by `steepness_error` of it; on a plane there is no difference.
 
     Ground wider than Assess.surroundings is terrain, not an obstacle: its edge is a hazard, its top is judged as
     ground.
@@ -57,6 +66,15 @@ class Binarise(Stage):
     )
     least_support: float = parameter(
         0.3, "share of the cells within a wheel's reach that must be known for a cell to be free", low=0.0, high=1.0
+    )
+    fall: float = parameter(
+        0.1, "how far below the ground about it hidden ground lies that may be a drop: a part of its depth is all that "
+        "shows of a ditch", unit="m", low=0.0,
+    )  # fmt: skip
+    fall_reach: float = parameter(1.0, "how far from there it may begin to fall", unit="m", low=0.0)
+    brink: float = parameter(0.15, "cells this near to where it may fall are not free: half a wheel", unit="m", low=0.0)
+    steepness_error: float = parameter(
+        0.25, "share of the difference of steepness and slope that may be missing from it", low=0.0
     )
     min_points: int = parameter(1, "points without which a cell is unknown, where the map counts them", low=1)
 
@@ -91,6 +109,7 @@ class Binarise(Stage):
         limit = self.max_slope + _SLOPE_ROUNDING
 
         known = np.isfinite(slope) & np.isfinite(roughness) & (support >= self.least_support) & self._sure(elevation)
+        known &= ~(steepness + self.steepness_error * (steepness - slope) > limit) & ~self._at_brink(elevation)
         reason = np.where(known, Reason.CLEAR, Reason.UNSURE)
         reason[_near(high | belly, self.beside / elevation.resolution)] = Reason.BESIDE
         reason[roughness > self.max_roughness] = Reason.ROUGHNESS
@@ -104,6 +123,18 @@ class Binarise(Stage):
         if "variance" not in elevation.layers:
             return np.ones(elevation.shape, bool)
         return elevation.layers["variance"] <= self.max_sigma**2
+
+
+    def _at_brink(self, elevation: ElevationMap) -> Array:
+        """Cells next to hidden ground that falls away, (rows, cols) bool."""
+        if "drop" not in elevation.layers:
+            return np.zeros(elevation.shape, bool)
+        hidden = elevation.layers["occluded"] == 1
+        falls = hidden & (elevation.layers["drop"] >= self.fall)
+        reach = int(self.fall_reach / elevation.resolution + 1e-6)
+        if reach and falls.any():
+            falls = binary_dilation(falls, np.ones((3, 3)), iterations=reach, mask=hidden)
+        return _near(falls, self.brink / elevation.resolution)
 
 
 def _near(cells: Array, distance: float) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Tiles, Transform
+from stages.kernels.neighbours import lie_of_cells
 from stages.kernels.rigid import transform_points
 from stages.overlap import fit_plane
 from stages.stage import Stage, parameter
@@ -23,7 +24,8 @@ from stages.voxelise import Voxelise
 # What is remembered of a cell, 30 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
 # best: the smallest standard deviation among them; below, above: from the height to the cell's extremes; first, last:
 # ms since the first frame; numbers stop at the largest of their type. hidden: 1 where nothing is known, but a frame
-# looked and could not see it; doubt: by how much the newest frame contradicts it, where that is not settled.
+# looked and could not see it, and then height is what it must lie below; doubt: by how much the newest frame
+# contradicts it, where that is not settled.
 CELL = np.dtype(
     [
         ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u2"),
@@ -35,6 +37,7 @@ MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that n
 _MS = 1_000_000
 LARGEST_JUMP = 5.0  # standard deviations, from one frame to the next, of what joins them to the map
 PATIENCE = 3  # frames in succession that do not join the map begin a new one
+_STEEPEST = 3.0  # rise per run; a cell at the edge of a rock may be steeper, and what it is off by is bounded
 # Beyond this the pose's frame does not have z up. An odometry that knows no tilt may differ by the slope of the ground.
 _LARGEST_LEAN = np.radians(30.0)
 
@@ -65,11 +68,13 @@ class Fuse(Stage):
     The map that a frame gives is a square of `window` about the rover, its sides along the axes of the pose's frame. It
     holds all that the frame changed, so the maps of a run, each laid over those before, are the whole region. Layers:
     - elevation, minimum, maximum, m: means over frames, weighted by inverse variance;
-    - variance, m^2: of the elevation against what lies about it. Frames see a cell alike and err alike: the share
-      `shared` of the smallest variance stays, however many frames there are;
+    - variance, m^2: of the elevation against what lies about it. A frame that is misplaced by `position` is off by that
+      times the slope, where its cell has one, and by `alignment` anywhere. Frames see a cell alike and err alike: the
+      share `shared` of the smallest variance stays, however many frames there are;
     - count (points); first, last: when the evidence in the cell was gathered, s since the map's first frame;
       frames: how many it is from (at most 65535); contradictions: how often the height was contradicted;
-    - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere.
+    - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere; and
+      ceiling, m: the lowest line of sight over the hidden ones.
 
     A frame contradicts a cell if it is off by more than `contradiction` standard deviations. Then the cell's evidence
     loses half its weight, and as soon as the newer is as sure, the newer takes its place; until then the cell is stated
@@ -88,15 +93,18 @@ class Fuse(Stage):
     window: float = parameter(20.0, "width of the map that is given with each frame", unit="m", low=0.5)
     tilt_sigma: float = parameter(0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0)
     height_sigma: float = parameter(0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0)
+    position: float = parameter(
+        0.012, "standard deviation of a frame's horizontal place against those it is merged with", unit="m", low=0.0
+    )
     alignment: float = parameter(
-        0.005, "standard deviation that errors of position add to a cell's height", unit="m", low=1e-4
+        0.002, "standard deviation that is left in a cell's height by joining its frame", unit="m", low=1e-4
     )
     follow_tilt: float = parameter(0.05, "share of a frame's own tilt that the map takes over", low=0.0, high=1.0)
     follow_height: float = parameter(
         0.003, "share of its own height; much less, for heights that are pulled lean the map", low=0.0, high=1.0
     )
     contradiction: float = parameter(3.0, "standard deviations that two heights of a cell may differ", low=1.0)
-    shared: float = parameter(0.3, "share of a cell's variance that is the same in all frames", low=0.0, high=1.0)
+    shared: float = parameter(0.5, "share of a cell's variance that is the same in all frames", low=0.0, high=1.0)
 
     ordered: ClassVar[bool] = True
     _map: Region = field(default_factory=Region, init=False, repr=False, compare=False)
@@ -123,21 +131,22 @@ class Fuse(Stage):
         cells = self._map.cells.read(row, col, *local.shape)
         known = np.isfinite(local.layers["elevation"]) & np.isfinite(local.layers["variance"])
         seen = {name: local.layers[name][known].astype(np.float64) for name in local.layers}
-        seen["variance"] += self.alignment**2
+        seen["variance"] += self._misplaced(local)[known]
         x, y = _offsets(known, row, col, placed, self.resolution)
         plane = self._plane(cells[known], seen, x, y)
         if self._jumped(plane):
             self._map.begin(pose.frame_id, cloud.stamp)
             cells, plane = self._map.cells.read(row, col, *local.shape), np.zeros(3)
         self._map.plane, self._map.refused = plane, 0
-        rise = plane[0] + plane[1] * x + plane[2] * y
         for height in ("elevation", "minimum", "maximum"):
-            seen[height] += rise
+            seen[height] += plane @ [np.ones_like(x), x, y]
         cells[known] = self._merged(cells[known], seen, (cloud.stamp - self._map.epoch) // _MS)
-        hidden = ~known & (local.layers.get("occluded", np.zeros(known.shape)) == 1)
-        cells["hidden"][hidden] = cells["frames"][hidden] == 0
+        ceiling = local.layers.get("ceiling", np.full(known.shape, np.nan))
+        hidden = ~known & np.isfinite(ceiling) & (cells["frames"] == 0)
+        x, y = _offsets(hidden, row, col, placed, self.resolution)
+        cells[hidden] = _below(cells[hidden], ceiling[hidden] + plane @ [np.ones_like(x), x, y])
         self._map.cells.write(row, col, cells, known | hidden)
-        self._map.last, self._map.hides = cloud.stamp, "occluded" in local.layers
+        self._map.last, self._map.hides = cloud.stamp, "ceiling" in local.layers
         return self._around(cloud.stamp, _lifted(placed, plane))
 
     @property
@@ -150,6 +159,11 @@ class Fuse(Stage):
             raise ValueError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
         if cloud.stamp <= self._map.last:
             raise ValueError(f"Fuse: the cloud of {cloud.stamp} ns comes after that of {self._map.last} ns")
+
+    def _misplaced(self, local: ElevationMap) -> Array:
+        """What errors of a frame's place add to the variance of its cells, (rows, cols)."""
+        east, north, _ = lie_of_cells(local.layers["elevation"].astype(np.float64)) / self.resolution
+        return np.asarray(self.alignment**2 + self.position**2 * np.minimum(east**2 + north**2, _STEEPEST**2))
 
     def _plane(self, cells: Array, seen: dict[str, Array], x: Array, y: Array) -> Array:
         """What a frame has to rise to join the map: (3,) height at the rover, m, and slopes along x and y.
@@ -240,7 +254,9 @@ class Fuse(Stage):
         for name in ("frames", "contradictions"):
             layers[name] = cells[name].astype(np.float32)
         if self._map.hides:
-            layers["occluded"] = np.where(known, 0, np.where(cells["hidden"] == 1, 1, np.nan)).astype(np.float32)
+            hidden = cells["hidden"] == 1
+            layers["occluded"] = np.where(known, 0, np.where(hidden, 1, np.nan)).astype(np.float32)
+            layers["ceiling"] = np.where(hidden, cells["height"], np.nan).astype(np.float32)
         origin = (col * self.resolution, row * self.resolution)
         return ElevationMap(stamp, layers, self.resolution, origin, self._map.frame_id, level=placed)
 
@@ -249,6 +265,14 @@ def _sum(numbers: Array, more: Array | int) -> Array:
     """Unsigned numbers with `more` added, or the largest of their type."""
     most = np.iinfo(numbers.dtype).max
     return np.asarray(np.minimum(numbers + np.asarray(more, np.float64), most).astype(numbers.dtype))
+
+
+def _below(cells: Array, ceiling: Array) -> Array:
+    """Hidden cells (n,) that lie below the heights `ceiling`, too."""
+    cells = cells.copy()
+    cells["height"] = np.where(cells["hidden"] == 1, np.minimum(cells["height"], ceiling), ceiling)
+    cells["hidden"] = 1
+    return cells
 
 
 def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> Transform:
@@ -299,7 +323,7 @@ def local_cells(
     sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
     local = Voxelise(resolution=resolution, region=region)(replace(cloud, points=points, sensor=sensor))
     col, row = (int(number) - extent // 2 for number, extent in zip(cell, local.shape[::-1], strict=True))
-    heights = ("elevation", "minimum", "maximum")
+    heights = [name for name in ("elevation", "minimum", "maximum", "ceiling") if name in local.layers]
     lifted = {name: local.layers[name] + np.float32(placed.translation[2]) for name in heights}
     origin = (col * resolution, row * resolution)
     return replace(local, layers={**local.layers, **lifted}, origin=origin, frame_id=placed.parent), row, col

@@ -21,14 +21,19 @@ _LEAST_HORIZONTAL = 0.1
 
 @dataclass(frozen=True)
 class Level(Stage):
-    """Carries a cloud from the camera into the gravity-aligned frame `level`."""
+    """Carries a cloud from the camera into the gravity-aligned frame `level`.
+
+    `tilt_sigma` is that of the tilt at the frame's time: of readings with a standard deviation s, 0.8 s where it lies
+    between two of them, s / sqrt(n) where it is smoothed over n, as many before the frame as after it. Errors about the
+    two axes are taken as independent, so at (x, y) a height has the variance tilt_sigma^2 (x^2 + y^2).
+    """
 
     camera_height: float = parameter(
         1.0, "height of the left camera above the origin, where base_link is not known", unit="m", low=0.0
     )
     tilt_sigma: float = parameter(
-        0.0042, "standard deviation of the tilt about each horizontal axis, for the map's common variance (0.24 "
-        "degrees: 0.3 of a reading, less by interpolation between two)",
+        0.0042, "standard deviation of the tilt, as it comes, about each horizontal axis, for the map's common "
+        "variance (0.24 degrees: 0.3 of a reading, less by interpolation between two)",
         unit="rad", low=0.0, high=0.5,
     )  # fmt: skip
 

@@ -6,9 +6,21 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flow.cli import main
+from recordings.simulator.simulation import Simulation
+from tests.bench.terrain import SLOPE, TILT_NOISE, nodes, tilt_errors
+
+
+@pytest.mark.parametrize("pipeline", ["rover", "fast", "paper"])
+def test_the_tilt_is_as_far_off_as_its_pipeline_states(pipeline: str) -> None:
+    ground = {"frames": 30, "slope": float(SLOPE), "relief_cells": 512, "abundance": 0.0}
+    errors = tilt_errors(pipeline, Simulation(**ground, tilt_noise=float(TILT_NOISE), seed=21))
+    stated = next(node.actor for node in nodes(pipeline) if node.name == "points").tilt_sigma
+    assert errors.shape == (120, 2)
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(stated, rel=0.12)
 
 
 @pytest.mark.slow

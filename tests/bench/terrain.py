@@ -3,7 +3,9 @@
 Run as `python -m tests.bench.terrain [--seeds 11 12 13] [--rocks 0.05 0.15] [--frames 30] [--stride 1] [--json FILE]`;
 a stride of 10 makes a short form. Ground of 5 degrees RMS over 1 m, that is slopes to 15 degrees and a few beyond;
 inclinometer noise 0.3 degrees; everything else is the simulator's default. Each frame goes through the stages as the
-pipelines set them, one after the other on one core.
+pipelines set them, one after the other on one core. Whether stated sigmas with the tilt's hold is counted for every
+frame with the tilt errors of all frames, and of as many times between: what they are off by, a frame's cells are off
+by together.
 """
 
 from __future__ import annotations
@@ -80,6 +82,22 @@ def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
     return tilt
 
 
+def tilt_errors(pipeline: str, simulation: Simulation) -> Array:
+    """By how much the pipeline's tilt is off, (N, 2): slopes along x and y that it gives to level ground, at each frame
+    of the traverse and three times between."""
+    times = simulation.start + np.arange(4 * simulation.frames) * round(0.25e9 / simulation.rate)
+    offset = simulation.stamp(0) - simulation.start
+    return np.array([tilt_error(simulation, measured_tilt(pipeline, simulation, int(at) + offset)) for at in times])
+
+
+def tilt_error(simulation: Simulation, tilt: Tilt) -> Array:
+    """The same (2,) for one tilt."""
+    base = simulation.base_at(tilt.stamp)
+    level = traverse.level_pose(base)
+    up = level.rotation.T @ base.rotation @ simulation.mounts[2].rotation @ tilt.up
+    return np.asarray(up[:2] / up[2])
+
+
 def seen_by_both(simulation: Simulation, stamp: int, truth: FrameTruth) -> Disparity:
     """The true disparity of the pixels that both cameras see, as if measured without error."""
     true = log.true_disparity(simulation, stamp, truth)
@@ -113,13 +131,18 @@ def through(pipeline: str, streams: dict[str, Any]) -> tuple[dict[str, Any], flo
 def score(simulations: Sequence[Simulation], stride: int, runs: dict[str, str]) -> dict[str, Run]:
     """Each run over the frames of all simulations."""
     found = {name: Run() for name in runs}
+    others = {
+        pipeline: np.concatenate([tilt_errors(pipeline, simulation) for simulation in simulations])
+        for pipeline in set(runs.values())
+    }
     for simulation in simulations:
         for given, exact, ground in frames(simulation, stride):
             for name, pipeline in runs.items():
                 measured = {"tilt": measured_tilt(pipeline, simulation, given["stereo"].stamp)}
                 streams, seconds = through(pipeline, given | (exact if "true" in name else measured))
                 layers: dict[str, Array] = dict(streams["elevation_map"].layers)
-                found[name].tally.add(ground, layers, streams["navigation_map"].cells)
+                tilts = others[pipeline] - tilt_error(simulation, streams["tilt"])
+                found[name].tally.add(ground, layers, streams["navigation_map"].cells, tilts)
                 found[name].seconds.append(seconds)
     return found
 

@@ -83,6 +83,19 @@ def test_intervals_hold_for_errors_as_large_as_stated_and_tilt_counts_in_the_tot
     assert silent["random"] == found["random"]
 
 
+def test_one_tilt_says_little_about_whether_intervals_hold_and_many_tell() -> None:
+    truth, random, tilt = flat_truth(), np.random.default_rng(3), 0.003
+    own, others = np.array([0.2 * tilt, 0.1 * tilt]), random.normal(0, tilt, (400, 2))
+    lean = own[0] * X + own[1] * Y
+    layers = {"elevation": lean, "variance": np.full((N, N), 1e-12), "common_variance": (tilt * RADIUS) ** 2}
+    assert scored(truth, layers)["intervals"]["total"]["1"] == 1.0
+    tally = TerrainTally()
+    tally.add(truth, layers, None, others - own)
+    total = tally.measures()["intervals"]["total"]
+    assert total["1"] == pytest.approx(0.683, abs=0.03)
+    assert total["2"] == pytest.approx(0.954, abs=0.02)
+
+
 def test_a_rock_counts_as_in_view_by_the_height_that_shows_and_as_found_by_a_hazard_on_it() -> None:
     rocks = (
         (4.0, 0.0, 0.5, 0.25, 400.0, 0.9),  # found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,19 @@ def seen_disparity(rocks: tuple[tuple[float, float, float], ...] = ROCKS, camera
             hit = (b - np.sqrt(b * b - a * c)) / a
             depth = np.fmin(depth, hit)
         return camera.fx * camera.baseline / depth
+
+
+def profile_disparity(profile: Callable[[Array], Array], camera: StereoCamera = CAMERA) -> Array:
+    """Exact disparity (H, W) float64 of ground whose height, m, `profile` gives for any distance ahead, the same to the
+    left and right; NaN where no ray meets it within 14 m."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    rays = rays @ level_from_camera().T
+    ahead = np.linspace(0.3, 14, 30_000)
+    highest = np.maximum.accumulate((profile(ahead) - HEIGHT) / ahead)  # so far: a ray ends where it meets ground first
+    meets = np.searchsorted(highest, rays[..., 2] / rays[..., 0])
+    distance = np.append(ahead, np.nan)[np.minimum(meets, len(ahead))]
+    return camera.fx * camera.baseline * rays[..., 0] / distance  # type: ignore[no-any-return]
 
 
 def blank_frame(camera: StereoCamera = CAMERA, stamp: int = 7) -> StereoFrame:

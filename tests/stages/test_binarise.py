@@ -100,6 +100,17 @@ def test_a_plane_beyond_the_slope_limit_is_a_hazard_for_its_slope() -> None:
     assert (result.cells == Cell.HAZARD).all()
 
 
+def test_a_ridge_that_may_be_too_steep_under_a_wheel_is_unknown_and_a_gentle_one_is_free() -> None:
+    x, _ = grid()
+    ridge = np.exp(-(((x - 2) / 0.24) ** 2))
+    steep, doubtful, gentle = (map_of(height * ridge) for height in (0.14, 0.12, 0.1))
+    flanks = np.abs(np.abs(x - 2) - 0.17) < 0.03
+    assert (decided(steep).reason[flanks] == Reason.SLOPE).all()
+    assert (decided(doubtful).reason[flanks] == Reason.UNSURE).all()
+    assert (decided(doubtful, steepness_error=0.0).cells == Cell.FREE).all()
+    assert (decided(gentle).cells == Cell.FREE).all()
+
+
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 1000), gx=st.floats(-0.2, 0.2), gy=st.floats(-0.2, 0.2), offset=st.floats(-5, 5))
 def test_tilting_and_raising_the_scene_changes_no_step_and_no_roughness(

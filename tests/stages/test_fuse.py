@@ -135,9 +135,11 @@ def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(
         local, row, col = local_cells(*arguments)
         x, y = centres(local)
         looked = np.hypot(x, y) < 3
-        occluded = np.where(np.isfinite(local.layers["elevation"]), 0, np.where(looked, 1, np.nan)).astype(np.float32)
-        return replace(local, layers={**local.layers, "occluded": occluded}), row, col
+        known = np.isfinite(local.layers["elevation"])
+        ceiling = np.where(~known & looked, next(heights), np.nan).astype(np.float32)
+        return replace(local, layers={**local.layers, "ceiling": ceiling}), row, col
 
+    heights = iter((-0.2, -0.1))
     monkeypatch.setattr("stages.fuse.local_cells", hiding)
     fuse = Fuse()
     fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
@@ -145,10 +147,12 @@ def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(
     assert [cell(terrain, *place, "occluded") for place in ((1.02, 0.02), (2.52, 0.02), (1.02, 2.22))] == [1, 0, 0]
     assert np.isnan(cell(terrain, -5.0, 0.02, "occluded"))
     assert np.isnan(cell(terrain, 1.02, 0.02))
+    assert cell(terrain, 1.02, 0.02, "ceiling") == pytest.approx(-0.2, abs=0.01)  # the lower of the two
+    assert np.isnan(cell(terrain, 2.52, 0.02, "ceiling"))
 
 
 def test_a_mean_over_frames_is_weighted_by_inverse_variance():
-    fuse = Fuse(tilt_sigma=0.0, height_sigma=0.0)
+    fuse = Fuse(tilt_sigma=0.0, height_sigma=0.0, position=0.0)
     clouds = [
         drive(0, flat, at=(0.0, 0.0, 0.0)),
         drive(1, lambda x, y: flat(x, y) + 0.01, sigma=0.04, at=(0.0, 0.0, 0.0)),
@@ -168,8 +172,18 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance():
     np.testing.assert_allclose(terrain.layers["variance"][40:360, 40:360][both], variance[both], rtol=2e-3)
 
 
+def test_a_frame_is_surer_of_level_cells_than_of_steep_ones_for_its_place_is_not_sure():
+    spread, steep = {}, 0.2
+    for position in (0.0, 0.05):
+        terrain = Fuse(position=position)(*drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0)), MOUNT)
+        spread[position] = terrain.layers["variance"]
+    known = np.isfinite(spread[0.0])
+    added = float(np.mean((spread[0.05] - spread[0.0])[known]))
+    assert added == pytest.approx((0.05 * steep) ** 2, rel=0.3)
+
+
 def test_many_frames_of_one_place_do_not_make_it_known_beyond_what_they_share():
-    fuse = Fuse()
+    fuse = Fuse(alignment=0.01, position=0.0)
     for frame in range(40):
         cloud, pose = drive(frame, at=(0.0, 0.0, 0.3))
         terrain = fuse(cloud, pose, MOUNT)

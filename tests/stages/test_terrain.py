@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,11 +14,23 @@ import pytest
 from stages.assess import Assess
 from stages.binarise import Binarise
 from stages.clean import Clean
-from stages.data import Cell, Disparity, ElevationMap, Mount, NavigationMap, StereoCamera, StereoFrame, Tilt
+from stages.data import (
+    Array,
+    Cell,
+    Disparity,
+    ElevationMap,
+    Mount,
+    NavigationMap,
+    Pose,
+    StereoCamera,
+    StereoFrame,
+    Tilt,
+)
+from stages.fuse import Fuse
 from stages.level import Level
 from stages.reproject import Reproject
 from stages.voxelise import Voxelise
-from tests.stages.terrain_scene import HEIGHT, ROCKS, UP, as_disparity, blank_frame, seen_disparity
+from tests.stages.terrain_scene import HEIGHT, ROCKS, UP, as_disparity, blank_frame, profile_disparity, seen_disparity
 
 
 def mapped(
@@ -44,6 +58,74 @@ def test_a_simulated_scene_has_its_ground_at_zero_its_rocks_as_hazards_and_their
         assert (navigation.cells[on_rock] == Cell.HAZARD).sum() >= 5
         behind = np.isnan(height) & (x > cx) & (np.hypot(x - cx, y - cy) < 2 * radius)
         assert behind.any()
+
+
+def profiled(profile: Callable[[Array], Array], seed: int = 1, **limits: float) -> tuple[Array, NavigationMap]:
+    """Distance ahead (rows, cols), m, and the navigation map of ground with this profile, before a noisy camera."""
+    exact = profile_disparity(profile)
+    noisy = exact + np.random.default_rng(seed).normal(0, 0.1, exact.shape)
+    elevation, _ = mapped(blank_frame(), as_disparity(noisy), Tilt(7, UP), HEIGHT)
+    ahead = elevation.origin[0] + (np.arange(elevation.shape[1]) + 0.5) * elevation.resolution
+    lane = np.abs(elevation.origin[1] + (np.arange(elevation.shape[0]) + 0.5) * elevation.resolution) < 0.8
+    navigation = Binarise(**limits)(elevation)
+    cells = {name: getattr(navigation, name)[lane] for name in ("cells", "reason")}
+    return np.broadcast_to(ahead, cells["cells"].shape), replace(navigation, **cells)
+
+
+BLIND = {"fall": 100.0}  # as if no drop were ever suspected
+
+
+@pytest.mark.parametrize("edge", [3.0, 4.5, 6.5])
+def test_the_edge_of_a_drop_whose_foot_is_hidden_is_not_free_and_the_way_to_it_is(edge: float) -> None:
+    ahead, cliff = profiled(lambda x: np.where(x < edge, 0.0, -3.0))
+    brink, way = (ahead > edge - 0.1) & (ahead < edge), (ahead > 2.0) & (ahead < edge - 0.3)
+    assert not (cliff.cells[brink] == Cell.FREE).any()
+    assert (cliff.cells[way] == Cell.FREE).mean() > 0.98
+    assert not (cliff.cells[ahead > edge] == Cell.FREE).any()
+    _, blind = profiled(lambda x: np.where(x < edge, 0.0, -3.0), **BLIND)
+    assert (blind.cells[brink] == Cell.FREE).mean() > 0.5  # so the rest of the rules does not see it
+
+
+@pytest.mark.parametrize(("near", "width"), [(2.5, 0.5), (4.0, 0.6), (5.5, 1.0)])
+def test_the_near_edge_of_a_ditch_whose_bottom_is_hidden_is_not_free(near: float, width: float) -> None:
+    def ditched(x: Array) -> Array:
+        return np.where((x < near) | (x > near + width), 0.0, -1.0)
+
+    ahead, ditch = profiled(ditched)
+    _, blind = profiled(ditched, **BLIND)
+    brink, before = (ahead > near - 0.1) & (ahead < near), (ahead > 1.8) & (ahead < near - 0.3)
+    inside, after = (ahead > near) & (ahead < near + width), (ahead > near + width + 0.4) & (ahead < 7.5)
+    assert not (ditch.cells[brink | inside] == Cell.FREE).any()
+    assert (ditch.cells[before] == Cell.FREE).mean() > 0.98
+    np.testing.assert_array_equal(ditch.cells[after], blind.cells[after])
+    assert (blind.cells[brink] == Cell.FREE).mean() > 0.9  # so the rest of the rules does not see it
+
+
+@pytest.mark.parametrize("at", [3.0, 4.5, 6.0])
+@pytest.mark.parametrize("slope", [0.0, 0.1, -0.05])
+def test_the_ground_before_and_behind_a_mere_bump_stays_free(at: float, slope: float) -> None:
+    def bumpy(x: Array) -> Array:
+        return np.asarray(slope * x + 0.1 * np.exp(-(((x - at) / 0.25) ** 2)))
+
+    ahead, bump = profiled(bumpy)
+    _, blind = profiled(bumpy, **BLIND)
+    about = (np.abs(ahead - at) < 1.5) & (ahead > 2.0)
+    assert (blind.cells[about] == Cell.FREE).sum() > 500
+    assert (bump.cells[about] == Cell.FREE).sum() > 0.98 * (blind.cells[about] == Cell.FREE).sum()
+
+
+def test_the_regional_map_knows_the_edge_of_a_drop_too() -> None:
+    exact = profile_disparity(lambda x: np.where(x < 4.5, 0.0, -3.0))
+    cloud = Level(camera_height=HEIGHT)(Clean()(Reproject()(blank_frame(), as_disparity(exact))), Tilt(7, UP, "camera"))
+    pose = Pose(7, [100.0, 50.0, 3.0], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
+    elevation = Assess()(Fuse()(cloud, pose))
+    ahead = elevation.origin[0] - 100 + (np.arange(elevation.shape[1]) + 0.5) * elevation.resolution
+    lane = elevation.shape[0] // 2 + np.arange(-15, 15)
+    cells, blind = (Binarise(**limits)(elevation).cells[lane] for limits in ({}, BLIND))
+    brink = (ahead > 4.4) & (ahead < 4.5)
+    assert not (cells[:, brink] == Cell.FREE).any()
+    assert (cells[:, (ahead > 2) & (ahead < 4.2)] == Cell.FREE).mean() > 0.98
+    assert (blind[:, brink] == Cell.FREE).mean() > 0.5
 
 
 def test_the_boulder_of_a_real_scene_stands_on_level_ground() -> None:
