@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test check-all bench study lint clean
+.PHONY: demo test check-all bench study pictures lint clean
 
 demo: $(READY)
 	$(BIN)/roverflow demo --out demo
@@ -20,6 +20,9 @@ bench: $(READY)
 
 study: $(READY)
 	$(BIN)/python -m tests.study demo/study
+
+pictures: $(READY)
+	$(BIN)/python -m tests.pictures docs
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,9 +1,15 @@
-"""What the command line's arguments may be, each a function from text that argparse calls."""
+"""What the command line's arguments may be: functions from text that argparse calls, and the check of outputs."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from flow.errors import UsageError
+
+_OF_OTHERS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pfm", ".txt", ".py", ".yaml", ".yml", ".bag", ".db3"}
 
 
 def count(text: str) -> int:
@@ -14,6 +20,17 @@ def count(text: str) -> int:
         value = 0
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not '{text}'")
+    return value
+
+
+def magnitude(text: str) -> float:
+    """A number of at least 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number of at least 0, not '{text}'")
     return value
 
 
@@ -34,3 +51,21 @@ def size(text: str) -> tuple[int, int]:
     if not (width.isdigit() and height.isdigit()):
         raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, such as 640x480, not '{text}'")
     return int(width), int(height)
+
+
+def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path]) -> None:
+    """Refuse outputs that cannot be written, that would replace what is being read, or that are one file twice."""
+    taken: list[Path] = []
+    for path in filter(None, outputs):
+        if not path.parent.is_dir():
+            raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
+        if path.exists() and not path.is_file():
+            raise UsageError(f"{path} is a folder or a device; give the name of a file")
+        for given in inputs:
+            if path.exists() and given.exists() and path.samefile(given):
+                raise UsageError(f"{path} is what is being read; choose another name for the output")
+        if path.exists() and path.suffix.lower() in _OF_OTHERS:
+            raise UsageError(f"{path} is there already, and not the output of an earlier run; choose another name")
+        if path.resolve() in taken:
+            raise UsageError(f"{path} is given for two outputs; choose another name for one")
+        taken.append(path.resolve())

@@ -7,20 +7,18 @@ file, the line, and the nearest name that would have been valid.
 from __future__ import annotations
 
 import importlib
-import math
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import yaml
 
 from flow.errors import PipelineError, UsageError
 from flow.graph import Graph, Node, Place, accepts, clock_of, in_order, is_aligner, output_of, ports_of
-from flow.units import quantity
+from flow.values import coerced
 
 SHIPPED = Path(__file__).parent / "pipelines"
 _RESERVED = ("use", "optional")
@@ -293,7 +291,7 @@ class _Builder:
                     f"{self._use(item, what)} has no parameter '{key}'{_nearest(key, parameters)}"
                 )
             try:
-                values[key] = _coerced(value.plain(), hints[key], parameters[key])
+                values[key] = coerced(value.plain(), hints[key], parameters[key])
             except ValueError as error:
                 raise value.place.error(f"{self._use(item, what)}.{key}: {error}") from error
         for key, parameter in parameters.items():
@@ -347,51 +345,10 @@ def _parameters(kind: type) -> dict[str, Field[Any]]:
 
 
 def _shown(kind: Any) -> str:
-    return kind.__name__ if isinstance(kind, type) else str(kind).replace("stages.data.", "")
-
-
-def _coerced(value: Any, kind: Any, parameter: Field[Any]) -> Any:
-    """`value` as a parameter of type `kind`; raises ValueError where it is none."""
-    if get_origin(kind) in (Union, UnionType):
-        options = get_args(kind)
-        if value is None and type(None) in options:
-            return None
-        several = [option for option in options if get_origin(option) is tuple]
-        one = [option for option in options if option not in (type(None), *several)]
-        return _coerced(value, (several if isinstance(value, list) and several else one or several)[0], parameter)
-    if get_origin(kind) is tuple:
-        if not isinstance(value, list):
-            raise ValueError(f"expected a list, not {value!r}")
-        return tuple(_coerced(item, get_args(kind)[0], parameter) for item in value)
-    if get_origin(kind) is not None or kind is Any:
-        return value
-    if kind in (int, float):
-        return _number(value, kind, parameter)
-    if not isinstance(value, kind):
-        raise ValueError(f"expected {kind.__name__}, not {value!r}")
-    return value
-
-
-def _number(value: Any, kind: type, parameter: Field[Any]) -> float | int:
-    unit = parameter.metadata.get("unit", "")
-    if isinstance(value, str):
-        value = quantity(value, unit)
-        if kind is int and float(value).is_integer():
-            value = int(value)
-    elif unit in ("ns",) and not isinstance(value, bool):
-        raise ValueError(f"{value!r} needs a unit, such as '{value} ms'")
-    if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
-        wanted = {"int": "a whole number", "float": "a number"}[kind.__name__]
-        raise ValueError(f"expected {wanted}{f' in {unit}' if unit else ''}, not {value!r}")
-    low, high = parameter.metadata.get("low"), parameter.metadata.get("high")
-    for wrong, wanted in (
-        (not math.isfinite(value), "finite"),
-        (low is not None and value < low, f"at least {low}"),
-        (high is not None and value > high, f"at most {high}"),
-    ):
-        if wrong:
-            raise ValueError(f"must be {wanted}{f' {unit}' if unit else ''}, not {value}")
-    return kind(value)  # type: ignore[no-any-return]
+    """A type as pipeline files speak of it: `Tilt`, or `Tilt | Pose`."""
+    if isinstance(kind, type):
+        return kind.__name__.replace("NoneType", "None")
+    return " | ".join(map(_shown, get_args(kind)))
 
 
 __all__ = ["PipelineError", "find", "load"]

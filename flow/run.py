@@ -17,8 +17,9 @@ from typing import Any
 from flow.engine import Engine
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.feeder import Event, Feeder
+from flow.findings import Finding, findings
 from flow.graph import Graph, Sink
-from flow.ledger import Ledger, Verdict, failure
+from flow.ledger import Ledger, Verdict
 from flow.survey import surveyed
 
 
@@ -108,7 +109,7 @@ def run(
     """Run an opened log through `graph`; returns the summary.
 
     log: iterates over (log time, stream, item), has `missing` (stream -> why the log cannot provide it), and where
-    stages survey it `excerpts` (see flow.survey). Of a stage that has a `finding`, a sentence, it is read at the end.
+    stages survey it `excerpts` (see flow.survey). What stages found is asked at the end (see flow.findings).
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
     closed and readable by then.
@@ -119,7 +120,7 @@ def run(
         raise UsageError(str(error)) from None
     stop, ledger = stop or Stop(), Ledger()
     wall, cpu = time.perf_counter(), time.process_time()
-    surveys = dict[str, str]()
+    surveys = dict[str, Finding]()
     with suppress(_StoppedError):
         graph, surveys = surveyed(graph, lambda *which: (_events(part, stop) for part in log.excerpts(*which)))
     streams = graph.frame_streams
@@ -128,7 +129,8 @@ def run(
     sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
     feeder, engine, finished = Feeder(graph, ledger), None, False
     try:
-        if sinks.open(streams, {**(about or {}), "surveys": "\n".join(map(": ".join, surveys.items()))}):
+        said = "\n".join(f"{name}: {found['sentence']}" for name, found in surveys.items())
+        if sinks.open(streams, {**(about or {}), "surveys": said}):
             engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
             try:
                 finished = _feed(feeder, log, engine, stop)
@@ -144,22 +146,11 @@ def run(
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
             "surveys": surveys,
-            "findings": _findings(graph),
+            "findings": findings(graph),
             "outputs": [str(outputs[use]) for use in used],
         }
         sinks.close(summary)
     return summary
-
-
-def _findings(graph: Graph) -> dict[str, str]:
-    """What there is to say at the end of a run (stream -> sentence): what was left out, the `finding` of stages."""
-    said = {name: f"left out: {why}" for name, why in graph.left_out.items()}
-    for node in graph.stages:
-        try:
-            said[node.name] = str(getattr(node.actor, "finding", ""))
-        except Exception as error:  # no reason to leave the outputs open
-            said[node.name] = failure(error)
-    return {name: sentence for name, sentence in said.items() if sentence}
 
 
 class _StoppedError(Exception):

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from flow.feeder import Event, Feeder
+from flow.findings import WARNING, Finding, finding, plain
 from flow.graph import Graph, Node
 from flow.ledger import Absent, Ledger, failure
 
@@ -19,15 +20,15 @@ EXCERPTS = 9
 Excerpts = Callable[[int, set[str]], Iterable[Iterable[Event]]]
 
 
-def surveyed(graph: Graph, excerpts: Excerpts) -> tuple[Graph, dict[str, str]]:
-    """The graph with its surveying stages fixed, and what each found (stream -> sentence).
+def surveyed(graph: Graph, excerpts: Excerpts) -> tuple[Graph, dict[str, Finding]]:
+    """The graph with its surveying stages fixed, and what each found (stream -> finding).
 
     A stage surveys if its `surveys` is true; its `survey` takes what `__call__` takes, of several frames each, and
-    returns the stage to run and a sentence. `excerpts(count, streams)` gives that many stretches of the log, spread
+    returns the stage to run and what it found. `excerpts(count, streams)` gives that many stretches of the log, spread
     over all of it; the first whole frame of each is taken. Raises PipelineError where a stage that remembers frames is
     needed for it.
     """
-    nodes, findings = list(graph.nodes), dict[str, str]()
+    nodes, findings = list(graph.nodes), dict[str, Finding]()
     if not any(_surveys(node) for node in nodes):
         return graph, findings
     needed = _upstream(nodes)
@@ -41,9 +42,11 @@ def surveyed(graph: Graph, excerpts: Excerpts) -> tuple[Graph, dict[str, str]]:
         if _surveys(node):
             given = {port: [sample[stream] for sample in samples] for port, stream in node.inputs.items()}
             try:
-                actor, findings[node.name] = node.actor.survey(**given)
+                actor, said = node.actor.survey(**given)
+                findings[node.name] = plain(said)
             except Exception as error:  # the stage then has no more to go by than each frame
-                actor, findings[node.name] = node.actor, f"could not survey the log: {failure(error)}"
+                actor = node.actor
+                findings[node.name] = finding(WARNING, f"could not survey the log: {failure(error)}")
             nodes[place] = node = replace(node, actor=actor)
             left -= 1
         if left:

@@ -35,7 +35,7 @@ def quantity(text: str, unit: str) -> float:
     """
     match = _QUANTITY.match(text)
     if match is None:
-        raise ValueError(f"'{text}' is not a number with a unit such as '5 {unit or 'ms'}'")
+        raise ValueError(f"'{text}' is not a number{f' with a unit such as 5 {unit}' if unit else ''}")
     number, given = float(match[1]), match[2]
     if given == "":
         return number

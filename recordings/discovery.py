@@ -136,7 +136,7 @@ def _find_images(topics: Sequence[Topic], settings: Settings, found: Topics) -> 
     if not pairs:
         listed = _listed(candidates)
         why = {
-            0: "the log has no camera image",
+            0: "the log has no camera image (sensor_msgs/Image or CompressedImage); give one that has",
             1: f"the log has one image topic only ({listed}), stereo needs two",
         }.get(len(candidates), f"no two image topics are named like a left and a right one ({listed})")
         remedy = "; set 'left' and 'right' of the source to the topics" if len(candidates) > 1 else ""

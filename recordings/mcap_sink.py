@@ -95,15 +95,18 @@ class McapSink:
         if writer.closed:  # a write failed, which was told then
             return
         entries = list(summary.get("entries", ()))
-        findings = [(_OK, stream, text, {"finding": text}) for stream, text in summary.get("findings", {}).items()]
+        found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
+        findings = [_finding(stream, said) for stream, said in found]
         if entries or (findings and self._last_stamp is not None):
             latest = max([0, *(entry.stamp for entry in entries)])
             stamp = latest if self._last_stamp is None else self._last_stamp
             lost = _statuses(entries) if entries else []
             writer.write("/nav/diagnostics", diagnostics(stamp, [*lost, *findings]), stamp)
         counts = {name: str(summary[name]) for name in _COUNTS if name in summary}
-        for group in ("drops", "messages", "findings"):
+        for group in ("drops", "messages"):
             counts |= {f"{group}.{name}": str(count) for name, count in summary.get(group, {}).items()}
+        for stream, said in summary.get("findings", {}).items():
+            counts[f"findings.{stream}"] = f"{said['severity']}: {said['sentence']}"
         writer.metadata("roverflow.run", counts)
         writer.close()
 
@@ -119,6 +122,12 @@ def _transforms(items: Iterable[Any]) -> Iterator[Transform]:
         known = item.sensor if isinstance(item, PointCloud) else getattr(item, "level", None)
         if known is not None:
             yield known
+
+
+def _finding(stream: str, said: Mapping[str, str]) -> tuple[int, str, str, dict[str, str]]:
+    """The diagnostic status of something that a run found."""
+    level = _WARN if said["severity"] == "warning" else _OK
+    return level, stream, said["sentence"], {"finding": said["sentence"], "severity": said["severity"]}
 
 
 def _health(stream: str, health: TiltHealth) -> tuple[int, str, str, dict[str, str]]:

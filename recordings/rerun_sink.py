@@ -117,9 +117,13 @@ class RerunSink:
             level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
             text = f"{verdict}: {self._frames} frames{''.join(f', {drop}' for drop in drops)}"
             self._recording.log(LEDGER, rr.TextLog(text, level=level))
-            for stream, finding in dict(summary.get("findings", {})).items():
-                self._recording.log(LEDGER, rr.TextLog(f"{stream}: {finding}", level=rr.TextLogLevel.INFO))
+            said = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
+            for stream, found in said:
+                level = rr.TextLogLevel.WARN if found["severity"] == "warning" else rr.TextLogLevel.INFO
+                self._recording.log(LEDGER, rr.TextLog(f"{stream}: {found['sentence']}", level=level))
             facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
+            for key in {"surveys", "findings"} & facts.keys():
+                facts[key] = {name: f"{found['severity']}: {found['sentence']}" for name, found in summary[key].items()}
             self._recording.log(SUMMARY, _document(verdict, self._about, facts), static=True)
             self._arrange()
         try:

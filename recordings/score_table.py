@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from recordings.pose_measures import format_pose
 from recordings.scoring import Score
 from recordings.stereo_measures import CROP_STEP, REGIONS, THRESHOLDS
 from recordings.terrain_measures import format_terrain
@@ -17,7 +18,7 @@ def format_score(found: Score) -> str:
         parts.append(_disparity_lines(found.disparity))
     if found.terrain is not None:
         parts.append(format_terrain(found.terrain))
-    parts.append(_tilt_lines(found))
+    parts.append([*_tilt_lines(found), *(format_pose(found.pose) if found.pose is not None else [])])
     return "\n\n".join("\n".join(lines) for lines in parts if lines)
 
 

@@ -21,13 +21,14 @@ from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2, terrain_measures
 from recordings.errors import LogError
+from recordings.pose_measures import PoseTally
 from recordings.stereo_measures import StereoErrors, cropped_columns
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")
 TRUTHS = (
     "/truth/disparity", "/truth/occlusion", "/truth/elevation_map", "/truth/navigation_map", "/truth/rocks",
-    "/truth/tilt",
+    "/truth/tilt", "/truth/pose",
 )  # fmt: skip
 PATIENCE = 5_000_000_000  # ns of log time after which no log adds to a frame any more
 
@@ -42,7 +43,8 @@ class Score:
     else the frame's largest), rounded up to 16;
     terrain: `terrain_measures.TerrainTally.measures`;
     tilt: frames, mean, max; untilted: why -> frames with a true tilt whose own could not be scored;
-    per_frame: the main figures of each frame. None where the truth has no such topics (tilt: where no frame has both).
+    pose: `PoseTally.measures`; per_frame: the main figures of each frame.
+    None where the truth has no such topics (tilt: where no frame has both).
     """
 
     frames: int
@@ -53,6 +55,7 @@ class Score:
     terrain: dict[str, Any] | None = None
     tilt: dict[str, float] | None = None
     untilted: dict[str, int] = field(default_factory=dict)
+    pose: dict[str, float] | None = None
     per_frame: list[dict[str, float]] = field(default_factory=list)
 
     def to_json(self) -> str:
@@ -74,7 +77,7 @@ def score(result: Path, truth: Path) -> Score:
 def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dict[str, Any]]]:
     """(stamp, {topic: message}) of all frames of both logs, each when it is complete."""
     streams = [
-        ros2.iter_messages(result, [*RESULTS, "/tf"]),
+        ros2.iter_messages(result, [*RESULTS, "/nav/pose", "/tf"]),
         ros2.iter_messages(truth, [*TRUTHS, "/tf_static"]),
     ]
     waiting: dict[int, dict[str, Any]] = {}
@@ -107,6 +110,7 @@ class _Tally:
         self.terrain: terrain_measures.TerrainTally | None = None
         self.tilts: list[float] = []
         self.untilted: dict[str, int] = {}
+        self.pose = PoseTally()
         self.per_frame: list[dict[str, float]] = []
 
     def add(self, stamp: int, frame: dict[str, Any]) -> None:
@@ -128,6 +132,8 @@ class _Tally:
             row |= self._add_terrain(stamp, frame)
         if "/truth/tilt" in frame:
             row |= self._add_tilt(frame)
+        if "/truth/pose" in frame:
+            row |= self.pose.add(frame["/truth/pose"], frame.get("/nav/pose"))
         self.per_frame.append(row)
 
     def _add_disparity(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
@@ -226,6 +232,7 @@ class _Tally:
             terrain=self.terrain.measures() if self.terrain else None,
             tilt={"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)} if tilts else None,
             untilted=self.untilted,
+            pose=self.pose.measures(),
             per_frame=self.per_frame,
         )  # fmt: skip
 

@@ -8,7 +8,7 @@ nothing but the images to go by, and their covariance grows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,20 +16,33 @@ from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.level import level_transform
-from stages.stage import Stage, parameter
+from stages.stage import Finding, Severity, Stage, parameter
 
 VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once
 
 
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What is known of the camera after a frame.
+
+    segment, camera, told: as the motion tells, the camera in its segment's first and the covariance (6, 6) of that;
+    world: the camera in its segment's world (z up); covariance: (6, 6) of that, of position (m) and turn (rad) about
+    the world's axes; way: m driven in the segment.
+    """
+
+    segment: int
+    camera: Transform
+    told: Array
+    world: Transform
+    covariance: Array
+    way: float
+
+
 @dataclass
 class _Memory:
-    """The camera in its segment's world (z up), the covariance (6, 6) of its position and turn about the world's axes,
-    and the motion it was told last."""
+    """The state after the last frame, and how many poses were made."""
 
-    world: Transform | None = None
-    covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    motion: CameraMotion | None = None
-    way: float = 0.0  # m driven in the segment
+    state: _State | None = None
     visual: int = 0
 
 
@@ -61,49 +74,49 @@ class Locate(Stage):
             return logged
         if motion.camera is None:
             raise ValueError(f"Locate: no pose can be told from the images: {motion.lost}")
-        self._follow(motion, motion.camera, tilt, mount)
-        return self._pose(motion, mount)
+        before = self._memory.state
+        if before is None or before.segment != motion.segment:
+            state = self._begun(motion, motion.camera, tilt, mount)
+        else:
+            state = self._drawn(_carried(before, motion, motion.camera), tilt, mount)
+        self._memory.state = state
+        self._memory.visual += 1
+        return self._pose(motion.stamp, state, mount)
 
-    @property
-    def finding(self) -> str:
-        """That poses are visual, and in which frames; empty where poses are given."""
-        memory = self._memory
-        if not memory.visual or memory.motion is None:
-            return ""
-        last = memory.motion.segment
-        frames = VISUAL_FRAME if last < 2 else f"{VISUAL_FRAME} to {_frame_of(last)}"
-        return f"no pose is given; {memory.visual} by visual odometry, in {frames}"
+    def finding(self) -> Finding | None:
+        """That poses are visual, and in which frames, a warning for several; None where poses are given."""
+        if self._memory.state is None:
+            return None
+        last = self._memory.state.segment
+        said = f"no pose is given; {self._memory.visual} by visual odometry, in {VISUAL_FRAME}"
+        if last < 2:
+            return Finding(said)
+        parted = f"{said} to {_frame_of(last)}, which nothing joins: tracking was lost between them"
+        return Finding(parted, Severity.WARNING)
 
-    def _follow(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> None:
-        memory = self._memory
-        before = memory.motion
-        memory.motion, memory.visual = motion, memory.visual + 1
-        if before is None or before.camera is None or memory.world is None or motion.segment != before.segment:
-            memory.world = level_transform(tilt, mount, camera.child, camera_height=0.0)
-            memory.covariance = np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0])
-            memory.way = 0.0
-            return
-        world = memory.world.after(before.camera.inverse().after(camera))
-        covariance = _grown(memory.covariance, world, memory.world, before, motion)
-        memory.way += float(np.linalg.norm(world.translation - memory.world.translation))
-        # What the tilt says is where up is: the turns about the two level axes.
+    def _begun(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> _State:
+        """The first frame of a segment: at its origin, upright by the tilt."""
+        world = level_transform(tilt, mount, camera.child, camera_height=0.0)
+        covariance = np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0])
+        return _State(motion.segment, camera, motion.covariance, world, covariance, 0.0)
+
+    def _drawn(self, state: _State, tilt: Tilt, mount: Mount) -> _State:
+        """The state after the tilt had its say: it tells where up is, that is, the turns about the two level axes."""
+        world, covariance = state.world, state.covariance
         up = world.rotation @ mount.camera_from_inclinometer @ tilt.up
         gain = covariance[:, 3:5] @ np.linalg.inv(covariance[3:5, 3:5] + self.tilt_noise**2 * np.eye(2))
         change = gain @ np.array([up[1], -up[0]])  # the turn that brings up to z
         turn = np.asarray(Rotation.from_rotvec(change[3:]).as_matrix())
-        memory.covariance = covariance - gain @ covariance[3:5]
-        memory.world = Transform(world.parent, world.child, turn @ world.rotation, world.translation + change[:3])
+        drawn = Transform(world.parent, world.child, turn @ world.rotation, world.translation + change[:3])
+        return replace(state, world=drawn, covariance=covariance - gain @ covariance[3:5])
 
-    def _pose(self, motion: CameraMotion, mount: Mount) -> Pose:
-        memory = self._memory
-        assert memory.world is not None
+    def _pose(self, stamp: int, state: _State, mount: Mount) -> Pose:
         base = mount.base_from_camera
-        placed = memory.world if base is None else memory.world.after(base.inverse())
-        alike = self._alike(placed.translation, memory.way)
-        covariance = memory.covariance + alike.T @ alike
+        placed = state.world if base is None else state.world.after(base.inverse())
+        alike = self._alike(placed.translation, state.way)
         return Pose(
-            motion.stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),
-            _frame_of(motion.segment), placed.child, covariance,
+            stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),
+            _frame_of(state.segment), placed.child, state.covariance + alike.T @ alike,
         )  # fmt: skip
 
     def _alike(self, place: Array, way: float) -> Array:
@@ -120,19 +133,18 @@ class Locate(Stage):
         ])  # fmt: skip
 
 
-def _grown(covariance: Array, now: Transform, then: Transform, before: CameraMotion, motion: CameraMotion) -> Array:
-    """The covariance after the step from one motion to the next: the way levers the turns, and the step adds its own.
-
-    covariance, then, now: in the world; the motions' own are in the axes of their segment's first camera.
-    """
-    assert before.camera is not None
-    assert motion.camera is not None
-    step = _levered(before.covariance, motion.camera.translation - before.camera.translation)
-    values, axes = np.linalg.eigh(motion.covariance - step)
+def _carried(before: _State, motion: CameraMotion, camera: Transform) -> _State:
+    """The state carried along by the images: the way levers the turns' errors, and the step adds its own."""
+    world = before.world.after(before.camera.inverse().after(camera))
+    way = world.translation - before.world.translation
+    # What the motion's covariance, in the axes of its segment's first camera, has gained since the frame before.
+    step = motion.covariance - _levered(before.told, camera.translation - before.camera.translation)
+    values, axes = np.linalg.eigh(step)
     added = (axes * np.clip(values, 0, None)) @ axes.T  # two frames tracked from one keyframe may err the same way
-    turned = np.kron(np.eye(2), now.rotation @ motion.camera.rotation.T)
-    grown: Array = _levered(covariance, now.translation - then.translation) + turned @ added @ turned.T
-    return grown
+    turned = np.kron(np.eye(2), world.rotation @ camera.rotation.T)
+    covariance = _levered(before.covariance, way) + turned @ added @ turned.T
+    driven = before.way + float(np.linalg.norm(way))
+    return _State(motion.segment, camera, motion.covariance, world, covariance, driven)
 
 
 def _levered(covariance: Array, way: Array) -> Array:

@@ -53,8 +53,10 @@ class Match(Stage):
 
     Penalties count in units of the matching cost: census bits that differ, or with the gradient 1.5 units for each.
     Colour is converted to gray. `prior`, an earlier or coarser result of the same size, draws the search towards it; it
-    is no evidence, and where it is unknown it says nothing. What it measured nearer than the search range, or with
-    `farthest` beyond it, stays unknown; without a prior some of that is taken for something within the range.
+    is no evidence, and where it is unknown it says nothing. What it measured nearer than the search range stays
+    unknown, or with `nearer` prior as the prior has it: a coarse search reaches nearer, and so near that is no loss.
+    With `farthest`, what it measured beyond stays unknown, too. Without a prior some of both is taken for something
+    within the range.
 
     The confidence is the probability that the disparity is right within 1 px, as far as the lead of the best sum of
     paths over the others tells, with the penalties that suit the cost and 8 paths.
@@ -76,6 +78,9 @@ class Match(Stage):
     speckle_range: float = parameter(1.0, "disparity step that separates patches", unit="px", low=0)
     prior_weight: float = parameter(0.5, "cost of each pixel of distance from the prior", low=0, high=16)
     prior_reach: float = parameter(4.0, "distance from which the prior's cost grows no more", unit="px", low=0, high=64)
+    nearer: str = parameter(
+        "unknown", "what becomes of matches that the prior has nearer than the range", choices=("unknown", "prior")
+    )
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
     memory: int = parameter(
         400, "for the sums of paths; larger frames are swept in bands, to the same result", unit="MB", low=1
@@ -94,17 +99,22 @@ class Match(Stage):
         search = self._search(frame.camera)
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
         guide = None if prior is None else self._guide(prior, search)
-        excluded = None if prior is None else self._excluded(prior, search)
+        nearer, beyond = (None, None) if prior is None else self._excluded(prior, search)
+        excluded = nearer if beyond is None else nearer | beyond
         found = match(left, right, self._rule(search), guide, excluded, self.threads, self.memory << 20)
-        return Disparity(frame.stamp, found.pixels, found.source, found.confidence, camera=frame.camera)
+        layers = found.pixels, found.source, found.confidence
+        if prior is not None and self.nearer == "prior":
+            for layer, known in zip(layers, (prior.pixels, prior.source, prior.confidence), strict=True):
+                np.copyto(layer, known, where=nearer)
+        return Disparity(frame.stamp, *layers, camera=frame.camera)
 
-    def _excluded(self, prior: Disparity, search: range) -> Array:
-        """Where a measurement of the prior shows that the match is not in the range, (H, W) bool."""
-        excluded: Array = prior.pixels > search.stop + BEYOND
-        if search.start > self.minimum:
-            excluded |= prior.pixels < search.start - BEYOND
-        excluded &= prior.source == Source.MEASURED
-        return excluded
+    def _excluded(self, prior: Disparity, search: range) -> tuple[Array, Array | None]:
+        """Where a measurement of the prior shows that the match is nearer than the range, and beyond it, (H, W) bool;
+        None where that is not asked."""
+        measured = prior.source == Source.MEASURED
+        nearer = measured & (prior.pixels > search.stop + BEYOND)
+        beyond = measured & (prior.pixels < search.start - BEYOND) if search.start > self.minimum else None
+        return nearer, beyond
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
         height, width = frame.left.shape[:2]

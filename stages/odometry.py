@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
-from stages.stage import Stage, parameter
+from stages.stage import Finding, Stage, parameter
 from stages.tracking import Step, View, step_between, view
 
 
@@ -27,8 +27,7 @@ class _Keyframe:
 @dataclass
 class _Memory:
     keyframe: _Keyframe | None = None
-    segment: int = 0
-    losses: int = 0
+    segment: int = 0  # 1 from the log's first frame on
     blind: int = 0
 
 
@@ -54,26 +53,27 @@ class VisualOdometry(Stage):
                 f"VisualOdometry: the disparity is {disparity.pixels.shape}, the left image {frame.left.shape[:2]}; "
                 "join the disparity with the rectified frame it was made from"
             )
-        memory, seen = self._memory, view(frame, disparity)
-        before = memory.keyframe
-        step = step_between(before.view, seen, self.least) if before is not None else None
-        if before is not None and step is not None and self._likely(step):
+        before, seen = self._memory.keyframe, view(frame, disparity)
+        if before is None:  # everything is counted from the log's first frame, whatever it shows
+            return self._begun(frame, seen)
+        step = step_between(before.view, seen, self.least)
+        if step is not None and self._likely(step):
             return self._followed(frame.stamp, before, step, seen)
-        return self._begun(frame, seen)
+        if seen.known < self.least:
+            return self._blind(frame.stamp, seen)
+        lost = f"less than {self.least} features agree with the frame before; segment {self._memory.segment + 1} begins"
+        return self._begun(frame, seen, lost)
 
-    @property
-    def finding(self) -> str:
-        """What to say of the whole run: where tracking was lost; empty where it never was."""
-        memory = self._memory
+    def finding(self) -> Finding | None:
+        """What to say of the whole run: where tracking was lost; None where it never was."""
+        segments, blind = self._memory.segment, self._memory.blind
         parts = []
-        if memory.losses:
-            parts.append(
-                f"tracking was lost {_times(memory.losses)}, so the motion is in {memory.losses + 1} segments that "
-                "nothing joins"
-            )
-        if memory.blind:
-            parts.append(f"{memory.blind} {'frame shows' if memory.blind == 1 else 'frames show'} too little to track")
-        return "; ".join(parts)
+        if segments > 1:
+            times = "once" if segments == 2 else f"{segments - 1} times"
+            parts.append(f"tracking was lost {times}, so the motion is in {segments} segments that nothing joins")
+        if blind:
+            parts.append(f"{blind} {'frame shows' if blind == 1 else 'frames show'} too little to track")
+        return Finding("; ".join(parts)) if parts else None
 
     def _likely(self, step: Step) -> bool:
         return step.error <= self.worst and float(np.linalg.norm(step.translation)) <= self.fastest
@@ -90,20 +90,15 @@ class VisualOdometry(Stage):
             memory.keyframe = _Keyframe(seen, camera, covariance)
         return CameraMotion(stamp, memory.segment, camera, covariance, step.inliers, step.error)
 
-    def _begun(self, frame: StereoFrame, seen: View) -> CameraMotion:
-        """The first frame of a segment, or one that shows too little to begin one: the keyframe then stays.
+    def _blind(self, stamp: int, seen: View) -> CameraMotion:
+        """No motion; the keyframe stays, so that the next frame that shows enough goes on from it."""
+        self._memory.blind += 1
+        lost = f"only {seen.known} features with a disparity are in view, less than {self.least}"
+        return CameraMotion(stamp, self._memory.segment, None, np.zeros((6, 6)), lost=lost)
 
-        The log's first frame is where everything is counted from, whatever it shows.
-        """
+    def _begun(self, frame: StereoFrame, seen: View, lost: str = "") -> CameraMotion:
+        """The first frame of a segment; `lost` says why the one before ended."""
         memory = self._memory
-        if seen.known < self.least and memory.keyframe is not None:
-            memory.blind += 1
-            lost = f"only {seen.known} features with a disparity are in view, less than {self.least}"
-            return CameraMotion(frame.stamp, memory.segment, None, np.zeros((6, 6)), lost=lost)
-        lost = ""
-        if memory.keyframe is not None:
-            memory.losses += 1
-            lost = f"less than {self.least} features agree with the frame before; segment {memory.segment + 1} begins"
         memory.segment += 1
         camera = Transform(f"{frame.camera.frame_id}/start", frame.camera.frame_id, np.eye(3), np.zeros(3))
         memory.keyframe = _Keyframe(seen, camera, np.zeros((6, 6)))
@@ -126,7 +121,3 @@ def _cross(vector: Array) -> Array:
     """The matrix of the cross product with a vector."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"

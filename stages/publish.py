@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+Array = NDArray[Any]
+
 
 def publish(owner: object, name: str, shape: tuple[int | None, ...], dtype: DTypeLike) -> None:
     """Check the array field `name` of a frozen dataclass and make it read-only.
@@ -43,7 +45,7 @@ def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: boo
     publish(owner, name, shape, np.float64)
 
 
-def read_only(array: NDArray[Any]) -> NDArray[Any]:
+def read_only(array: Array) -> Array:
     """A read-only view. An array that owns its memory becomes read-only itself, so that nobody who still holds it can
     change what was published; one that is a part or a view of another cannot promise as much for that other."""
     if array.flags.owndata:
@@ -53,7 +55,7 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
-def check_rotation(rotation: NDArray[Any], where: str) -> None:
+def check_rotation(rotation: Array, where: str) -> None:
     """Raise ValueError unless a (3, 3) matrix is orthonormal and right-handed."""
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
         raise ValueError(f"{where} is not a rotation matrix")

@@ -20,7 +20,7 @@ import numpy as np
 from stages.data import Array, CameraModel, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
-from stages.stage import Stage, parameter
+from stages.stage import Finding, Severity, Stage, parameter
 
 DISTORTION_SIZES = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 LARGEST_OFFSET = 64.0  # px
@@ -69,27 +69,32 @@ class Rectify(Stage):
         """Whether the stage wants to see frames of the whole log before it is called: unless told the row offset."""
         return self.row_offset is None
 
-    def survey(self, frame: Sequence[StereoFrame]) -> tuple[Rectify, str]:
-        """The stage with the row offset that frames have in common, and a sentence about it."""
+    def survey(self, frame: Sequence[StereoFrame]) -> tuple[Rectify, Finding]:
+        """The stage with the row offset that frames have in common, and what there is to say about it."""
         plain = []
         for each in frame:
             with suppress(ValueError):  # the run will meet the frame again, and say what is the matter with it
                 plain.append(_rectified(each, ()))
         offset = _measured(plain)
         if offset is None:
-            return replace(self, row_offset=0.0), "the row offset is not clear from the images; none is corrected"
+            unclear = "the row offset is not clear from the images; none is corrected"
+            return replace(self, row_offset=0.0), Finding(unclear)
         terms = tuple(round(term, 4) for term in offset.terms)
         found = (
             f"rows differ by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, +- {offset.error:.2f}"
             f" ({offset.features} features of {len(plain)} frames)"
         )
+        severity = Severity.NOTE
         if offset.crossed > MOST_CROSSED:
+            severity = Severity.WARNING
             found += f"; {offset.crossed:.0%} of the features look farther than infinity: are left and right swapped?"
         if not offset.clear:
-            return replace(self, row_offset=0.0), f"{found}: too little to correct"
+            return replace(self, row_offset=0.0), Finding(f"{found}: too little to correct", severity)
         if offset.largest > UNUSUAL:
+            severity = Severity.WARNING
             found += "; so much is unusual: are the images rectified, and with this calibration?"
-        return replace(self, row_offset=terms), f"{found}; corrected, as row_offset={list(terms)} would"
+        sentence = f"{found}; corrected, as row_offset={list(terms)} would"
+        return replace(self, row_offset=terms), Finding(sentence, severity)
 
     @property
     def _terms(self) -> tuple[float, ...] | None:

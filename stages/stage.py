@@ -1,11 +1,13 @@
-"""What every stage shares: parameters that carry their unit, range and meaning, checked when the stage is made."""
+"""What every stage shares: parameters that carry their unit, range and meaning, and what it may say of a whole run."""
 
 from __future__ import annotations
 
 import math
 import numbers
+import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from enum import StrEnum
 from typing import Any
 
 
@@ -40,3 +42,37 @@ class Stage:
             if (low is not None and not value >= low) or (high is not None and not value <= high):
                 bounds = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
                 raise ValueError(f"{where} must be {bounds}{f' {unit}' if unit else ''}, not {value}")
+
+    def snapshot(self) -> bytes:
+        """What the stage remembers of the frames so far, to go on from with `restore`, in this version of the product.
+
+        All that is remembered stands in fields that are no parameters, so no stage has to write its own.
+        """
+        memory = {item.name: getattr(self, item.name) for item in fields(self) if not item.init}
+        return pickle.dumps((type(self).__qualname__, memory))
+
+    def restore(self, snapshot: bytes) -> None:
+        """Remember what a stage of this class, with the same parameters, did when it made the snapshot.
+
+        It is a pickle: restore none that comes from strangers. Raises ValueError for one of another class.
+        """
+        name, memory = pickle.loads(snapshot)
+        if name != type(self).__qualname__:
+            raise ValueError(f"a snapshot of {name} is not one of {type(self).__qualname__}; restore each into its own")
+        for field_name, value in memory.items():
+            object.__setattr__(self, field_name, value)
+
+
+class Severity(StrEnum):
+    """How much a finding matters: a WARNING is printed last and stands out, for results may be wrong."""
+
+    NOTE = "note"
+    WARNING = "warning"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a stage's `finding()` says of a whole run, or its `survey` of a log, in one sentence."""
+
+    sentence: str
+    severity: Severity = Severity.NOTE

@@ -7,14 +7,14 @@ fault that a tilt can have. A rover that stands still proves nothing and crowds 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, PointCloud, Source, Tilt, TiltHealth, Transform
-from stages.stage import Stage, parameter
+from stages.stage import Finding, Severity, Stage, parameter
 from stages.tilt_diagnosis import INCONSISTENT, Diagnosis, Evidence, diagnose
 
 MOVED = 0.05  # m, or
@@ -23,6 +23,7 @@ GROUND_FROM, GROUND_TO = 0.5, 8.0  # m of depth, of the ground that a plane is l
 GROUND_POINTS = 4000
 GROUND_ROUNDS = 6
 GROUND_NOISE = 0.03  # m
+NOTHING_YET = Diagnosis("", "no frames to judge the tilt yet", False, float("nan"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +37,33 @@ class _Sight:
     ground: Array
 
 
-@dataclass
-class _Memory:
-    """The frames that count, the last frame of all, and what was judged of them."""
+@dataclass(frozen=True)
+class _Verdict:
+    """What all judgements come to. last: of them; fault: the one to tell at the end, None where none was found; faults:
+    how many judgements found one; clear: how many found one or could rule out all."""
 
-    kept: deque[_Sight] = field(default_factory=deque)
-    last: _Sight | None = None
-    since: int = 0  # frames kept since the last judgement
-    judged: Diagnosis = field(default_factory=lambda: Diagnosis("", "no frames to judge the tilt yet", False, np.nan))
+    last: Diagnosis = NOTHING_YET
     fault: Diagnosis | None = None
     faults: int = 0
     clear: int = 0
-    judgements: int = 0
+
+    def and_then(self, judged: Diagnosis) -> _Verdict:
+        """The verdict after one more judgement."""
+        if not judged.fault:
+            return replace(self, last=judged, clear=self.clear + judged.clear)
+        vague = judged.fault == INCONSISTENT  # as where a fault begins or ends
+        told = self.fault if vague and self.fault is not None else judged
+        return _Verdict(judged, told, self.faults + 1, self.clear + 1)
+
+
+@dataclass
+class _Memory:
+    """The frames that count, the last frame of all, how many were kept since they were judged, and the verdict."""
+
+    kept: deque[_Sight] = field(default_factory=deque)
+    last: _Sight | None = None
+    since: int = 0
+    verdict: _Verdict = field(default_factory=_Verdict)
 
 
 @dataclass(frozen=True)
@@ -78,20 +94,19 @@ class CheckTilt(Stage):
             turn = self._residual(sight)
             memory.last = sight
             self._keep(sight)
-        judged = memory.judged
+        judged = memory.verdict.last
         slope = _angle(up, ground) if np.isfinite(ground).all() else np.nan
         return TiltHealth(motion.stamp, turn, slope, len(memory.kept), judged.fault, judged.sentence)
 
-    @property
-    def finding(self) -> str:
-        """What to say of the whole run."""
-        memory = self._memory
-        if memory.since:
-            self._judge()
-        if memory.fault is None:
-            return memory.judged.sentence
-        where = "" if memory.faults == memory.judgements else f" ({memory.faults} of {memory.judgements} judgements)"
-        return memory.fault.sentence + where
+    def finding(self) -> Finding:
+        """What to say of the whole run, the frames after the last judgement included; a fault is a warning."""
+        verdict = self._memory.verdict
+        if self._memory.since:
+            verdict = verdict.and_then(self._diagnosis())
+        if verdict.fault is None:
+            return Finding(verdict.last.sentence)
+        where = "" if verdict.faults == verdict.clear else f" ({verdict.faults} of {verdict.clear} judgements)"
+        return Finding(verdict.fault.sentence + where, Severity.WARNING)
 
     def _residual(self, sight: _Sight) -> float:
         """By how much up differs from the last frame's, carried along by the camera; NaN in a new segment."""
@@ -115,22 +130,17 @@ class CheckTilt(Stage):
             memory.kept.popleft()
         memory.since += 1
         if memory.since >= self.interval:
-            self._judge()
+            memory.verdict, memory.since = memory.verdict.and_then(self._diagnosis()), 0
 
-    def _judge(self) -> None:
-        memory, kept = self._memory, self._memory.kept
+    def _diagnosis(self) -> Diagnosis:
+        """What the frames that are kept now show."""
+        kept = self._memory.kept
         evidence = Evidence(
             np.array([sight.stamp for sight in kept]), np.array([sight.segment for sight in kept]),
             np.array([sight.camera.rotation for sight in kept]), np.array([sight.drift for sight in kept]),
             np.array([sight.up for sight in kept]), kept[-1].mount, np.array([sight.ground for sight in kept]),
         )  # fmt: skip
-        memory.judged, memory.since = diagnose(evidence, self.least_angle, self.least_offset), 0
-        if memory.judged.fault:
-            memory.faults += 1
-            if memory.fault is None or memory.judged.fault != INCONSISTENT:  # as where a fault begins or ends
-                memory.fault = memory.judged
-        if memory.judged.fault or memory.judged.clear:
-            memory.judgements += 1
+        return diagnose(evidence, self.least_angle, self.least_offset)
 
 
 def _ground_normal(cloud: PointCloud) -> Array:

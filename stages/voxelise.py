@@ -15,7 +15,13 @@ from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Source
 from stages.kernels.grid import FIGURES, cell_percentile, cell_statistics
 from stages.kernels.neighbours import lie_of_cells
 from stages.kernels.occlusion import lowest_sight
+from stages.kernels.spread import PLACES, laid_along_sight
 from stages.stage import Stage, parameter
+
+Grid = tuple[float, tuple[float, float], int, float]  # resolution, origin, rows and columns, region
+FINEST = 0.25  # of a cell, below which a point's reach is not worth following
+WITNESSES = 3  # places along lines of sight that a cell without a point of its own must have
+SUMS = [FIGURES.index(name) for name in ("count", "sum", "sum_of_squares", "noise")]
 
 
 @dataclass(frozen=True)
@@ -23,7 +29,9 @@ class Voxelise(Stage):
     """Averages a levelled cloud over the cells of a grid.
 
     Layers:
-    - elevation (mean), minimum, maximum, m, and count, of the measured points; without any, count is 0, the others NaN;
+    - elevation (mean), minimum, maximum, m, and count, of the measured points; without any, count is 0, the others NaN.
+      With `reach`, an empty cell that at least 3 places fall into at which measured points might be as well, 4 along
+      each line of sight, has the mean of these, and counts each place for a quarter of a point;
     - variance, m^2: of the mean against the cell's true mean height, from what is random within a frame;
     - common_variance, m^2: from the tilt's uncertainty, which moves a whole frame at once, so that neither many points
       nor many cells average it out: (tilt_sigma * range)^2;
@@ -48,6 +56,10 @@ class Voxelise(Stage):
     scatter: float = parameter(0.27, "share of the scatter beyond the slope's in the variance", low=0.0)
     bend: float = parameter(0.5, "share of the square of the height off the neighbours in the variance", low=0.0)
     sampling: float = parameter(0.003, "what a single point may miss of its cell", unit="m", low=0.0)
+    reach: float = parameter(
+        0.0, "how far along its line of sight, in standard deviations of its depth, a measured point speaks for cells "
+        "that no point falls into; 0 = it does not", low=0.0,
+    )  # fmt: skip
     percentiles: tuple[float, ...] = parameter((), "further layers: percentiles of a cell's heights, 50 the median")
     filled: str = parameter(
         "apart", "filled points: a layer of their own, or counted as measured", choices=("apart", "counted")
@@ -66,7 +78,7 @@ class Voxelise(Stage):
         origin = (-half * self.resolution, -half * self.resolution)
         measured, guessed = self._parted(cloud)
         grid = self.resolution, origin, 2 * half, self.region
-        figures = cell_statistics(measured.points, measured.sigma, *grid)
+        figures = self._reached(cell_statistics(measured.points, measured.sigma, *grid), measured, grid)
         layers = self._layers(figures, measured, origin)
         if cloud.sensor is not None and cloud.shape is not None:
             ceiling = np.where(layers["count"] > 0, np.nan, _ceiling(measured, grid))
@@ -87,6 +99,20 @@ class Voxelise(Stage):
             return cloud, None
         guess = cloud.source == Source.FILLED
         return (cloud.only(~guess), cloud.only(guess)) if guess.any() else (cloud, None)
+
+    def _reached(self, figures: Array, cloud: PointCloud, grid: Grid) -> Array:
+        """The figures of `cell_statistics`, with those of empty cells that lie within the reach of points."""
+        sensor = cloud.sensor
+        if sensor is None or self.reach == 0:
+            return figures
+        if cloud.source is not None:
+            cloud = cloud.only(cloud.source == Source.MEASURED)
+        least = FINEST * self.resolution
+        points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.reach, least)
+        near = cell_statistics(points, sigma, *grid)
+        reached = (figures[:, :, 0] == 0) & (near[:, :, 0] >= WITNESSES)
+        near[:, :, SUMS] /= len(PLACES)
+        return np.where(reached[:, :, None], near, figures)
 
     def _layers(self, figures: Array, cloud: PointCloud, origin: tuple[float, float]) -> dict[str, Array]:
         count, total, squares, minimum, maximum, noise = (figures[:, :, i] for i in range(len(FIGURES)))
@@ -132,7 +158,7 @@ def _lever(cloud: PointCloud, height: Array, x: Array, y: Array, east: Array, no
         return np.asarray(np.where(depth > 0, (dz - east * dx - north * dy) / depth, 1.0))
 
 
-def _ceiling(cloud: PointCloud, grid: tuple[float, tuple[float, float], int, float]) -> Array:
+def _ceiling(cloud: PointCloud, grid: Grid) -> Array:
     """The lowest line of sight over each cell, m, NaN where none jumps over it."""
     assert cloud.sensor is not None
     assert cloud.shape is not None

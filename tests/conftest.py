@@ -6,8 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from mcap.reader import make_reader
 from mcap.writer import Writer
+
+settings.register_profile("untimed", deadline=None)  # the first example may compile a kernel
+settings.load_profile("untimed")
 
 FRAMES = 4
 

@@ -38,18 +38,20 @@ def log(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return path
 
 
-def judged(log: Path, folder: Path) -> str:
-    """What a run says of the tilt."""
+def judged(log: Path, folder: Path) -> tuple[str, str]:
+    """What a run says of the tilt: how much it matters, and the sentence."""
     pipeline, summary = folder / "check.yaml", folder / "summary.json"
     pipeline.write_text(PIPELINE)
     arguments = ["-p", pipeline, "-o", folder / "out.mcap", "--no-rrd", "--summary", summary]
     main(["run", *map(str, [log, *arguments])])
-    return str(json.loads(summary.read_text())["findings"]["health"])
+    found = json.loads(summary.read_text())["findings"]["health"]
+    return found["severity"], found["sentence"]
 
 
 @pytest.mark.slow
 def test_a_sound_log_is_not_accused(log: Path, tmp_path: Path) -> None:
-    found = judged(log, tmp_path)
+    severity, found = judged(log, tmp_path)
+    assert severity == "note"
     assert found.startswith(("tilt and camera agree to 0.", "not enough motion in 50 frames to rule out a wrong mount"))
 
 
@@ -57,7 +59,8 @@ def test_a_sound_log_is_not_accused(log: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named(log: Path, tmp_path: Path, fault: str) -> None:
     plant, name = FAULTS[fault]
-    found = judged(plant(log, tmp_path / "faulty.mcap"), tmp_path)
+    severity, found = judged(plant(log, tmp_path / "faulty.mcap"), tmp_path)
+    assert severity == "warning"
     assert name in found.split(":")[0], found
     assert " or " not in found.split(":")[0], found
 

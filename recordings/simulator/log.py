@@ -22,6 +22,7 @@ from stages.data import (
     Disparity,
     ElevationMap,
     NavigationMap,
+    Pose,
     Reason,
     Source,
     Transform,
@@ -56,9 +57,7 @@ def inclinometer(simulation: Simulation, number: int, stamp: int, log_time: int)
 
 def odometry(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:
     """/odometry and /tf: dead reckoning since the first message."""
-    first, now = simulation.base_at(simulation.begin), simulation.base_at(stamp)
-    way = simulation.way(stamp) - simulation.way(simulation.begin)
-    pose = traverse.odometry_pose(stamp, first, now, way, simulation.odometry_drift)
+    pose = simulation.odometry[number]
     rotation = Rotation.from_quat(pose.quaternion).as_matrix()
     moved = Transform(pose.frame_id, pose.child_frame_id, rotation, pose.position)
     return [(log_time, "/odometry", ros2.odometry(pose)), (log_time, "/tf", ros2.transform_message([(moved, stamp)]))]
@@ -93,6 +92,7 @@ def _truth_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> di
         "/truth/navigation_map": ros2.occupancy_grid(hazards),
         "/truth/rocks": _rocks_message(simulation, stamp, truth),
         "/truth/tilt": _tilt_message(stamp, truth),
+        "/truth/pose": ros2.odometry(_true_pose(stamp, truth)),
     }
 
 
@@ -175,6 +175,11 @@ def _rocks_message(simulation: Simulation, stamp: int, truth: FrameTruth) -> Any
         fields=fields, is_bigendian=False, point_step=4 * len(ROCK_FIELDS), row_step=4 * table.size,
         data=table.view(np.uint8).reshape(-1), is_dense=True,
     )  # fmt: skip
+
+
+def _true_pose(stamp: int, truth: FrameTruth) -> Pose:
+    quaternion = Rotation.from_matrix(truth.base.rotation).as_quat(canonical=True)
+    return Pose(stamp, truth.base.translation, quaternion, truth.base.parent, truth.base.child)
 
 
 def _tilt_message(stamp: int, truth: FrameTruth) -> Any:

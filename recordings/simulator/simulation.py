@@ -16,8 +16,9 @@ import numpy as np
 
 from recordings import ros2
 from recordings.simulator import log, raycast, shading, sunlight, traverse
+from recordings.simulator.odometry import dead_reckoning
 from recordings.simulator.terrain import Terrain, make_terrain
-from stages.data import Array, StereoCamera, Transform
+from stages.data import Array, Pose, StereoCamera, Transform
 
 SECOND = 1_000_000_000
 EPOCH = 1_700_000_000 * SECOND
@@ -52,9 +53,11 @@ class Simulation:
     camera_height above base_link, pitch_down: the mast; slope: RMS over 1 m; relief_cells, relief_resolution: the
     repeating ground tile; abundance: k of Golombek's rock law (0.05 sparse, 0.15 dense); smallest_rock, largest_rock:
     diameters; sun_elevation, sun_azimuth: the light; color: rgb8, else mono8; noise: image noise at half scale, share
-    of full scale; tilt_noise: of one inclinometer sample; tilt_rate, odometry_rate: Hz; odometry_drift: share of the
-    way; frame_offset: of frame times after inclinometer samples; map_half_width, map_resolution: truth maps; region:
-    how far from the camera a visible cell counts; horizon: beyond it is sky; threads: change the time, not the bytes.
+    of full scale; tilt_noise: of one inclinometer sample; tilt_rate, odometry_rate: Hz; odometry_scale: share by which
+    odometry overstates the way; odometry_turn: its heading's error after 1 m, one sigma, growing with the root of the
+    way (0 and 0: exact); frame_offset: of frame times after inclinometer samples; map_half_width, map_resolution: truth
+    maps; region: how far from the camera a visible cell counts; horizon: beyond it is sky; threads: change the time,
+    not the bytes.
     """
 
     frames: int = 12
@@ -78,7 +81,8 @@ class Simulation:
     tilt_noise: float = float(np.radians(0.1))
     tilt_rate: float = 20.0
     odometry_rate: float = 10.0
-    odometry_drift: float = 0.01
+    odometry_scale: float = 0.01
+    odometry_turn: float = float(np.radians(0.2))
     frame_offset: float = 0.013
     map_half_width: float = 8.0
     map_resolution: float = 0.05
@@ -92,6 +96,7 @@ class Simulation:
             "frames": 1, "rate": 1e-3, "speed": 0, "width": 16, "height": 16, "baseline": 1e-3, "camera_height": 0.1,
             "slope": 0, "relief_resolution": 1e-3, "abundance": 0, "smallest_rock": 0.01, "noise": 0, "tilt_noise": 0,
             "seed": 0, "tilt_rate": 1, "odometry_rate": 1, "map_half_width": 0.5, "map_resolution": 1e-3, "threads": 1,
+            "odometry_scale": -0.5, "odometry_turn": 0,
         }  # fmt: skip
         for name, low in least.items():
             if not getattr(self, name) >= low:
@@ -171,6 +176,14 @@ class Simulation:
         """world <- base_link at a time, ns."""
         return traverse.base_pose(self.terrain, self.route, self.way(stamp))
 
+    @cached_property
+    def odometry(self) -> tuple[Pose, ...]:
+        """The odometry of the whole drive, as logged."""
+        stamps = self._sensor_stamps(self.odometry_rate)
+        ways = np.array([self.way(stamp) for stamp in stamps])
+        bases = [self.base_at(stamp) for stamp in stamps]
+        return tuple(dead_reckoning(stamps, bases, ways, self.odometry_scale, self.odometry_turn, self._rng(5)))
+
     def frame(self, index: int) -> FrameTruth:
         """Images and exact geometry of one frame."""
         base = self.base_at(self.stamp(index))
@@ -208,15 +221,18 @@ class Simulation:
     def _events(self) -> Iterator[tuple[int, Callable[[], list[log.Logged]], int | None]]:
         """(log time, maker of the messages then written, frame index or None), unordered; made on demand."""
         yield self.begin, partial(log.static_transforms, self, self.begin), None
-        length = (self.stamp(self.frames - 1) + MARGIN - self.begin) / SECOND
         sensors = ((log.inclinometer, self.tilt_rate, 4_000_000), (log.odometry, self.odometry_rate, 9_000_000))
         for make, rate, latency in sensors:
-            for number in range(int(np.ceil(length * rate)) + 1):
-                stamp = self.begin + round(number / rate * SECOND)
+            for number, stamp in enumerate(self._sensor_stamps(rate)):
                 yield stamp + latency, partial(make, self, number, stamp, stamp + latency), None
         for index in range(self.frames):
             at = self.stamp(index) + 21_000_000
             yield at, partial(log.frame, self, index, at), index
+
+    def _sensor_stamps(self, rate: float) -> list[int]:
+        """Stamps, ns, of a sensor of so many Hz, from before the first frame until after the last."""
+        length = (self.stamp(self.frames - 1) + MARGIN - self.begin) / SECOND
+        return [self.begin + round(number / rate * SECOND) for number in range(int(np.ceil(length * rate)) + 1)]
 
     def _intrinsics(self) -> tuple[float, float, float, float]:
         return self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy

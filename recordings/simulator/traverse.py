@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.rig import BODY_FROM_OPTICAL
 from recordings.simulator.terrain import Terrain
-from stages.data import LEVEL_FRAME, Array, Pose, Transform
+from stages.data import LEVEL_FRAME, Array, Transform
 
 BODY_LENGTH, BODY_WIDTH = 1.0, 0.8
 LEFT_FRAME, RIGHT_FRAME = "left_camera_optical", "right_camera_optical"
@@ -103,18 +103,3 @@ def inclinometer_reading(base: Transform, mount: Transform, noise: float, rng: n
     attitude = (wobble * Rotation.from_matrix(base.rotation @ mount.rotation)).as_matrix()
     heading = float(np.arctan2(attitude[1, 0], attitude[0, 0]))
     return np.asarray((Rotation.from_euler("z", -heading) * Rotation.from_matrix(attitude)).as_quat(canonical=True))
-
-
-def odometry_pose(stamp: int, start: Transform, now: Transform, way: float, drift: float) -> Pose:
-    """odom -> base_link: `odom` is the level frame at the start; dead reckoning loses `drift` of the way.
-
-    The error is what wheels and gyros do: a scale error of `drift` and a heading error of `drift` rad per 10 m.
-    """
-    odom = level_pose(start).inverse()
-    true = Transform("odom", "world", odom.rotation, odom.translation).after(now)
-    turn = Rotation.from_euler("z", drift * way / 10)
-    position = turn.apply(true.translation * (1 + drift * np.array([1.0, 1.0, 0.0])))
-    attitude = turn * Rotation.from_matrix(true.rotation)
-    spread = (drift * max(abs(way), 0.1)) ** 2
-    covariance = np.diag([spread, spread, spread, 1e-5, 1e-5, spread / 100 + 1e-5])
-    return Pose(stamp, position, np.asarray(attitude.as_quat(canonical=True)), "odom", "base_link", covariance)

@@ -14,6 +14,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,7 +127,7 @@ def _seams(simulation: Simulation, log: Path, frames: dict[int, dict[str, object
     return np.array(seams)
 
 
-def _upright(poses: list[Pose], stamp: int) -> Transform:
+def _upright(poses: Sequence[Pose], stamp: int) -> Transform:
     """Frame `level` by the position and heading of the pose at `stamp`."""
     later = next(place for place, pose in enumerate(poses) if pose.stamp >= stamp)
     pose = poses[later - 1].interpolated(poses[later], stamp)
@@ -154,13 +155,10 @@ def _errors(simulation: Simulation, maps: list[ElevationMap]) -> tuple[Array, Ar
     """Errors of the cells that each frame changed, less a plane, their standard deviations, and the share of cells that
     were contradicted in the end."""
     errors, sigmas = [], []
-    first, begin = simulation.base_at(simulation.begin), simulation.way(simulation.begin)
     for terrain in maps:
         layers, now = terrain.layers, simulation.base_at(terrain.stamp)
-        way = simulation.way(terrain.stamp) - begin
-        pose = traverse.odometry_pose(terrain.stamp, first, now, way, simulation.odometry_drift)
         true = traverse.level_pose(now)
-        given = _upright([pose, pose], terrain.stamp)
+        given = _upright(simulation.odometry, terrain.stamp)
         rows, cols = terrain.shape
         fresh = np.isfinite(layers["last"]) & (layers["last"] >= np.nanmax(layers["last"]))
         x, y = ((np.arange(n) + 0.5) * CELL + at for n, at in zip((cols, rows), terrain.origin, strict=True))

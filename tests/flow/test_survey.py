@@ -8,6 +8,7 @@ import pytest
 from flow.errors import PipelineError
 from flow.pipeline import load
 from flow.run import Stop, run
+from stages.stage import Finding
 from tests.flow.toys import Couple, Keep, Log, Number
 
 PIPELINE = """
@@ -32,13 +33,18 @@ class Centre:
     def surveys(self) -> bool:
         return self.mean is None
 
-    def survey(self, couple: Sequence[Couple]) -> tuple["Centre", str]:
+    def survey(self, couple: Sequence[Couple]) -> tuple["Centre", Finding]:
         values = [one.value for one in couple]
         mean = sum(values) / len(values) if values else 0.0
-        return replace(self, mean=mean), f"mean {mean:g} of {len(values)}"
+        return replace(self, mean=mean), Finding(f"mean {mean:g} of {len(values)}")
 
     def __call__(self, couple: Couple) -> Couple:
         return Couple(couple.stamp, couple.value - self.mean)
+
+
+def said(summary):
+    """What the survey found."""
+    return summary["surveys"]["centred"]["sentence"]
 
 
 class Excerpted(Log):
@@ -72,7 +78,7 @@ EVENTS = [event for stamp in range(1, 9) for event in both(stamp, float(stamp))]
 def test_the_first_whole_frame_of_each_excerpt_is_shown_through_the_stages_before(tmp_path):
     log = Excerpted(EVENTS, [(0, 6), (7, 12), (12, 16)])  # the second begins between a left and its right
     summary, sink = result_of(tmp_path, log)
-    assert summary["surveys"] == {"centred": f"mean {2 * (1 + 5 + 7) / 3:g} of 3"}
+    assert said(summary) == f"mean {2 * (1 + 5 + 7) / 3:g} of 3"
     assert sink.values("centred")[1] == pytest.approx(2 - 26 / 3)
     assert (summary["verdict"], summary["frames_in"]) == ("COMPLETE", 8)
     assert log.asked == [(9, {"left", "right"})]
@@ -80,7 +86,7 @@ def test_the_first_whole_frame_of_each_excerpt_is_shown_through_the_stages_befor
 
 def test_a_frame_that_a_stage_fails_on_is_no_sample(tmp_path):
     summary, _ = result_of(tmp_path, Excerpted(EVENTS, [(0, 6), (12, 16)]), bad="7")
-    assert summary["surveys"] == {"centred": "mean 2 of 1"}
+    assert said(summary) == "mean 2 of 1"
     assert summary["drops"] == {"failed": 1}
 
 
@@ -93,19 +99,20 @@ def test_an_excerpt_that_breaks_down_costs_only_itself(tmp_path):
 
     log.excerpts = lambda count, streams: [broken(), iter(EVENTS[:4])]
     summary, _ = result_of(tmp_path, log)
-    assert summary["surveys"] == {"centred": "mean 2 of 1"}
+    assert said(summary) == "mean 2 of 1"
 
 
 def test_a_survey_without_frames_says_so_and_the_run_goes_on(tmp_path):
     summary, _ = result_of(tmp_path, Excerpted(EVENTS, []))
-    assert summary["surveys"] == {"centred": "mean 0 of 0"}
+    assert said(summary) == "mean 0 of 0"
     assert summary["frames_out"] == 8
 
 
 def test_a_survey_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(Centre, "survey", lambda self, couple: 1 // 0)
     summary, _ = result_of(tmp_path, Excerpted(EVENTS, [(0, 6)]))
-    assert summary["surveys"]["centred"].startswith("could not survey the log: ZeroDivisionError: ")
+    assert summary["surveys"]["centred"]["severity"] == "warning"
+    assert said(summary).startswith("could not survey the log: ZeroDivisionError: ")
     assert summary["drops"] == {"failed": 8}  # this stage cannot do without
 
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+from stages.stage import Finding, Severity
+
 
 @dataclass(frozen=True)
 class Couple:
@@ -80,12 +82,12 @@ class Total:
         self.seen.append(couple.value)
         return Couple(couple.stamp, sum(self.seen))
 
-    @property
-    def finding(self) -> str:
-        """The sum of all; it breaks down at 12."""
+    def finding(self) -> Finding | None:
+        """The sum of all, a warning from 30 on; it breaks down at 12."""
         if sum(self.seen) == 12:
             raise RuntimeError("unlucky")
-        return f"the sum is {sum(self.seen)}" if self.seen else ""
+        severity = Severity.WARNING if sum(self.seen) >= 30 else Severity.NOTE
+        return Finding(f"the sum is {sum(self.seen)}", severity) if self.seen else None
 
 
 @dataclass(frozen=True)

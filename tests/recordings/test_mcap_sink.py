@@ -174,12 +174,16 @@ def test_the_tilts_health_and_what_the_run_found_are_in_the_diagnostics(tmp_path
     sink.open(path, STREAMS, ABOUT)
     fault = TiltHealth(START, 0.05, float("nan"), 40, "the sign of pitch is flipped", "turn it round")
     sink.write(Record(START, {"health": fault}))
-    sink.close(SUMMARY | {"findings": {"health": "turn it round", "pose": "visual"}, "entries": []})
+    found = {
+        "health": {"severity": "warning", "sentence": "turn it round"},
+        "pose": {"severity": "note", "sentence": "visual"},
+    }
+    sink.close(SUMMARY | {"findings": found, "entries": []})
     frame, end = [message.status for topic, _, message in iter_messages(path) if topic == "/nav/diagnostics"]
     assert [(status.level, status.name) for status in frame] == [(0, "roverflow"), (1, "health")]
     assert frame[1].message == "turn it round"
     values = {value.key: value.value for value in frame[1].values}
     assert values == {"tilt off turn": "2.865 deg", "frames": "40", "fault": "the sign of pitch is flipped"}
     assert [(status.level, status.name, status.message) for status in end] == [
-        (0, "health", "turn it round"), (0, "pose", "visual"),
+        (1, "health", "turn it round"), (0, "pose", "visual"),
     ]  # fmt: skip

@@ -421,10 +421,14 @@ def test_the_tilt_check_is_a_plot_and_says_once_what_is_wrong(whole: Path, tmp_p
     assert rows(whole, "/motion/features", "Scalars:scalars")[0][2] == [321.0]
     path = record_of(
         tmp_path / "run.rrd", [Record(START, scene()), Record(START + STEP, scene(START + STEP))],
-        {"verdict": "COMPLETE", "findings": {"health": "the sign of pitch is flipped"}},
+        {
+            "verdict": "COMPLETE",
+            "findings": {"health": {"severity": "warning", "sentence": "the sign of pitch is flipped"}},
+        },
     )  # fmt: skip
     assert [value for *_, value in rows(path, "/ledger/health", "TextLog:text")] == [["turn it round"]]
     assert rows(path, "/ledger", "TextLog:text")[-1][2] == ["health: the sign of pitch is flipped"]
+    assert rows(path, "/ledger", "TextLog:level")[-1][2] == ["WARN"]
 
 
 def test_the_logs_own_pose_is_drawn_once(tmp_path: Path) -> None:

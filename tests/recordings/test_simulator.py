@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import ros2
 from recordings.simulator import Simulation, log, raycast, terrain, traverse
+from recordings.simulator.odometry import dead_reckoning
 from stages.data import Cell, Transform
 
 SMALL = Simulation(
@@ -317,7 +318,7 @@ def test_a_log_has_everything_a_replay_needs_in_log_time_order(logged):
     assert per_frame == {
         "/stereo/left/image_rect", "/stereo/left/camera_info", "/stereo/right/image_rect", "/stereo/right/camera_info",
         "/truth/disparity", "/truth/occlusion", "/truth/elevation_map", "/truth/navigation_map", "/truth/rocks",
-        "/truth/tilt",
+        "/truth/tilt", "/truth/pose",
     }  # fmt: skip
     wanted = [SMALL.stamp(index) for index in range(SMALL.frames)]
     for topic in per_frame:
@@ -332,16 +333,47 @@ def test_a_log_has_everything_a_replay_needs_in_log_time_order(logged):
     assert static == {"left_camera_optical", "right_camera_optical", "inclinometer_link"}
 
 
-def test_odometry_without_drift_tells_how_far_the_rover_drove():
-    first = SMALL.base_at(SMALL.begin)
-    later = SMALL.stamp(1)
-    pose = traverse.odometry_pose(later, first, SMALL.base_at(later), 1.0, 0.0)
-    moved = Transform("odom", "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
-    odom = traverse.level_pose(first)
-    expected = odom.inverse().after(SMALL.base_at(later))
-    np.testing.assert_allclose(moved.rotation, expected.rotation, atol=1e-12)
-    np.testing.assert_allclose(moved.translation, expected.translation, atol=1e-12)
-    assert np.hypot(*pose.position[:2]) == pytest.approx(0.75, abs=0.01)
+def test_the_true_pose_is_logged_with_every_frame(logged):
+    for message in logged[0]["/truth/pose"]:
+        base, place = SMALL.base_at(ros2.stamp_of(message.header)), message.pose.pose.position
+        assert (message.header.frame_id, message.child_frame_id) == ("world", "base_link")
+        np.testing.assert_array_equal([place.x, place.y, place.z], base.translation)
+        np.testing.assert_allclose(rotation(message.pose.pose.orientation), base.rotation, atol=1e-12)
+
+
+def test_odometry_without_errors_is_exact():
+    exact = replace(SMALL, odometry_scale=0.0, odometry_turn=0.0)
+    odom = traverse.level_pose(exact.base_at(exact.begin)).inverse()
+    for pose in exact.odometry:
+        expected = odom.after(exact.base_at(pose.stamp))
+        np.testing.assert_allclose(Rotation.from_quat(pose.quaternion).as_matrix(), expected.rotation, atol=1e-12)
+        np.testing.assert_allclose(pose.position, expected.translation, atol=1e-9)
+
+
+def test_odometry_overstates_the_way_and_loses_the_heading_by_as_much_as_told():
+    """Over many drives; the heading's error, and that of the place across the way, grow with the way as they should."""
+    long, scale, turn = 16.0, 0.02, np.radians(0.5)
+    ways = np.linspace(0, long, 161)
+    bases = [Transform("world", "base_link", np.eye(3), np.array([way, 0.0, 0.0])) for way in ways]
+    ends = []
+    for seed in range(400):
+        pose = dead_reckoning(range(161), bases, ways, scale, turn, np.random.default_rng(seed))[-1]
+        ends.append([*pose.position, Rotation.from_quat(pose.quaternion).as_euler("zyx")[0]])
+    along, across, up, heading = np.array(ends).T
+    assert np.median(along) == pytest.approx(long * (1 + scale), rel=0.002)
+    assert np.std(heading) == pytest.approx(turn * np.sqrt(long), rel=0.1)
+    assert np.std(across) == pytest.approx(turn * np.sqrt(long**3 / 3), rel=0.1)
+    assert np.abs(up).max() == 0.0
+    stated = np.sqrt(np.diag(pose.covariance))
+    assert stated[5] == pytest.approx(np.std(heading), rel=0.1)
+    assert stated[1] == pytest.approx(np.hypot(scale * long, np.std(across)), rel=0.1)
+
+
+def test_odometry_does_not_drift_while_the_rover_stands():
+    still = [Transform("world", "base_link", np.eye(3), np.zeros(3))] * 50
+    poses = dead_reckoning(range(50), still, np.zeros(50), 0.02, 0.1, np.random.default_rng(0))
+    assert all(np.array_equal(pose.position, poses[0].position) for pose in poses)
+    assert all(np.array_equal(pose.quaternion, poses[0].quaternion) for pose in poses)
 
 
 def test_equal_simulations_write_equal_bytes_whatever_the_threads(tmp_path: Path):

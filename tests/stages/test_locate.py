@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from recordings.simulator.traverse import level_pose
 from stages import Locate, Mount, Pose, Tilt, Transform
 from stages.data import Array
+from stages.stage import Finding, Severity
 from tests.stages.drive import FRAMES, Drive, motions
 
 DRIVE = Drive(2, 6.0)
@@ -45,7 +46,7 @@ def test_poses_of_base_link_follow_the_drive_and_say_that_they_are_visual():
     np.testing.assert_allclose(poses[0].position, 0, atol=1e-12)
     assert np.linalg.norm(places[-1]) < 0.05  # of 12 m; the first tilt's noise is all that errs here
     assert np.abs(turns[:, 2]).max() < 0.1
-    assert stage.finding == f"no pose is given; {FRAMES} by visual odometry, in visual_odom"
+    assert stage.finding() == Finding(f"no pose is given; {FRAMES} by visual odometry, in visual_odom")
 
 
 def test_the_tilt_is_smoothed_along_the_images():
@@ -86,7 +87,7 @@ def test_the_logs_own_pose_goes_through_untouched():
     given = (Tilt(7, DRIVE.ups(1)[0]), mount_of(DRIVE))
     assert stage(motion, *given, pose) is pose
     assert stage(replace(motion, camera=None, lost="dark"), *given, pose) is pose
-    assert stage.finding == ""
+    assert stage.finding() is None
 
 
 def test_after_a_lost_track_the_poses_are_in_a_frame_of_their_own():
@@ -96,7 +97,10 @@ def test_after_a_lost_track_the_poses_are_in_a_frame_of_their_own():
     poses = [stage(motion, Tilt(motion.stamp, up), mount_of(DRIVE)) for motion, up in zip(given, ups, strict=True)]
     assert [pose.frame_id for pose in poses] == ["visual_odom"] * 3 + ["visual_odom/2"] * 3
     np.testing.assert_allclose(poses[3].position, 0, atol=1e-12)
-    assert stage.finding.endswith("in visual_odom to visual_odom/2")
+    found = stage.finding()
+    assert found is not None
+    assert "in visual_odom to visual_odom/2, which nothing joins" in found.sentence
+    assert found.severity is Severity.WARNING
 
 
 def test_without_base_link_it_is_the_cameras_pose():

@@ -93,6 +93,26 @@ def test_what_lies_beyond_the_farthest_of_interest_is_neither_searched_nor_made_
     assert 15 <= np.nanmin(match(moved).pixels) < 20
 
 
+def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
+    frame, truth = slope
+    known = np.arange(320) >= truth + 2
+    prior = Disparity(
+        0, np.where(known, truth, np.nan).astype(np.float32), np.full(truth.shape, Source.MEASURED, np.uint8),
+        np.full(truth.shape, 0.7, np.float32),
+    )  # fmt: skip
+    bare, joined = Match(disparities=24)(frame, prior), Match(disparities=24, nearer="prior")(frame, prior)
+    nearer = known & (truth > 26.5)
+    assert nearer.sum() > 1000
+    assert np.isnan(bare.pixels[nearer]).all()
+    np.testing.assert_array_equal(joined.pixels[nearer], prior.pixels[nearer])
+    assert (joined.source[nearer] == Source.MEASURED).all()
+    assert (joined.confidence[nearer] == np.float32(0.7)).all()
+    farther = truth < 25
+    np.testing.assert_array_equal(joined.pixels[farther], bare.pixels[farther])
+    guess = replace(prior, source=np.full(truth.shape, Source.FILLED, np.uint8))  # is no measurement
+    assert np.nanmax(Match(disparities=24, nearer="prior")(frame, guess).pixels) < 24.5
+
+
 def test_sixteen_bits_and_colour_match_like_eight_bits_and_gray(slope):
     frame, truth = slope
     deep = frame_of(frame.left.astype(np.uint16) * 9 + 700, frame.right.astype(np.uint16) * 9 + 700)

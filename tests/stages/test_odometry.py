@@ -52,7 +52,7 @@ def test_the_camera_is_followed_to_a_fraction_of_a_degree_and_a_hundredth_of_the
     assert np.linalg.norm(found.translation - true.translation) < 0.01 * way + 0.005
     assert {motion.segment for motion in motions} == {1}
     assert found.child == inputs[0][0].camera.frame_id
-    assert odometry.finding == ""
+    assert odometry.finding() is None
 
 
 def test_what_it_says_of_its_error_grows_and_holds(drive):
@@ -91,7 +91,7 @@ def test_tracking_that_is_lost_begins_a_segment_and_says_so(drive):
     assert motion.segment == 2
     assert "segment 2 begins" in motion.lost
     np.testing.assert_array_equal(camera_of(motion).translation, 0)
-    assert odometry.finding.startswith("tracking was lost once, so the motion is in 2 segments")
+    assert odometry.finding().sentence.startswith("tracking was lost once, so the motion is in 2 segments")
 
 
 def test_features_that_agree_only_roughly_are_no_track(drive):
@@ -115,7 +115,7 @@ def test_a_blind_frame_has_no_motion_and_the_next_goes_on_from_the_last_that_saw
     assert after.segment == 1
     true = cameras[0].inverse().after(cameras[2])
     assert np.linalg.norm(camera_of(after).translation - true.translation) < 0.02
-    assert odometry.finding == "1 frame shows too little to track"
+    assert odometry.finding().sentence == "1 frame shows too little to track"
 
 
 def test_where_everything_is_counted_from_needs_no_features(drive):

@@ -190,8 +190,8 @@ def test_without_evidence_there_is_no_offset(pair):
     assert measure([pair]) is None
     frame = StereoFrame(1, *pair, StereoCamera(240, 240, 160, 120, 0.1, WIDTH, HEIGHT))
     assert np.array_equal(Rectify()(frame).right, pair[1])
-    stage, sentence = Rectify().survey([frame])
-    assert (stage.row_offset, "not clear" in sentence) == (0.0, True)
+    stage, found = Rectify().survey([frame])
+    assert (stage.row_offset, "not clear" in found.sentence, found.severity) == (0.0, True, "note")
 
 
 def test_features_in_a_corner_claim_no_more_about_the_whole_image_than_they_know():
@@ -210,9 +210,10 @@ def test_a_survey_measures_what_its_frames_have_in_common(rectified):
     models = (CameraModel(*LARGE, k, np.zeros(5), np.eye(3), p) for p in (p_left, p_right))
     camera = StereoCamera.from_models(*models, "cam", rectified)
     frames = [StereoFrame(stamp, *a_pair(TURNED, stamp, LARGE), camera) for stamp in range(3)]
-    stage, sentence = Rectify().survey(frames)
+    stage, found = Rectify().survey(frames)
     assert np.abs(offset_field(stage.row_offset, *LARGE) - offset_field(TURNED, *LARGE)).max() < 0.1
-    assert "of 3 frames" in sentence
+    assert "of 3 frames" in found.sentence
+    assert found.severity == "note"
     assert (Rectify().surveys, stage.surveys) == (True, False)
     aligned = stage(frames[0])
     assert measure([(aligned.left, aligned.right)]).largest < 0.1
@@ -228,18 +229,19 @@ def test_a_survey_measures_what_its_frames_have_in_common(rectified):
 def test_a_survey_tells_of_images_that_cannot_be_a_rectified_pair(rows, swapped, words):
     left, right = a_pair((rows,), size=LARGE)
     pair = (right, left) if swapped else (left, right)
-    _, sentence = Rectify().survey([StereoFrame(1, *pair, StereoCamera(500, 500, 320, 240, 0.1, *LARGE))])
-    assert words in sentence
-    assert ("swapped" in sentence) == swapped
+    _, found = Rectify().survey([StereoFrame(1, *pair, StereoCamera(500, 500, 320, 240, 0.1, *LARGE))])
+    assert words in found.sentence
+    assert ("swapped" in found.sentence) == swapped
+    assert found.severity == "warning"
 
 
 def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
     frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), StereoCamera(500, 500, 320, 240, 0.1, *LARGE))
     bad = CameraModel(*LARGE, K, np.zeros(5), np.eye(3), P_LEFT, "pinhole")
     broken = StereoFrame(2, frame.left, frame.right, replace(frame.camera, raw=(bad, bad)))
-    stage, sentence = Rectify().survey([broken, frame])
+    stage, found = Rectify().survey([broken, frame])
     assert stage.row_offset[0] == pytest.approx(1.0, abs=0.1)
-    assert "of 1 frames" in sentence
+    assert "of 1 frames" in found.sentence
 
 
 def test_a_list_of_terms_is_taken_as_the_survey_prints_it():

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from stages import CheckTilt, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.data import Array
+from stages.stage import Severity
 from tests.stages.drive import FRAMES, Drive, motions
 from tests.tilt_faults import flipped
 
@@ -42,7 +43,8 @@ def test_a_sound_tilt_comes_to_be_called_sound():
     assert 0.05 < np.degrees(np.sqrt(np.nanmean(np.square([health.turn for health in found])))) < 0.4
     assert found[-1].frames == FRAMES
     assert {health.fault for health in found} == {""}
-    assert stage.finding.startswith("tilt and camera agree to 0.")
+    assert stage.finding().sentence.startswith("tilt and camera agree to 0.")
+    assert stage.finding().severity is Severity.NOTE
 
 
 def test_a_flipped_sign_is_found_long_before_the_fiftieth_frame_and_told_at_the_end():
@@ -50,14 +52,16 @@ def test_a_flipped_sign_is_found_long_before_the_fiftieth_frame_and_told_at_the_
     found = checked(np.array([flipped(0)(up) for up in DRIVE.ups()]), stage)
     first = next(count for count, health in enumerate(found) if health.fault)
     assert first < 30
-    assert "the sign of pitch is flipped" in stage.finding
+    assert "the sign of pitch is flipped" in stage.finding().sentence
+    assert stage.finding().severity is Severity.WARNING
+    assert stage.finding() == stage.finding()  # to ask changes nothing
 
 
 def test_frames_that_stand_still_crowd_nothing_out():
     moving, halting = CheckTilt(), CheckTilt()
     checked(DRIVE.ups(), moving)
     assert checked(DRIVE.ups(), halting, repeats=4)[-1].frames == FRAMES
-    assert halting.finding == moving.finding
+    assert halting.finding() == moving.finding()
 
 
 def test_what_the_log_mends_halfway_is_still_told_at_the_end():
@@ -65,8 +69,8 @@ def test_what_the_log_mends_halfway_is_still_told_at_the_end():
     ups[:25] = [flipped(0)(up) for up in ups[:25]]
     stage = CheckTilt(window=20)
     checked(ups, stage)
-    assert "the sign of pitch is flipped" in stage.finding
-    assert "judgements)" in stage.finding
+    assert "the sign of pitch is flipped" in stage.finding().sentence
+    assert "judgements)" in stage.finding().sentence
 
 
 def test_the_ground_in_view_is_measured_whatever_lies_on_it_and_whatever_frame_the_cloud_is_in():

@@ -14,6 +14,7 @@ from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Tilt, Transform
 from stages.kernels.grid import cell_statistics, cell_statistics_reference
 from stages.kernels.neighbours import lie_of_cells, lie_of_cells_reference
 from stages.kernels.occlusion import lowest_sight, lowest_sight_reference
+from stages.kernels.spread import laid_along_sight, laid_along_sight_reference
 from stages.level import Level
 from stages.reproject import Reproject
 from stages.voxelise import Voxelise
@@ -221,3 +222,47 @@ def test_a_cloud_that_is_not_level_is_refused() -> None:
     )  # fmt: skip
     with pytest.raises(ValueError, match="'cam', not 'level'"):
         Voxelise()(cloud)
+
+
+def test_points_are_laid_along_their_lines_of_sight_as_the_reference_lays_them() -> None:
+    random = np.random.default_rng(3)
+    points = (SENSOR.translation + random.uniform(1, 8, (500, 1)) * SENSOR.rotation[:, 2]
+              + random.normal(0, 0.3, (500, 3))).astype(np.float32)  # fmt: skip
+    sigma = random.uniform(0, 0.1, 500).astype(np.float32)
+    copies, their_sigma = laid_along_sight(points, sigma, SENSOR, 2.0, 0.05)
+    expected, expected_sigma = laid_along_sight_reference(points, sigma, SENSOR, 2.0, 0.05)
+    np.testing.assert_allclose(copies, expected, atol=2e-6)
+    np.testing.assert_array_equal(their_sigma, expected_sigma)
+    assert 0 < len(copies) < 4 * len(points)
+    eye, axis = SENSOR.translation, SENSOR.rotation[:, 2]
+    far = points[sigma * np.float32(2) >= np.float32(0.05)]
+    moved = (copies.reshape(-1, 4, 3) - eye) @ axis - ((far - eye) @ axis)[:, None]
+    np.testing.assert_allclose(moved, 2 * their_sigma.reshape(-1, 4) * np.array([-1, -0.5, 0.5, 1]), atol=1e-5)
+
+
+def rows_apart(sigma: float) -> PointCloud:
+    """Level ground hit every 20 cm, as by the rows of an image, 8 points a cell wide, with an unsure depth."""
+    x, y = (layer.ravel() for layer in np.meshgrid(np.arange(5.02, 6.0, 0.2), np.linspace(0.005, 0.045, 8)))
+    return cloud_of(np.column_stack([x, y, np.zeros(len(x))]), sigma)
+
+
+def test_a_cell_that_points_missed_by_their_own_uncertainty_is_known_by_them() -> None:
+    cloud = rows_apart(sigma=0.06)
+    bare, reached = Voxelise()(cloud).layers, Voxelise(reach=2.0)(cloud).layers
+    own = bare["count"] > 0
+    gained = (reached["count"] > 0) & ~own
+    assert own.sum() == 5
+    assert gained.sum() >= 15
+    for name in ("elevation", "minimum", "maximum", "count", "common_variance"):
+        np.testing.assert_array_equal(reached[name][own], bare[name][own])
+    np.testing.assert_array_equal(np.isnan(reached["elevation"]), reached["count"] == 0)
+    assert 0.75 <= reached["count"][gained].min() < reached["count"][gained].max() <= 8
+    assert np.abs(reached["elevation"][gained]).max() < 0.05
+    assert reached["variance"][gained].min() > 0
+
+
+def test_only_measured_points_reach_beyond_their_cell() -> None:
+    cloud = rows_apart(sigma=0.06)
+    plane = replace(cloud, source=np.full(len(cloud.points), Source.PLANE, np.uint8))
+    for name, layer in Voxelise()(plane).layers.items():
+        np.testing.assert_array_equal(Voxelise(reach=2.0)(plane).layers[name], layer)

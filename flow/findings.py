@@ -1,0 +1,47 @@
+"""What there is to say of a whole run or log, a sentence for a stream: a note, or a warning that must not be missed.
+
+A warning is no loss: it changes neither the ledger nor the verdict. Findings are plain dictionaries with a "severity"
+and a "sentence", as the summary has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from flow.graph import Graph
+from flow.ledger import failure
+
+Finding = dict[str, str]
+
+NOTE, WARNING = "note", "warning"
+
+
+def finding(severity: str, sentence: str) -> Finding:
+    """One finding, as the summary has it."""
+    return {"severity": severity, "sentence": sentence}
+
+
+def plain(said: Any) -> Finding:
+    """A finding out of what a stage returns: an object with `severity` and `sentence`."""
+    return finding(str(said.severity), str(said.sentence))
+
+
+def findings(graph: Graph) -> dict[str, Finding]:
+    """What there is to say at the end of a run: what was left out, and what the `finding()` of stages returns."""
+    said = {name: finding(NOTE, f"left out: {why}") for name, why in graph.left_out.items()}
+    for node in graph.stages:
+        if not hasattr(node.actor, "finding"):
+            continue
+        try:
+            returned = node.actor.finding()
+            if returned is not None:
+                said[node.name] = plain(returned)
+        except Exception as error:  # no reason to leave the outputs open
+            said[node.name] = finding(WARNING, failure(error))
+    return said
+
+
+def lines(found: Mapping[str, Finding], severity: str) -> list[str]:
+    """The findings of this severity, a line each."""
+    return [f"{name}: {item['sentence']}" for name, item in found.items() if item["severity"] == severity]

@@ -1,0 +1,76 @@
+"""A log through a pipeline as one asks for it on the command line: files in, files out, a bar on the terminal.
+
+The rest of the runtime knows no paths of pipelines, no terminal and no libraries whose threads must be held back.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+
+def replay(
+    log: Path,
+    pipeline: str,
+    out: Path,
+    rrd: Path | None,
+    *,
+    overrides: Sequence[str] = (),
+    workers: int = 2,
+    start: float | None = None,
+    end: float | None = None,
+) -> dict[str, Any]:
+    """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary."""
+    import cv2
+    from threadpoolctl import threadpool_limits
+    from tqdm import tqdm
+
+    from flow import pipeline as pipelines
+    from flow.allocator import keep_freed_memory
+    from flow.run import Stop, interrupts, run
+
+    graph = pipelines.load(pipeline, overrides)
+    outputs = {}
+    for use, sink in graph.sinks:
+        path = {".mcap": out, ".rrd": rrd}.get(sink.suffix)
+        if path is not None:
+            outputs[use] = path
+    keep_freed_memory()
+    cv2.setNumThreads(1)  # frames in flight fill the cores, not threads inside one call
+    stop = Stop()
+    with graph.source.open(log, start=start, end=end) as opened, threadpool_limits(1):
+        about = {
+            "roverflow": product_version(),
+            "pipeline": graph.text,
+            "overrides": "\n".join(overrides),
+            "log": log.name,
+            **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
+        }
+        with tqdm(total=opened.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
+            drops = 0
+
+            def on_frame(whole: bool) -> None:
+                nonlocal drops
+                drops += not whole
+                bar.set_postfix(dropped=drops, refresh=False)
+                bar.update()
+
+            with interrupts(stop, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)):
+                summary = run(graph, opened, outputs, workers=workers, about=about, stop=stop, on_frame=on_frame)
+    return as_json(summary | {"overrides": list(overrides)})
+
+
+def as_json(summary: dict[str, Any]) -> dict[str, Any]:
+    """A run's summary without the ledger's entry objects; "ledger" has them as plain values."""
+    return {name: value for name, value in summary.items() if name != "entries"}
+
+
+def product_version() -> str:
+    """The version of the installed product."""
+    try:
+        return version("roverflow")
+    except PackageNotFoundError:
+        return "unknown"

@@ -1,0 +1,54 @@
+"""What a value of a pipeline file becomes as a parameter of a stage: of its type, in its unit, within its range."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import Field
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
+
+from flow.units import quantity
+
+
+def coerced(value: Any, kind: Any, parameter: Field[Any]) -> Any:
+    """`value` as a parameter of type `kind`; raises ValueError where it is none."""
+    if get_origin(kind) in (Union, UnionType):
+        options = get_args(kind)
+        if value is None and type(None) in options:
+            return None
+        several = [option for option in options if get_origin(option) is tuple]
+        one = [option for option in options if option not in (type(None), *several)]
+        return coerced(value, (several if isinstance(value, list) and several else one or several)[0], parameter)
+    if get_origin(kind) is tuple:
+        if not isinstance(value, list):
+            raise ValueError(f"expected a list, not {value!r}")
+        return tuple(coerced(item, get_args(kind)[0], parameter) for item in value)
+    if get_origin(kind) is not None or kind is Any:
+        return value
+    if kind in (int, float):
+        return _number(value, kind, parameter)
+    if not isinstance(value, kind):
+        raise ValueError(f"expected {kind.__name__}, not {value!r}")
+    return value
+
+
+def _number(value: Any, kind: type, parameter: Field[Any]) -> float | int:
+    unit = parameter.metadata.get("unit", "")
+    if isinstance(value, str):
+        value = quantity(value, unit)
+        if kind is int and float(value).is_integer():
+            value = int(value)
+    elif unit in ("ns",) and not isinstance(value, bool):
+        raise ValueError(f"{value!r} needs a unit, such as '{value} ms'")
+    if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
+        wanted = {"int": "a whole number", "float": "a number"}[kind.__name__]
+        raise ValueError(f"expected {wanted}{f' in {unit}' if unit else ''}, not {value!r}")
+    low, high = parameter.metadata.get("low"), parameter.metadata.get("high")
+    for wrong, wanted in (
+        (not math.isfinite(value), "finite"),
+        (low is not None and value < low, f"at least {low}"),
+        (high is not None and value > high, f"at most {high}"),
+    ):
+        if wrong:
+            raise ValueError(f"must be {wanted}{f' {unit}' if unit else ''}, not {value}")
+    return kind(value)  # type: ignore[no-any-return]

@@ -1,0 +1,40 @@
+"""What stages find in a run is said to the user and to the sinks, a warning last, where it is not missed."""
+
+from pathlib import Path
+
+from flow.report import report
+from flow.run import run
+from tests.flow.test_engine import graph, replayed, traverse
+from tests.flow.toys import Log
+
+
+def printed(folder, frames, capsys):
+    """The lines that a run of so many frames prints."""
+    pipeline = graph(folder)
+    ((use, _),) = pipeline.sinks
+    summary = run(pipeline, Log(traverse(frames)), {use: Path("unused")})
+    report(summary | {"outputs": []})
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_note_is_one_of_the_lines_and_a_warning_the_last(tmp_path, capsys):
+    assert printed(tmp_path, 5, capsys)[1:] == ["  total: the sum is 20.0"]
+    verdict, *more = printed(tmp_path, 6, capsys)
+    assert verdict.startswith("COMPLETE: 6 of 6 frames whole")
+    assert more == ["WARNING: total: the sum is 30.0"]
+
+
+def test_what_a_stage_found_is_said_at_the_end_to_the_user_and_to_the_sinks(tmp_path):
+    sink, summary = replayed(graph(tmp_path), traverse(5))
+    said = {"total": {"severity": "note", "sentence": "the sum is 20.0"}}
+    assert summary["findings"] == sink.summary["findings"] == said
+    warned = replayed(graph(tmp_path), traverse(6))[1]
+    assert warned["findings"] == {"total": {"severity": "warning", "sentence": "the sum is 30.0"}}
+    assert warned["verdict"] == "COMPLETE"  # for nothing was lost
+    assert replayed(graph(tmp_path), [])[1]["findings"] == {}
+
+
+def test_a_finding_that_breaks_down_costs_the_run_nothing(tmp_path):
+    _, summary = replayed(graph(tmp_path), traverse(4))
+    said = {"total": {"severity": "warning", "sentence": "RuntimeError: unlucky"}}
+    assert (summary["verdict"], summary["findings"]) == ("COMPLETE", said)

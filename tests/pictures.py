@@ -1,0 +1,102 @@
+"""The pictures of docs/terrain.md: `make pictures` draws them anew, of simulated traverses.
+
+terrain.jpg: for three frames the left image, the elevation, the navigation map by its reasons, and what was true of
+the cells that a pixel of both cameras hits. region.jpg: the regional map of a traverse, beside it its navigation map.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tifffile
+
+from flow.cli import main as roverflow
+from recordings import paint
+from recordings.simulator import Simulation
+from stages.data import Array, Cell, ElevationMap, Reason
+from tests.bench.terrain import frames, measured_tilt, through
+
+VIEWS = ((11, 0.05, 15), (12, 0.15, 0), (13, 0.15, 15))  # seed, rocks k, frame of 30: the first or the middle one
+SHOWN = (Reason.CLEAR, Reason.STEP, Reason.BESIDE, Reason.SLOPE, Reason.OCCLUDED, Reason.UNSURE, Reason.UNOBSERVED)
+WIDTH, HEIGHT = 440, 330  # px of each panel
+TRAVERSE = ("--frames", "40", "--seed", "12", "--rocks", "0.1")
+ZOOM = 2
+INK = (225, 225, 225)
+
+
+def main(folder: Path) -> None:
+    """Draw both into a folder."""
+    cv2.setNumThreads(1)
+    _write(folder / "terrain.jpg", terrain_picture())
+    _write(folder / "region.jpg", region_picture())
+
+
+def terrain_picture() -> Array:
+    """A row of panels for each of `VIEWS`, and the legend of the reasons, RGB."""
+    rows = []
+    for seed, abundance, number in VIEWS:
+        simulation = Simulation(
+            frames=30, seed=seed, abundance=abundance, slope=np.radians(5), tilt_noise=np.radians(0.3)
+        )
+        *_, (given, _, ground) = frames(simulation, number or simulation.frames)
+        stamp = given["stereo"].stamp
+        streams, _ = through("rover", given | {"tilt": measured_tilt("rover", simulation, stamp)})
+        terrain, navigation = streams["elevation_map"], streams["navigation_map"]
+        told = paint.legend_colours(navigation.reason, paint.REASONS)
+        true = paint.legend_colours(
+            np.select([~ground.seen, ground.rock >= 0.2, ground.hazard],
+                      [Reason.UNOBSERVED, Reason.STEP, Reason.SLOPE], Reason.CLEAR), paint.REASONS,
+        )  # fmt: skip
+        maps = [_ahead(grid, terrain) for grid in (paint.paint_elevation(terrain), told, true)]
+        rows.append(np.hstack([cv2.resize(given["stereo"].left, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), *maps]))
+    return np.vstack([*rows, _legend(rows[0].shape[1])])
+
+
+def region_picture() -> Array:
+    """The exported regional map and navigation map of a traverse, side by side, RGB."""
+    with tempfile.TemporaryDirectory() as place:
+        traverse, result, maps = (Path(place) / name for name in ("log.mcap", "out.mcap", "maps"))
+        for command in (("simulate", traverse, *TRAVERSE), ("run", traverse, "-o", result, "--no-rrd"),
+                        ("export", result, maps)):  # fmt: skip
+            if roverflow([str(word) for word in command]):
+                raise RuntimeError(f"roverflow {command[0]} failed")
+        elevation = tifffile.imread(maps / "elevation.tif")
+        gray = cv2.imread(str(maps / "navigation_map.pgm"), cv2.IMREAD_UNCHANGED)
+    terrain = ElevationMap(0, {"elevation": elevation[::-1].copy()}, 0.05, (0.0, 0.0), "odom")
+    cells = np.select([gray == 254, gray == 0], [Cell.FREE, Cell.HAZARD], Cell.UNKNOWN).astype(np.int8)
+    painted = np.hstack([paint.paint_elevation(terrain)[::-1], paint.legend_colours(cells, paint.CELLS)])
+    framed = cv2.copyMakeBorder(painted, 8, 8, 8, 8, cv2.BORDER_CONSTANT, value=paint.UNKNOWN_RGB)
+    return framed.repeat(ZOOM, 0).repeat(ZOOM, 1)
+
+
+def _ahead(painted: Array, terrain: ElevationMap) -> Array:
+    """A painted grid, from the rover's place on, as seen from above, in a panel."""
+    behind = round(-terrain.origin[0] / terrain.resolution)
+    view = paint.birds_eye(painted[:, behind:])
+    scale = HEIGHT / view.shape[0]
+    view = cv2.resize(view, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    left = (view.shape[1] - WIDTH) // 2
+    return np.ascontiguousarray(view[:, left : left + WIDTH])
+
+
+def _legend(width: int) -> Array:
+    line = np.full((40, width, 3), paint.UNKNOWN_RGB, np.uint8)
+    for place, reason in enumerate(SHOWN):
+        name, rgb = paint.REASONS[reason]
+        x = 16 + place * (width // len(SHOWN))
+        cv2.rectangle(line, (x, 10), (x + 20, 30), rgb, cv2.FILLED)
+        cv2.rectangle(line, (x, 10), (x + 20, 30), INK, 1)
+        cv2.putText(line, name, (x + 30, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.55, INK, 1, cv2.LINE_AA)
+    return line
+
+
+def _write(file: Path, picture: Array) -> None:
+    cv2.imwrite(str(file), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("docs"))

@@ -1,0 +1,70 @@
+"""The error of poses is that of the way they tell, wherever their frame of reference has its origin and heading."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recordings.pose_measures import PoseTally, format_pose
+from recordings.ros2 import odometry
+from stages.data import Pose
+
+
+def pose(place, heading=0.0, frame="odom", child="base_link"):
+    """A pose with some roll, as a message."""
+    turn = Rotation.from_euler("ZYX", [heading, 0.05, -0.1])
+    return odometry(Pose(0, place, turn.as_quat(), frame, child))
+
+
+def tallied(pairs):
+    tally = PoseTally()
+    for true, given in pairs:
+        tally.add(true, given)
+    return tally.measures()
+
+
+def test_poses_that_are_only_told_in_another_frame_have_no_error():
+    turn, shift = Rotation.from_euler("z", 1.1), np.array([5.0, -3.0, 2.0])
+    places = np.array([[0, 0, 0], [1, 0.2, 0.1], [2, 1, 0.3]], float)
+    found = tallied(
+        (pose(turn.apply(place) + shift, 1.1 + heading, "world"), pose(place, heading))
+        for place, heading in zip(places, (0.0, 0.3, 0.9), strict=True)
+    )
+    assert found["drift"] == pytest.approx(0, abs=1e-12)
+    assert found["heading"] == pytest.approx(0, abs=1e-12)
+    assert found["way"] == pytest.approx(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def test_the_drift_is_the_last_error_over_the_way_there_and_back():
+    found = tallied([
+        (pose([0, 0, 0]), pose([0, 0, 0])),
+        (pose([4, 0, 0]), pose([4.5, 0, 0], 0.2)),
+        (pose([0, 0, 0]), pose([0.04, 0.03, 0], -0.1)),
+    ])  # fmt: skip
+    assert found["drift"] == pytest.approx(0.05 / 8)
+    assert (found["largest"], found["heading"]) == (pytest.approx(0.5), pytest.approx(0.2))
+
+
+def test_each_part_begins_anew_and_adds_its_own_error_and_way():
+    found = tallied([
+        (pose([0, 0, 0]), pose([0, 0, 0], frame="visual_odom")),
+        (pose([1, 0, 0]), pose([1.02, 0, 0], frame="visual_odom")),
+        (pose([2, 0, 0]), None),
+        (pose([3, 0, 0]), pose([0, 0, 0], frame="visual_odom/2")),
+        (pose([6, 0, 0]), pose([2.94, 0, 0], frame="visual_odom/2")),
+    ])  # fmt: skip
+    assert found["drift"] == pytest.approx((0.02 + 0.06) / (1 + 3))
+    assert (found["parts"], found["frames"], found["missing"]) == (2, 4, 1)
+    first, second = format_pose(found)
+    assert "off by 2.00% of 4.00 m driven, 6.0 cm and 0.00 deg at most, in 2 parts that nothing joins" in first
+    assert "not scored in 1 frames: none is given" in second
+
+
+def test_a_pose_of_something_else_is_not_scored():
+    assert tallied([(pose([0, 0, 0]), None)]) is None
+    found = tallied([(pose([0, 0, 0]), pose([0, 0, 0], child="camera"))])
+    assert math.isnan(found["drift"])
+    assert format_pose(found) == ["pose         not scored in 1 frames: it is not base_link's, as the truth is"]

@@ -1,0 +1,76 @@
+"""A stage that remembers can be put down halfway and taken up by another: the results have the same bits."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+
+import stages
+from recordings.simulator import Simulation
+from recordings.simulator.log import true_disparity
+from stages import CheckTilt, Fuse, Level, Locate, Mount, Reproject, StereoFrame, Tilt, VisualOdometry
+from tests.stages.drive import Drive, motions
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    """Stage -> what each of some frames gives it."""
+    simulation, drive = Simulation(frames=FRAMES, width=320, height=240, relief_cells=512, seed=5), Drive(2, 6.0)
+    given = {VisualOdometry: [], Fuse: []}
+    left = simulation.mounts[0]
+    for index in range(FRAMES):
+        truth, stamp = simulation.frame(index), simulation.stamp(index)
+        frame = StereoFrame(stamp, *truth.images, simulation.camera)
+        disparity = replace(true_disparity(simulation, stamp, truth), camera=simulation.camera)
+        given[VisualOdometry].append((frame, disparity))
+        base, mount = simulation.base_at(stamp), Mount(stamp, left.rotation.T, left)
+        cloud = Level()(Reproject()(frame, disparity), Tilt(stamp, base.rotation[2]), mount)
+        given[Fuse].append((cloud, simulation.odometry[5 + 5 * index], mount))
+    moved = motions(drive.cameras(), drive.stamps())
+    tilts = [Tilt(motion.stamp, up) for motion, up in zip(moved, drive.ups(), strict=True)]
+    upright = [(motion, tilt, Mount(0, drive.mount)) for motion, tilt in zip(moved, tilts, strict=True)]
+    return given | {Locate: upright, CheckTilt: upright}
+
+
+def same(one, other):
+    """Whether two data, or what is in them, have the same bits."""
+    if is_dataclass(one):
+        return type(one) is type(other) and all(same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+    if hasattr(one, "items"):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple | list):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+    return one == other or (one != one and other != other)
+
+
+@pytest.mark.parametrize("kind", [VisualOdometry, Locate, CheckTilt, Fuse])
+def test_a_run_in_two_parts_is_the_whole_run(inputs, kind):
+    frames, whole, first, second = inputs[kind], kind(), kind(), kind()
+    half = len(frames) // 2 + 1
+    wanted = [whole(*given) for given in frames]
+    found = [first(*given) for given in frames[:half]]
+    kept = first.snapshot()
+    first(*frames[half])  # what the first does afterwards is no concern of the second
+    second.restore(kept)
+    found += [second(*given) for given in frames[half:]]
+    assert all(map(same, wanted, found))
+    if hasattr(whole, "finding"):
+        assert second.finding() == whole.finding()
+    afresh = kind()
+    assert not all(same(wanted[half + i], afresh(*given)) for i, given in enumerate(frames[half:]))
+
+
+def test_every_stage_that_remembers_is_tried_above():
+    remembering = {kind for name in stages.__all__ if getattr(kind := getattr(stages, name), "ordered", False)}
+    assert remembering == {VisualOdometry, Locate, CheckTilt, Fuse}
+
+
+def test_a_snapshot_of_another_stage_is_refused():
+    with pytest.raises(ValueError, match="a snapshot of Locate is not one of CheckTilt"):
+        CheckTilt().restore(Locate().snapshot())

@@ -1,0 +1,103 @@
+"""Scenes of a data set become logs on the command line, and are run and scored like others."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from flow.cli import main
+from tests.recordings.middlebury_scene import write_scene
+
+SMALL = ("--set", "disparities=64")
+
+
+def roverflow(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+MATCHING = """
+source: {use: recordings.McapSource}
+streams:
+  stereo: {use: flow.align.pair, left: left, right: right, slop: 5 ms}
+  disparity: {use: stages.Match, frame: stereo, disparities: 192}
+sinks: [{use: recordings.McapSink}]
+"""
+
+
+def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, capsys):
+    scene, log, out = write_scene(tmp_path / "Box"), tmp_path / "box.mcap", tmp_path / "out.mcap"
+    assert roverflow("import", "middlebury", scene, log) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1].endswith("run it with --set disparities=32")
+    assert roverflow("run", log, "--set", "disparities=32", "-o", out, "--no-rrd") == 0
+    (tmp_path / "matching.yaml").write_text(MATCHING)
+    matching = ("-p", tmp_path / "matching.yaml", "--set", "disparity.disparities=32")
+    assert roverflow("run", log, *matching, "-o", tmp_path / "matched.mcap", "--no-rrd") == 0
+    scores = []
+    for name in ("out", "matched"):
+        capsys.readouterr()
+        paths = tmp_path / f"{name}.mcap", tmp_path / f"{name}.json"
+        assert roverflow("score", paths[0], "--truth", log, "--json", paths[1]) == 0
+        table = capsys.readouterr().out
+        assert all(word in table for word in ("bad-0.5", "bad-4", "occluded", "without the leftmost 32 columns"))
+        assert "missing" not in table  # the maps, of which there is no truth
+        scores.append(json.loads(paths[1].read_text())["disparity"])
+    for score in scores:
+        assert score["whole_image"]["all"]["pixels"] == 96 * 64 - 28
+        assert score["cropped_image"]["leftmost_columns_cropped"] == [32]
+        assert score["cropped_image"]["nonocc"]["bad_1"] < 0.05
+    refined, matched = (score["whole_image"]["all"] for score in scores)
+    assert refined["density"] > matched["density"]
+
+
+def test_a_folder_of_scenes_becomes_a_log_each(tmp_path, capsys):
+    for name in ("Two", "One"):
+        write_scene(tmp_path / "trainingF" / name)
+    assert roverflow("import", "middlebury", tmp_path / "trainingF", tmp_path / "logs") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in said] == [str(tmp_path / "logs" / f"{name}.mcap") for name in ("One", "Two")]
+    assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["One.mcap", "Two.mcap"]
+    assert roverflow("import", "middlebury", tmp_path / "trainingF", tmp_path / "all.mcap") == 2
+    assert "give a folder for the logs" in capsys.readouterr().err
+
+
+def test_a_broken_scene_does_not_keep_the_others_from_being_imported(tmp_path, capsys):
+    for name in ("One", "Two", "Three"):
+        write_scene(tmp_path / "scenes" / name)
+    (tmp_path / "scenes" / "One" / "disp0GT.pfm").write_bytes(b"spoilt")
+    assert roverflow("import", "middlebury", tmp_path / "scenes", tmp_path / "logs") == 2
+    assert "1 of 3 scenes could not be imported" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["Three.mcap", "Two.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "out", "words"),
+    [
+        ("disp0GT.pfm", "out.mcap", "disp0GT.pfm is not a PFM file"),
+        ("calib.txt", "out.mcap", "calib.txt lacks 'cam0'"),
+        ("im1.png", "out.mcap", "im1.png is not an image"),
+        (None, "Box/im0.png", "is what is being read"),
+        (None, "Box", "is a folder or a device"),
+        (None, "Bex.png", "not the output of an earlier run"),
+    ],
+)
+def test_a_scene_that_cannot_be_imported_is_refused_in_one_sentence(tmp_path, capsys, spoilt, out, words):
+    scene = write_scene(tmp_path / "Box")
+    if out == "Bex.png":
+        (tmp_path / out).write_bytes(b"a picture")
+    before = (scene / "im0.png").read_bytes()
+    if spoilt:
+        (scene / spoilt).write_bytes(b"spoilt")
+    assert roverflow("import", "middlebury", scene, tmp_path / out) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert {path.name for path in tmp_path.iterdir()} - {"Bex.png"} == {"Box"}
+    assert (scene / "im0.png").read_bytes() == before
+
+
+def test_the_help_of_the_import_says_what_it_takes_for_granted(capsys):
+    with pytest.raises(SystemExit):
+        roverflow("import", "middlebury", "--help")
+    assert "it is taken to look level from 1 m" in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,121 @@
+"""What the command line refuses: one sentence that says what, where and what to do, before anything is written."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flow.cli import main
+from tests.conftest import rewrite
+
+ROOT = Path(__file__).parent.parent
+SMALL = ("--set", "disparities=64")
+
+
+def roverflow(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+def drop(*parts: str):
+    return lambda topic, index, data: None if any(part in topic for part in parts) else data
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (drop("/imu", "/truth"), "tilt"),
+        (drop("camera_info"), "CameraInfo"),
+        (drop("/right"), "one image topic only"),
+        (drop("/tf_static"), "tf_static"),
+        (drop("/"), "no messages"),
+    ],
+    ids=["no tilt", "no calibration", "one camera", "no mounting", "nothing"],
+)
+def test_a_log_that_lacks_something_is_refused_in_one_sentence(traverse, tmp_path, capsys, change, words):
+    log = rewrite(traverse, tmp_path / "lacking.mcap", change)
+    assert roverflow("run", log, "-o", tmp_path / "out.mcap") == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [log]
+
+
+@pytest.mark.parametrize("content", [b"", b"this is no log\n" * 100, b"\x89MCAP0\r\n"], ids=["empty", "text", "magic"])
+def test_a_file_that_is_no_log_is_refused_in_one_sentence(tmp_path, capsys, content):
+    log = tmp_path / "odd.mcap"
+    log.write_bytes(content)
+    for command in (("run", log), ("info", log)):
+        assert roverflow(*command) == 2
+        said = capsys.readouterr().err
+        assert "odd.mcap" in said
+        assert said.count("\n") == 1
+    assert roverflow("run", tmp_path / "nowhere.mcap") == 2
+
+
+@pytest.mark.parametrize("option", ["-o", "--rrd", "--summary"])
+def test_what_is_read_is_never_overwritten(traverse, tmp_path, capsys, option):
+    before = traverse.stat()
+    (tmp_path / "link").symlink_to(traverse)
+    for name in (traverse, tmp_path / "link"):
+        assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, name) == 2
+        assert "is what is being read" in capsys.readouterr().err
+    assert traverse.stat() == before
+
+
+@pytest.mark.parametrize("options", [("--rrd", "out.mcap"), ("--summary", "out.mcap")])
+def test_one_file_is_never_two_outputs(traverse, tmp_path, capsys, options):
+    assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", options[0], tmp_path / options[1]) == 2
+    assert "two outputs" in capsys.readouterr().err
+
+
+def test_a_device_is_never_replaced_by_a_file(traverse, tmp_path, capsys):
+    pipe = tmp_path / "pipe.mcap"
+    os.mkfifo(pipe)
+    assert roverflow("run", traverse, "-o", pipe) == 2
+    assert roverflow("simulate", pipe, "--frames", 1) == 2
+    assert "device" in capsys.readouterr().err
+    assert not pipe.is_file()
+
+
+def test_an_output_without_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys):
+    assert roverflow("run", traverse, *SMALL, "-o", tmp_path / "nowhere" / "out.mcap", "--no-rrd") == 2
+    assert "nowhere" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["-o", "--rrd", "--summary"])
+def test_an_output_that_is_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys, option):
+    (tmp_path / "taken").mkdir()
+    assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, tmp_path / "taken") == 2
+    assert "taken is a folder or a device" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+@pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "soon"])
+def test_an_odd_start_is_refused(traverse, seconds, capsys):
+    with pytest.raises(SystemExit) as caught:
+        roverflow("run", traverse, f"--start={seconds}")
+    assert caught.value.code == 2
+    assert "seconds after the log's first message" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--slope", "--tilt-noise", "--odometry-turn", "--rocks"])
+@pytest.mark.parametrize("value", ["-1", "nan", "steep"])
+def test_a_simulation_of_less_than_nothing_is_refused(tmp_path, option, value, capsys):
+    with pytest.raises(SystemExit) as caught:
+        roverflow("simulate", tmp_path / "log.mcap", option, value)
+    assert caught.value.code == 2
+    assert f"argument {option}: must be a number of at least 0, not '{value}'" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_output_is_said_in_a_sentence():
+    """A disk that is full where the drawing of a graph is sent to."""
+    code = "import sys; from flow.cli import main; sys.exit(main(['graph']))"
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    assert done.returncode == 2
+    assert done.stderr.startswith("roverflow: the output: No space left on device")
