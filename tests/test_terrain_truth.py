@@ -25,23 +25,23 @@ def test_the_tilt_is_as_far_off_as_its_pipeline_states(pipeline: str) -> None:
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(stated, rel=0.12)
 
 
-def check(found: dict[str, Run], alarms: float, known: float) -> None:
+def check(found: dict[str, Run], alarms: float, slack: float = 0.0) -> None:
     """What maps must be, on frames of any traverse: of `rover`, and of the same stages given true disparity and tilt.
 
-    alarms: how many of the truly safe cells may be called hazards, on ground of any slope to 15 degrees; known: how
-    many of the cells that a pixel of both cameras hits must have a value. The aim is 0.97, which is not reached.
+    alarms: how many of the truly safe cells may be called hazards, on ground of any slope to 15 degrees; slack: by how
+    much more the intervals may miss where the traverse has few tilts.
     """
     true, rover = (found[name].tally.measures() for name in ("rover, true disparity and tilt", "rover"))
     heights, intervals, rocks, hazards = (rover[name] for name in ("heights", "intervals", "rocks", "hazards"))
     assert true["heights"]["0-8 m"]["raw"]["rmse"] <= 0.01
     assert heights["0-4 m"]["levelled"]["rmse"] <= 0.02
     assert heights["4-8 m"]["levelled"]["rmse"] <= 0.04
-    assert heights["0-8 m"]["completeness"] >= known
+    assert heights["0-8 m"]["completeness"] >= 0.97
     assert heights["0-8 m"]["levelled"]["within_5cm"] >= 0.95
     assert rover["made_up"]["of_cells"] <= 0.01
     for interval in (intervals["random"], intervals["total"]):
-        assert 0.61 <= interval["1"] <= 0.75
-        assert 0.91 <= interval["2"] <= 0.99
+        assert abs(interval["1"] - 0.68) <= 0.07 + slack
+        assert abs(interval["2"] - 0.95) <= 0.04 + slack
     assert rocks["0.2 m"]["found"] >= 0.98 * rocks["0.2 m"]["in_view"]
     assert rocks["0.3 m"]["found"] == rocks["0.3 m"]["in_view"]
     assert hazards["free_on_rock"] <= 0.002
@@ -60,16 +60,16 @@ def traverse_of(seed: int, abundance: float) -> Simulation:
 
 
 def test_two_frames_have_maps_one_would_drive_on() -> None:
-    found = score([traverse_of(12, 0.15)], 15, COMPARED)
+    found = score([traverse_of(11, 0.15)], 15, COMPARED)
     assert found["rover"].tally.measures()["rocks"]["0.2 m"]["in_view"] >= 1
-    check(found, alarms=0.08, known=0.91)
+    check(found, alarms=0.08, slack=0.04)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("abundance", "alarms"), [(0.05, 0.03), (0.15, 0.08)])
 def test_three_traverses_have_maps_one_would_drive_on(abundance: float, alarms: float) -> None:
-    check(score([traverse_of(seed, abundance) for seed in (11, 12, 13)], 10, COMPARED), alarms, known=0.93)
+    check(score([traverse_of(seed, abundance) for seed in (11, 12, 13)], 10, COMPARED), alarms)
 
 
 @pytest.mark.slow
