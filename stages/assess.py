@@ -44,8 +44,9 @@ class Assess(Stage):
     - steepness, rad: of all that is no obstacle, under a wheel;
     - roughness, m: root mean square of the same off its plane under the footprint;
     - support: share of the cells within a wheel's reach that are known;
-    - drop, m: how far below the ground about it a hidden cell lies at least, by the line of sight that passes over it,
-      NaN in others; where the map says below what hidden cells lie (layer `ceiling`).
+    - drop, m: how far below the ground of the surroundings a hidden cell lies at least, by the line of sight that
+      passes over it, NaN in others; where the map says below what hidden cells lie (layer `ceiling`). The far wall of a
+      ditch would bend a narrower plane.
     """
 
     footprint: float = parameter(1.0, "width and length of the rover: the window of slope and roughness", unit="m",
@@ -67,7 +68,7 @@ class Assess(Stage):
         height = elevation.layers["elevation"].astype(np.float64)
         observed = np.isfinite(height)
         height = np.where(observed, height, 0.0)
-        ground, trend, slope = self._ground(height, observed, elevation.resolution)
+        ground, wide, trend, slope = self._ground(height, observed, elevation.resolution)
         step, support = self._step(elevation, height, observed, ground, trend)
         passable = observed & ~(step >= self.obstacle)
         steepness = fit_planes(height, passable, _cells(self.wheel, elevation.resolution), _WHEEL_LEVERAGE)
@@ -81,13 +82,13 @@ class Assess(Stage):
             "support": np.where(observed, support, np.nan),
         }
         if "ceiling" in elevation.layers:
-            layers["drop"] = np.where(observed, np.nan, ground - elevation.layers["ceiling"])
+            layers["drop"] = np.where(observed, np.nan, wide - elevation.layers["ceiling"])
         added = {name: layer.astype(np.float32) for name, layer in layers.items()}
         return replace(elevation, layers={**elevation.layers, **added})
 
-    def _ground(self, height: Array, observed: Array, resolution: float) -> tuple[Array, Array, Array]:
-        """Height of the ground at each cell, the slope (2, rows, cols) of its surroundings, rise per cell, and the
-        slope under the footprint, rad.
+    def _ground(self, height: Array, observed: Array, resolution: float) -> tuple[Array, Array, Array, Array]:
+        """Height of the ground at each cell, by the plane between the wheels and by that of the surroundings, the slope
+        (2, rows, cols) of the surroundings, rise per cell, and the slope under the footprint, rad.
 
         Where the plane between the wheels is not known (the middle of a large rock), the height is that of the
         surroundings' plane; where that is not known, a step is measured against the level.
@@ -107,7 +108,7 @@ class Assess(Stage):
         footprint = _cells(self.footprint, resolution)
         under = local if footprint == narrow else fit_planes(height, ground, footprint, _LEVERAGE)
         level = np.where(np.isfinite(local[0]), local[0], around[0])
-        return level, self._trend(around[1:3], resolution), _slope(under, resolution)
+        return level, around[0], self._trend(around[1:3], resolution), _slope(under, resolution)
 
     def _trend(self, slopes: Array, resolution: float) -> Array:
         """The slopes (2, rows, cols), rise per cell, cut to `steepest`; 0 where they are not known."""

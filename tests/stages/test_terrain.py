@@ -34,10 +34,10 @@ from tests.stages.terrain_scene import HEIGHT, ROCKS, UP, as_disparity, blank_fr
 
 
 def mapped(
-    frame: StereoFrame, disparity: Disparity, tilt: Tilt, camera_height: float
+    frame: StereoFrame, disparity: Disparity, tilt: Tilt, camera_height: float, reach: float = 0.0
 ) -> tuple[ElevationMap, NavigationMap]:
     cloud = Level(camera_height=camera_height)(Clean()(Reproject()(frame, disparity)), tilt, Mount(7, np.eye(3)))
-    elevation = Assess()(Voxelise()(cloud))
+    elevation = Assess()(Voxelise(reach=reach)(cloud))
     return elevation, Binarise()(elevation)
 
 
@@ -64,7 +64,7 @@ def profiled(profile: Callable[[Array], Array], seed: int = 1, **limits: float) 
     """Distance ahead (rows, cols), m, and the navigation map of ground with this profile, before a noisy camera."""
     exact = profile_disparity(profile)
     noisy = exact + np.random.default_rng(seed).normal(0, 0.1, exact.shape)
-    elevation, _ = mapped(blank_frame(), as_disparity(noisy), Tilt(7, UP), HEIGHT)
+    elevation, _ = mapped(blank_frame(), as_disparity(noisy), Tilt(7, UP), HEIGHT, reach=2.25)
     ahead = elevation.origin[0] + (np.arange(elevation.shape[1]) + 0.5) * elevation.resolution
     lane = np.abs(elevation.origin[1] + (np.arange(elevation.shape[0]) + 0.5) * elevation.resolution) < 0.8
     navigation = Binarise(**limits)(elevation)
