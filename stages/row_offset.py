@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.hamming import clear_partners
 
 FEATURES = 4000  # per image
 SMALLEST = 32  # px, side of an image that has any
@@ -182,13 +183,9 @@ def _paired_features(left: Array, right: Array) -> tuple[Array, Array]:
     (points, codes), (partners, partner_codes) = (detector.detectAndCompute(image, None) for image in (left, right))
     if len(points) < 2 or len(partners) < 2:
         return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
-    pairs = [
-        best
-        for best, second in cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(codes, partner_codes, 2)
-        if best.distance <= ALIKE and best.distance < DISTINCT * second.distance
-    ]
-    here = np.array([points[pair.queryIdx].pt for pair in pairs], np.float32).reshape(-1, 2)
-    there = np.array([partners[pair.trainIdx].pt for pair in pairs], np.float32).reshape(-1, 2)
+    left_places, right_places = (np.array([point.pt for point in found], np.float32) for found in (points, partners))
+    chosen, matched = clear_partners(codes, partner_codes, ALIKE, DISTINCT)
+    here, there = left_places[chosen], right_places[matched]
     within = np.abs(here[:, 1] - there[:, 1]) <= REACH
     return here[within], there[within]
 
