@@ -111,14 +111,15 @@ def run(
     stages survey it `excerpts` (see flow.survey). Of a stage that has a `finding`, a sentence, it is read at the end.
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
-    closed and readable by then.
+    closed and readable by then. In the summary, start_seconds are those of wall_seconds that the survey and the opening
+    of the outputs took, before the first frame.
     """
     try:
         graph = graph.without(log.missing)
     except PipelineError as error:
         raise UsageError(str(error)) from None
     stop, ledger = stop or Stop(), Ledger()
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall, cpu, started = time.perf_counter(), time.process_time(), 0.0
     surveys = dict[str, str]()
     with suppress(_StoppedError):
         graph, surveys = surveyed(graph, lambda *which: (_events(part, stop) for part in log.excerpts(*which)))
@@ -130,6 +131,7 @@ def run(
     try:
         if sinks.open(streams, {**(about or {}), "surveys": "\n".join(map(": ".join, surveys.items()))}):
             engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
+            started = time.perf_counter() - wall
             try:
                 finished = _feed(feeder, log, engine, stop)
             finally:
@@ -138,7 +140,10 @@ def run(
                 engine.finish(stop.abandoning)
             sinks.errors += [engine.failure] if engine.failure else []
     finally:
-        times = {"wall_seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+        times = {
+            "wall_seconds": time.perf_counter() - wall, "start_seconds": started,
+            "cpu_seconds": time.process_time() - cpu,
+        }  # fmt: skip
         whole = finished and not sinks.errors and not stop.finishing() and not len(ledger)
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
