@@ -119,7 +119,7 @@ def run(
     except PipelineError as error:
         raise UsageError(str(error)) from None
     stop, ledger = stop or Stop(), Ledger()
-    wall, cpu, started = time.perf_counter(), time.process_time(), 0.0
+    wall, cpu = time.perf_counter(), time.process_time()
     surveys = dict[str, str]()
     with suppress(_StoppedError):
         graph, surveys = surveyed(graph, lambda *which: (_events(part, stop) for part in log.excerpts(*which)))
@@ -128,11 +128,12 @@ def run(
     wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
     sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
     feeder, engine, finished = Feeder(graph, ledger), None, False
+    started = 0.0
     try:
         if sinks.open(streams, {**(about or {}), "surveys": "\n".join(map(": ".join, surveys.items()))}):
             engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
-            started = time.perf_counter() - wall
             try:
+                started = time.perf_counter() - wall
                 finished = _feed(feeder, log, engine, stop)
             finally:
                 if not finished:
