@@ -12,8 +12,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from mcap.writer import CompressionType, Writer
+
 from recordings.errors import LogError
-from recordings.mcap_writer import McapWriter
 from recordings.ros2_types import TYPES
 from recordings.whole_file import give_name, temporary_name, unwritable
 
@@ -37,7 +38,8 @@ class Ros2Writer:
             self._file = self._partial.open("wb")
         except OSError as error:
             raise self._unwritable(error) from error
-        self._writer = McapWriter(self._file, profile, library="roverflow")
+        self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=CompressionType.ZSTD)
+        self._writer.start(profile=profile, library="roverflow")
 
     @property
     def closed(self) -> bool:
@@ -55,17 +57,18 @@ class Ros2Writer:
             count = self._counts[topic] = self._counts.get(topic, 0) + 1
             large = len(data) >= LARGE
             if large:
-                self._writer.end_chunk()
-            self._writer.message(channel, count, stamp, data)
+                self._writer.flush()
+            self._writer.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=count)
             if large:
-                self._writer.end_chunk()
+                self._writer.flush()
         except OSError as error:
             raise self._unwritable(error) from error
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append one metadata record, its keys in sorted order."""
         try:
-            self._writer.metadata(name, dict(sorted(values.items())))
+            self._writer.flush()
+            self._writer.add_metadata(name, dict(sorted(values.items())))
         except OSError as error:
             raise self._unwritable(error) from error
 
@@ -103,8 +106,8 @@ class Ros2Writer:
         if topic not in self._channels:
             if kind not in self._schemas:
                 text, _ = TYPES.generate_msgdef(kind, ros_version=2)
-                self._schemas[kind] = self._writer.schema(kind, "ros2msg", text.encode())
-            self._channels[topic] = self._writer.channel(topic, "cdr", self._schemas[kind]), kind
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind]), kind
         channel, have = self._channels[topic]
         if have != kind:
             raise ValueError(f"topic {topic} holds {have}, so {kind} cannot be written to it")
