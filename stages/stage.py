@@ -40,3 +40,10 @@ class Stage:
             if (low is not None and not value >= low) or (high is not None and not value <= high):
                 bounds = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
                 raise ValueError(f"{where} must be {bounds}{f' {unit}' if unit else ''}, not {value}")
+
+
+def check_same_time(stage: Stage, **stamps: int) -> None:
+    """Refuse data that are not of one time; stamps: by the name of the port."""
+    if len(set(stamps.values())) > 1:
+        found = ", ".join(f"{name} of {stamp} ns" for name, stamp in stamps.items())
+        raise ValueError(f"{type(stage).__name__}: {found}: join data that were made from one frame")

@@ -128,7 +128,7 @@ VARIANTS: dict[str, Chain] = {
     "rover without surfaces": refined("checked", surface=0),
     "rover, planes replace matches": refined("checked", near=1000, plane_weight=1, inlier_share=0),
     "rover, holes filled by WLS": refined("checked", fill="wls"),
-    "rover, bilateral radius 6": refined("checked", bilateral_radius=6, bilateral_space=4.0),
+    "rover, bilateral radius 6": refined("checked", bilateral_radius=6),
     "rover, 64 planes tried": refined("checked", hypotheses=64),
     "rover with 8 paths": eight,
     "rover, matched once more": twice,
