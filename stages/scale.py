@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 
-from stages.data import Array, Disparity, StereoCamera, StereoFrame
-from stages.kernels.doubling import doubled
+from stages.data import Disparity, StereoCamera, StereoFrame
+from stages.kernels.scaling import doubled, halved
 from stages.match import SMALLEST_SIDE
 from stages.stage import Stage, check_same_time, parameter
 
@@ -24,7 +24,7 @@ class Halve(Stage):
         if frame.camera.raw is not None:
             raise ValueError("Halve: the frame is not rectified; put stages.Rectify before stages.Halve")
         full_height, full_width = frame.left.shape[:2]
-        left, right = _halved(frame.left), _halved(frame.right)
+        left, right = halved(frame.left), halved(frame.right)
         height, width = left.shape[:2]
         if min(height, width) < SMALLEST_SIDE:
             raise ValueError(
@@ -78,11 +78,3 @@ class Swap(Stage):
         last = camera.width - 1
         mirrored = replace(camera, cx=last - camera.cx_right, cx_right=last - camera.cx)
         return StereoFrame(frame.stamp, cv2.flip(frame.right, 1), cv2.flip(frame.left, 1), mirrored)
-
-
-def _halved(image: Array) -> Array:
-    height, width = image.shape[:2]
-    if height % 2 or width % 2:
-        image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-    half: Array = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return half

@@ -291,6 +291,18 @@ def _along_row(left, right, before, after, value):  # type: ignore[no-untyped-de
     return right if abs(right - value) < F32(APART) else value
 
 
+def extent_reference(disparity: Array) -> Extent:
+    """`extent` in plain numpy."""
+    known = np.isfinite(disparity)
+    height, width = known.shape
+    rows, columns = known.any(axis=1), known.any(axis=0)
+    last = width - 1 - known[:, ::-1].argmax(axis=1)
+    return Extent(
+        np.where(columns, known.argmax(axis=0), height), np.where(rows, known.argmax(axis=1), 4 * width),
+        np.where(rows, last, -4 * width),
+    )  # fmt: skip
+
+
 def fill_holes_reference(
     disparity: Array, image: Array, within: Extent, reach: float, margin: float
 ) -> tuple[Array, Array]:
