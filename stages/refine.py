@@ -68,7 +68,7 @@ class Refine(Stage):
         0.6, "least share of matched pixels for a plane to be accepted, in a surface half of it", low=0, high=1
     )
     slope: float = parameter(0.5, "steepest disparity gradient of an accepted plane", unit="px/px", low=0)
-    plane_weight: float = parameter(0.7, "weight of the plane against a match near to it", low=0, high=1)
+    plane_weight: float = parameter(0.5, "weight of the plane against a match near to it", low=0, high=1)
     plane_fill: bool = parameter(True, "whether an accepted plane also fills the holes of its segment")
     fill: str = parameter("background", "how the other holes are filled", choices=("background", "wls", "none"))
     fill_reach: float = parameter(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recordings.simulator import Simulation
 from stages.data import Disparity, Source, StereoCamera, StereoFrame
 from stages.match import Match
 from stages.refine import Refine
@@ -180,10 +181,11 @@ def bits(disparity):
     return [getattr(disparity, field).tobytes() for field in FIELDS]
 
 
-@pytest.mark.parametrize("parameters", [{"surface": 0, "superpixels": 200}, {"surface": 8, "superpixels": 40}])
+@pytest.mark.parametrize("parameters", [{"surface": 0, "superpixels": 200}, {"superpixels": 40, "valid_share": 0.95}])
 def test_the_stamp_decides_every_bit(box, parameters):
     frame, matches, _ = box
-    refine = Refine(smallest=1, hypotheses=1, **parameters)  # of one draw nothing else is found as well
+    # Of one draw another seed makes another plane; so sure of matches, only those of surfaces are accepted.
+    refine = Refine(smallest=1, hypotheses=1, **parameters)
     again, other = (refine(replace(frame, stamp=n), replace(matches, stamp=n)) for n in (5, 6))
     first = refine(frame, matches)
     assert bits(again) == bits(first)
@@ -240,24 +242,73 @@ def test_the_bilateral_filter_takes_noise_and_leaves_the_step(box):
     assert error.max() < 1
 
 
-def test_a_plane_counts_matches_by_their_confidence():
+# No superpixel with a hole has a plane then, a surface may have: half of it is to be matched.
+SURFACES_ONLY = {"superpixels": 1, "smallest": 1, "surface": 1, "valid_share": 1.0}
+
+
+@pytest.mark.parametrize("parameters", [{**SURFACES_ONLY, "surface": 0, "valid_share": 0.6}, SURFACES_ONLY])
+def test_a_plane_counts_matches_by_their_confidence(parameters):
     frame, pixels, source, confidence = flat_scene()
     doubted = np.random.default_rng(4).random(SHAPE) < 0.5
     pixels[doubted], confidence[doubted] = 8.4, 0.5
     hole = np.s_[50:55, 70:75]
     pixels[hole], source[hole], confidence[hole] = np.nan, 0, 0
-    refine = Refine(superpixels=1, smallest=1, surface=0, median=0, bilateral_radius=0)
+    refine = Refine(median=0, bilateral_radius=0, **parameters)
     filled = refine(frame, Disparity(5, pixels, source, confidence))
     half = doubted[np.isfinite(pixels)].mean()
     mean = (8 * (1 - half) + 8.4 * half * 0.5) / (1 - half + half * 0.5)
     assert filled.pixels[hole] == pytest.approx(mean, abs=0.01)
 
 
+def test_a_surface_draws_half_as_far_as_a_superpixel_and_what_it_agrees_with_is_worth_more():
+    frame, pixels, source, confidence = flat_scene()
+    pixels[60, 80], pixels[60, 90] = 8.4, 8.7
+    pixels[30, 30], source[30, 30] = np.nan, 0
+    matches = Disparity(5, pixels, source, confidence)
+    drawn = Refine(median=0, bilateral_radius=0, plane_weight=1, near=1, **SURFACES_ONLY)(frame, matches)
+    assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
+    assert drawn.pixels[60, 90] == np.float32(8.7)
+    assert drawn.confidence[60, 70] > drawn.confidence[60, 90] > 0.9
+    assert (drawn.source[60, 70], drawn.source[60, 90]) == (Source.MEASURED, Source.MEASURED)
+
+
+def test_what_a_superpixel_filled_is_no_evidence_for_a_surface():
+    frame, pixels, source, confidence = flat_scene()
+    holes = np.random.default_rng(6).random(SHAPE) < 0.3
+    holes[:, 60:] = True  # the rest is three eighths of the image, and matched by seven tenths
+    pixels[holes], source[holes] = np.nan, 0
+    refine = Refine(superpixels=48, smallest=1, surface=48, fill="none", bilateral_radius=0)
+    filled = refine(frame, Disparity(5, pixels, source, confidence))
+    assert np.isfinite(filled.pixels[:, :59]).mean() > 0.95
+    assert np.isnan(filled.pixels[:, 62:]).all()
+
+
+def test_a_match_moves_to_its_median_where_that_is_near():
+    frame, pixels, source, confidence = flat_scene()
+    pixels[60, 80], pixels[60, 100] = 8.9, 11
+    bare = {"plane_weight": 0, "surface": 0, "bilateral_radius": 0}
+    moved = Refine(median=5, near=1, **bare)(frame, Disparity(5, pixels, source, confidence))
+    assert (moved.pixels[60, 80], moved.pixels[60, 100]) == (8, 11)
+
+
+def test_wls_counts_matches_by_their_confidence():
+    frame, pixels, source, confidence = flat_scene()
+    hole = np.s_[1:, 70:90]
+    pixels[hole], source[hole], confidence[hole] = np.nan, 0, 0
+    pixels[:, 90:], confidence[:, 90:] = 9, 0.5
+    doubted = Refine(fill="wls", plane_weight=0, plane_fill=False, surface=0, median=0, bilateral_radius=0)
+    middle = doubted(frame, Disparity(5, pixels, source, confidence)).pixels[60, 79:81]
+    equal = np.where(confidence > 0, np.float32(1), np.float32(0))
+    halfway = doubted(frame, Disparity(5, pixels, source, equal)).pixels[60, 79:81]
+    assert halfway == pytest.approx(8.5, abs=0.05)
+    assert (middle < halfway - 0.1).all()
+
+
 def test_wls_fills_no_farther_than_evidence_reaches():
     frame, pixels, source, confidence = flat_scene()
     hole = np.s_[30:, 60:150]
     pixels[hole], source[hole] = np.nan, 0
-    pixels[:20], source[:20] = np.nan, 0
+    pixels[:20, 10:150], source[:20, 10:150] = np.nan, 0
     refine = Refine(fill="wls", fill_reach=20, fill_margin=6, plane_fill=False, bilateral_radius=0)
     known = np.isfinite(refine(frame, Disparity(5, pixels, source, confidence)).pixels)
     row = known[70].nonzero()[0]
@@ -320,6 +371,25 @@ def test_on_real_scenes_rover_beats_paper_matching_alone_and_the_released_code()
     assert (fast[:3] <= [0.76, 0.70, 0.63] * released.mean(axis=0)[:3]).all()
     assert (np.array(scores)[:, 3, :7] < released).all()  # no scene worse in any column
     assert rover[7] > 99
+
+
+def test_confidence_is_the_share_that_is_right_on_a_frame_it_was_not_fitted_to():
+    stated, right = [], []
+    for seed, abundance in ((21, 0.08), (22, 0.18)):
+        simulation = Simulation(frames=2, width=480, height=360, seed=seed, abundance=abundance)
+        camera, found = simulation.camera, simulation.frame(1)
+        truth = camera.fx * camera.baseline / found.depth
+        frame = StereoFrame(seed, *found.images, camera)
+        refined = stereo_part("rover", frame, 72, entry="rectified")["disparity"]
+        scored = np.isfinite(refined.pixels) & (truth > 0) & (truth < 70)
+        stated.append(refined.confidence[scored])
+        right.append(np.abs(refined.pixels - truth)[scored] <= 1)
+    claimed, found_right = np.concatenate(stated), np.concatenate(right)
+    for low, high, tolerance in ((0.5, 0.8, 0.2), (0.8, 0.95, 0.1), (0.95, 1.01, 0.02)):
+        within = (claimed >= low) & (claimed < high)
+        assert within.sum() > 1000
+        assert found_right[within].mean() == pytest.approx(claimed[within].mean(), abs=tolerance)
+    assert found_right.mean() == pytest.approx(claimed.mean(), abs=0.03)
 
 
 @pytest.mark.slow
