@@ -15,7 +15,8 @@ import numpy as np
 from stages.data import Array, Disparity, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.bilateral import joint_bilateral
-from stages.kernels.holes import OCCLUSION, Extent, extent, fill_holes, within_reach
+from stages.kernels.extent import Extent, extent, within_reach
+from stages.kernels.holes import OCCLUSION, fill_holes
 from stages.kernels.planar import near_median, pull_to_planes, trusted_matches
 from stages.kernels.planes import Planes, fit_planes
 from stages.kernels.slic import superpixels

@@ -8,13 +8,12 @@ tells occlusions from mismatches: with that disparity the right camera would see
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import cv2
 import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
+from stages.kernels.extent import Extent
 from stages.kernels.halves import pairs
 
 F32 = np.float32
@@ -33,23 +32,6 @@ LENGTHS = np.hypot(*RAYS.T).astype(np.float32)
 WORTH = np.where(RAYS[:, 0] == 0, F32(ROW), F32(1))
 NOTHING = F32(np.inf)
 BYTE, EIGHT, SIXTEEN = np.uint32(255), np.uint32(8), np.uint32(16)
-
-
-class Extent(NamedTuple):
-    """How far the evidence reaches, of a disparity image (H, W). Where there is none, first > last, top = H."""
-
-    top: Array  # (W,) int64, the uppermost row in which a column is known
-    first: Array  # (H,) int64, the first column in which a row is known
-    last: Array  # (H,) int64, the last one
-
-
-def extent(disparity: Array) -> Extent:
-    """How far what is known reaches. disparity: (H, W) float32, NaN = unknown."""
-    height, width = disparity.shape
-    found = Extent(np.full(width, height, np.int64), np.full(height, 4 * width, np.int64), np.full(height, -4 * width))
-    _find_top(disparity, found.top)
-    _find_ends(disparity, found.first, found.last)
-    return found
 
 
 def fill_holes(
@@ -87,50 +69,11 @@ def fill_holes(
     return filled, kinds
 
 
-def within_reach(disparity: Array, within: Extent, reach: float, margin: float) -> Array:
-    """Where a pixel is known at most `reach` px away, and `margin` px beyond the evidence at the most, (H, W) bool."""
-    row, column = np.arange(disparity.shape[0])[:, np.newaxis], np.arange(disparity.shape[1])
-    near: Array = cv2.distanceTransform(np.isnan(disparity).astype(np.uint8), cv2.DIST_L2, 5) <= reach
-    near &= (row >= within.top - margin) & (column >= within.first[:, np.newaxis] - margin)
-    near &= column <= within.last[:, np.newaxis] + margin
-    return near
-
-
 def _packed(image: Array) -> Array:
     """The colours of a gray or RGB image, (H, W) uint32: a byte each."""
     form = cv2.COLOR_GRAY2RGBA if image.ndim == 2 else cv2.COLOR_RGB2RGBA
     packed: Array = cv2.cvtColor(image, form).view(np.uint32)[..., 0]
     return packed
-
-
-@kernel
-def _find_top(disparity, top):  # type: ignore[no-untyped-def]
-    missing = top.size
-    for y in range(disparity.shape[0]):
-        if missing == 0:
-            break
-        for x in range(top.size):
-            d = disparity[y, x]
-            if d == d and y < top[x]:
-                top[x] = y
-                missing -= 1
-
-
-@kernel
-def _find_ends(disparity, first, last):  # type: ignore[no-untyped-def]
-    width = disparity.shape[1]
-    for y in range(disparity.shape[0]):
-        row = disparity[y]
-        x = 0
-        while x < width and row[x] != row[x]:
-            x += 1
-        if x == width:
-            continue
-        first[y] = x
-        x = width - 1
-        while row[x] != row[x]:
-            x -= 1
-        last[y] = x
 
 
 @kernel
@@ -289,18 +232,6 @@ def _along_row(left, right, before, after, value):  # type: ignore[no-untyped-de
     if abs(left - value) < F32(APART):
         return left
     return right if abs(right - value) < F32(APART) else value
-
-
-def extent_reference(disparity: Array) -> Extent:
-    """`extent` in plain numpy."""
-    known = np.isfinite(disparity)
-    height, width = known.shape
-    rows, columns = known.any(axis=1), known.any(axis=0)
-    last = width - 1 - known[:, ::-1].argmax(axis=1)
-    return Extent(
-        np.where(columns, known.argmax(axis=0), height), np.where(rows, known.argmax(axis=1), 4 * width),
-        np.where(rows, last, -4 * width),
-    )  # fmt: skip
 
 
 def fill_holes_reference(

@@ -10,8 +10,9 @@ import numpy as np
 
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
+from stages.kernels.extent import Extent
 from stages.kernels.halves import pairs
-from stages.kernels.holes import APART, Extent
+from stages.kernels.holes import APART
 
 F32 = np.float32
 MEASURED = int(Source.MEASURED)

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.holes import extent
+from stages.kernels.extent import extent
 from stages.kernels.planar import (
     near_median,
     near_median_reference,
