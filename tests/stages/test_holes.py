@@ -55,8 +55,10 @@ def test_what_an_object_hides_goes_on_behind_it(box):
     assert (kinds == KEPT).all()
 
 
-def test_a_hole_that_both_cameras_see_is_a_mismatch_and_parts_where_the_image_does(box):
+@pytest.mark.parametrize("bright", [BRIGHT, DARK + 45])  # behind an edge, or only less like
+def test_a_hole_that_both_cameras_see_is_a_mismatch_and_parts_where_the_image_does(box, bright):
     disparity, image = box
+    image[image == BRIGHT] = bright
     truth = disparity.copy()
     hole = np.s_[30:50, 70:90]  # across the box's right edge
     disparity[hole] = np.nan

@@ -29,8 +29,9 @@ def test_a_halved_frame_sees_the_same_depth():
     frame, truth = slope_frame()
     small = Halve()(frame)
     assert small.left.shape == (49, 66)
+    camera = small.camera  # pixel 0 of the half lies between 0 and 1 of the whole
+    assert (camera.fx, camera.cx, camera.cy, camera.cx_right) == (100, 29.75, 24.75, 31.25)
     disparity = Match(disparities=16, speckle_size=0)(small)
-    camera = small.camera
     depth = camera.fx * camera.baseline / (disparity.pixels + camera.cx_right - camera.cx)
     full = frame.camera
     expected = full.fx * full.baseline / (truth[:96:2, :130:2] + 0.05 + full.cx_right - full.cx)
