@@ -112,7 +112,8 @@ def run(
     stages survey it `excerpts` (see flow.survey). What stages found is asked at the end (see flow.findings).
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
-    closed and readable by then.
+    closed and readable by then. In the summary, start_seconds are those of wall_seconds that the survey and the opening
+    of the outputs took, before the first frame.
     """
     try:
         graph = graph.without(log.missing)
@@ -128,11 +129,13 @@ def run(
     wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
     sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
     feeder, engine, finished = Feeder(graph, ledger), None, False
+    started = 0.0
     try:
         said = "\n".join(f"{name}: {found['sentence']}" for name, found in surveys.items())
         if sinks.open(streams, {**(about or {}), "surveys": said}):
             engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
             try:
+                started = time.perf_counter() - wall
                 finished = _feed(feeder, log, engine, stop)
             finally:
                 if not finished:
@@ -140,7 +143,10 @@ def run(
                 engine.finish(stop.abandoning)
             sinks.errors += [engine.failure] if engine.failure else []
     finally:
-        times = {"wall_seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+        times = {
+            "wall_seconds": time.perf_counter() - wall, "start_seconds": started,
+            "cpu_seconds": time.process_time() - cpu,
+        }  # fmt: skip
         whole = finished and not sinks.errors and not stop.finishing() and not len(ledger)
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),

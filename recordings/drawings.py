@@ -6,7 +6,7 @@ frame lacks in that frame's time step, so the viewer never shows the last frame'
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,7 @@ import rerun as rr
 
 from recordings import paint
 from recordings.desk import LEDGER, Panel, Place
+from recordings.rvl import MEDIA_TYPE, rvl
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -64,6 +65,7 @@ def draws(*kinds: type) -> Callable[[Draw], Draw]:
 class Canvas:
     """Where pictures go: one recording, whose clocks stand at one frame.
 
+    What frames have in common, as a legend, is logged where it changes only (`keep`): that saves half of all the calls.
     hung: every place that ever had a picture, in the order of hanging; the desk is made from it; camera: of the first
     frame, by which a pair at half size, say, is told from the pair itself.
     """
@@ -74,6 +76,8 @@ class Canvas:
     hung: dict[tuple[Panel, str], Place] = field(default_factory=dict)
     camera: StereoCamera | None = None
     _said: dict[str, str] = field(default_factory=dict)
+    _sizes: dict[str, tuple[int, ...]] = field(default_factory=dict)  # of depth images
+    _kept: dict[str, Hashable] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
 
@@ -84,11 +88,30 @@ class Canvas:
         for place in places:
             self.hung.setdefault((place.panel, place.path), place)
 
+    def keep(self, path: str, content: Hashable, draw: Callable[[], Any]) -> None:
+        """Log what `draw()` makes, unless it hangs there since the frame before and has the same `content`."""
+        if path in self._before and self._kept.get(path) == content:
+            self._now[path] = self._before[path]
+        else:
+            self._kept[path] = content
+            self.log(path, draw())
+
     def say(self, path: str, text: str, level: rr.TextLogLevel) -> None:
         """A line in the ledger, where it is not what `path` said last."""
         if self._said.get(path) != text:
             self._said[path] = text
             self.recording.log(f"{LEDGER}/{path}", rr.TextLog(text, level=level))
+
+    def depth(self, path: str, steps: Array, meter: float, limit: float, place: Place) -> None:
+        """An image (H, W) uint16, 0 = unknown, coloured from 0 to `limit`, `meter` of which are 1 on hover."""
+        if path not in self._sizes:
+            # The viewer asks before the first frame what the images are packed in, and then takes no other answer.
+            packed = rr.EncodedDepthImage.from_fields(media_type=MEDIA_TYPE)
+            self.recording.log(path, packed, static=True)
+        self._sizes[path] = steps.shape
+        turbo = rr.components.Colormap.Turbo
+        image = rr.EncodedDepthImage(rvl(steps), meter=meter, colormap=turbo, depth_range=(0.0, limit))
+        self.log(path, image, place)
 
     def photograph(self, path: str, pixels: Array, place: Place) -> None:
         """An image (H, W) gray or (H, W, 3) RGB, 8 or 16 bit, as JPEG."""
@@ -99,8 +122,10 @@ class Canvas:
 
     def labels(self, path: str, codes: Array, legend: Mapping[int, tuple[str, paint.Rgb]], place: Place) -> None:
         """A label image (H, W); its names stand above it and appear on hover."""
-        names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
-        self.recording.log(path, rr.AnnotationContext(names), static=True)
+        if self._said.get(path) != str(legend):
+            self._said[path] = str(legend)
+            names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
+            self.recording.log(path, rr.AnnotationContext(names), static=True)
         self.log(f"{path}/labels", rr.SegmentationImage(codes.astype(np.uint8)), place)
         self.legend(f"{path}/legend", codes.shape, legend.values())
 
@@ -114,22 +139,25 @@ class Canvas:
     def legend(self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, paint.Rgb]]) -> None:
         """Named dots above a picture of (H, W)."""
         height, width = shape
-        names, colours = zip(*entries, strict=True)
+        content = shape, *entries
+        names, colours = zip(*content[1:], strict=True)
         dots = [((place + 0.5) * width / len(names), -0.14 * height) for place in range(len(names))]
+        round_dot, pin = rr.Radius.ui_points(5.0), rr.Radius.ui_points(0.5)
+        self.keep(path, content, lambda: rr.Points2D(dots, colors=colours, radii=round_dot, draw_order=30.0))
         # A label takes its dot's colour, which may be as dark as the desk: the text hangs on dots of its own.
-        self.log(path, rr.Points2D(dots, colors=colours, radii=rr.Radius.ui_points(5.0), draw_order=30.0))
-        pin = rr.Radius.ui_points(0.5)
-        texts = rr.Points2D(dots, colors=[TEXT], labels=names, show_labels=True, radii=pin, draw_order=31.0)
-        self.log(f"{path}/text", texts)
+        texts: dict[str, Any] = {"labels": names, "show_labels": True, "radii": pin, "draw_order": 31.0}
+        self.keep(f"{path}/text", content, lambda: rr.Points2D(dots, colors=[TEXT], **texts))
 
     def clear_the_rest(self) -> None:
         """Take down what hung in the frame before and was not drawn again."""
         for path, kind in self._before.items():
             if path in self._now:
                 continue
-            if issubclass(kind, rr.EncodedImage | rr.EncodedDepthImage):
-                # Cleared, it would go on being shown (rerun-io/rerun#12793); without bytes it is not.
+            # Cleared, an encoded image would go on being shown (rerun-io/rerun#12793).
+            if issubclass(kind, rr.EncodedImage):  # without bytes it is not
                 self.recording.log(path, kind.from_fields(clear_unset=True))
+            elif issubclass(kind, rr.EncodedDepthImage):  # of which nothing is known
+                self.recording.log(path, rr.EncodedDepthImage(rvl(np.zeros(self._sizes[path], np.uint16))))
             else:
                 self.recording.log(path, rr.Clear(recursive=False))
         self._before, self._now = self._now, {}
@@ -155,15 +183,11 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     """The disparities (hover reads them in px), where each comes from, and the superpixels' edges."""
     steps = np.minimum(np.fmax(disparity.pixels * np.float32(DISPARITY_STEPS) + np.float32(0.5), 0), 65535)
     steps = steps.astype(np.uint16)  # of NaN, fmax has made 0
-    _, blob = cv2.imencode(".png", steps, FAST_PNG)
     limit = paint.disparity_limit(disparity.pixels)
-    image = rr.EncodedDepthImage(
-        blob.tobytes(), media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
-        depth_range=(0.0, limit * DISPARITY_STEPS),
-    )  # fmt: skip
-    canvas.log(f"{path}/pixels", image, Place(Panel.DISPARITY, f"{path}/pixels", path))
+    place = Place(Panel.DISPARITY, f"{path}/pixels", path)
+    canvas.depth(place.path, steps, DISPARITY_STEPS, limit * DISPARITY_STEPS, place)
     canvas.scale(f"{path}/pixels/scale", steps.shape, 0.0, limit, "px", cv2.COLORMAP_TURBO)
-    percent = 100.0 * np.bincount(disparity.source.ravel(), minlength=len(Source)) / disparity.source.size
+    percent = [100.0 * np.count_nonzero(disparity.source == kind) / disparity.source.size for kind in Source]
     made = [kind for kind in (Source.PLANE, Source.FILLED) if percent[kind]]
     if made:  # else it is measured wherever it is known
         source = Place(Panel.SOURCE, f"{path}/source", f"{path}: source")
@@ -326,23 +350,22 @@ def _frame_suffix(frame_id: str) -> str:
 
 def _lines_ahead(canvas: Canvas, path: str, shape: tuple[int, int], grid: ElevationMap | NavigationMap) -> None:
     """Lines across a bird's-eye view at every second metre of x, with their distance, and where the rover is."""
-    width = float(shape[0])
+    width, rover = float(shape[0]), _rover(grid)
     far, left = (start + count * grid.resolution for start, count in zip(grid.origin, shape[::-1], strict=True))
     first, last = np.ceil(grid.origin[0] / LINE_SPACING), np.floor(far / LINE_SPACING)
     ahead = LINE_SPACING * np.arange(first, last + 1) + 0.0  # no minus zero
     depths = (far - ahead) / grid.resolution
     lines = [[(0.0, depth), (width, depth)] for depth in depths]
-    thin = rr.Radius.ui_points(0.6)
-    canvas.log(path, rr.LineStrips2D(lines, colors=[(255, 255, 255, 80)], radii=thin, draw_order=20.0))
     marks = [(width, depth) for depth in depths]
     names = [f"{x:.0f} m" for x in ahead]
-    rover = _rover(grid)
     if rover is not None:
         spot = ((left - rover[1]) / grid.resolution, (far - rover[0]) / grid.resolution)
         marks, names = [*marks, spot], [*names, "rover"]
-    dot = rr.Radius.ui_points(2.0)
-    points = rr.Points2D(marks, labels=names, show_labels=True, colors=[(255, 255, 255)], radii=dot, draw_order=21.0)
-    canvas.log(f"{path}/distances", points)
+    content, thin, dot = (tuple(marks), tuple(names)), rr.Radius.ui_points(0.6), rr.Radius.ui_points(2.0)
+    faint, white = [(255, 255, 255, 80)], [(255, 255, 255)]
+    canvas.keep(path, content, lambda: rr.LineStrips2D(lines, colors=faint, radii=thin, draw_order=20.0))
+    points: dict[str, Any] = {"labels": names, "show_labels": True, "colors": white, "radii": dot, "draw_order": 21.0}
+    canvas.keep(f"{path}/distances", content, lambda: rr.Points2D(marks, **points))
 
 
 def _rover(grid: ElevationMap | NavigationMap) -> tuple[float, float] | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -50,10 +51,9 @@ _AMBIENT = 0.35
 def colours(values: Array, low: float, high: float, palette: int) -> Array:
     """values, any shape (..., ), as RGB uint8 (..., 3) of an OpenCV palette over [low, high]; NaN is UNKNOWN_RGB."""
     known = np.isfinite(values)
-    share = np.where(known, np.clip((values - low) / (high - low), 0.0, 1.0), 0.0)
-    level = (share * 255.0 + 0.5).astype(np.uint8)
-    rgb: Array = _table(palette)[level]
-    rgb[~known] = UNKNOWN_RGB
+    share = np.clip((values[known] - low) / (high - low), 0.0, 1.0)
+    rgb: Array = np.full((*values.shape, 3), UNKNOWN_RGB, np.uint8)
+    rgb[known] = _table(palette)[(share * 255.0 + 0.5).astype(np.uint8)]
     return rgb
 
 
@@ -144,7 +144,14 @@ def hillshade(elevation: Array, resolution: float, light: Array = _LIGHT) -> Arr
 
     light: unit vector (3,) towards the sun, along x, y and up.
     """
-    slope_x, slope_y = (_slope(elevation, axis) / resolution for axis in (1, 0))
+    known = np.isfinite(elevation)
+    shade = np.full(elevation.shape, _brightness(np.zeros(1), np.zeros(1), light)[0])
+    slope_x, slope_y = _slopes(elevation, known)
+    shade[known] = _brightness(slope_x / resolution, slope_y / resolution, light)
+    return shade
+
+
+def _brightness(slope_x: Array, slope_y: Array, light: Array) -> Array:
     normal = np.sqrt(slope_x**2 + slope_y**2 + 1.0)
     lit: Array = np.clip((light[2] - light[0] * slope_x - light[1] * slope_y) / normal, 0.0, 1.0)
     return _AMBIENT + (1.0 - _AMBIENT) * lit
@@ -154,11 +161,13 @@ def paint_elevation(terrain: ElevationMap, limits: tuple[float, float] | None = 
     """Shaded relief of the layer "elevation" as RGB (rows, cols, 3), in grid order (see `birds_eye`)."""
     elevation = terrain.layers["elevation"]
     low, high = elevation_limits(elevation) if limits is None else limits
-    rgb = colours(elevation, low, high, cv2.COLORMAP_VIRIDIS)
+    rgb: Array = np.full((*elevation.shape, 3), UNKNOWN_RGB, np.uint8)
     known = np.isfinite(elevation)
+    rgb_known = colours(elevation[known], low, high, cv2.COLORMAP_VIRIDIS)
     flat = _AMBIENT + (1.0 - _AMBIENT) * _LIGHT[2]  # level ground keeps the palette's colour
-    shade = hillshade(elevation, terrain.resolution)[known] / flat
-    rgb[known] = np.clip(rgb[known] * shade[:, None], 0.0, 255.0).astype(np.uint8)
+    slope_x, slope_y = _slopes(elevation, known)
+    shade = _brightness(slope_x / terrain.resolution, slope_y / terrain.resolution, _LIGHT) / flat
+    rgb[known] = np.clip(rgb_known * shade[:, None], 0.0, 255.0).astype(np.uint8)
     return rgb
 
 
@@ -178,28 +187,41 @@ def surface(terrain: ElevationMap) -> tuple[Array, Array]:
 
     A triangle stands only where its three cells are known: holes stay holes.
     """
-    elevation = terrain.layers["elevation"]
-    known = np.isfinite(elevation)
+    elevation, (rows, cols) = terrain.layers["elevation"], terrain.shape
     x, y = cell_centres(terrain.shape, terrain.resolution, terrain.origin)
-    row, col = np.nonzero(known)
-    vertices = np.column_stack([x[col], y[row], elevation[known]]).astype(np.float32)
-    number = np.full(terrain.shape, -1, np.int64)
-    number[known] = np.arange(len(vertices))
-    here, east, north, across = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    at = np.flatnonzero(np.isfinite(elevation))
+    row, col = np.divmod(at, cols)
+    vertices = np.column_stack([x[col], y[row], elevation.ravel()[at]]).astype(np.float32)
+    number = np.full(rows * cols, -1, np.int32)
+    number[at] = np.arange(len(at), dtype=np.int32)
+    corner = at[(row < rows - 1) & (col < cols - 1)]
+    here, east, north, across = (number[corner + step] for step in (0, 1, cols, cols + 1))
     halves = ((here, east, across), (here, across, north))
-    triangles = np.concatenate([np.stack(corners, -1).reshape(-1, 3) for corners in halves])
-    return vertices, triangles[(triangles >= 0).all(1)].astype(np.uint32)
+    triangles = np.concatenate([np.stack(half, -1)[np.minimum(half[1], half[2]) >= 0] for half in halves])
+    return vertices, triangles.astype(np.uint32)
 
 
-def _slope(elevation: Array, axis: int) -> Array:
-    """Mean of the rises to the two neighbours along `axis`, per cell; a missing neighbour does not count."""
-    ahead = np.diff(elevation, axis=axis, append=np.nan)
-    behind = np.diff(elevation, axis=axis, prepend=np.nan)
-    sides = np.isfinite(ahead).astype(np.float32) + np.isfinite(behind)
-    return np.asarray((np.nan_to_num(ahead) + np.nan_to_num(behind)) / np.maximum(sides, 1.0))
+def _slopes(elevation: Array, known: Array) -> tuple[Array, Array]:
+    """Per known cell, along x and along y: the mean of the rises to its two neighbours; a missing one does not count.
+
+    Most cells of a map are unknown, so the known ones are gathered first.
+    """
+    framed = np.pad(elevation, 1, constant_values=np.nan).ravel()
+    row, col = np.nonzero(known)
+    width = elevation.shape[1] + 2
+    at = (row + 1) * width + col + 1
+    means = []
+    for step in (1, width):
+        ahead, behind = framed[at + step] - framed[at], framed[at] - framed[at - step]
+        sides = np.isfinite(ahead).astype(np.float32) + np.isfinite(behind)
+        means.append((np.nan_to_num(ahead) + np.nan_to_num(behind)) / np.maximum(sides, 1.0))
+    return means[0], means[1]
 
 
+@cache
 def _table(palette: int) -> Array:
     """The 256 RGB colours of an OpenCV palette, (256, 3) uint8."""
     steps = np.arange(256, dtype=np.uint8)[:, None]
-    return np.ascontiguousarray(cv2.applyColorMap(steps, palette)[:, 0, ::-1])
+    table = np.ascontiguousarray(cv2.applyColorMap(steps, palette)[:, 0, ::-1])
+    table.flags.writeable = False
+    return table

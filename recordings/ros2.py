@@ -121,9 +121,9 @@ def point_cloud(cloud: PointCloud) -> Any:
     count = len(cloud.points)
     names = ("x", "y", "z", "rgb", "sigma") + (() if cloud.source is None else ("source",))
     packed = np.zeros((count, len(names)), np.dtype("<f4"))
-    packed[:, :3] = cloud.points
-    red, green, blue = (cloud.colors[:, channel].astype(np.uint32) for channel in range(3))
-    packed.view(np.dtype("<u4"))[:, 3] = red << 16 | green << 8 | blue
+    for axis in range(3):  # numpy copies column by column faster
+        packed[:, axis] = cloud.points[:, axis]
+        packed.view(np.uint8)[:, 4 * 3 + 2 - axis] = cloud.colors[:, axis]  # blue in the lowest byte
     packed[:, 4] = cloud.sigma
     if cloud.source is not None:
         packed[:, 5] = cloud.source

@@ -12,7 +12,7 @@ import numpy as np
 
 from stages.data import Disparity, Source
 from stages.kernels.contradiction import contradicted
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_same_time, parameter
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class CrossCheck(Stage):
                 f"CrossCheck: the disparities have shapes {disparity.pixels.shape} and {backward.pixels.shape}; "
                 "match the swapped frame at the same size"
             )
+        check_same_time(self, disparity=disparity.stamp, backward=backward.stamp)
         seen = np.where(backward.source == Source.UNKNOWN, np.float32(np.nan), backward.pixels)
         wrong = contradicted(disparity.pixels, seen, self.tolerance, self.threads)
         return replace(

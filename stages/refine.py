@@ -15,21 +15,25 @@ import numpy as np
 from stages.data import Array, Disparity, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.bilateral import joint_bilateral
-from stages.kernels.holes import OCCLUSION, Extent, extent, fill_holes
+from stages.kernels.extent import Extent, extent, within_reach
+from stages.kernels.holes import OCCLUSION, fill_holes
 from stages.kernels.planar import near_median, pull_to_planes, trusted_matches
 from stages.kernels.planes import Planes, fit_planes
 from stages.kernels.slic import superpixels
 from stages.kernels.smoother import smooth
 from stages.kernels.sources import Trust, name_sources
 from stages.kernels.surfaces import surfaces
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_same_time, parameter
 
 F32 = np.float32
 EVEN = 6  # gray levels within a census window that a camera's noise and compression make of one
+COMPACTNESS = 10.0  # SLIC's weight of position against colour, CIELAB units
+SMOOTHING, EDGE = 8000.0, 1.0  # the paper's: lambda of the WLS; gray levels over which its coupling falls to 1/e
+BILATERAL_GRAY, BILATERAL_DISPARITY = 10.0, 1.0  # scales of the bilateral filter, gray levels and px
 LEAST_WEIGHT = 0.05  # of a match that was let in, however low its confidence
-# Measured with the pipeline `rover`: means of eight Middlebury scenes and four simulated frames.
+# Measured with the pipeline `rover`: the mean of eight Middlebury scenes and of the simulated frames of tests/study.py.
 TRUST = Trust(
-    agreed=(0.87, 0.975, 0.998), alone=(0.62, 0.87, 0.96), replaced=0.82, plane=0.78, mismatch=0.6, occlusion=0.58
+    agreed=(0.88, 0.98, 0.998), alone=(0.62, 0.86, 0.97), replaced=0.81, plane=0.84, mismatch=0.6, occlusion=0.57
 )
 
 
@@ -39,8 +43,8 @@ class Refine(Stage):
 
     Only MEASURED pixels are matches; all others count as holes. What moves by at most `inlier_distance` stays MEASURED.
     A match that moves farther has been replaced by what lies about it: it becomes PLANE, as a hole that a plane fills.
-    With `fill` wls the other holes are filled from all around by the confidence-weighted smoother; with background
-    along the row: an occlusion from its farther end, a mismatch from both. The confidence is the share of pixels of
+    With `fill` background the other holes are filled from what lies about them and looks like them, from the farther
+    surface where there are two; with wls by the confidence-weighted smoother. The confidence is the share of pixels of
     that origin that were right within 1 px.
     """
 
@@ -57,7 +61,6 @@ class Refine(Stage):
     smallest: int = parameter(
         300, "pixels that a superpixel shall have on average; a small image gets fewer", unit="px", low=1
     )
-    compactness: float = parameter(10.0, "SLIC's weight of position against colour, CIELAB units", low=0.1)
     surface: int = parameter(16, "superpixels in a surface, the larger support of planes; 0 = none", low=0)
     inlier_distance: float = parameter(0.5, "deviation from a plane that makes an outlier", unit="px", low=0.01)
     hypotheses: int = parameter(16, "planes tried per segment", low=1)
@@ -66,27 +69,24 @@ class Refine(Stage):
         0.6, "least share of matched pixels for a plane to be accepted, in a surface half of it", low=0, high=1
     )
     slope: float = parameter(0.5, "steepest disparity gradient of an accepted plane", unit="px/px", low=0)
-    plane_weight: float = parameter(0.7, "weight of the plane against a match near to it", low=0, high=1)
+    plane_weight: float = parameter(0.5, "weight of the plane against a match near to it", low=0, high=1)
     plane_fill: bool = parameter(True, "whether an accepted plane also fills the holes of its segment")
     fill: str = parameter("background", "how the other holes are filled", choices=("background", "wls", "none"))
     fill_reach: float = parameter(
-        64.0, "background: how much wider than the step between its ends a filled hole may be", unit="px", low=0
+        64.0, "distance from which a hole is still filled; what is hidden here, from any", unit="px", low=0
     )
     fill_margin: float = parameter(
         16.0, "how far beyond the last match, at the image's border or towards the sky", unit="px", low=0
     )
-    fill_support: float = parameter(0.001, "wls: least smoothed confidence that fills a pixel", low=0)
-    wls_lambda: float = parameter(8000.0, "wls: strength of the smoothing", low=0)
-    wls_sigma: float = parameter(1.0, "wls: gray levels over which the coupling falls to 1/e", low=0.01)
-    bilateral_radius: int = parameter(3, "radius of the bilateral filter, 0 = none", unit="px", low=0, high=32)
-    bilateral_space: float = parameter(3.0, "its standard deviation in the image", unit="px", low=0.1)
-    bilateral_gray: float = parameter(10.0, "its scale in gray levels", low=0.1)
-    bilateral_disparity: float = parameter(1.0, "its scale in disparity", unit="px", low=0.01)
+    bilateral_radius: int = parameter(
+        3, "radius of the bilateral filter and its scale in the image, 0 = none", unit="px", low=0, high=32
+    )
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         if disparity.pixels.shape != frame.left.shape[:2]:
             raise ValueError(f"Refine: disparity is {disparity.pixels.shape}, the image is {frame.left.shape[:2]}")
+        check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         image = eight_bit(frame.left)[0]
         guide = gray(image)
         matches = trusted_matches(
@@ -95,11 +95,11 @@ class Refine(Stage):
         if frame.left.dtype == np.uint8:  # of more bits nothing tells where the sensor ends
             matches[_burnt_out(image, guide, self.burnt_out)] = np.nan
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
-        labels, count = superpixels(image, self._count(matches.size), self.compactness, threads=self.threads)
+        labels, count = superpixels(image, self._count(matches.size), COMPACTNESS, threads=self.threads)
         weights = np.where(np.isnan(matches), F32(0), disparity.confidence)
         within = extent(pixels)
         pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
-        filled, kinds = self._filled(pixels, weights, within, guide)
+        filled, kinds = self._filled(pixels, weights, within, image, guide)
         refined = self._bilateral(filled, guide)
         source, confidence = name_sources(
             matches, disparity.confidence, agreed, kinds, refined, self.inlier_distance, TRUST, self.threads
@@ -124,7 +124,7 @@ class Refine(Stage):
         if not self.surface:
             return pixels, agreed
         group, groups = surfaces(
-            image, labels, count, max(1, count // self.surface), self.compactness, threads=self.threads
+            image, labels, count, max(1, count // self.surface), COMPACTNESS, threads=self.threads
         )
         # Every other pixel of every other row is plenty for a surface.
         few = np.s_[::2, ::2]
@@ -147,24 +147,26 @@ class Refine(Stage):
         supported = (planes.inlier_share >= self.inlier_share) & (planes.valid_share >= valid_share)
         return np.where((supported & (slope <= self.slope * spacing))[:, None], planes.coefficients, np.nan)
 
-    def _filled(self, pixels: Array, confidence: Array, within: Extent, guide: Array) -> tuple[Array, Array]:
+    def _filled(
+        self, pixels: Array, confidence: Array, within: Extent, image: Array, guide: Array
+    ) -> tuple[Array, Array]:
         """The remaining holes filled as far as evidence reaches, (H, W) float32, and their kinds of `holes`."""
         if self.fill == "background":
-            return fill_holes(pixels, within, self.fill_reach, self.fill_margin, self.threads)
+            return fill_holes(pixels, image, within, self.fill_reach, self.fill_margin, self.threads)
         hole = np.isnan(pixels)
         kinds = np.where(hole, np.uint8(OCCLUSION), np.uint8(0))
         if self.fill == "none":
             return pixels, kinds
         weights = np.where(hole, F32(0), np.maximum(confidence, F32(LEAST_WEIGHT)))
-        smoothed, support = smooth(pixels, weights, guide, self.wls_lambda, self.wls_sigma)
-        smoothed[support < self.fill_support] = np.nan
+        smoothed, _ = smooth(pixels, weights, guide, SMOOTHING, EDGE)
+        smoothed[~within_reach(pixels, within, self.fill_reach, self.fill_margin)] = np.nan
         return np.where(hole, smoothed, pixels), kinds
 
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
         if self.bilateral_radius == 0:
             return pixels
         return joint_bilateral(
-            pixels, guide, self.bilateral_radius, self.bilateral_space, self.bilateral_gray, self.bilateral_disparity,
+            pixels, guide, self.bilateral_radius, self.bilateral_radius, BILATERAL_GRAY, BILATERAL_DISPARITY,
             self.threads,
         )  # fmt: skip
 

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
+from itertools import repeat
 
 import cv2
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.hamming import clear_partners
 
 FEATURES = 4000  # per image
 SMALLEST = 32  # px, side of an image that has any
@@ -33,6 +36,7 @@ DEPENDENT = 3.0  # how much larger errors are, held against exact truth, than if
 CELL = 1 / 128  # of the image's sizes: what is seen at one place in many frames errs alike, and counts once
 NEGLIGIBLE = 0.1  # px, root mean square: less is not worth an interpolation; exactly aligned images measure up to 0.05
 ROUNDS = 20  # of reweighting
+THREADS = 2  # the frames wait for the survey, so that nothing else keeps the cores busy
 TUKEY = 4.685  # standard deviations, beyond which an outlier has no weight
 MODELS = (5, 3, 1)  # terms of the models tried, richest first: all; shift, x and y; shift
 
@@ -103,17 +107,24 @@ def measure(pairs: Sequence[tuple[Array, Array]]) -> RowOffset | None:
     The richest model is taken that the features determine to `CLEAR` everywhere in the image. Tracking draws fractions
     of a pixel towards one half, by up to 0.03 px; so what remains after a first correction is measured once more.
     """
-    alike = [(left, _as_bright(right, left)) for left, right in pairs]
-    seen = [(left, right, *_near_the_most_common(*_paired_features(left, right))) for left, right in alike]
-    found = [_offsets(*view) for view in seen]
-    for count in MODELS:
-        first = _fit(found, count)
-        if first is None or first.error > CLEAR:
-            continue
-        rest = _fit([_offsets(left, *_corrected(first, *view)) for left, *view in seen], count)
-        if rest is not None and rest.error <= CLEAR:
-            return replace(rest, terms=tuple(np.add(first.terms, rest.terms).tolist()), crossed=_crossed(seen))
+    with ThreadPoolExecutor(THREADS) as threads:
+        seen = list(threads.map(_view, pairs))
+        found = list(threads.map(lambda view: _offsets(*view), seen))
+        for count in MODELS:
+            first = _fit(found, count)
+            if first is None or first.error > CLEAR:
+                continue
+            again = list(threads.map(_offsets_after, repeat(first), seen))
+            rest = _fit(again, count)
+            if rest is not None and rest.error <= CLEAR:
+                return replace(rest, terms=tuple(np.add(first.terms, rest.terms).tolist()), crossed=_crossed(seen))
     return None
+
+
+def _view(pair: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
+    """Left and right image, alike in brightness, and the places (N, 2) of their features in either."""
+    left, right = pair[0], _as_bright(pair[1], pair[0])
+    return left, right, *_near_the_most_common(*_paired_features(left, right))
 
 
 def _crossed(seen: Sequence[tuple[Array, Array, Array, Array]]) -> float:
@@ -130,11 +141,11 @@ def _as_bright(image: Array, model: Array) -> Array:
     return cv2.convertScaleAbs(image, alpha=scale, beta=float(model.mean()) - scale * mean)
 
 
-def _corrected(offset: RowOffset, right: Array, here: Array, there: Array) -> tuple[Array, Array, Array]:
-    """The right image and the places of features in both after the offset is taken away."""
+def _corrected(offset: RowOffset, left: Array, right: Array, here: Array, there: Array) -> tuple[Array, ...]:
+    """The view after the offset is taken away from the right image and the places of its features."""
     moved = there.copy()
     moved[:, 1] += offset_at(offset.terms, *_centred(there[:, 0], here[:, 1], right.shape))
-    return moved_down(right, offset.terms), here, moved
+    return left, moved_down(right, offset.terms), here, moved
 
 
 def _centred(x: Array, y: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
@@ -161,6 +172,11 @@ def _near_the_most_common(here: Array, there: Array) -> tuple[Array, Array]:
     return here[near], there[near]
 
 
+def _offsets_after(offset: RowOffset, view: tuple[Array, ...]) -> tuple[Array, Array]:
+    """`_offsets` that are left after this one is taken away."""
+    return _offsets(*_corrected(offset, *view))
+
+
 def _offsets(left: Array, right: Array, here: Array, there: Array) -> tuple[Array, Array]:
     """Where features are in the right image (N, 2), from its centre in its sizes, and their row offsets (N,)."""
     if not len(here):
@@ -182,13 +198,9 @@ def _paired_features(left: Array, right: Array) -> tuple[Array, Array]:
     (points, codes), (partners, partner_codes) = (detector.detectAndCompute(image, None) for image in (left, right))
     if len(points) < 2 or len(partners) < 2:
         return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
-    pairs = [
-        best
-        for best, second in cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(codes, partner_codes, 2)
-        if best.distance <= ALIKE and best.distance < DISTINCT * second.distance
-    ]
-    here = np.array([points[pair.queryIdx].pt for pair in pairs], np.float32).reshape(-1, 2)
-    there = np.array([partners[pair.trainIdx].pt for pair in pairs], np.float32).reshape(-1, 2)
+    left_places, right_places = (np.array([point.pt for point in found], np.float32) for found in (points, partners))
+    chosen, matched = clear_partners(codes, partner_codes, ALIKE, DISTINCT)
+    here, there = left_places[chosen], right_places[matched]
     within = np.abs(here[:, 1] - there[:, 1]) <= REACH
     return here[within], there[within]
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 
-from stages.data import Array, Disparity, StereoCamera, StereoFrame
-from stages.kernels.doubling import doubled
-from stages.stage import Stage, parameter
+from stages.data import Disparity, StereoCamera, StereoFrame
+from stages.kernels.scaling import doubled, halved
+from stages.match import SMALLEST_SIDE
+from stages.stage import Stage, check_same_time, parameter
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,14 @@ class Halve(Stage):
     def __call__(self, frame: StereoFrame) -> StereoFrame:
         if frame.camera.raw is not None:
             raise ValueError("Halve: the frame is not rectified; put stages.Rectify before stages.Halve")
-        left, right = _halved(frame.left), _halved(frame.right)
+        full_height, full_width = frame.left.shape[:2]
+        left, right = halved(frame.left), halved(frame.right)
         height, width = left.shape[:2]
+        if min(height, width) < SMALLEST_SIDE:
+            raise ValueError(
+                f"Halve: images are {full_width}x{full_height}, too small to be matched at half size: each side must "
+                f"be at least {2 * SMALLEST_SIDE - 1} px; use a pipeline without stages.Halve, such as paper"
+            )
         camera = frame.camera
         # Pixel centres are whole numbers: what was at u is at (u + 0.5) / 2 - 0.5.
         cx, cy, cx_right = ((value + 0.5) / 2 - 0.5 for value in (camera.cx, camera.cy, camera.cx_right))
@@ -48,6 +55,7 @@ class Enlarge(Stage):
         small = disparity.pixels.shape
         if small != ((height + 1) // 2, (width + 1) // 2):
             raise ValueError(f"Enlarge: the disparity has shape {small}, which is not half of {(height, width)}")
+        check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         pixels = doubled(disparity.pixels, height, width, self.threads)
         source, confidence = (
             cv2.resize(layer, (2 * small[1], 2 * small[0]), interpolation=cv2.INTER_NEAREST)[:height, :width]
@@ -70,11 +78,3 @@ class Swap(Stage):
         last = camera.width - 1
         mirrored = replace(camera, cx=last - camera.cx_right, cx_right=last - camera.cx)
         return StereoFrame(frame.stamp, cv2.flip(frame.right, 1), cv2.flip(frame.left, 1), mirrored)
-
-
-def _halved(image: Array) -> Array:
-    height, width = image.shape[:2]
-    if height % 2 or width % 2:
-        image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-    half: Array = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return half

@@ -76,3 +76,10 @@ class Finding:
 
     sentence: str
     severity: Severity = Severity.NOTE
+
+
+def check_same_time(stage: Stage, **stamps: int) -> None:
+    """Refuse data that are not of one time; stamps: by the name of the port."""
+    if len(set(stamps.values())) > 1:
+        found = ", ".join(f"{name} of {stamp} ns" for name, stamp in stamps.items())
+        raise ValueError(f"{type(stage).__name__}: {found}: join data that were made from one frame")

@@ -14,6 +14,7 @@ import numpy as np
 
 from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
+from stages.kernels.hamming import clear_partners
 
 DETECTION_WIDTH = 640  # px; features are looked for in an image of at most about this width
 FEATURES = 1500
@@ -111,16 +112,8 @@ def step_between(earlier: View, later: View, least: int) -> Step | None:
 def _pairs(earlier: View, later: View) -> tuple[Array, Array]:
     """Indices of features, those of the earlier view known in space, that are each other's clearly best partner."""
     known = np.flatnonzero(np.isfinite(earlier.points[:, 2]))
-    if len(known) < 2 or len(later.places) < 2:
-        return np.empty(0, np.intp), np.empty(0, np.intp)
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    pairs = [
-        best
-        for best, second in matcher.knnMatch(earlier.codes[known], later.codes, 2)
-        if best.distance <= ALIKE and best.distance < DISTINCT * second.distance
-    ]
-    here = known[np.array([pair.queryIdx for pair in pairs], np.intp)]
-    return here, np.array([pair.trainIdx for pair in pairs], np.intp)
+    here, there = clear_partners(earlier.codes[known], later.codes, ALIKE, DISTINCT)
+    return known[here], there
 
 
 def _tracked_step(earlier: View, later: View, matrix: Array, turn: Array, shift: Array, least: int) -> Step | None:

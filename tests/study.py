@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from recordings.simulator import Simulation
 from stages import CrossCheck, Disparity, Enlarge, Match, Rectify, Refine, Source, StereoCamera, StereoFrame
 from stages.data import Array
 from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stereo_part
-from tests.bench.stereo_scores import errors
+from tests.bench.stereo_scores import errors, rows_filled
 
 PLAIN: dict[str, Any] = {
     "median": 0, "plane_weight": 0, "plane_fill": False, "surface": 0, "bilateral_radius": 0, "trusted": 0,
@@ -70,7 +71,7 @@ def refined(stream: str, **parameters: Any) -> Chain:
 
 
 def alone(streams: dict[str, Any], case: Case) -> Disparity:
-    """Matching as `Match` does it alone, its holes filled along the rows."""
+    """Matching as `Match` does it alone, its holes filled."""
     return Refine(**PLAIN)(case.frame, Match(disparities=case.disparities)(case.frame))
 
 
@@ -104,14 +105,20 @@ def eight(streams: dict[str, Any], case: Case) -> Disparity:
     return Refine()(case.frame, CrossCheck()(matched, streams["backward"]))
 
 
+def by_rows(streams: dict[str, Any], case: Case) -> Disparity:
+    """`rover` with holes filled along their rows, from the farther end, without asking the image."""
+    refined = Refine(fill="none")(case.frame, streams["checked"])
+    return replace(refined, pixels=rows_filled(refined.pixels))
+
+
 def whole(pipeline: str) -> Chain:
     """A pipeline as it ships, on the frame as given."""
     return lambda _, case: stereo_part(pipeline, case.frame, case.disparities, entry="rectified")["disparity"]
 
 
 STEPS: dict[str, Chain] = {
-    "matching alone, rows filled": alone,
-    "coarse to fine, rows filled": refined("matched", **PLAIN),
+    "matching alone, filled": alone,
+    "coarse to fine, filled": refined("matched", **PLAIN),
     "+ view from the right": refined("checked", **PLAIN),
     "+ doubtful matches dropped": refined("checked", **{**PLAIN, "trusted": 0.5}),
     "+ median": refined("checked", **{**PLAIN, "trusted": 0.5, "median": 5}),
@@ -127,8 +134,9 @@ VARIANTS: dict[str, Chain] = {
     "rover without planes": refined("checked", plane_weight=0, plane_fill=False, surface=0),
     "rover without surfaces": refined("checked", surface=0),
     "rover, planes replace matches": refined("checked", near=1000, plane_weight=1, inlier_share=0),
+    "rover, holes filled along rows": by_rows,
     "rover, holes filled by WLS": refined("checked", fill="wls"),
-    "rover, bilateral radius 6": refined("checked", bilateral_radius=6, bilateral_space=4.0),
+    "rover, bilateral radius 6": refined("checked", bilateral_radius=6),
     "rover, 64 planes tried": refined("checked", hypotheses=64),
     "rover with 8 paths": eight,
     "rover, matched once more": twice,

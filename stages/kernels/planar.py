@@ -10,8 +10,9 @@ import numpy as np
 
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
+from stages.kernels.extent import Extent
 from stages.kernels.halves import pairs
-from stages.kernels.holes import APART, Extent
+from stages.kernels.holes import APART
 
 F32 = np.float32
 MEASURED = int(Source.MEASURED)
@@ -77,6 +78,21 @@ def pull_to_planes(
             lambda: _pull(*given, low, high, middle, len(pixels), pulled, spoke),
         )
     return pulled, spoke
+
+
+def trusted_matches_reference(pixels: Array, source: Array, confidence: Array, least: float) -> Array:
+    """`trusted_matches` in plain numpy."""
+    trusted = (source == MEASURED) & (confidence >= F32(least)) & np.isfinite(pixels)
+    return np.where(trusted, pixels, F32(np.nan))
+
+
+def near_median_reference(matches: Array, side: int, near: float) -> Array:
+    """`near_median` in plain numpy, which sorts each window."""
+    low = np.pad(np.where(np.isnan(matches), -np.inf, matches), side // 2, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(low, (side, side)).reshape(*matches.shape, -1)
+    median = np.sort(windows, axis=2)[..., side * side // 2].astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        return np.where(abs(median - matches) <= F32(near), median, matches)
 
 
 @kernel

@@ -82,13 +82,6 @@ def segment_pixels(labels: Array, count: int, both: AtOnce = in_turn) -> tuple[A
     return start, index
 
 
-def render_planes(coefficients: Array, labels: Array) -> Array:
-    """The disparity image (H, W) float32 that the planes describe; NaN in segments without one."""
-    image = np.empty(labels.shape, np.float32)
-    _render(coefficients, labels, image)
-    return image
-
-
 @kernel
 def _count_labels(labels, counts):  # type: ignore[no-untyped-def]
     for i in range(labels.size):
@@ -100,14 +93,6 @@ def _place_pixels(labels, first, place, index):  # type: ignore[no-untyped-def]
     for i in range(labels.size):
         index[place[labels[i]]] = first + i
         place[labels[i]] += 1
-
-
-@kernel
-def _render(coefficients, labels, image):  # type: ignore[no-untyped-def]
-    for y in range(labels.shape[0]):
-        for x in range(labels.shape[1]):
-            s = labels[y, x]
-            image[y, x] = coefficients[s, 0] * x + coefficients[s, 1] * y + coefficients[s, 2]
 
 
 @kernel

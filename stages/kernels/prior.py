@@ -50,3 +50,12 @@ def add_prior(costs, begin, table, width):  # type: ignore[no-untyped-def]
     n = lanes_in(width)
     for x in range(begin.size):
         store(costs, x * n, plus_capped(load(costs, x * n, width), load(table, begin[x], width)))
+
+
+def prior_costs_reference(prior: Array, minimum: int, lanes: int, weight: float, reach: float) -> Array:
+    """The costs that `prior_costs` describes, in plain numpy: (H, W, lanes) uint8."""
+    place = np.rint((prior - np.float32(minimum)) * np.float32(PHASES)) / PHASES
+    distance = np.minimum(np.abs(np.arange(lanes) - place[..., np.newaxis]), reach)
+    distance[~np.isfinite(place)] = 0
+    costs: Array = np.clip(np.round(weight * distance), 0, 255).astype(np.uint8)
+    return costs

@@ -16,6 +16,7 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel, kernel
 from stages.kernels.halves import AtOnce, in_turn, pairs
+from stages.kernels.scaling import halved
 from stages.kernels.workspace import Workspaces
 
 F32 = np.float32
@@ -43,7 +44,7 @@ def superpixels(
         scale = 2 if min(height // grid[0], width // grid[1]) >= LEAST_CELL and min(height, width) > 1 else 1
         small = colour
         if scale == 2:
-            half = _halved(image)
+            half = halved(image[: height // 2 * 2, : width // 2 * 2])
             small = _colour_planes(half, space.array((3, *half.shape[:2]), np.float32), both)
         centres = _grid_centres(small, *grid)
         for _ in range(iterations - 1):
@@ -83,13 +84,6 @@ def _colour_planes(image: Array, planes: Array, both: AtOnce = in_turn) -> Array
         lambda: _fill_colour_planes(image[middle:], planes[:, middle:]),
     )
     return planes
-
-
-def _halved(image: Array) -> Array:
-    """The image at half size, each pixel the mean of four; an odd last row or column is left out."""
-    even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
-    half: Array = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return half
 
 
 def _fill_colour_planes(image: Array, planes: Array) -> None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 
 from stages.data import Array
+from stages.kernels.compiled import fast_kernel, kernel
 
 F32 = np.float32
 BLOCK = 320  # columns solved together: their working set stays in the second-level cache
@@ -51,7 +51,7 @@ def _solve_in_blocks(moment: Array, mass: Array, coupling: Array, strength: np.f
         _solve(moment, mass, coupling, strength, upper, start, stop)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _couple(guide, coupling, out):  # type: ignore[no-untyped-def]
     """out[y, x]: the coupling of pixel (y, x) with the one above it; 0 in row 0."""
     out[0, :] = F32(0)
@@ -60,7 +60,7 @@ def _couple(guide, coupling, out):  # type: ignore[no-untyped-def]
             out[y, x] = coupling[abs(np.int32(guide[y, x]) - np.int32(guide[y - 1, x]))]
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@fast_kernel
 def _solve(moment, mass, coupling, strength, upper, start, stop):  # type: ignore[no-untyped-def]
     """Solve (I + strength * A) u = f down every column of two right-hand sides, in place, by the Thomas algorithm."""
     height = moment.shape[0]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
 from stages.kernels.halves import pairs
-from stages.kernels.holes import MISMATCH
+from stages.kernels.holes import KEPT, MISMATCH
 
 F32 = np.float32
 OWN = 0.5, 0.75, 1.0
@@ -23,8 +23,8 @@ class Trust(NamedTuple):
     alone: tuple[float, float, float]  # a match that none does
     replaced: float  # by its surroundings
     plane: float  # a hole that a plane fills
-    mismatch: float  # a hole filled from both ends
-    occlusion: float  # and from the farther one
+    mismatch: float  # a hole filled from about it
+    occlusion: float  # and one that is hidden from the right camera
 
 
 def name_sources(
@@ -68,7 +68,23 @@ def _name(matches, confidence, agreed, kinds, refined, moved, tables, others, so
                 worth[y, x] = tables[0 if agreed[y, x] else 1, step]
             elif match == match:
                 source[y, x], worth[y, x] = PLANE, replaced
-            elif kinds[y, x] == 0:
+            elif kinds[y, x] == KEPT:
                 source[y, x], worth[y, x] = PLANE, plane
             else:
                 source[y, x], worth[y, x] = FILLED, mismatch if kinds[y, x] == MISMATCH else occlusion
+
+
+def name_sources_reference(
+    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, moved: float, trust: Trust
+) -> tuple[Array, Array]:
+    """`name_sources` in plain numpy."""
+    own = np.rint(np.clip(confidence, 0, 1) * F32(255)).astype(np.float64) / 255
+    stayed = np.abs(refined - matches) <= F32(moved)
+    conditions = [
+        np.isnan(refined), stayed & agreed, stayed, np.isfinite(matches), kinds == KEPT, kinds == MISMATCH,
+    ]  # fmt: skip
+    codes = [UNKNOWN, MEASURED, MEASURED, PLANE, PLANE, FILLED]
+    tables = [np.interp(own, OWN, values) for values in (trust.agreed, trust.alone)]
+    worths: list[Any] = [0.0, *tables, trust.replaced, trust.plane, trust.mismatch]
+    source = np.select(conditions, codes, FILLED).astype(np.uint8)
+    return source, np.select(conditions, worths, trust.occlusion).astype(np.float32)

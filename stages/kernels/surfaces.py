@@ -78,3 +78,33 @@ def _sum_up(image, labels, first, sums):  # type: ignore[no-untyped-def]
             total[3] += first + y
             total[4] += x
             total[5] += 1
+
+
+def surfaces_reference(
+    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, iterations: int = 3
+) -> tuple[Array, int]:
+    """`surfaces` in plain numpy, superpixel after superpixel."""
+    height, width = image.shape[:2]
+    step = math.sqrt(height * width / min(groups, count))
+    rows, cols = max(1, round(height / step)), max(1, round(width / step))
+    points, sizes, home = np.empty((count, 5)), np.empty(count), np.empty((count, 2), int)
+    for s in range(count):
+        y, x = np.nonzero(labels == s)
+        colour = np.broadcast_to(image[y, x].reshape(len(y), -1), (len(y), 3)).astype(np.int64)
+        rgb = np.rint(colour.sum(axis=0) / len(y)).astype(np.uint8)
+        points[s, :3] = cv2.cvtColor(rgb[None, None], cv2.COLOR_RGB2LAB)[0, 0] * [100 / 255, 1, 1]
+        place = np.array([y.sum() / len(y), x.sum() / len(x)]) + 0.5
+        points[s, 3:], sizes[s] = place * (compactness / step), len(y)
+        place = points[s, 3:] / (compactness / step)
+        home[s] = np.minimum(np.floor(place * [rows / height, cols / width]), [rows - 1, cols - 1])
+    nearest = home[:, 0] * cols + home[:, 1]
+    for _ in range(iterations):
+        members = [nearest == k for k in range(rows * cols)]
+        centres = [(points[m] * sizes[m, None]).sum(axis=0) / sizes[m].sum() if m.any() else None for m in members]
+        for s in range(count):
+            around = [tuple(home[s] + step) for step in AROUND]
+            inside = [r * cols + c for r, c in around if 0 <= r < rows and 0 <= c < cols]
+            reached = [k for k in inside if centres[k] is not None]
+            nearest[s] = min(reached, key=lambda k: ((points[s] - centres[k]) ** 2).sum())
+    used, surface = np.unique(nearest, return_inverse=True)
+    return surface.astype(np.int32), len(used)

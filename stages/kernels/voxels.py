@@ -22,15 +22,19 @@ def voxel_means(points: Array, colors: Array, edge: float) -> tuple[Array, Array
     """
     if not len(points):
         return np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros((0, 3), np.uint8)
-    low = np.floor(points.min(axis=0).astype(np.float64) / edge).astype(np.int64)
-    high = np.floor(points.max(axis=0).astype(np.float64) / edge).astype(np.int64)
-    index, count, total = _voxel_means(np.ascontiguousarray(points), np.ascontiguousarray(colors), edge, low, high)
+    index, count, total = _voxel_means(np.ascontiguousarray(points), np.ascontiguousarray(colors), edge)
     return index, count, (total // count[:, None]).astype(np.uint8)
 
 
 @numba.njit(nogil=True, cache=True)
-def _voxel_means(points, colors, edge, low, high):  # type: ignore[no-untyped-def]
+def _voxel_means(points, colors, edge):  # type: ignore[no-untyped-def]
     n = points.shape[0]
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for axis in range(3):  # numpy takes four times as long for this as all the rest does
+        least = most = points[0, axis]
+        for i in range(n):
+            least, most = min(least, points[i, axis]), max(most, points[i, axis])
+        low[axis], high[axis] = int(np.floor(np.float64(least) / edge)), int(np.floor(np.float64(most) / edge))
     cols, rows, levels = high[0] - low[0] + 1, high[1] - low[1] + 1, high[2] - low[2] + 1
     place, height = np.empty(n, np.int32), np.empty(n, np.int32)
     start = np.zeros(rows * cols + 1, np.int64)

@@ -128,8 +128,7 @@ def start_up(cache: Path) -> None:
 
 def accuracy(folder: Path) -> None:
     """Print the errors of Match and of OpenCV's best mode on scenes with truth, before refinement."""
-    from stages.kernels.background import fill_background
-    from tests.bench.stereo_scores import load_scene
+    from tests.bench.stereo_scores import load_scene, rows_filled
 
     rows: dict[str, list[list[float]]] = {}
     for scene in sorted(folder.iterdir()):
@@ -142,7 +141,7 @@ def accuracy(folder: Path) -> None:
         scored = (mask == 255) & np.isfinite(truth) & (np.arange(truth.shape[1]) >= levels)
         for name, pixels in results.items():
             kept = np.abs(pixels - truth)[scored & np.isfinite(pixels)]
-            filled = np.abs(fill_background(pixels, np.inf) - truth)[scored]
+            filled = np.abs(rows_filled(pixels) - truth)[scored]
             bad = [np.mean(~(filled <= limit)) for limit in (0.5, 1)]
             rows.setdefault(name, []).append([np.mean(kept > 1), len(kept) / scored.sum(), *bad])
     print(f"\n{'mean of the scenes, not occluded, %':34} kept bad-1  density  filled bad-0.5  filled bad-1")

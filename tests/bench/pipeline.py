@@ -38,7 +38,8 @@ def _bench(log: Path, pipeline: str, size: str, disparities: int, cores: int) ->
     busy = summary["cpu_seconds"] / summary["wall_seconds"]
     print(
         f"\n{pipeline} {size}, {disparities} disparities: {summary['frames_per_second']:.2f} frames/s, "
-        f"{busy:.2f} of {cores} cores busy, peak memory {summary['peak_memory_mb']:.0f} MB"
+        f"{busy:.2f} of {cores} cores busy, {summary['start_seconds']:.1f} s before the first frame, "
+        f"peak memory {summary['peak_memory_mb']:.0f} MB"
     )
     for stage, seconds in summary["seconds"].items():
         print(f"  {stage:24} {1000 * seconds / summary['frames_out']:8.1f} ms/frame")

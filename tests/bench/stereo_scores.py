@@ -18,7 +18,6 @@ from flow.pipeline import load
 from recordings.middlebury import read_scene
 from recordings.stereo_measures import StereoErrors
 from stages.data import Array, Disparity, StereoFrame
-from stages.kernels.background import fill_background
 from stages.match import Match
 from stages.match_opencv import MatchOpenCV
 from stages.refine import Refine
@@ -45,6 +44,17 @@ def errors(pixels: Array, truth: Array, mask: Array, margin: int) -> Array:
     return np.array([*(100 * np.array(bad)), found["all"]["rmse"], 100 * found["all"]["density"]])
 
 
+def rows_filled(disparity: Array) -> Array:
+    """A disparity image without holes: each takes the farther of the two disparities at its ends in the row."""
+    known = np.isfinite(disparity)
+    column = np.arange(disparity.shape[1])
+    left = np.maximum.accumulate(np.where(known, column, -1), axis=1)
+    right = np.flip(np.minimum.accumulate(np.flip(np.where(known, column, len(column)), axis=1), axis=1), axis=1)
+    padded = np.pad(disparity, ((0, 0), (1, 1)), constant_values=np.nan)
+    ends = np.take_along_axis(padded, left + 1, axis=1), np.take_along_axis(padded, right + 1, axis=1)
+    return np.where(known, disparity, np.fmin(*ends)).astype(np.float32)
+
+
 def chains(frame: StereoFrame, levels: int) -> dict[str, Array]:
     """Disparity pixels of each way to compute them."""
     paper_match, paper = paper_stages()
@@ -52,10 +62,10 @@ def chains(frame: StereoFrame, levels: int) -> dict[str, Array]:
     matched = Match(disparities=levels)(frame)
     as_paper = replace(paper_match, disparities=levels)(frame)
     results: dict[str, Disparity | Array] = {
-        "rover match, filled": fill_background(matched.pixels, np.inf),
+        "rover match, filled": rows_filled(matched.pixels),
         "rover match + rover refine": rover(frame, matched),
         "rover match + paper refine": paper(frame, matched),
-        "paper match, filled": fill_background(as_paper.pixels, np.inf),
+        "paper match, filled": rows_filled(as_paper.pixels),
         "paper match + paper refine": paper(frame, as_paper),
         "paper match + rover refine": rover(frame, as_paper),
     }

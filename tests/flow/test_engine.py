@@ -62,6 +62,7 @@ def test_every_stream_of_every_frame_arrives_in_stamp_order(tmp_path):
     assert sink.values("raised") == pytest.approx({i * 100 * MS: 5.0 * i + i * 0.1 for i in range(40)})
     assert summary["verdict"] == "COMPLETE"
     assert (summary["frames_in"], summary["frames_out"], summary["drops"]) == (40, 40, {})
+    assert 0 < summary["start_seconds"] <= summary["wall_seconds"]
 
 
 def test_a_stage_that_remembers_sees_the_frames_in_order(tmp_path):

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from recordings.simulator import Simulation
 from recordings.simulator.log import true_disparity
 from stages.data import Disparity, Source, StereoFrame
-from stages.kernels.background import fill_background
 from stages.match import COSTS, Match
-from tests.bench.stereo_scores import load_scene
+from tests.bench.stereo_scores import load_scene, rows_filled
 from tests.stages.test_match_opencv import frame_of, slanted_pair, textured
 
 ROOT = Path(__file__).parents[2]
@@ -284,7 +283,7 @@ def test_real_scenes_are_matched_better_than_by_opencv():
         best = np.where(sixteenths < 0, np.nan, sixteenths / 16).astype(np.float32)
         scored = (mask == 255) & np.isfinite(truth) & (np.arange(truth.shape[1]) >= levels)
         for pixels in (Match(disparities=levels)(frame).pixels, best):
-            kept, filled = scored & np.isfinite(pixels), np.abs(fill_background(pixels, np.inf) - truth)[scored]
+            kept, filled = scored & np.isfinite(pixels), np.abs(rows_filled(pixels) - truth)[scored]
             wrong = (np.abs(pixels - truth)[kept] > 1).mean()
             scores.append([wrong, kept.sum() / scored.sum(), (filled > 1).mean(), (filled > 0.5).mean()])
     ours, theirs = np.mean(scores[::2], axis=0), np.mean(scores[1::2], axis=0)

@@ -1,13 +1,18 @@
 """Planes and matches brought together: equal to plain references, in one piece or two."""
 
-import cv2
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.holes import extent
-from stages.kernels.planar import near_median, pull_to_planes, pull_to_planes_reference, trusted_matches
+from stages.kernels.extent import extent
+from stages.kernels.planar import (
+    near_median,
+    near_median_reference,
+    pull_to_planes,
+    pull_to_planes_reference,
+    trusted_matches,
+    trusted_matches_reference,
+)
 
 
 def scene(height, width, seed):
@@ -32,15 +37,24 @@ def test_planes_pull_and_fill_as_the_reference_does(height, width, margin, seed,
     assert np.array_equal(spoke, expected_spoke)
 
 
-@pytest.mark.parametrize("height", [1, 2, 5, 24])
-@pytest.mark.parametrize("side", [3, 5])
-def test_the_median_of_two_halves_is_that_of_the_whole(height, side):
-    pixels, *_ = scene(height, 40, 3)
-    low = np.where(np.isnan(pixels), np.float32(-np.inf), pixels)
-    median = cv2.medianBlur(low, side)
-    expected = np.where(np.abs(median - pixels) <= 1.5, median, pixels)
-    for threads in (1, 2):
-        assert np.array_equal(near_median(pixels, side, 1.5, threads), expected, equal_nan=True)
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 24), st.integers(1, 30), st.sampled_from([3, 5]), st.sampled_from([0.0, 1.5, 1000.0]),
+       st.integers(0, 2**31), st.sampled_from([1, 2]))  # fmt: skip
+def test_the_median_is_that_of_sorted_windows(height, width, side, near, seed, threads):
+    pixels, *_ = scene(height, width, seed)
+    moved = near_median(pixels, side, near, threads)
+    assert np.array_equal(moved, near_median_reference(pixels, side, near), equal_nan=True)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1, 2]))
+def test_trusted_matches_are_those_of_the_reference(height, width, seed, threads):
+    pixels, *_ = scene(height, width, seed)
+    rng = np.random.default_rng(seed)
+    source = rng.integers(0, 4, pixels.shape, dtype=np.uint8)
+    confidence = rng.choice(np.array([0.2, 0.5, 0.7], np.float32), pixels.shape)
+    kept = trusted_matches(pixels, source, confidence, 0.5, threads)
+    assert np.array_equal(kept, trusted_matches_reference(pixels, source, confidence, 0.5), equal_nan=True)
 
 
 def test_only_measured_finite_and_trusted_pixels_are_matches():

@@ -90,6 +90,23 @@ def test_assignment_is_the_nearest_of_nine_centres(photo):
     assert np.array_equal(sums[:, 5], np.bincount(labels.ravel(), minlength=rows * cols))
 
 
+def test_a_step_moves_each_centre_to_the_mean_of_what_is_nearest_to_it(photo):
+    image = photo[:90, :131]
+    colour, rows, cols = slic._colour_planes(image, np.empty((3, *image.shape[:2]), np.float32)), 6, 9
+    centres = slic._grid_centres(colour, rows, cols)
+    labels = slic.assign_reference(colour, centres, rows, cols, 0.4).ravel()
+    values = [*colour.reshape(3, -1), *np.mgrid[:90, :131].reshape(2, -1)]
+    means = np.stack([np.bincount(labels, v, rows * cols) for v in values], axis=1)
+    means /= np.bincount(labels, minlength=rows * cols)[:, None]
+    slic._move(colour, centres, (rows, cols), 0.4**0.5, in_turn)
+    assert centres == pytest.approx(means, abs=0.05)
+
+
+def test_settled_centres_explain_the_image_better_than_a_grid(photo):
+    settled, grid = (slic.superpixels(photo, 600, iterations=n)[0] for n in (5, 1))
+    assert explained_variance(photo, settled) > explained_variance(photo, grid) + 0.002
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 70), st.integers(1, 70), st.integers(1, 400), st.integers(0, 2**31))
 def test_any_size_and_count_gives_connected_labels_twice_the_same(height, width, count, seed):

@@ -1,7 +1,9 @@
-"""A disparity image at double size: along surfaces the line between its values, at their edges the nearest of them."""
+"""Half the size of an image, and back: a disparity image is doubled along the line between its values on a surface, and
+at the edge of one takes the nearest."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from stages.data import Array
@@ -10,6 +12,15 @@ from stages.kernels.halves import pairs
 
 F32 = np.float32
 LARGEST_STEP = 1.0  # px of the small image, within a surface
+
+
+def halved(image: Array) -> Array:
+    """An image at half size, each pixel the mean of four; an odd last row or column is repeated."""
+    height, width = image.shape[:2]
+    if height % 2 or width % 2:
+        image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    half: Array = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return half
 
 
 def doubled(small: Array, height: int, width: int, threads: int = 1) -> Array:
@@ -43,9 +54,9 @@ def doubled_reference(small: Array, height: int, width: int) -> Array:
     beside = np.clip(row + np.where(y % 2, 1, -1), 0, small.shape[0] - 1)
     next_col = np.clip(col + np.where(x % 2, 1, -1), 0, small.shape[1] - 1)
     nearest = small[row, col]
-    along = 0.75 * nearest + 0.25 * small[row, next_col]
-    other = 0.75 * small[beside, col] + 0.25 * small[beside, next_col]
-    smooth = 0.75 * along + 0.25 * other
+    along = F32(0.75) * nearest + F32(0.25) * small[row, next_col]
+    other = F32(0.75) * small[beside, col] + F32(0.25) * small[beside, next_col]
+    smooth = F32(0.75) * along + F32(0.25) * other
     with np.errstate(invalid="ignore"):
-        large: Array = 2 * np.where(np.abs(smooth - nearest) < LARGEST_STEP, smooth, nearest)
-    return large.astype(np.float32)
+        large: Array = F32(2) * np.where(np.abs(smooth - nearest) < F32(LARGEST_STEP), smooth, nearest)
+    return large

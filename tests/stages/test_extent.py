@@ -1,0 +1,27 @@
+"""How far evidence reaches: as the plain reference says, and a little farther, not more."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.kernels.extent import extent, extent_reference, within_reach
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 12), st.integers(1, 40), st.integers(0, 2**31))
+def test_the_extent_is_that_of_its_reference(height, width, seed):
+    rng = np.random.default_rng(seed)
+    known = rng.random((height, width)) < rng.uniform(0.02, 0.7)
+    disparity = np.where(known, 5, np.nan).astype(np.float32)
+    for ours, expected in zip(extent(disparity), extent_reference(disparity), strict=True):
+        assert np.array_equal(ours, expected)
+
+
+def test_within_reach_is_near_to_something_known_and_within_the_margin():
+    bay = np.full((30, 50), np.nan, np.float32)
+    bay[12:, 10:40] = bay[0, :45] = 5
+    near = within_reach(bay, extent(bay), reach=3, margin=2)
+    assert near[20].nonzero()[0].tolist() == [*range(8, 42)]
+    wider = within_reach(bay, extent(bay), reach=3, margin=9)
+    assert wider[20].nonzero()[0].tolist() == [*range(7, 43)]
+    assert not wider[1:12].any()  # rows of which nothing is known

@@ -1,0 +1,92 @@
+"""The pipelines on scenes with truth: better than matching, the paper and its code, and as sure as they are right."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recordings.simulator import Simulation
+from stages.data import StereoFrame
+from stages.match import Match
+from tests.bench.refining import RELEASED, stereo_part
+from tests.bench.stereo_scores import errors, rows_filled
+from tests.study import real, simulated
+
+
+def outcomes(frame, disparities):
+    """Pixels of matching alone, rows filled, of `paper`, of `fast` and of `rover`."""
+    matched = rows_filled(Match(disparities=disparities)(frame).pixels)
+    pipelines = (stereo_part(name, frame, disparities, entry="rectified") for name in ("paper", "fast", "rover"))
+    return [matched, *(streams["disparity"].pixels for streams in pipelines)]
+
+
+def real_cases():
+    folder = Path(os.environ.get("ROVERFLOW_DATA", "")) / "middlebury-q"
+    if not folder.is_dir():
+        pytest.skip("ROVERFLOW_DATA names no folder with middlebury-q")
+    return list(real(folder))
+
+
+def test_on_a_simulated_frame_rover_beats_paper_and_matching_alone():
+    case = simulated(480, 360)[1]
+    scores = [errors(pixels, case.truth, case.mask, case.disparities) for pixels in outcomes(case.frame, 72)]
+    matched, paper, fast, rover = scores
+    assert (rover[:6] < 0.97 * matched[:6]).all()
+    assert (rover[:6] < 0.9 * paper[:6]).all()
+    assert (fast[:6] < 0.9 * paper[:6]).all()
+    assert rover[6] < min(matched[6], paper[6])
+    assert rover[7] > 99
+
+
+@pytest.mark.slow
+def test_on_real_scenes_rover_beats_paper_matching_alone_and_the_released_code():
+    cases = real_cases()
+    scores = [[errors(p, c.truth, c.mask, c.disparities) for p in outcomes(c.frame, c.disparities)] for c in cases]
+    released = np.array([RELEASED[case.name] for case in cases])
+    matched, paper, fast, rover = np.mean(scores, axis=0)
+    assert (rover[:7] < matched[:7]).all()
+    assert (rover[:7] < paper[:7]).all()
+    limits = [0.66, 0.60, 0.53, 0.68, 0.62, 0.56, 0.64]
+    assert (rover[:7] <= limits * released.mean(axis=0)).all()
+    assert (fast[:3] <= [0.76, 0.70, 0.63] * released.mean(axis=0)[:3]).all()
+    assert (np.array(scores)[:, 3, :7] < released).all()  # no scene worse in any column
+    assert rover[7] > 99
+
+
+def test_confidence_is_the_share_that_is_right_on_a_frame_it_was_not_fitted_to():
+    stated, right = [], []
+    for seed, abundance in ((21, 0.08), (22, 0.18)):
+        simulation = Simulation(frames=2, width=480, height=360, seed=seed, abundance=abundance)
+        camera, found = simulation.camera, simulation.frame(1)
+        truth = camera.fx * camera.baseline / found.depth
+        frame = StereoFrame(seed, *found.images, camera)
+        refined = stereo_part("rover", frame, 72, entry="rectified")["disparity"]
+        scored = np.isfinite(refined.pixels) & (truth > 0) & (truth < 70)
+        stated.append(refined.confidence[scored])
+        right.append(np.abs(refined.pixels - truth)[scored] <= 1)
+    claimed, found_right = np.concatenate(stated), np.concatenate(right)
+    for low, high, tolerance in ((0.5, 0.8, 0.2), (0.8, 0.95, 0.1), (0.95, 1.01, 0.02)):
+        within = (claimed >= low) & (claimed < high)
+        assert within.sum() > 1000
+        assert found_right[within].mean() == pytest.approx(claimed[within].mean(), abs=tolerance)
+    assert found_right.mean() == pytest.approx(claimed.mean(), abs=0.03)
+
+
+@pytest.mark.slow
+def test_confidence_is_the_share_that_is_right_of_real_and_simulated_pixels_alike():
+    pools = []
+    for cases in (simulated(), real_cases()):
+        stated, right = [], []
+        for case in cases:
+            refined = stereo_part("rover", case.frame, case.disparities, entry="rectified")["disparity"]
+            scored = np.isfinite(refined.pixels) & np.isfinite(case.truth)
+            stated.append(refined.confidence[scored])
+            right.append(np.abs(refined.pixels - case.truth)[scored] <= 1)
+        pools.append((np.concatenate(stated), np.concatenate(right)))
+    for low, high in ((0.5, 0.7), (0.7, 0.85), (0.85, 0.95), (0.95, 1.01)):
+        within = [(stated >= low) & (stated < high) for stated, _ in pools]
+        claimed = [stated[area].mean() for (stated, _), area in zip(pools, within, strict=True)]
+        found = [right[area].mean() for (_, right), area in zip(pools, within, strict=True)]
+        assert np.mean(found) == pytest.approx(np.mean(claimed), abs=0.1)
+        assert found == pytest.approx(claimed, abs=0.25)

@@ -1,0 +1,40 @@
+"""Source and confidence: what each pixel is called, and what it is worth, as the plain reference says."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.data import Source
+from stages.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN
+from stages.kernels.sources import Trust, name_sources, name_sources_reference
+
+TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.83, 0.84, 0.58, 0.56)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1, 2]))
+def test_names_are_those_of_the_reference(height, width, seed, threads):
+    rng = np.random.default_rng(seed)
+    shape = height, width
+    matches = np.where(rng.random(shape) < 0.4, np.nan, rng.uniform(2, 9, shape)).astype(np.float32)
+    refined = np.where(np.isnan(matches), 5, matches + rng.choice([0, 0.4, 0.5, 0.6, -3], shape)).astype(np.float32)
+    refined[rng.random(shape) < 0.2] = np.nan
+    kinds = np.where(np.isnan(matches), rng.integers(0, 4, shape), KEPT).astype(np.uint8)
+    confidence = rng.uniform(-0.1, 1.1, shape).astype(np.float32)
+    given = matches, confidence, rng.random(shape) < 0.5, kinds, refined, 0.5, TRUST
+    source, worth = name_sources(*given, threads)
+    expected, expected_worth = name_sources_reference(*given)
+    assert np.array_equal(source, expected)
+    assert np.array_equal(worth, expected_worth)
+
+
+def test_every_origin_has_its_own_worth():
+    nan = np.nan
+    matches = np.array([[8, 8, 8, nan, nan, nan, nan]], np.float32)
+    refined = np.array([[8.5, 8, 8.6, 8, 8, 8, nan]], np.float32)
+    kinds = np.array([[KEPT, KEPT, KEPT, KEPT, MISMATCH, OCCLUSION, OPEN]], np.uint8)
+    agreed = np.array([[True, False, True, True, False, False, False]])
+    source, worth = name_sources(matches, np.full((1, 7), 0.75, np.float32), agreed, kinds, refined, 0.5, TRUST)
+    names = [Source(code).name for code in source[0]]
+    assert names == ["MEASURED", "MEASURED", "PLANE", "PLANE", "FILLED", "FILLED", "UNKNOWN"]
+    assert np.allclose(worth[0], [0.98, 0.86, 0.83, 0.84, 0.58, 0.56, 0], atol=1e-3)
