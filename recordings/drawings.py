@@ -16,7 +16,6 @@ import rerun as rr
 
 from recordings import paint
 from recordings.desk import LEDGER, Panel, Place
-from recordings.rvl import MEDIA_TYPE, rvl
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -76,7 +75,6 @@ class Canvas:
     hung: dict[tuple[Panel, str], Place] = field(default_factory=dict)
     camera: StereoCamera | None = None
     _said: dict[str, str] = field(default_factory=dict)
-    _sizes: dict[str, tuple[int, ...]] = field(default_factory=dict)  # of depth images
     _kept: dict[str, Hashable] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
@@ -101,17 +99,6 @@ class Canvas:
         if self._said.get(path) != text:
             self._said[path] = text
             self.recording.log(f"{LEDGER}/{path}", rr.TextLog(text, level=level))
-
-    def depth(self, path: str, steps: Array, meter: float, limit: float, place: Place) -> None:
-        """An image (H, W) uint16, 0 = unknown, coloured from 0 to `limit`, `meter` of which are 1 on hover."""
-        if path not in self._sizes:
-            # The viewer asks before the first frame what the images are packed in, and then takes no other answer.
-            packed = rr.EncodedDepthImage.from_fields(media_type=MEDIA_TYPE)
-            self.recording.log(path, packed, static=True)
-        self._sizes[path] = steps.shape
-        turbo = rr.components.Colormap.Turbo
-        image = rr.EncodedDepthImage(rvl(steps), meter=meter, colormap=turbo, depth_range=(0.0, limit))
-        self.log(path, image, place)
 
     def photograph(self, path: str, pixels: Array, place: Place) -> None:
         """An image (H, W) gray or (H, W, 3) RGB, 8 or 16 bit, as JPEG."""
@@ -153,11 +140,9 @@ class Canvas:
         for path, kind in self._before.items():
             if path in self._now:
                 continue
-            # Cleared, an encoded image would go on being shown (rerun-io/rerun#12793).
-            if issubclass(kind, rr.EncodedImage):  # without bytes it is not
+            if issubclass(kind, rr.EncodedImage | rr.EncodedDepthImage):
+                # Cleared, it would go on being shown (rerun-io/rerun#12793); without bytes it is not.
                 self.recording.log(path, kind.from_fields(clear_unset=True))
-            elif issubclass(kind, rr.EncodedDepthImage):  # of which nothing is known
-                self.recording.log(path, rr.EncodedDepthImage(rvl(np.zeros(self._sizes[path], np.uint16))))
             else:
                 self.recording.log(path, rr.Clear(recursive=False))
         self._before, self._now = self._now, {}
@@ -183,9 +168,13 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     """The disparities (hover reads them in px), where each comes from, and the superpixels' edges."""
     steps = np.minimum(np.fmax(disparity.pixels * np.float32(DISPARITY_STEPS) + np.float32(0.5), 0), 65535)
     steps = steps.astype(np.uint16)  # of NaN, fmax has made 0
+    _, blob = cv2.imencode(".png", steps, FAST_PNG)
     limit = paint.disparity_limit(disparity.pixels)
-    place = Place(Panel.DISPARITY, f"{path}/pixels", path)
-    canvas.depth(place.path, steps, DISPARITY_STEPS, limit * DISPARITY_STEPS, place)
+    image = rr.EncodedDepthImage(
+        blob.tobytes(), media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
+        depth_range=(0.0, limit * DISPARITY_STEPS),
+    )  # fmt: skip
+    canvas.log(f"{path}/pixels", image, Place(Panel.DISPARITY, f"{path}/pixels", path))
     canvas.scale(f"{path}/pixels/scale", steps.shape, 0.0, limit, "px", cv2.COLORMAP_TURBO)
     percent = [100.0 * np.count_nonzero(disparity.source == kind) / disparity.source.size for kind in Source]
     made = [kind for kind in (Source.PLANE, Source.FILLED) if percent[kind]]

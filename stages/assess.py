@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import label
+from scipy.ndimage import find_objects, label
 
 from stages.data import Array, ElevationMap
 from stages.kernels.footprint import fit_planes
@@ -65,6 +65,24 @@ class Assess(Stage):
 
     def __call__(self, elevation: ElevationMap) -> ElevationMap:
         """The map with the layers added."""
+        window = self._window(elevation)
+        within = replace(elevation, layers={name: layer[window] for name, layer in elevation.layers.items()})
+        layers = dict(elevation.layers)
+        for name, layer in self._assessed(within).items():
+            layers[name] = np.full(elevation.shape, np.nan, np.float32)
+            layers[name][window] = layer
+        return replace(elevation, layers=layers)
+
+    def _window(self, elevation: ElevationMap) -> tuple[slice, slice]:
+        """The rows and columns that anything can be told of: those of the observed cells, and of the widest window."""
+        found = find_objects(np.isfinite(elevation.layers["elevation"]).astype(np.int8))
+        reach = _cells(max(self.surroundings, self.footprint, self.wheel_track), elevation.resolution)
+        rows, cols = found[0] if found else (slice(0, 1), slice(0, 1))
+        first_row, first_col = max(rows.start - reach, 0), max(cols.start - reach, 0)
+        return slice(first_row, rows.stop + reach), slice(first_col, cols.stop + reach)
+
+    def _assessed(self, elevation: ElevationMap) -> dict[str, Array]:
+        """The layers, (rows, cols)."""
         height = elevation.layers["elevation"].astype(np.float64)
         observed = np.isfinite(height)
         height = np.where(observed, height, 0.0)
@@ -83,8 +101,7 @@ class Assess(Stage):
         }
         if "ceiling" in elevation.layers:
             layers["drop"] = np.where(observed, np.nan, wide - elevation.layers["ceiling"])
-        added = {name: layer.astype(np.float32) for name, layer in layers.items()}
-        return replace(elevation, layers={**elevation.layers, **added})
+        return layers
 
     def _ground(self, height: Array, observed: Array, resolution: float) -> tuple[Array, Array, Array, Array]:
         """Height of the ground at each cell, by the plane between the wheels and by that of the surroundings, the slope

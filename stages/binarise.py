@@ -32,10 +32,10 @@ class Binarise(Stage):
     - ROUGHNESS: has heights about it whose root mean square off their plane exceeds `max_roughness`;
     - BESIDE: is measured, and within `beside` of a cell that is a hazard for STEP or CLEARANCE: to a cell or two nobody
       knows where a rock ends (0.25 px of disparity are 7 cm at 8 m).
-    Other cells are unknown where they have no points (OCCLUDED where the map says so, else UNOBSERVED), and UNSURE
-    where so few cells lie about them that the ground is not determined or a step not ruled out, or where the layer
-    `variance`, if the map has it, does not say that the height is known to `max_sigma`, or at a brink, or where a wheel
-    might stand too steeply. The rest is free (CLEAR).
+    Other cells are unknown where they have no height (OCCLUDED where the map says so, else UNOBSERVED), and UNSURE
+    where they have fewer points than `min_points`, where so few cells lie about them that the ground is not determined
+    or a step not ruled out, or where the layer `variance`, if the map has it, does not say that the height is known to
+    `max_sigma`, or at a brink, or where a wheel might stand too steeply. The rest is free (CLEAR).
 
     A brink is a cell within `brink` of hidden ground that falls away: that lies, within `fall_reach` through what is
     hidden, at least `fall` below the ground about it (layer `drop`, if the map has it). Behind a bump one sees the
@@ -89,7 +89,8 @@ class Binarise(Stage):
         else:
             reason = self._rover(elevation, observed)
         hidden = elevation.layers.get("occluded", np.zeros_like(height)) == 1
-        reason[~observed] = np.where(hidden, Reason.OCCLUDED, Reason.UNOBSERVED)[~observed]
+        unseen = np.where(hidden, Reason.OCCLUDED, Reason.UNOBSERVED)
+        reason[~observed] = np.where(np.isfinite(height), Reason.UNSURE, unseen)[~observed]
         cells = np.full(reason.shape, Cell.HAZARD, np.int8)
         cells[reason == Reason.CLEAR] = Cell.FREE
         cells[np.isin(reason, UNKNOWN)] = Cell.UNKNOWN

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import resource
-import struct
 import subprocess
 import sys
 import threading
@@ -16,14 +15,10 @@ import cv2
 import numpy as np
 import pytest
 import rerun as rr
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import array_shapes, arrays
 
 from recordings.desk import CLOCK, FRAME, Panel, Place, desk
 from recordings.errors import LogError
 from recordings.rerun_sink import RerunSink
-from recordings.rvl import rvl
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -137,27 +132,6 @@ def entities(path: Path) -> set[str]:
     return {chunk.entity_path for chunk in rr.chunk.RrdReader(str(path)).stream()}
 
 
-def unpacked(blob: list[int]) -> Array:
-    """The image, (H, W), of an RVL blob, by the letter of the paper."""
-    _, _, _, width, height = struct.unpack_from("<iffII", bytes(blob))
-    words = np.frombuffer(bytes(blob), "<u4", offset=20)
-    groups = iter((words[:, None] >> np.arange(28, -4, -4, dtype=np.uint32) & 15).ravel().tolist())
-
-    def number() -> int:
-        group = next(groups)
-        return group & 7 | (number() << 3 if group & 8 else 0)
-
-    values, value = list[int](), 0
-    while len(values) < width * height:
-        values += [0] * number()
-        for _ in range(number()):
-            difference = number()
-            value += difference >> 1 ^ -(difference & 1)
-            values.append(value)
-    assert not any(groups)
-    return np.array(values).reshape(height, width)
-
-
 def decoded(blob: list[int] | bytes, flags: int) -> Array:
     image = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), flags)
     assert image is not None
@@ -196,30 +170,12 @@ def test_only_the_logs_clock_and_the_frame_count_are_timelines(whole: Path) -> N
 
 
 def test_disparities_survive_to_an_eighth_of_a_pixel_and_unknown_is_zero(whole: Path) -> None:
-    stored = unpacked(rows(whole, "/disparity/pixels", "EncodedDepthImage:blob")[0][2][0]) / 8.0
+    blob = rows(whole, "/disparity/pixels", "EncodedDepthImage:blob")[0][2][0]
+    stored = decoded(blob, cv2.IMREAD_UNCHANGED) / 8.0
     truth = scene()["disparity"].pixels
     known = np.isfinite(truth)
     assert np.abs(stored[known] - truth[known]).max() <= 1 / 16
     assert (stored[~known] == 0).all()
-
-
-@given(
-    arrays(np.uint16, array_shapes(min_dims=2, max_dims=2, max_side=40), elements=st.sampled_from([0, 0, 1, 7, 65535])),
-)
-def test_rvl_loses_nothing(values: Array) -> None:
-    np.testing.assert_array_equal(unpacked(list(rvl(values))), values)
-
-
-def test_the_viewer_is_told_for_all_times_how_disparities_are_packed(whole: Path) -> None:
-    """Told with each frame only, it shows them, but greets its user with an error."""
-    kinds = rows(whole, "/disparity/pixels", "EncodedDepthImage:media_type")
-    assert kinds == [(None, None, ["application/rvl"])]
-
-
-def test_rvl_takes_little_room_where_values_change_little() -> None:
-    ramp = np.add.outer(np.arange(480), np.arange(640) // 8).astype(np.uint16)
-    assert len(rvl(ramp)) < ramp.size  # half a byte a value, and little else
-    assert len(rvl(np.zeros_like(ramp))) < 30
 
 
 def test_what_frames_have_in_common_is_stored_once(whole: Path) -> None:
@@ -333,13 +289,13 @@ def test_what_a_frame_lacks_is_cleared_at_that_frame(tmp_path: Path) -> None:
         shown = [(frame, bool(value)) for _, frame, value in rows(path, legend, "Points2D:positions")]
         assert shown == [(0, True), (2, True)], legend  # and once more when it hangs again
         assert [frame for _, frame, value in rows(path, legend, "Clear:is_recursive") if value is not None] == [1]
-    # An encoded image is emptied instead, for the viewer ignores its clearing; of one of disparities nothing is known.
-    for entity in ("/rectified/left", "/rectified/camera/image", "/disparity/superpixels"):
-        blobs = [value for *_, value in rows(path, entity, "EncodedImage:blob")]
+    # An encoded image is emptied instead, for the viewer ignores its clearing.
+    for entity, kind in (
+        ("/rectified/left", "EncodedImage"), ("/rectified/camera/image", "EncodedImage"),
+        ("/disparity/superpixels", "EncodedImage"), ("/disparity/pixels", "EncodedDepthImage"),
+    ):  # fmt: skip
+        blobs = [value for *_, value in rows(path, entity, f"{kind}:blob")]
         assert [bool(blob) for blob in blobs] == [True, False, True], entity
-    shown = [unpacked(value[0]) for *_, value in rows(path, "/disparity/pixels", "EncodedDepthImage:blob")]
-    assert [picture.shape for picture in shown] == [(HEIGHT, WIDTH)] * 3
-    assert [bool(picture.any()) for picture in shown] == [True, False, True]
 
 
 def test_losses_are_told_at_their_own_stamps(tmp_path: Path) -> None:

@@ -361,3 +361,34 @@ def test_plane_kernel_equals_the_plain_reference(seed: int, radius: int, share: 
     got, want = fit_planes(heights, use, radius, 0.2503), fit_planes_reference(heights, use, radius, 0.2503)
     np.testing.assert_array_equal(np.isnan(got), np.isnan(want))
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)
+
+
+def test_the_size_of_the_grid_about_known_ground_changes_nothing() -> None:
+    terrain = rolling_terrain(3)
+    small = terrain.elevation
+    rows, cols = small.shape
+    patch = np.s_[70 : 70 + rows, 31 : 31 + cols]
+
+    def widened(layer: Array) -> Array:
+        wide = np.full((rows + 150, cols + 90), np.nan, np.float32)
+        wide[patch] = layer
+        return wide
+
+    large = replace(small, layers={name: widened(layer) for name, layer in small.layers.items()})
+    expected, found = Assess()(small).layers, Assess()(large).layers
+    for name, layer in expected.items():
+        np.testing.assert_allclose(found[name][patch], layer, atol=1e-6, err_msg=name)
+
+
+def test_a_map_of_which_nothing_is_known_is_assessed_as_unknown() -> None:
+    nothing = Assess()(map_of(np.full((60, 60), np.nan)))
+    assert all(np.isnan(layer).all() for layer in nothing.layers.values())
+    assert (Binarise()(nothing).cells == Cell.UNKNOWN).all()
+
+
+def test_a_height_on_too_few_points_is_unsure_not_unobserved() -> None:
+    count = np.full((80, 80), 5.0)
+    count[40, 40] = 0.75
+    navigation = decided(map_of(np.zeros((80, 80)), count=count))
+    assert (navigation.cells[40, 40], navigation.reason[40, 40]) == (Cell.UNKNOWN, Reason.UNSURE)
+    assert (navigation.cells == Cell.FREE).sum() == 80 * 80 - 1
