@@ -15,12 +15,13 @@ from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Source
 from stages.kernels.grid import FIGURES, cell_percentile, cell_statistics
 from stages.kernels.neighbours import lie_of_cells
 from stages.kernels.occlusion import lowest_sight
-from stages.kernels.spread import PLACES, laid_along_sight
+from stages.kernels.spread import laid_along_sight
 from stages.stage import Stage, parameter
 
 Grid = tuple[float, tuple[float, float], int, float]  # resolution, origin, rows and columns, region
 FINEST = 0.25  # of a cell, below which a point's reach is not worth following
 WITNESSES = 3  # places along lines of sight that a cell without a point of its own must have
+REACHED = 0.5  # the count of such a cell: less than a point
 SUMS = [FIGURES.index(name) for name in ("count", "sum", "sum_of_squares", "noise")]
 
 
@@ -30,8 +31,8 @@ class Voxelise(Stage):
 
     Layers:
     - elevation (mean), minimum, maximum, m, and count, of the measured points; without any, count is 0, the others NaN.
-      With `reach`, an empty cell that at least 3 places fall into at which measured points might be as well, 4 along
-      each line of sight, has the mean of these, and counts each place for a quarter of a point;
+      With `reach`, an empty cell into which at least 3 places fall where measured points might lie as well, 4 of them
+      along each line of sight, has the mean of these, and a count of 0.5: it is known, but no point says so;
     - variance, m^2: of the mean against the cell's true mean height, from what is random within a frame;
     - common_variance, m^2: from the tilt's uncertainty, which moves a whole frame at once, so that neither many points
       nor many cells average it out: (tilt_sigma * range)^2;
@@ -111,7 +112,7 @@ class Voxelise(Stage):
         points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.reach, least)
         near = cell_statistics(points, sigma, *grid)
         reached = (figures[:, :, 0] == 0) & (near[:, :, 0] >= WITNESSES)
-        near[:, :, SUMS] /= len(PLACES)
+        near[:, :, SUMS] *= REACHED / np.maximum(near[:, :, :1], WITNESSES)
         return np.where(reached[:, :, None], near, figures)
 
     def _layers(self, figures: Array, cloud: PointCloud, origin: tuple[float, float]) -> dict[str, Array]:
