@@ -23,26 +23,20 @@ def count(text: str) -> int:
     return value
 
 
-def magnitude(text: str) -> float:
+def magnitude(text: str, what: str = "a number of at least 0") -> float:
     """A number of at least 0."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a number of at least 0, not '{text}'")
+        raise argparse.ArgumentTypeError(f"must be {what}, not '{text}'")
     return value
 
 
 def seconds(text: str) -> float:
     """Seconds after a log's first message."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be seconds after the log's first message, not '{text}'")
-    return value
+    return magnitude(text, "seconds after the log's first message")
 
 
 def size(text: str) -> tuple[int, int]:

@@ -287,9 +287,7 @@ class _Builder:
             if key in _RESERVED or key in (skip or ()):
                 continue
             if key not in parameters:
-                raise value.place.error(
-                    f"{self._use(item, what)} has no parameter '{key}'{_nearest(key, parameters)}"
-                )
+                raise value.place.error(f"{self._use(item, what)} has no parameter '{key}'{_nearest(key, parameters)}")
             try:
                 values[key] = coerced(value.plain(), hints[key], parameters[key])
             except ValueError as error:

@@ -143,10 +143,8 @@ def run(
                 engine.finish(stop.abandoning)
             sinks.errors += [engine.failure] if engine.failure else []
     finally:
-        times = {
-            "wall_seconds": time.perf_counter() - wall, "start_seconds": started,
-            "cpu_seconds": time.process_time() - cpu,
-        }  # fmt: skip
+        times = {"wall_seconds": time.perf_counter() - wall, "start_seconds": started}
+        times["cpu_seconds"] = time.process_time() - cpu
         whole = finished and not sinks.errors and not stop.finishing() and not len(ledger)
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),

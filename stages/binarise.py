@@ -34,8 +34,9 @@ class Binarise(Stage):
       knows where a rock ends (0.25 px of disparity are 7 cm at 8 m).
     Other cells are unknown where they have no height (OCCLUDED where the map says so, else UNOBSERVED), and UNSURE
     where they have fewer points than `min_points`, where so few cells lie about them that the ground is not determined
-    or a step not ruled out, or where the layer `variance`, if the map has it, does not say that the height is known to
-    `max_sigma`, or at a brink, or where a wheel might stand too steeply. The rest is free (CLEAR).
+    or a step not ruled out, where the layer `variance`, if the map has it, does not say that the height is known to
+    `max_sigma`, within `rim` of an obstacle, at a brink, or where a wheel might stand too steeply. The rest is free
+    (CLEAR).
 
     A brink is a cell within `brink` of hidden ground that falls away: that lies, within `fall_reach` through what is
     hidden, at least `fall` below the ground about it (layer `drop`, if the map has it). Behind a bump one sees the
@@ -60,7 +61,8 @@ class Binarise(Stage):
     margin: float = parameter(
         0.03, "a height this close to its limit counts as reaching it: cells blunt a peak", unit="m", low=0.0
     )
-    beside: float = parameter(0.1, "cells this near to an obstacle are hazards too", unit="m", low=0.0)
+    beside: float = parameter(0.05, "cells this near to an obstacle are hazards too", unit="m", low=0.0)
+    rim: float = parameter(0.1, "cells this near to one are not free", unit="m", low=0.0)
     max_sigma: float = parameter(
         0.067, "standard deviation of a cell's height beyond which it is not free (3 are a step)", unit="m", low=0.0
     )
@@ -76,21 +78,20 @@ class Binarise(Stage):
     steepness_error: float = parameter(
         0.25, "share of the difference of steepness and slope that may be missing from it", low=0.0
     )
-    min_points: int = parameter(1, "points without which a cell is unknown, where the map counts them", low=1)
+    min_points: int = parameter(1, "points without which a cell is not free, where the map counts them", low=1)
 
     def __call__(self, elevation: ElevationMap) -> NavigationMap:
         """The navigation map on the grid of `elevation`."""
         height = elevation.layers["elevation"]
         observed = np.isfinite(height)
-        if "count" in elevation.layers:
-            observed &= elevation.layers["count"] >= self.min_points
         if self.method == "absolute":
             reason = np.where(observed & (height > self.max_step), Reason.ELEVATION, Reason.CLEAR)
         else:
             reason = self._rover(elevation, observed)
+        if "count" in elevation.layers:
+            reason[(reason == Reason.CLEAR) & (elevation.layers["count"] < self.min_points)] = Reason.UNSURE
         hidden = elevation.layers.get("occluded", np.zeros_like(height)) == 1
-        unseen = np.where(hidden, Reason.OCCLUDED, Reason.UNOBSERVED)
-        reason[~observed] = np.where(np.isfinite(height), Reason.UNSURE, unseen)[~observed]
+        reason[~observed] = np.where(hidden, Reason.OCCLUDED, Reason.UNOBSERVED)[~observed]
         cells = np.full(reason.shape, Cell.HAZARD, np.int8)
         cells[reason == Reason.CLEAR] = Cell.FREE
         cells[np.isin(reason, UNKNOWN)] = Cell.UNKNOWN
@@ -110,7 +111,8 @@ class Binarise(Stage):
         limit = self.max_slope + _SLOPE_ROUNDING
 
         known = np.isfinite(slope) & np.isfinite(roughness) & (support >= self.least_support) & self._sure(elevation)
-        known &= ~(steepness + self.steepness_error * (steepness - slope) > limit) & ~self._at_brink(elevation)
+        known &= steepness + self.steepness_error * (steepness - slope) <= limit
+        known &= ~self._at_brink(elevation) & ~_near(high | belly, self.rim / elevation.resolution)
         reason = np.where(known, Reason.CLEAR, Reason.UNSURE)
         reason[_near(high | belly, self.beside / elevation.resolution)] = Reason.BESIDE
         reason[roughness > self.max_roughness] = Reason.ROUGHNESS
@@ -124,7 +126,6 @@ class Binarise(Stage):
         if "variance" not in elevation.layers:
             return np.ones(elevation.shape, bool)
         return elevation.layers["variance"] <= self.max_sigma**2
-
 
     def _at_brink(self, elevation: ElevationMap) -> Array:
         """Cells next to hidden ground that falls away, (rows, cols) bool."""

@@ -19,11 +19,12 @@ from stages.stage import Stage, check_same_time, parameter
 class CrossCheck(Stage):
     """The disparity without the pixels that the right image's disparity contradicts.
 
-    `backward` is the disparity of the swapped frame (stages.Swap). Where it is unknown it contradicts nothing. It
-    must have been searched over the same range: what it could not find it takes for something else.
+    `backward` is the disparity of the swapped frame (stages.Swap). Where it is unknown it contradicts nothing. What it
+    was not searched for it takes for something else: nearer pixels, from a prior, are not asked (`disparities`).
     """
 
     tolerance: float = parameter(1.0, "largest difference that is no contradiction", unit="px", low=0)
+    disparities: int = parameter(0, "search range of `backward`; 0: that of `disparity`", unit="px", low=0)
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
     def __call__(self, disparity: Disparity, backward: Disparity) -> Disparity:
@@ -35,6 +36,8 @@ class CrossCheck(Stage):
         check_same_time(self, disparity=disparity.stamp, backward=backward.stamp)
         seen = np.where(backward.source == Source.UNKNOWN, np.float32(np.nan), backward.pixels)
         wrong = contradicted(disparity.pixels, seen, self.tolerance, self.threads)
+        if self.disparities:
+            wrong &= disparity.pixels <= self.disparities
         return replace(
             disparity,
             pixels=np.where(wrong, np.float32(np.nan), disparity.pixels),

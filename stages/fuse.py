@@ -18,7 +18,7 @@ from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pos
 from stages.kernels.neighbours import lie_of_cells
 from stages.kernels.rigid import transform_points
 from stages.overlap import fit_plane
-from stages.stage import Stage, parameter
+from stages.stage import Finding, Severity, Stage, parameter
 from stages.voxelise import Voxelise
 
 # What is remembered of a cell, 30 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
@@ -45,16 +45,17 @@ _LARGEST_LEAN = np.radians(30.0)
 @dataclass(eq=False)
 class Region:
     """The map so far: its frame, the stamps of its first and last frame, ns, whether those tell what was hidden from
-    them, its cells, the plane that joined the last frame, and how many in succession did not join."""
+    them, its cells, the plane that joined the last frame, how many in succession did not join, and how often the map
+    began anew for that."""
 
     frame_id: str = ""
     epoch: int = 0
     last: int = -1
     hides: bool = False
     cells: Tiles = field(default_factory=lambda: Tiles(CELL))
-
     plane: Array = field(default_factory=lambda: np.zeros(3))
     refused: int = 0
+    anew: int = 0
 
     def begin(self, frame_id: str, stamp: int) -> None:
         """Start anew: nothing joins the two."""
@@ -83,7 +84,8 @@ class Fuse(Stage):
     Where the pose is in another frame than before, as after visual odometry lost its way, the map begins anew.
 
     A frame that lies off the map unlike those before, by more than five times what is expected of its errors
-    (`tilt_sigma`, `height_sigma`), is refused; with the third in succession the map begins anew. Of the plane that
+    (`tilt_sigma`, `height_sigma`), is refused; with the third in succession the map begins anew, which a warning says
+    at the end. Of the plane that
     joins a frame a small share is left in (`follow_tilt`, `follow_height`), so that in the long run the map follows
     gravity and the pose and not the errors of its first frame.
     """
@@ -136,6 +138,7 @@ class Fuse(Stage):
         plane = self._plane(cells[known], seen, x, y)
         if self._jumped(plane):
             self._map.begin(pose.frame_id, cloud.stamp)
+            self._map.anew += 1
             cells, plane = self._map.cells.read(row, col, *local.shape), np.zeros(3)
         self._map.plane, self._map.refused = plane, 0
         for height in ("elevation", "minimum", "maximum"):
@@ -148,6 +151,16 @@ class Fuse(Stage):
         self._map.cells.write(row, col, cells, known | hidden)
         self._map.last, self._map.hides = cloud.stamp, "ceiling" in local.layers
         return self._around(cloud.stamp, _lifted(placed, plane))
+
+    def finding(self) -> Finding | None:
+        """That the map began anew amid a run, a warning."""
+        if not self._map.anew:
+            return None
+        return Finding(
+            f"height or tilt jumped against the map, which began anew in the same frame, {self._map.frame_id}, "
+            f"{self._map.anew} times: maps from before and after that do not join",
+            Severity.WARNING,
+        )
 
     @property
     def nbytes(self) -> int:

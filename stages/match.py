@@ -99,22 +99,23 @@ class Match(Stage):
         search = self._search(frame.camera)
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
         guide = None if prior is None else self._guide(prior, search)
-        nearer, beyond = (None, None) if prior is None else self._excluded(prior, search)
-        excluded = nearer if beyond is None else nearer | beyond
+        excluded = None if prior is None else self._excluded(prior, search)
         found = match(left, right, self._rule(search), guide, excluded, self.threads, self.memory << 20)
         layers = found.pixels, found.source, found.confidence
         if prior is not None and self.nearer == "prior":
+            # The search loses what lies within a pixel or two of its end, too.
+            taken = np.isnan(found.pixels) & (prior.pixels > search.stop - BEYOND) & (prior.source == Source.MEASURED)
             for layer, known in zip(layers, (prior.pixels, prior.source, prior.confidence), strict=True):
-                np.copyto(layer, known, where=nearer)
+                np.copyto(layer, known, where=taken)
         return Disparity(frame.stamp, *layers, camera=frame.camera)
 
-    def _excluded(self, prior: Disparity, search: range) -> tuple[Array, Array | None]:
-        """Where a measurement of the prior shows that the match is nearer than the range, and beyond it, (H, W) bool;
-        None where that is not asked."""
-        measured = prior.source == Source.MEASURED
-        nearer = measured & (prior.pixels > search.stop + BEYOND)
-        beyond = measured & (prior.pixels < search.start - BEYOND) if search.start > self.minimum else None
-        return nearer, beyond
+    def _excluded(self, prior: Disparity, search: range) -> Array:
+        """Where a measurement of the prior shows that the match is not in the range, (H, W) bool."""
+        excluded: Array = prior.pixels > search.stop + BEYOND
+        if search.start > self.minimum:
+            excluded |= prior.pixels < search.start - BEYOND
+        excluded &= prior.source == Source.MEASURED
+        return excluded
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
         height, width = frame.left.shape[:2]

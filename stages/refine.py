@@ -89,9 +89,7 @@ class Refine(Stage):
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         image = eight_bit(frame.left)[0]
         guide = gray(image)
-        matches = trusted_matches(
-            disparity.pixels, disparity.source, disparity.confidence, self.trusted, self.threads
-        )
+        matches = trusted_matches(disparity.pixels, disparity.source, disparity.confidence, self.trusted, self.threads)
         if frame.left.dtype == np.uint8:  # of more bits nothing tells where the sensor ends
             matches[_burnt_out(image, guide, self.burnt_out)] = np.nan
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
@@ -114,18 +112,14 @@ class Refine(Stage):
     ) -> tuple[Array, Array]:
         """Matches near their planes drawn towards them, holes filled from them, (H, W) float32; where, (H, W) bool."""
         margin = self.fill_margin if self.plane_fill else -1.0
-        planes = fit_planes(
-            pixels, labels, count, self.inlier_distance, self.hypotheses, seed, weights, self.threads
-        )
+        planes = fit_planes(pixels, labels, count, self.inlier_distance, self.hypotheses, seed, weights, self.threads)
         accepted = self._accepted(planes, self.valid_share)
         pixels, agreed = pull_to_planes(
             pixels, accepted, labels, within, self.near, self.plane_weight, margin, self.threads
         )
         if not self.surface:
             return pixels, agreed
-        group, groups = surfaces(
-            image, labels, count, max(1, count // self.surface), COMPACTNESS, threads=self.threads
-        )
+        group, groups = surfaces(image, labels, count, max(1, count // self.surface), COMPACTNESS, threads=self.threads)
         # Every other pixel of every other row is plenty for a surface.
         few = np.s_[::2, ::2]
         sparse, regions = (layer[few].copy() for layer in (pixels, labels))

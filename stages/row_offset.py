@@ -190,7 +190,7 @@ def _offsets(left: Array, right: Array, here: Array, there: Array) -> tuple[Arra
 
 
 def _paired_features(left: Array, right: Array) -> tuple[Array, Array]:
-    """Features of both images that are each other's clearly best partner, (N, 2) float32 px each."""
+    """Features of both images that have a clearly best partner, (N, 2) float32 px each."""
     if min(left.shape) < SMALLEST:
         return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
     # Coarse scales place a feature within a pixel or two only.

@@ -110,7 +110,7 @@ def step_between(earlier: View, later: View, least: int) -> Step | None:
 
 
 def _pairs(earlier: View, later: View) -> tuple[Array, Array]:
-    """Indices of features, those of the earlier view known in space, that are each other's clearly best partner."""
+    """Indices of features, those of the earlier view known in space, that have a clearly best partner."""
     known = np.flatnonzero(np.isfinite(earlier.points[:, 2]))
     here, there = clear_partners(earlier.codes[known], later.codes, ALIKE, DISTINCT)
     return known[here], there

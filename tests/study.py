@@ -166,9 +166,7 @@ def measure(cases: list[Case]) -> dict[str, Array]:
             for area in (edges, ~edges):
                 truth = np.where(area & (case.mask == 255), case.truth, np.float32(np.nan))
                 parts.append(errors(pixels, truth, case.mask, case.disparities)[1])
-            rows.setdefault(name, []).append(
-                np.append(errors(pixels, case.truth, case.mask, case.disparities), parts)
-            )
+            rows.setdefault(name, []).append(np.append(errors(pixels, case.truth, case.mask, case.disparities), parts))
     return {name: np.mean(values, axis=0) for name, values in rows.items()}
 
 

@@ -105,9 +105,7 @@ def _within_image(simulation: Simulation, points: Array, margin: float = 0.0) ->
     depth = np.where(points[:, 2] > 0.05, points[:, 2], np.nan)
     u, v = points[:, 0] / depth * camera.fx + camera.cx, points[:, 1] / depth * camera.fy + camera.cy
     reach = 0.5 + margin
-    return np.asarray(
-        (u >= -reach) & (u < camera.width - 1 + reach) & (v >= -reach) & (v < camera.height - 1 + reach)
-    )
+    return np.asarray((u >= -reach) & (u < camera.width - 1 + reach) & (v >= -reach) & (v < camera.height - 1 + reach))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -99,8 +99,8 @@ class Simulation:
             "odometry_scale": -0.5, "odometry_turn": 0,
         }  # fmt: skip
         for name, low in least.items():
-            if not getattr(self, name) >= low:
-                raise ValueError(f"Simulation.{name} must be at least {low}, not {getattr(self, name)}")
+            if not low <= getattr(self, name) < np.inf:
+                raise ValueError(f"Simulation.{name} must be at least {low} and finite, not {getattr(self, name)}")
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
         if not 0 < self.sun_elevation <= np.pi / 2:

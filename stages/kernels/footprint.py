@@ -6,10 +6,10 @@ costs the same whatever the window's size; coordinates are shifted to the window
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 
 # Least determinant / trace of the cells' spread, which is close to its smaller eigenvalue: a band less than three cells
 # wide has no slope across. No ratio of small integers equals it, so that rounding does not decide.
@@ -31,7 +31,7 @@ def fit_planes(heights: Array, use: Array, radius: int, leverage: float) -> Arra
     return planes
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _add_row(sums, heights, use, row, sign):  # type: ignore[no-untyped-def]
     """Add (sign 1) or take away (sign -1) one row from the six sums of every column."""
     for col in range(heights.shape[1]):
@@ -46,7 +46,7 @@ def _add_row(sums, heights, use, row, sign):  # type: ignore[no-untyped-def]
             column[5] += sign * z * z
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _fit_planes(heights, use, radius, leverage, planes):  # type: ignore[no-untyped-def]
     rows, cols = heights.shape
     sums = np.zeros((cols, 6), np.float64)
@@ -80,7 +80,7 @@ def _fit_planes(heights, use, radius, leverage, planes):  # type: ignore[no-unty
                 _solve(planes[:, row, ahead], row, ahead, leverage, n, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz)
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _solve(plane, row, col, leverage, n, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz):  # type: ignore[no-untyped-def]
     mx, my, mz = sx / n, sy / n, sz / n
     vxx, vxy, vyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my

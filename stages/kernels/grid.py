@@ -7,10 +7,10 @@ one sort of all points by cell and height, for those who ask.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 
 FIGURES = ("count", "sum", "sum_of_squares", "minimum", "maximum", "noise")
 
@@ -38,7 +38,7 @@ def cell_statistics(
     )
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _cell_statistics(points, sigma, cells_per_metre, x0, y0, size, region):  # type: ignore[no-untyped-def]
     cells = np.zeros((size, size, 6), np.float64)
     cells[:, :, 3] = np.inf

@@ -37,7 +37,9 @@ def clear_partners(codes: Array, others: Array, alike: int, distinct: float) -> 
     """Which of `codes`, (N, 32) uint8, have a partner among `others`, (M, 32) uint8, and which, indices (n,) each.
 
     A partner differs by at most `alike` bits, and by less than `distinct` times as many as the next best (Lowe, 2004).
+    Of more than `MOST` others the first are asked: a detector gives so many only of patterns, where all look alike.
     """
+    others = others[:MOST]
     if len(codes) == 0 or len(others) < 2:
         return np.empty(0, np.intp), np.empty(0, np.intp)
     index, best, second = nearest_two(codes, others)

@@ -5,10 +5,10 @@ Where one of two opposite neighbours is missing the slope is that to the other o
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 
 
 def lie_of_cells(heights: Array) -> Array:
@@ -22,7 +22,7 @@ def lie_of_cells(heights: Array) -> Array:
     return _lie_of_cells(np.ascontiguousarray(heights))  # type: ignore[no-any-return]
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _lie_of_cells(heights):  # type: ignore[no-untyped-def]
     rows, cols = heights.shape
     lie = np.full((3, rows, cols), np.nan)

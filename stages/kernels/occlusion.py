@@ -8,10 +8,10 @@ hidden lies below the line that jumps over it, or it would be seen.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 
 
 def lowest_sight(
@@ -39,7 +39,7 @@ def lowest_sight(
     return lowest
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _mark(lowest, x, y, z, dx, dy, dz, length, cells_per_metre, x0, y0, region):  # type: ignore[no-untyped-def]
     """Lower the cells under the line from (x, y, z), in direction (dx, dy, dz), (dx, dy) a unit vector, to it; sampled
     four times a cell."""
@@ -54,7 +54,7 @@ def _mark(lowest, x, y, z, dx, dy, dz, length, cells_per_metre, x0, y0, region):
                 lowest[row, col] = height
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _lowest_sight(points, pixel, width, camera_x, camera_y, camera_z, cells_per_metre, x0, y0, region, lowest):  # type: ignore[no-untyped-def]
     last = np.full(width, -1, np.int64)
     for i in range(points.shape[0] - 1, -1, -1):

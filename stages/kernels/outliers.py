@@ -8,10 +8,10 @@ The test counts, in eight directions, the neighbours whose inverse depth differs
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 
 # Four rings of eight neighbours: rings of 1 to 4 px, so that a cloud of every 2nd, 3rd or 4th pixel has some as well.
 _RINGS = 4
@@ -88,7 +88,7 @@ def pixel_rays(points: Array, pixel: Array, width: int) -> Array:
     return rays
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _inverse_depth(points, pixel, height, width, reach):  # type: ignore[no-untyped-def]
     inverse = np.full((height, width), np.nan, np.float32)
     for i in range(points.shape[0]):
@@ -98,7 +98,7 @@ def _inverse_depth(points, pixel, height, width, reach):  # type: ignore[no-unty
     return inverse
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _supported(points, sigma, pixel, inverse, offsets, deviations, slope, share, least, rays, reach):  # type: ignore[no-untyped-def]
     height, width = inverse.shape
     enough = int(np.ceil(share * len(offsets)))

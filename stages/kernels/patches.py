@@ -7,12 +7,12 @@ is an island; a rock is not, for its foot stands on the ground.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 
 # Pixels looked ahead for the next point: a cloud may hold every 4th only.
 _GAP = 4
@@ -33,7 +33,7 @@ def depth_images(
     return images[0], images[1]
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _depth_images(points, sigma, pixel, kept, factor, images):  # type: ignore[no-untyped-def]
     for i in kept:
         inverse = 1.0 / np.float64(points[i, 2])
@@ -54,7 +54,7 @@ def patch_sizes(inverse: Array, tolerance: Array, slope: float) -> Array:
     )
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _linked(inverse, tolerance, slope, row, col, up, left):  # type: ignore[no-untyped-def]
     """Flat index of the next point upwards or leftwards if it is linked to this one, else -1."""
     width = inverse.shape[1]
@@ -68,7 +68,7 @@ def _linked(inverse, tolerance, slope, row, col, up, left):  # type: ignore[no-u
     return -1
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _root(parent, i):  # type: ignore[no-untyped-def]
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -76,7 +76,7 @@ def _root(parent, i):  # type: ignore[no-untyped-def]
     return i
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _patch_sizes(inverse, tolerance, slope):  # type: ignore[no-untyped-def]
     height, width = inverse.shape
     parent = np.empty(height * width, np.int32)

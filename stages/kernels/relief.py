@@ -6,10 +6,10 @@ given slope of the surroundings explains is taken off, so that a plane has no st
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 
 
 def lowest_around(heights: Array, use: Array, trend: Array, radius: int) -> tuple[Array, Array]:
@@ -33,7 +33,7 @@ def _disc(radius: int) -> Array:
     return np.ascontiguousarray(np.column_stack([rows[inside], cols[inside]]))
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _lowest_around(heights, use, trend, disc):  # type: ignore[no-untyped-def]
     rows, cols = heights.shape
     lowest = np.full((rows, cols), np.nan)

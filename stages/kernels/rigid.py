@@ -5,10 +5,10 @@ A matrix product of the linear algebra library would do, but its last bits depen
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 
 
 def transform_points(points: Array, rotation: Array, translation: Array) -> Array:
@@ -23,7 +23,7 @@ def transform_points(points: Array, rotation: Array, translation: Array) -> Arra
     )
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _transform_points(points, r, t):  # type: ignore[no-untyped-def]
     moved = np.empty(points.shape, np.float32)
     for i in range(points.shape[0]):

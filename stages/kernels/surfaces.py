@@ -48,9 +48,7 @@ def surfaces(
     return surface.astype(np.int32), len(used)
 
 
-def _superpixel_points(
-    image: Array, labels: Array, count: int, scale: float, threads: int
-) -> tuple[Array, Array]:
+def _superpixel_points(image: Array, labels: Array, count: int, scale: float, threads: int) -> tuple[Array, Array]:
     """Mean colour (CIELAB, L in 0..100) and place (y, x times `scale`) of each, (count, 5), and its size (count,)."""
     middle = image.shape[0] // 2
     halves = np.zeros((2, count, 6), np.int64)

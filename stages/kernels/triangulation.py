@@ -6,10 +6,10 @@ cloud is allocated at its own size and comes out in raster order.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stages.data import Array, Source, StereoCamera
+from stages.kernels.compiled import kernel
 
 _FILLED = int(Source.FILLED)
 _PLANE = int(Source.PLANE)
@@ -48,7 +48,7 @@ def triangulate(
     )
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _depth(disparity, source, shift, focal_baseline, max_depth, filled):  # type: ignore[no-untyped-def]
     """Depth of a pixel, or 0 where it has no point."""
     if source == _UNKNOWN or (source == _FILLED and not filled):
@@ -58,7 +58,7 @@ def _depth(disparity, source, shift, focal_baseline, max_depth, filled):  # type
     return focal_baseline / effective if effective * max_depth >= focal_baseline and np.isfinite(effective) else 0.0
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, sigmas):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy, focal_baseline, shift = camera
     log_best, log_worst, sigma_plane, sigma_filled = sigmas

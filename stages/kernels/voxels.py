@@ -6,10 +6,10 @@ no table of all cubes is needed, nor a comparison of two points.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stages.data import Array
+from stages.kernels.compiled import kernel
 
 
 def voxel_means(points: Array, colors: Array, edge: float) -> tuple[Array, Array, Array]:
@@ -26,7 +26,7 @@ def voxel_means(points: Array, colors: Array, edge: float) -> tuple[Array, Array
     return index, count, (total // count[:, None]).astype(np.uint8)
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def _voxel_means(points, colors, edge):  # type: ignore[no-untyped-def]
     n = points.shape[0]
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)

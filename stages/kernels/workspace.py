@@ -59,4 +59,3 @@ class Workspaces:
         finally:
             with self.lock:
                 self.idle.append(space)
-

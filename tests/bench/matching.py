@@ -75,8 +75,8 @@ def speed() -> None:
                 contestants[f"{cost} {disparities} x{threads}"] = lambda match=match: match(frame)
             match = Match(cost=cost, disparities=disparities)
             pool = ThreadPoolExecutor(2)
-            contestants[f"{cost} {disparities}, 2 frames on 2 cores"] = (
-                lambda match=match, pool=pool: list(pool.map(match, [frame, frame]))
+            contestants[f"{cost} {disparities}, 2 frames on 2 cores"] = lambda match=match, pool=pool: list(
+                pool.map(match, [frame, frame])
             )
     seconds = medians(contestants)
     print(f"{'1280x960, median of ' + str(ROUNDS):42} {'ms':>8}  / HH   / 3WAY")

@@ -132,9 +132,7 @@ def speed() -> None:
     keep_freed_memory()
     frame = colour_pair()
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.left, frame.right)]
-    matcher = cv2.StereoSGBM.create(
-        0, DISPARITIES, 5, 4 * 25, 38 * 25, 1, 0, 1, 100, 2, cv2.STEREO_SGBM_MODE_HH
-    )
+    matcher = cv2.StereoSGBM.create(0, DISPARITIES, 5, 4 * 25, 38 * 25, 1, 0, 1, 100, 2, cv2.STEREO_SGBM_MODE_HH)
     matched = Match(disparities=DISPARITIES, threads=2)(frame)
     labels, count = superpixels(frame.left, SUPERPIXELS)
     points = segment_points(matched.pixels, labels)  # sorted out beforehand: we do that within the time

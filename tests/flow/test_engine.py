@@ -271,11 +271,14 @@ def test_a_pipeline_of_which_nothing_is_left_is_refused(tmp_path):
 
 def test_the_most_downstream_work_goes_first(tmp_path, monkeypatch):
     calls, gate = [], threading.Event()
-    text = PIPELINE[: PIPELINE.index("  thrice:")] + """
+    text = (
+        PIPELINE[: PIPELINE.index("  thrice:")]
+        + """
   next: {use: tests.flow.toys.Scale, couple: twice}
   last: {use: tests.flow.toys.Scale, couple: next}
 sinks: [{use: tests.flow.toys.Keep}]
 """
+    )
     pipeline = graph(tmp_path, text=text)
 
     def noted(self, couple):

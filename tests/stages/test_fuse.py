@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from stages import Fuse, Mount, PointCloud, Pose, Transform
 from stages.fuse import local_cells, placement
+from stages.stage import Severity
 from stages.tiles import Tiles
 
 SECOND = 1_000_000_000
@@ -328,6 +329,7 @@ def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jum
         with pytest.raises(ValueError, match=r"m and 0\.0 degrees off the map, .* left out of the regional map"):
             fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
     again = fuse(*drive(7), MOUNT)  # it was a slip: the map goes on
+    assert fuse.finding() is None
     assert again.layers["frames"].max() > terrain.layers["frames"].max()
     for frame in (8, 9, 10):
         cloud, pose = drive(frame)
@@ -336,6 +338,10 @@ def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jum
         except ValueError:
             assert frame < 10
     assert anew.layers["frames"].max() == 1
+    found = fuse.finding()
+    assert found is not None
+    assert found.severity is Severity.WARNING
+    assert "began anew in the same frame, odom, 1 times" in found.sentence
 
 
 def test_a_pose_in_another_frame_begins_the_map_anew():

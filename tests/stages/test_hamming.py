@@ -51,3 +51,6 @@ def test_too_few_have_no_clear_partner_and_too_many_are_refused() -> None:
     assert [len(part) for part in clear_partners(descriptors(0, 1), descriptors(3, 1), 64, 0.8)] == [0, 0]
     with pytest.raises(ValueError, match="2 to 16320 descriptors, not 16321"):
         nearest_two(descriptors(1, 1), np.zeros((MOST + 1, 32), np.uint8))
+    codes = descriptors(50, 1)
+    many = np.concatenate([codes, descriptors(MOST, 2)])  # as of a pattern of dots; none is lost for that
+    np.testing.assert_array_equal(clear_partners(codes, many, 64, 0.8)[1], np.arange(50))

@@ -89,6 +89,8 @@ def test_what_the_right_image_sees_otherwise_is_unknown():
     checked = CrossCheck()(given, Disparity(1, backward, given.source, given.confidence))
     assert np.argwhere(np.isnan(checked.pixels)).tolist() == [[0, 20]]
     assert (checked.source[0, 20], checked.confidence[0, 20]) == (Source.UNKNOWN, 0)
+    beyond = CrossCheck(disparities=4)(given, Disparity(1, backward, given.source, given.confidence))
+    assert np.isfinite(beyond.pixels).all()  # 5 px was not searched for from the right
 
 
 def test_sizes_that_do_not_fit_are_refused():
