@@ -3,8 +3,8 @@
 The paper's k-nearest-neighbour filter measures distances in space, which on the ground grow with the square of the
 range: it mistakes distance for error. The default here asks the image instead: a point stays where enough of its
 neighbours in the image see the same surface, judged in inverse depth, in which near and far ground look alike. It takes
-time linear in the points. Patches that support themselves but touch nothing else go as well. The paper's filter remains
-as method "knn".
+time linear in the points. Patches that support themselves but touch nothing else go as well where they are small, or
+hang in the air or lie under the ground. The paper's filter remains as method "knn".
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from stages.data import Array, PointCloud, Source
+from stages.kernels.order import out_of_order
 from stages.kernels.outliers import supported, usual_slope
-from stages.kernels.patches import depth_images, patch_sizes
+from stages.kernels.patches import depth_images, patches
 from stages.stage import Stage, parameter
 
 
@@ -75,7 +76,7 @@ class Clean(Stage):
                 self.least,
             )
         )
-        return kept[self._patches(cloud, kept, cloud.shape) >= self.patch * len(kept)]
+        return kept[self._whole(cloud, kept, cloud.shape)]
 
     def _with_filled(self, cloud: PointCloud) -> Array:
         """The same where the cloud has filled points: those are no evidence, so they support nobody and are cropped
@@ -87,11 +88,19 @@ class Clean(Stage):
         kept[measured[self._organised(cloud.only(measured))]] = True
         return np.flatnonzero(kept)
 
-    def _patches(self, cloud: PointCloud, kept: Array, shape: tuple[int, int]) -> Array:
-        """Of each point that was kept, how many points its patch has."""
-        inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, kept, shape, self.deviations)
-        sizes = patch_sizes(inverse, tolerance, self.spread * usual_slope(inverse))
-        return sizes.ravel().take(cloud.pixel.take(kept))
+    def _whole(self, cloud: PointCloud, kept: Array, shape: tuple[int, int]) -> Array:
+        """Which of the points that were kept are of a patch that is large enough and in order, (len(kept),) bool.
+
+        What lies beyond the crop bears witness: the sky begins above it.
+        """
+        far = np.flatnonzero(cloud.points[:, 2] > self.region + self.margin)
+        seen = np.concatenate([kept, far])
+        inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, seen, shape, self.deviations)
+        patch = patches(inverse, tolerance, self.spread * usual_slope(inverse))
+        sizes = np.bincount(patch.ravel() + 1, minlength=patch.size + 1)
+        place = cloud.pixel.take(kept)
+        large = sizes.take(patch.ravel().take(place) + 1) >= self.patch * len(kept)
+        return np.asarray(large & ~out_of_order(inverse, patch).ravel().take(place))
 
     def _knn(self, cloud: PointCloud) -> Array:
         """Indices of the points that stay, by the mean distance to their nearest neighbours in space."""

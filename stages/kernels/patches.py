@@ -1,4 +1,4 @@
-"""Sizes of the connected patches of an organised cloud, by union-find in one scan.
+"""The connected patches of an organised cloud, by union-find in one scan.
 
 Two points are linked where they are next to each other in the image, with no more than a few empty pixels between, and
 their inverse depths differ by what noise and slope explain. A mismatch that covers many pixels supports itself, but it
@@ -41,15 +41,15 @@ def _depth_images(points, sigma, pixel, kept, factor, images):  # type: ignore[n
         images[1, pixel[i]] = factor * sigma[i] * inverse * inverse
 
 
-def patch_sizes(inverse: Array, tolerance: Array, slope: float) -> Array:
-    """How many points the patch of each pixel has.
+def patches(inverse: Array, tolerance: Array, slope: float) -> Array:
+    """Which pixels are of one patch.
 
     inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; tolerance: (H, W) float32, difference that noise may
     explain, 1/m, the larger of two counts; slope: difference allowed besides for each pixel of distance, 1/m.
 
-    Returns (H, W) int32, 0 where there is no point.
+    Returns (H, W) int32: the flat index of the first pixel of its patch, -1 where there is no point.
     """
-    return _patch_sizes(  # type: ignore[no-any-return]
+    return _patches(  # type: ignore[no-any-return]
         np.ascontiguousarray(inverse), np.ascontiguousarray(tolerance), float(slope)
     )
 
@@ -77,10 +77,9 @@ def _root(parent, i):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _patch_sizes(inverse, tolerance, slope):  # type: ignore[no-untyped-def]
+def _patches(inverse, tolerance, slope):  # type: ignore[no-untyped-def]
     height, width = inverse.shape
     parent = np.empty(height * width, np.int32)
-    sizes = np.zeros(height * width, np.int32)
     for row in range(height):
         for col in range(width):
             i = row * width + col
@@ -97,14 +96,14 @@ def _patch_sizes(inverse, tolerance, slope):  # type: ignore[no-untyped-def]
     # Parents come before their children, so one pass in order reaches every root.
     for i in range(height * width):
         parent[i] = parent[parent[i]]
-        sizes[parent[i]] += 1
     for i in range(height * width):
-        sizes[i] = sizes[parent[i]] if inverse[i // width, i % width] > 0.0 else 0
-    return sizes.reshape(height, width)
+        if not inverse[i // width, i % width] > 0.0:
+            parent[i] = -1
+    return parent.reshape(height, width)
 
 
-def patch_sizes_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
-    """The same as `patch_sizes`: scipy's connected components of the graph of links."""
+def patches_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
+    """The same as `patches`: scipy's connected components of the graph of links."""
     present = inverse > 0
     index = np.arange(inverse.size).reshape(inverse.shape)
     links = []
@@ -119,5 +118,6 @@ def patch_sizes_reference(inverse: Array, tolerance: Array, slope: float) -> Arr
             links.append(np.stack([number[near[linked]], number[far[linked]]]))
     one, other = np.concatenate(links, axis=1)
     graph = coo_array((np.ones(len(one)), (one, other)), shape=(inverse.size, inverse.size))
-    label = connected_components(graph, directed=False)[1].reshape(inverse.shape)
-    return np.where(present, np.bincount(label.ravel())[label], 0).astype(np.int32)
+    label = connected_components(graph, directed=False)[1]
+    _, first = np.unique(label, return_index=True)
+    return np.where(present, first[label].reshape(inverse.shape), -1).astype(np.int32)

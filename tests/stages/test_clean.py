@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from stages.clean import Clean
 from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Transform
+from stages.kernels.order import out_of_order, out_of_order_reference
 from stages.kernels.outliers import supported, supported_reference
-from stages.kernels.patches import patch_sizes, patch_sizes_reference
+from stages.kernels.patches import patches, patches_reference
 from stages.reproject import Reproject
 from tests.stages.terrain_scene import (
     CAMERA,
@@ -125,9 +126,39 @@ def test_patch_kernel_equals_scipys_connected_components() -> None:
     inverse = random.integers(1, 4, (40, 50)).astype(np.float32)
     inverse[random.random(inverse.shape) < 0.4] = np.nan
     tolerance = random.uniform(0, 0.6, inverse.shape).astype(np.float32)
-    got, want = patch_sizes(inverse, tolerance, 0.2), patch_sizes_reference(inverse, tolerance, 0.2)
+    got, want = patches(inverse, tolerance, 0.2), patches_reference(inverse, tolerance, 0.2)
     assert len(np.unique(want)) > 8
     np.testing.assert_array_equal(got, want)
+
+
+def test_order_kernel_equals_the_plain_reference() -> None:
+    random = np.random.default_rng(8)
+    coarse = random.uniform(0.1, 0.5, (10, 12)).repeat(5, 0).repeat(5, 1)
+    inverse = (coarse + random.normal(0, 0.002, coarse.shape)).astype(np.float32)
+    inverse[random.random(inverse.shape) < 0.3] = np.nan
+    patch = patches(inverse, np.full(inverse.shape, 0.01, np.float32), 0.001)
+    got = out_of_order(inverse, patch)
+    assert 0 < got.sum() < np.isfinite(inverse).sum()
+    np.testing.assert_array_equal(got, out_of_order_reference(inverse, patch))
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "disparity"),
+    [((0, 60), (200, 300), 45.0), ((110, 150), (200, 400), 17.0), ((400, 480), (100, 500), 14.0)],
+    ids=["in the sky", "above far ground", "under the ground"],
+)
+def test_a_large_patch_goes_where_nothing_can_be(
+    rows: tuple[int, int], columns: tuple[int, int], disparity: float
+) -> None:
+    d = seen_disparity(((4.0, 0.0, 0.25),))
+    rock = d - seen_disparity(()) > 1.0
+    d[slice(*rows), slice(*columns)] = disparity
+    wrong = np.zeros(d.shape, bool)
+    wrong[slice(*rows), slice(*columns)] = True
+    pixels = Clean()(Reproject()(blank_frame(), as_disparity(d))).pixel
+    assert wrong.sum() > 5000
+    assert not np.isin(np.flatnonzero(wrong), pixels).any()
+    assert np.isin(np.flatnonzero(rock), pixels).mean() > 0.99
 
 
 def test_kernel_equals_the_plain_reference() -> None:
