@@ -59,6 +59,11 @@ class Place:
     title: str
     frame_id: str = LEVEL_FRAME
 
+    @property
+    def stream(self) -> str:
+        """What hangs there: the path begins with it."""
+        return self.path.partition("/")[0]
+
 
 def desk(hung: Iterable[Place]) -> rrb.Blueprint:
     """The blueprint for the pictures that hang so far, in the order in which they were first hung."""
@@ -94,7 +99,18 @@ def _stack(parts: Iterable[_Part | None]) -> _Part | None:
 
 
 def _pictures(drawn: Places, *panels: Panel) -> list[_View]:
-    return [rrb.Spatial2DView(origin=place.path, name=place.title) for place in _at(drawn, *panels)]
+    """The pictures of these panels; streams of which two would have tabs of one name put their own before it."""
+    places = _at(drawn, *panels)
+    streams: dict[str, set[str]] = {}
+    for place in places:
+        streams.setdefault(place.title, set()).add(place.stream)
+    alike = {stream for sharing in streams.values() if len(sharing) > 1 for stream in sharing}
+    return [
+        rrb.Spatial2DView(
+            origin=place.path, name=f"{place.stream}: {place.title}" if place.stream in alike else place.title
+        )
+        for place in places
+    ]
 
 
 def _images(drawn: Places) -> _Part | None:
