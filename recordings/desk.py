@@ -19,6 +19,7 @@ CLOCK = "log clock"  # the timeline of the frames' own stamps
 FRAME = "frame"  # the timeline that counts frames
 
 LEDGER, SUMMARY, SECONDS, QUEUES = "ledger", "summary", "seconds", "queues"
+LEGEND_LINES = 4  # of a plot; the legend of more would hide the plot
 
 Places = tuple["Place", ...]
 _View = rrb.Spatial2DView | rrb.Spatial3DView | rrb.TimeSeriesView | rrb.TextLogView | rrb.TextDocumentView
@@ -195,8 +196,11 @@ def _below(drawn: Places) -> _Part:
     plots: list[_Part] = []
     shares: list[float] = []
     for root, title in ((SECONDS, "stage time (s)"), (QUEUES, "queue depth (frames)")):
-        if any(place.path.startswith(f"{root}/") for place in _at(drawn, Panel.STAGE)):
-            plots.append(rrb.TimeSeriesView(origin=root, name=title, plot_legend=rrb.PlotLegend("LeftTop")))
+        lines = sum(place.stream == root for place in _at(drawn, Panel.STAGE))
+        few = lines <= LEGEND_LINES
+        if lines:
+            name = title if few else f"{title}: hover for names"
+            plots.append(rrb.TimeSeriesView(origin=root, name=name, plot_legend=rrb.PlotLegend("LeftTop", visible=few)))
             shares.append(1.4)
     panels = ((Panel.ANGLE, "tilt (degrees)"), (Panel.HEALTH, "tilt check (degrees)"), (Panel.FEATURES, "odometry"))
     angles = _tabs((_series(drawn, panel, title) for panel, title in panels), active=0)

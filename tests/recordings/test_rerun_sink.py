@@ -417,6 +417,15 @@ def test_two_streams_of_one_type_have_tabs_of_two_names() -> None:
     ]  # fmt: skip
 
 
+def test_a_legend_that_would_hide_its_plot_is_not_shown() -> None:
+    for stages in (2, 25):
+        places = [Place(Panel.STAGE, f"{root}/{n}", str(n)) for root in ("seconds", "queues") for n in range(stages)]
+        plots = views(desk(places).root_container)[:2]
+        shown = [plot.properties["PlotLegend"].visible.as_arrow_array().to_pylist() for plot in plots]
+        assert shown == [[stages == 2]] * 2
+        assert [plot.name.endswith("hover for names") for plot in plots] == [stages == 25] * 2
+
+
 def test_a_sink_that_is_not_open_writes_nothing_and_closes(tmp_path: Path) -> None:
     sink = RerunSink()
     sink.close({"verdict": "COMPLETE"})
