@@ -335,7 +335,7 @@ def _demo(options: argparse.Namespace) -> int:
     log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
     say("Simulating a traverse ...")
     simulate(log, frames=options.frames)
-    say("Replaying it through the pipeline 'rover' ...")
+    say("Replaying it through the pipeline 'rover' (a first run compiles, too, and its frames/s count that) ...")
     summary = replay(log, "rover", out, rrd, workers=os.cpu_count() or 1)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     report(summary)

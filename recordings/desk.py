@@ -19,6 +19,7 @@ CLOCK = "log clock"  # the timeline of the frames' own stamps
 FRAME = "frame"  # the timeline that counts frames
 
 LEDGER, SUMMARY, SECONDS, QUEUES = "ledger", "summary", "seconds", "queues"
+LEGEND_LINES = 4  # of a plot; the legend of more would hide the plot
 
 Places = tuple["Place", ...]
 _View = rrb.Spatial2DView | rrb.Spatial3DView | rrb.TimeSeriesView | rrb.TextLogView | rrb.TextDocumentView
@@ -59,6 +60,11 @@ class Place:
     title: str
     frame_id: str = LEVEL_FRAME
 
+    @property
+    def stream(self) -> str:
+        """What hangs there: the path begins with it."""
+        return self.path.partition("/")[0]
+
 
 def desk(hung: Iterable[Place]) -> rrb.Blueprint:
     """The blueprint for the pictures that hang so far, in the order in which they were first hung."""
@@ -94,7 +100,18 @@ def _stack(parts: Iterable[_Part | None]) -> _Part | None:
 
 
 def _pictures(drawn: Places, *panels: Panel) -> list[_View]:
-    return [rrb.Spatial2DView(origin=place.path, name=place.title) for place in _at(drawn, *panels)]
+    """The pictures of these panels; streams of which two would have tabs of one name put their own before it."""
+    places = _at(drawn, *panels)
+    streams: dict[str, set[str]] = {}
+    for place in places:
+        streams.setdefault(place.title, set()).add(place.stream)
+    alike = {stream for sharing in streams.values() if len(sharing) > 1 for stream in sharing}
+    return [
+        rrb.Spatial2DView(
+            origin=place.path, name=f"{place.stream}: {place.title}" if place.stream in alike else place.title
+        )
+        for place in places
+    ]
 
 
 def _images(drawn: Places) -> _Part | None:
@@ -179,8 +196,11 @@ def _below(drawn: Places) -> _Part:
     plots: list[_Part] = []
     shares: list[float] = []
     for root, title in ((SECONDS, "stage time (s)"), (QUEUES, "queue depth (frames)")):
-        if any(place.path.startswith(f"{root}/") for place in _at(drawn, Panel.STAGE)):
-            plots.append(rrb.TimeSeriesView(origin=root, name=title, plot_legend=rrb.PlotLegend("LeftTop")))
+        lines = sum(place.stream == root for place in _at(drawn, Panel.STAGE))
+        few = lines <= LEGEND_LINES
+        if lines:
+            name = title if few else f"{title}: hover for names"
+            plots.append(rrb.TimeSeriesView(origin=root, name=name, plot_legend=rrb.PlotLegend("LeftTop", visible=few)))
             shares.append(1.4)
     panels = ((Panel.ANGLE, "tilt (degrees)"), (Panel.HEALTH, "tilt check (degrees)"), (Panel.FEATURES, "odometry"))
     angles = _tabs((_series(drawn, panel, title) for panel, title in panels), active=0)

@@ -40,10 +40,11 @@ class _State:
 
 @dataclass
 class _Memory:
-    """The state after the last frame, and how many poses were made."""
+    """The state after the last frame, how many poses were made, and the last segment of the motion."""
 
     state: _State | None = None
     visual: int = 0
+    segment: int = 0
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ class Locate(Stage):
         Its frame is `visual_odom`: z up, origin and heading those of the first frame, and "visual_odom/2" and so on for
         what came after tracking was lost. Raises ValueError where the images do not tell the motion.
         """
+        self._memory.segment = motion.segment
         if logged is not None:
             return logged
         if motion.camera is None:
@@ -84,14 +86,18 @@ class Locate(Stage):
         return self._pose(motion.stamp, state, mount)
 
     def finding(self) -> Finding | None:
-        """That poses are visual, and in which frames, a warning for several; None where poses are given."""
-        if self._memory.state is None:
-            return None
-        last = self._memory.state.segment
-        said = f"no pose is given; {self._memory.visual} by visual odometry, in {VISUAL_FRAME}"
-        if last < 2:
-            return Finding(said)
-        parted = f"{said} to {_frame_of(last)}, which nothing joins: tracking was lost between them"
+        """Where poses come from, if not from the log, and how often tracking was lost: a warning where that parts them;
+        None where they are given and it never was."""
+        memory = self._memory
+        lost = "tracking was lost " + ("once" if memory.segment == 2 else f"{memory.segment - 1} times")
+        if memory.state is None:
+            return Finding(f"{lost} by visual odometry; the poses are the log's own") if memory.segment > 1 else None
+        poses = "1 pose" if memory.visual == 1 else f"{memory.visual} poses"
+        said = f"no pose is given: visual odometry supplies it ({poses})"
+        if memory.segment < 2:
+            return Finding(f"{said}, in frame {VISUAL_FRAME}")
+        frames = f"{VISUAL_FRAME} {'and' if memory.segment == 2 else 'to'} {_frame_of(memory.segment)}"
+        parted = f"{said}; {lost}, so they are in {memory.segment} frames, {frames}, that nothing joins"
         return Finding(parted, Severity.WARNING)
 
     def _begun(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> _State:

@@ -65,15 +65,11 @@ class VisualOdometry(Stage):
         return self._begun(frame, seen, lost)
 
     def finding(self) -> Finding | None:
-        """What to say of the whole run: where tracking was lost; None where it never was."""
-        segments, blind = self._memory.segment, self._memory.blind
-        parts = []
-        if segments > 1:
-            times = "once" if segments == 2 else f"{segments - 1} times"
-            parts.append(f"tracking was lost {times}, so the motion is in {segments} segments that nothing joins")
-        if blind:
-            parts.append(f"{blind} {'frame shows' if blind == 1 else 'frames show'} too little to track")
-        return Finding("; ".join(parts)) if parts else None
+        """How many frames show too little; None where all show enough. That tracking was lost is for Locate to tell,
+        which knows what that does to the poses."""
+        blind = self._memory.blind
+        shows = "frame shows" if blind == 1 else "frames show"
+        return Finding(f"{blind} {shows} too little to track") if blind else None
 
     def _likely(self, step: Step) -> bool:
         return step.error <= self.worst and float(np.linalg.norm(step.translation)) <= self.fastest

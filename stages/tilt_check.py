@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, PointCloud, Source, Tilt, TiltHealth, Transform
 from stages.stage import Finding, Severity, Stage, parameter
-from stages.tilt_diagnosis import INCONSISTENT, Diagnosis, Evidence, diagnose
+from stages.tilt_diagnosis import INCONSISTENT, Diagnosis, Evidence, diagnose, off_level
 
 MOVED = 0.05  # m, or
 TURNED = float(np.deg2rad(0.3))  # rad, by which a frame must differ from the one kept before
@@ -58,12 +58,15 @@ class _Verdict:
 
 @dataclass
 class _Memory:
-    """The frames that count, the last frame of all, how many were kept since they were judged, and the verdict."""
+    """The frames that count, the last frame of all, how many were kept since they were judged, the verdict, and the
+    least angle, rad, by which the ground was off level in any frame that shows it, with the number of these."""
 
     kept: deque[_Sight] = field(default_factory=deque)
     last: _Sight | None = None
     since: int = 0
     verdict: _Verdict = field(default_factory=_Verdict)
+    least_slope: float = np.inf
+    slopes: int = 0
 
 
 @dataclass(frozen=True)
@@ -94,8 +97,11 @@ class CheckTilt(Stage):
             turn = self._residual(sight)
             memory.last = sight
             self._keep(sight)
-        judged = memory.verdict.last
-        slope = _angle(up, ground) if np.isfinite(ground).all() else np.nan
+        slope = np.nan
+        if np.isfinite(ground).all():
+            slope = _angle(up, ground)
+            memory.least_slope, memory.slopes = min(memory.least_slope, slope), memory.slopes + 1
+        judged = self._told(memory.verdict)
         return TiltHealth(motion.stamp, turn, slope, len(memory.kept), judged.fault, judged.sentence)
 
     def finding(self) -> Finding:
@@ -104,9 +110,16 @@ class CheckTilt(Stage):
         if self._memory.since:
             verdict = verdict.and_then(self._diagnosis())
         if verdict.fault is None:
-            return Finding(verdict.last.sentence)
+            told = self._told(verdict)
+            return Finding(told.sentence, Severity.WARNING if told.fault else Severity.NOTE)
         where = "" if verdict.faults == verdict.clear else f" ({verdict.faults} of {verdict.clear} judgements)"
         return Finding(verdict.fault.sentence + where, Severity.WARNING)
+
+    def _told(self, verdict: _Verdict) -> Diagnosis:
+        """The last judgement; as long as none could tell anything, what the ground alone says of every frame so far."""
+        memory = self._memory
+        steep = off_level(memory.least_slope, memory.slopes) if verdict.clear == 0 and not verdict.last.fault else None
+        return steep or verdict.last
 
     def _residual(self, sight: _Sight) -> float:
         """By how much up differs from the last frame's, carried along by the camera; NaN in a new segment."""

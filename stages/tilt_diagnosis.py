@@ -20,6 +20,7 @@ from stages.data import Array
 NOISE = float(np.deg2rad(0.2))  # of a tilt, against which the camera's own drift is weighed; the real one is estimated
 LEAST_NOISE = float(np.deg2rad(0.05))
 GROUND = float(np.deg2rad(8))  # standard deviation of the slope of all ground in view
+STEEPEST = float(np.deg2rad(20))  # ground that is steeper in every frame is taken for a wrong tilt
 NOISIEST = float(np.deg2rad(2.0))  # beyond it tilt and camera do not agree, whatever the best explanation
 MARGIN = 25.0  # by how much a fault must fit better than none, in units of the noise's variance: five sigma
 RIVAL = 10.0  # and than other faults, or they are named with it
@@ -28,6 +29,7 @@ HIDDEN = 0.33  # standard deviation of a fault, over the least that counts, beyo
 PARAMETER = 4.0  # by how much a fault must fit better for each number that is fitted to it
 LEAST_FRAMES = 8
 INCONSISTENT = "inconsistent"  # the fault of a tilt that no single fault explains
+OFF_GROUND = "up is off the ground"  # of one that the ground contradicts, where the motion cannot tell why
 LONGEST = 0.6  # s, of time offsets that are tried
 SLOWEST = 1.5  # s between frames, beyond which no offset can be told
 WILD = 4.0  # how many times more than the camera the tilt must turn to have a wrong unit
@@ -114,6 +116,22 @@ def diagnose(evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_off
     return _passed(sound, axes, mount, offset, variance, n, float(before))
 
 
+def off_level(least: float, frames: int) -> Diagnosis | None:
+    """What the ground alone tells, of one frame or two as of many; None where it may well be terrain.
+
+    least: rad, the angle by which the ground in view is off level at least, in each of so many frames.
+    """
+    if not frames or least <= STEEPEST:
+        return None
+    every = "the only frame" if frames == 1 else f"every one of {frames} frames"
+    sentence = (
+        f"the ground in view is off level by {_deg(least)} or more in {every}, which is steeper than terrain is on the "
+        "whole; look at the sign of pitch, the inclinometer's axes and its mount (source.pitch.sign, "
+        "source.camera_from_inclinometer, --pitch-down of an import)"
+    )
+    return Diagnosis(OFF_GROUND, sentence, False, np.nan)
+
+
 def _named(best: _Cause, rivals: list[_Cause], n: int, before: float, after: float) -> Diagnosis:
     if after > NOISIEST:
         return _inconsistent(n, before)
@@ -152,7 +170,7 @@ def _passed(
             f"up is {_deg(slope)} off the ground's own normal ({n} frames): check the inclinometer's axes and "
             "source.camera_from_inclinometer; the rover has moved too little to tell which"
         )
-        return Diagnosis("up is off the ground", sentence, False, residual)
+        return Diagnosis(OFF_GROUND, sentence, False, residual)
     open_ = [c.fault for c in axes if c.score(variance) - sound.score(variance) < MARGIN]
     hidden = ["exchanged or flipped axes"] if open_ else []
     if mount.error * np.sqrt(variance) > HIDDEN:

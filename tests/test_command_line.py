@@ -84,7 +84,8 @@ def test_a_log_without_a_pose_gets_one_that_says_it_is_visual(traverse, tmp_path
         place = pose.pose.pose.position
         assert np.linalg.norm([place.x - true[0], place.y - true[1], place.z - true[2]]) < 0.03
     findings = json.loads(summary.read_text())["findings"]
-    assert findings["pose"]["sentence"] == f"no pose is given; {FRAMES} by visual odometry, in visual_odom"
+    said = f"no pose is given: visual odometry supplies it ({FRAMES} poses), in frame visual_odom"
+    assert findings["pose"]["sentence"] == said
     assert f"pose: {findings['pose']['sentence']}" in capsys.readouterr().out
 
 

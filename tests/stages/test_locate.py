@@ -46,7 +46,8 @@ def test_poses_of_base_link_follow_the_drive_and_say_that_they_are_visual():
     np.testing.assert_allclose(poses[0].position, 0, atol=1e-12)
     assert np.linalg.norm(places[-1]) < 0.05  # of 12 m; the first tilt's noise is all that errs here
     assert np.abs(turns[:, 2]).max() < 0.1
-    assert stage.finding() == Finding(f"no pose is given; {FRAMES} by visual odometry, in visual_odom")
+    said = f"no pose is given: visual odometry supplies it ({FRAMES} poses), in frame visual_odom"
+    assert stage.finding() == Finding(said)
 
 
 def test_the_tilt_is_smoothed_along_the_images():
@@ -97,10 +98,19 @@ def test_after_a_lost_track_the_poses_are_in_a_frame_of_their_own():
     poses = [stage(motion, Tilt(motion.stamp, up), mount_of(DRIVE)) for motion, up in zip(given, ups, strict=True)]
     assert [pose.frame_id for pose in poses] == ["visual_odom"] * 3 + ["visual_odom/2"] * 3
     np.testing.assert_allclose(poses[3].position, 0, atol=1e-12)
-    found = stage.finding()
-    assert found is not None
-    assert "in visual_odom to visual_odom/2, which nothing joins" in found.sentence
-    assert found.severity is Severity.WARNING
+    said = (
+        "no pose is given: visual odometry supplies it (6 poses); tracking was lost once, so they are in 2 frames, "
+        "visual_odom and visual_odom/2, that nothing joins"
+    )
+    assert stage.finding() == Finding(said, Severity.WARNING)
+
+
+def test_a_lost_track_is_a_mere_note_where_the_log_has_the_poses():
+    pose, stage = Pose(7, [1, 2, 3], [0, 0, 0, 1], "odom", "base_link"), Locate()
+    for segment in (1, 2, 3):
+        motion = motions(DRIVE.cameras(1), DRIVE.stamps(1), segment=segment)[0]
+        stage(motion, Tilt(7, DRIVE.ups(1)[0]), mount_of(DRIVE), pose)
+    assert stage.finding() == Finding("tracking was lost 2 times by visual odometry; the poses are the log's own")
 
 
 def test_without_base_link_it_is_the_cameras_pose():

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from stages import CheckTilt, Mount, PointCloud, Tilt, TiltHealth, Transform
@@ -85,6 +89,37 @@ def test_the_ground_in_view_is_measured_whatever_lies_on_it_and_whatever_frame_t
             0, sensor(cloud.points).astype(np.float32), cloud.colors, cloud.sigma, cloud.pixel, "level", sensor=sensor
         )  # fmt: skip
         assert abs(CheckTilt()(motion, tilt, mount, moved).ground - health.ground) < 1e-3
+
+
+@pytest.mark.parametrize("frames", [1, 2, 4, 12])
+def test_ground_far_off_level_in_every_frame_is_a_warning_however_few_they_are(frames):
+    """As where the pitch of a camera that looks down by 14.6 degrees has the wrong sign."""
+    stage, mount, tilt = CheckTilt(), Mount(0, np.eye(3)), np.array([0, -1.0, 0])
+    for motion in motions(DRIVE.cameras(1), [0]) * frames:
+        health = stage(motion, Tilt(motion.stamp, tilt, "camera"), mount, ground(29.2))
+        assert health.fault == "up is off the ground"
+    found = stage.finding()
+    assert found.severity is Severity.WARNING
+    assert re.search(r"off level by 29\.\d degrees or more in (the only|every)", found.sentence), found.sentence
+    assert "look at the sign of pitch, the inclinometer's axes and its mount" in found.sentence
+
+
+def test_steep_ground_is_no_fault_nor_is_a_bank_that_only_some_frames_show():
+    motion, tilt = motions(DRIVE.cameras(1), [0])[0], Tilt(0, np.array([0, -1.0, 0]), "camera")
+    for slopes in ((15.0, 15.0), (-15.0,), (29.0, 18.0)):
+        stage = CheckTilt()
+        health = [stage(motion, tilt, Mount(0, np.eye(3)), ground(slope)) for slope in slopes][-1]
+        assert (health.fault, stage.finding().severity) == ("", Severity.NOTE)
+
+
+def test_a_tilt_that_the_motion_proves_sound_stays_sound_on_a_hillside_of_25_degrees():
+    stage, mount = CheckTilt(), Mount(0, DRIVE.mount)
+    for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), DRIVE.ups(), strict=True):
+        level = Rotation.align_vectors([mount.camera_from_inclinometer @ up], [[0, -1.0, 0]])[0].as_matrix()
+        hill = ground(25.0)
+        stage(motion, Tilt(motion.stamp, up), mount, replace(hill, points=(hill.points @ level.T).astype(np.float32)))
+    assert stage.finding().severity is Severity.NOTE
+    assert stage.finding().sentence.startswith("tilt and camera agree to 0.")
 
 
 def test_an_empty_cloud_has_no_ground():
