@@ -94,7 +94,8 @@ class Reading:
 class McapLog:
     """An opened log; iterating gives (log time in ns, stream, item), an exception as item standing for a loss.
 
-    missing: stream -> why the log does not provide it, and what to do; topics: stream -> topic; frames: left images to
+    missing: stream -> why the log does not provide it, and what to do; refused: setting of the source that the log does
+    not bear out -> why; topics: stream -> topic; frames: left images to
     come; cameras: the calibrated pair, where both are there; static: the log's static transforms; problems: (stream,
     loss) that opening it came upon.
     """
@@ -104,6 +105,7 @@ class McapLog:
     start: float | None = None
     end: float | None = None
     missing: dict[str, str] = field(init=False)
+    refused: dict[str, str] = field(init=False)
     topics: dict[str, str] = field(init=False)
     cameras: tuple[Camera, Camera] | None = field(init=False)
     static: Frames = field(init=False)
@@ -116,6 +118,7 @@ class McapLog:
             self._check_range()
             self._opening = opening = Opening(self.file, self.source)
             self.missing, self.topics, self.problems = opening.missing, opening.topics, opening.problems
+            self.refused = opening.refused
             self.cameras, self.static, self.mount = opening.cameras, opening.static, opening.mount
         except BaseException:
             self.file.close()

@@ -38,7 +38,8 @@ T = TypeVar("T")
 class Opening:
     """What a log offers.
 
-    decoders: by channel; missing: stream -> why the log does not provide it, and what to do; topics: stream -> topic;
+    decoders: by channel; missing: stream -> why the log does not provide it, and what to do; refused: setting of the
+    source that the log does not bear out -> why; topics: stream -> topic;
     infos: side -> topic of its calibration, and the first of it; cameras: the calibrated pair, where both are there;
     static: the log's static transforms; tilt_frame: of the inclinometer's first message; problems: (stream, loss) that
     came up.
@@ -47,6 +48,7 @@ class Opening:
     def __init__(self, file: McapFile, source: McapSource) -> None:
         self.file, self.source = file, source
         self.missing: dict[str, str] = {}
+        self.refused: dict[str, str] = {}
         self.topics: dict[str, str] = {}
         self.infos: dict[str, tuple[str, CameraModel]] = {}
         self.cameras: tuple[Camera, Camera] | None = None
@@ -99,8 +101,13 @@ class Opening:
     def _discover(self) -> Topics:
         topics = [Topic(name, self.schemas[name], self.file.count(self.channels_of(name))) for name in self.schemas]
         topics.sort(key=lambda topic: topic.name)
-        bare = self.source.angles() is not None
-        found = discover(topics, self.source, bare, self._frame_of, self._untilted)
+        angles = self.source.angles()
+        found = discover(topics, self.source, angles is not None, self._frame_of, self._untilted)
+        if angles is not None and (topic := found.chosen.get("inclinometer")):
+            checked = self._first(topic, angles.check)
+            if isinstance(checked, LogError):
+                del found.chosen["inclinometer"]
+                found.refuse("inclinometer", "pitch and roll", f"bare angles of {topic}: {checked}")
         sealed = {self.file.channel(n).topic: why for n, why in self._sealed.items() if self.file.count({n})}
         listed = [f"{topic}: {why}" for topic, why in sorted(sealed.items()) if topic not in self.schemas]
         if listed:
@@ -108,6 +115,7 @@ class Opening:
             aside = f" (topics that cannot be decoded: {'; '.join(listed[:_LISTED])}{more})"
             found.missing = {stream: why + aside for stream, why in found.missing.items()}
         self.missing.update(found.missing)
+        self.refused.update(found.refused)
         self.topics.update({role: name for role, name in found.chosen.items() if role in _STREAMS})
         return found
 
