@@ -169,8 +169,7 @@ def _settled(item: _Value, settings: Mapping[str, _Value]) -> _Value:
     name = item.value[1:]
     if name not in settings:
         raise item.place.error(f"there is no setting '{name}'{_nearest(name, settings)}")
-    given = settings[name]
-    return _Value(given.value, given.place if given.place.line is None else item.place)
+    return settings[name]
 
 
 class _Builder:

@@ -23,8 +23,8 @@ source: {use: tests.flow.toys.Source}
 streams:
   both:   {use: flow.align.pair, left: left, right: right}
   height: {use: flow.align.interpolate, stream: level, at: both}
-  twice:  {use: tests.flow.toys.Scale, couple: both, factor: 2, nap: %(nap)s, bad: %(bad)s}
-  thrice: {use: tests.flow.toys.Scale, couple: both, factor: 3, nap: %(nap)s}
+  twice:  {use: tests.flow.toys.Scale, couple: both, factor: 2 m, nap: %(nap)s s, bad: %(bad)s}
+  thrice: {use: tests.flow.toys.Scale, couple: both, factor: 3 m, nap: %(nap)s s}
   sum:    {use: tests.flow.toys.Add, a: twice, b: thrice}
   raised: {use: tests.flow.toys.Add, a: sum, b: height}
   total:  {use: tests.flow.toys.Total, couple: twice}
