@@ -18,7 +18,7 @@ from recordings.decode import camera_model, frame_of, tilt_of
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError
 from recordings.mcap_index import Lost, said
-from recordings.mcap_reader import McapFile
+from recordings.mcap_reader import CONVERT, McapFile
 from recordings.rig import Camera, Frames, calibrated_pair, mounted
 from recordings.ros2_types import decoder_for, full_name
 from stages.data import CameraModel, Mount
@@ -82,7 +82,8 @@ class Opening:
     def _decoder(self, channel: Channel) -> Decoder:
         schema = self.file.schema(channel)
         if channel.message_encoding != "cdr":
-            raise LogError(f"its messages are in '{channel.message_encoding}', not in 'cdr' as those of ROS 2")
+            remedy = f"; convert the bag itself: {CONVERT}" if channel.message_encoding == "ros1" else ""
+            raise LogError(f"its messages are in '{channel.message_encoding}', not in 'cdr' as those of ROS 2{remedy}")
         if schema is None:
             raise LogError("its messages have no schema")
         decoder = decoder_for(schema.name, schema.encoding, schema.data)
