@@ -154,6 +154,21 @@ def test_a_module_that_does_not_import_is_named_with_its_line(tmp_path):
         loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", "broken.Stage"))
 
 
+def test_what_is_no_dataclass_is_not_told_to_be_itself(tmp_path):
+    (tmp_path / "plain.py").write_text("class Stage:\n    def __call__(self): ...\ndef function(): ...\n")
+    for name in ("Stage", "function"):
+        with pytest.raises(PipelineError, match=rf"toy.yaml:5: plain.{name} is no dataclass") as caught:
+            loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", f"plain.{name}"))
+        assert "did you mean" not in str(caught.value)
+
+
+def test_a_stage_that_breaks_down_as_it_is_made_is_named_with_its_line(tmp_path):
+    source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Odd(Add):\n    __call__ = Add.__call__\n"
+    (tmp_path / "odd.py").write_text(source + "    def __post_init__(self):\n        {}['nix']\n")
+    with pytest.raises(PipelineError, match=r"toy.yaml:6: KeyError: 'nix' \(odd.py, line 6; --debug"):
+        loaded(tmp_path, GOOD.replace("tests.flow.toys.Add", "odd.Odd"))
+
+
 def test_an_anchor_that_holds_itself_is_refused(tmp_path):
     with pytest.raises(PipelineError, match="anchor"):
         loaded(tmp_path, "a: &a [*a]\n")
