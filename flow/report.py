@@ -23,11 +23,16 @@ def headline(summary: dict[str, Any]) -> str:
     """The verdict of a run in a line: how many frames are whole, and what was lost, be it frames or what made none."""
     whole, of, drops = summary["frames_out"], summary["frames_in"], summary["drops"]
     all_but = summary["verdict"] == Verdict.COMPLETE or whole != of  # else "18 of 18" would hide what made no frame
-    frames = f"{whole} of {of} frames" if all_but else f"{whole} frame{'' if whole == 1 else 's'}"
+    frames = f"{whole} of {of} frames" if all_but else counted(whole, "frame")
     said = f"interrupted after {frames}" if summary["interrupted"] else f"{frames} whole"
     lost = ", ".join(f"{number} {reason}" for reason, number in drops.items())
     count = f", {sum(drops.values())} lost: {lost}" if drops else ""
     return f"{summary['verdict']}: {said}{count}; {summary['frames_per_second']:.2f} frames/s"
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things in words: "1 frame", "2 frames"."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def report(summary: dict[str, Any]) -> None:

@@ -39,7 +39,7 @@ class Opening:
     """What a log offers.
 
     decoders: by channel; missing: stream -> why the log does not provide it, and what to do; refused: setting of the
-    source that the log does not bear out -> why; topics: stream -> topic;
+    source that the log does not bear out -> why; undecodable: the topics that are, in words; topics: stream -> topic;
     infos: side -> topic of its calibration, and the first of it; cameras: the calibrated pair, where both are there;
     static: the log's static transforms; tilt_frame: of the inclinometer's first message; problems: (stream, loss) that
     came up.
@@ -58,6 +58,8 @@ class Opening:
         self.problems: list[tuple[str, LogError]] = []
         self.schemas: dict[str, str] = {}
         self.decoders: dict[int, Decoder] = {}
+        self.undecodable = ""
+        self._sought = set[str]()  # streams of which no topic was found
         self._sealed: dict[int, str] = {}  # channel -> why it cannot be decoded
         self._find_decoders()
         self._read_static()
@@ -67,6 +69,11 @@ class Opening:
         for stream in self.missing:
             self.topics.pop(stream, None)
         self._tell_sealed()
+
+    def refusals(self) -> dict[str, str]:
+        """`missing`, each as a sentence that stands alone: what was sought may be among what cannot be decoded."""
+        aside = f" ({self.undecodable})" if self.undecodable else ""
+        return {name: why + aside if name in self._sought else why for name, why in self.missing.items()}
 
     def channels_of(self, topic: str) -> set[int]:
         """The channels of a topic that can be decoded."""
@@ -113,8 +120,8 @@ class Opening:
         listed = [f"{topic}: {why}" for topic, why in sorted(sealed.items()) if topic not in self.schemas]
         if listed:
             more = f", and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-            aside = f" (topics that cannot be decoded: {'; '.join(listed[:_LISTED])}{more})"
-            found.missing = {stream: why + aside for stream, why in found.missing.items()}
+            self.undecodable = f"topics that cannot be decoded: {'; '.join(listed[:_LISTED])}{more}"
+        self._sought = set(found.missing)
         self.missing.update(found.missing)
         self.refused.update(found.refused)
         self.topics.update({role: name for role, name in found.chosen.items() if role in _STREAMS})
@@ -144,9 +151,8 @@ class Opening:
 
     def _find_mount(self) -> None:
         if self.cameras is None:
-            self.missing["mount"] = (
-                f"without a calibrated left camera there is no mount: {self.missing.get('left', '')}"
-            )
+            why = next(self.missing[side] for side in CAMERAS if side in self.missing)
+            self.missing["mount"] = f"without a calibrated pair of cameras there is no mount: {why}"
         elif "inclinometer" in self.missing:
             self.missing["mount"] = f"without an inclinometer there is no mount: {self.missing['inclinometer']}"
         else:

@@ -246,7 +246,7 @@ def _opened(path: Path) -> BinaryIO:
     if not start:
         raise LogError(f"{path} is empty (0 bytes); record it again")
     if start.startswith(b"#ROSBAG"):
-        raise LogError(f"{path} is a ROS 1 bag; make OUT/OUT.mcap of it first: {CONVERT}")
+        raise LogError(f"{path} is a ROS 1 bag; convert it to OUT/OUT.mcap first: {CONVERT}")
     if start.startswith(b"SQLite format 3"):
         raise LogError(f"{path} is a rosbag2 SQLite bag; convert it to MCAP first: mcap convert IN.db3 OUT.mcap")
     raise LogError(f"{path} is not an MCAP log (it does not begin like one); give a .mcap file")

@@ -167,7 +167,7 @@ def test_a_ros_1_bag_is_refused_with_the_command_that_converts_it(tmp_path: Path
         connection = writer.add_connection("/place", kind.__msgtype__, typestore=store)
         message = kind(header(0, stamp(1, 0), "map"), point(1.0, 2.0, 3.0))
         writer.write(connection, 10**9, store.serialize_ros1(message, kind.__msgtype__))
-    with pytest.raises(LogError, match=r"is a ROS 1 bag; make OUT/OUT\.mcap of it first: rosbags-convert") as caught:
+    with pytest.raises(LogError, match=r"is a ROS 1 bag; convert it to OUT/OUT\.mcap first: rosbags-convert") as caught:
         McapSource().open(tmp_path / "IN.bag")
     command = str(caught.value).rpartition(": ")[2].split()
     subprocess.run([Path(sys.executable).parent / command[0], *command[1:]], cwd=tmp_path, check=True)
