@@ -217,7 +217,7 @@ def _find_tilt(
     given = settings.inclinometer
     if given is not None:
         topic = next((topic for topic in topics if topic.name == given and topic.messages), None)
-        if topic is None:
+        if topic is None or topic.schema in (*IMAGES, INFO, TRANSFORMS, *(() if bare_angles else POSES)):
             candidates = [topic for topic in topics if topic.schema in (*TILTS, BARE_TILT)]
             found.refuse("inclinometer", "inclinometer", _not_there("inclinometer", given, "tilt", candidates))
         elif not bare_angles and topic.schema not in TILTS:

@@ -131,6 +131,7 @@ def test_a_full_output_is_said_in_a_sentence():
         ("left", "/nix", "its image topics are /stereo/left/image_rect_color"),
         ("right_info", "/nix", "its CameraInfo topics are /stereo/left/camera_info"),
         ("inclinometer", "/nix", "its tilt topics are /imu"),
+        ("inclinometer", "/odometry", "its tilt topics are /imu"),
     ],
 )
 def test_a_topic_that_is_named_but_not_there_is_refused_and_nothing_stands_in(
