@@ -298,8 +298,9 @@ class _Builder:
         try:
             return kind(**values)
         except Exception as error:  # whatever a stage of the user's own may raise
-            set_by_hand = [item.value[key].place for key in values if item.value[key].place.line is None]
-            raise (set_by_hand or [item.place])[-1].error(failure(error)) from error
+            by_hand = [item.value[key].place for key in values if item.value[key].place.line is None]
+            named = [item.value[key].place for key in values if f"{kind.__name__}.{key}" in str(error)]
+            raise (named or by_hand or [item.place])[-1].error(failure(error)) from error
 
     def _class(self, item: _Value, what: str) -> type:
         use = self._use(item, what)

@@ -141,6 +141,15 @@ def test_a_bad_setting_is_named(tmp_path, setting):
         loaded(tmp_path, overrides=[setting])
 
 
+def test_of_several_settings_the_one_at_fault_is_named(tmp_path):
+    source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Odd(Scale):\n"
+    source += "    __call__ = Scale.__call__\n    def __post_init__(self):\n        raise ValueError('Odd.nap: no')\n"
+    (tmp_path / "strict.py").write_text(source)
+    text = GOOD.replace("tests.flow.toys.Scale", "strict.Odd")
+    with pytest.raises(PipelineError, match=r"--set twice.nap=1 s: Odd.nap: no"):
+        loaded(tmp_path, text, overrides=["twice.nap=1 s", "twice.factor=2 m"])
+
+
 def test_stages_may_stand_beside_the_file_that_uses_them(tmp_path):
     source = "from tests.flow.toys import Scale\nclass Near(Scale):\n    __call__ = Scale.__call__\n"
     (tmp_path / "beside.py").write_text(source)
