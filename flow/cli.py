@@ -20,7 +20,7 @@ from typing import Any
 from flow.arguments import check_outputs, count, magnitude, seconds, size
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.replay import as_json, product_version, replay
-from flow.report import report, say
+from flow.report import counted, report, say
 
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -229,7 +229,7 @@ def simulate(out: Path, **settings: Any) -> None:
             bar.update(done - bar.n)
 
         simulation.write(out, progress)
-    say(f"{out}: {simulation.frames} frames with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
+    say(f"{out}: {counted(simulation.frames, 'frame')} with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
 
 
 def _import_images_arguments(sub: argparse.ArgumentParser) -> None:
@@ -252,7 +252,7 @@ def _import_images(options: argparse.Namespace) -> int:
         left, right, options.calibration, options.out,
         pitch_down=options.pitch_down, roll=options.roll, height=options.height, rate=options.rate,
     )  # fmt: skip
-    say(f"{options.out}: {frames} stereo frames ({options.out.stat().st_size / 1e6:.1f} MB)")
+    say(f"{options.out}: {counted(frames, 'stereo frame')} ({options.out.stat().st_size / 1e6:.1f} MB)")
     return COMPLETE
 
 

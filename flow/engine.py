@@ -11,7 +11,6 @@ nobody else, the engine cannot lock up, and since downstream work goes first, fe
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
@@ -22,8 +21,6 @@ from typing import Any
 
 from flow.graph import Node, Sink
 from flow.ledger import Absent, Entry, Ledger, Reason, failure
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -161,7 +158,6 @@ class Engine:
             try:
                 value = work.run(frame)
             except BaseException as error:
-                log.debug("%s failed", work.name, exc_info=True)
                 value = error
             seconds = time.perf_counter() - seconds
             with self._condition:

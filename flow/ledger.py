@@ -5,10 +5,15 @@ A run is COMPLETE when the ledger is empty. Nothing is ever dropped without an e
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter
 from dataclasses import asdict, dataclass
 from enum import StrEnum
+from pathlib import Path
+from traceback import extract_tb
+
+log = logging.getLogger(__name__)
 
 
 class Reason(StrEnum):
@@ -52,8 +57,20 @@ class Absent:
 
 
 def failure(error: BaseException) -> str:
-    """What the ledger says of an exception: a ValueError speaks for itself, others need their name."""
-    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+    """What the ledger says of an exception: a ValueError speaks for itself, others need their name and place."""
+    log.debug("%s", error, exc_info=error)
+    if isinstance(error, ValueError):
+        return str(error)
+    place = _place(error)
+    return f"{type(error).__name__}: {error}{f' ({place}; --debug shows the way there)' if place else ''}"
+
+
+def _place(error: BaseException) -> str:
+    """Where in the file of the stage that was called an exception came up; empty where none had been called."""
+    trace = [call for call in extract_tb(error.__traceback__) if not call.filename.startswith("<")]
+    calls = [call for call in trace if Path(call.filename).parent != Path(__file__).parent]
+    own = [call for call in calls if call.filename == calls[0].filename]
+    return f"{Path(own[-1].filename).name}, line {own[-1].lineno}" if own else ""
 
 
 class Ledger:

@@ -18,6 +18,7 @@ import yaml
 
 from flow.errors import PipelineError, UsageError
 from flow.graph import Graph, Node, Place, accepts, clock_of, in_order, is_aligner, output_of, ports_of
+from flow.ledger import failure
 from flow.values import coerced
 
 SHIPPED = Path(__file__).parent / "pipelines"
@@ -169,8 +170,7 @@ def _settled(item: _Value, settings: Mapping[str, _Value]) -> _Value:
     name = item.value[1:]
     if name not in settings:
         raise item.place.error(f"there is no setting '{name}'{_nearest(name, settings)}")
-    given = settings[name]
-    return _Value(given.value, given.place if given.place.line is None else item.place)
+    return settings[name]
 
 
 class _Builder:
@@ -297,9 +297,10 @@ class _Builder:
                 raise item.place.error(f"{self._use(item, what)} needs its parameter '{key}'")
         try:
             return kind(**values)
-        except (ValueError, TypeError) as error:
-            set_by_hand = [item.value[key].place for key in values if item.value[key].place.line is None]
-            raise (set_by_hand or [item.place])[-1].error(str(error)) from error
+        except Exception as error:  # whatever a stage of the user's own may raise
+            by_hand = [item.value[key].place for key in values if item.value[key].place.line is None]
+            named = [item.value[key].place for key in values if f"{kind.__name__}.{key}" in str(error)]
+            raise (named or by_hand or [item.place])[-1].error(failure(error)) from error
 
     def _class(self, item: _Value, what: str) -> type:
         use = self._use(item, what)
@@ -313,7 +314,10 @@ class _Builder:
             raise place.error(f"cannot import '{module_name}': {type(error).__name__}: {error}") from error
         kind = getattr(module, name, None)
         if not (isinstance(kind, type) and is_dataclass(kind)):
-            known = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
+            listed = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
+            known = [n for n in listed if is_dataclass(getattr(module, n, None))]
+            if hasattr(module, name):
+                raise place.error(f"{use} is no dataclass, as what a pipeline uses must be{_nearest(name, known)}")
             raise place.error(f"'{module_name}' has no '{name}' that a pipeline can use{_nearest(name, known)}")
         if what.startswith("stream") and not is_aligner(kind) and "__call__" not in vars(kind):
             raise place.error(f"{use} is no stage: it has no __call__")

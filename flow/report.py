@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.findings import NOTE, WARNING, lines
+from flow.ledger import Verdict
 
 
 def say(text: str) -> None:
@@ -18,10 +19,25 @@ def say(text: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def headline(summary: dict[str, Any]) -> str:
+    """The verdict of a run in a line: how many frames are whole, and what was lost, be it frames or what made none."""
+    whole, of, drops = summary["frames_out"], summary["frames_in"], summary["drops"]
+    all_but = summary["verdict"] == Verdict.COMPLETE or whole != of  # else "18 of 18" would hide what made no frame
+    frames = f"{whole} of {of} frames" if all_but else counted(whole, "frame")
+    said = f"interrupted after {frames}" if summary["interrupted"] else f"{frames} whole"
+    lost = ", ".join(f"{number} {reason}" for reason, number in drops.items())
+    count = f", {sum(drops.values())} lost: {lost}" if drops else ""
+    return f"{summary['verdict']}: {said}{count}; {summary['frames_per_second']:.2f} frames/s"
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things in words: "1 frame", "2 frames"."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def report(summary: dict[str, Any]) -> None:
     """Print the summary of a run."""
-    rate = f"{summary['frames_per_second']:.2f} frames/s"
-    say(f"{summary['verdict']}: {summary['frames_out']} of {summary['frames_in']} frames whole, {rate}")
+    say(headline(summary))
     found = [summary["surveys"], summary["findings"]]
     for line in [line for part in found for line in lines(part, NOTE)]:
         say(f"  {line}")

@@ -24,6 +24,9 @@ UNITS: dict[str, tuple[str, float]] = {
     "": ("number", 1.0),
 }
 
+# what nobody writes bare, for 20 may be meant as cm or as m -> the units to write it with
+_WRITTEN = {"time": ("ms", "s"), "length": ("cm", "m"), "angle": ("deg", "rad")}
+
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z%]*)\s*$")
 
 
@@ -38,6 +41,7 @@ def quantity(text: str, unit: str) -> float:
         raise ValueError(f"'{text}' is not a number{f' with a unit such as 5 {unit}' if unit else ''}")
     number, given = float(match[1]), match[2]
     if given == "":
+        check_bare(number, unit)
         return number
     if given not in UNITS:
         raise ValueError(f"'{text}' has the unknown unit '{given}'; expected {unit or 'a plain number'}")
@@ -46,3 +50,10 @@ def quantity(text: str, unit: str) -> float:
     if kind != wanted:
         raise ValueError(f"'{text}' is a {kind}; expected {f'a {wanted} in {unit}' if unit else 'a plain number'}")
     return number if given == unit else number * size / base
+
+
+def check_bare(number: float, unit: str) -> None:
+    """Raise ValueError for a number without a unit where `unit` is one of time, length or angle; 0 needs none."""
+    units = _WRITTEN.get(UNITS.get(unit, ("", 1.0))[0])
+    if units and number:
+        raise ValueError(f"{number:.15g} needs a unit; write {' or '.join(f'{number:.15g} {name}' for name in units)}")

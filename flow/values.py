@@ -7,7 +7,7 @@ from dataclasses import Field
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
-from flow.units import quantity
+from flow.units import check_bare, quantity
 
 
 def coerced(value: Any, kind: Any, parameter: Field[Any]) -> Any:
@@ -38,8 +38,8 @@ def _number(value: Any, kind: type, parameter: Field[Any]) -> float | int:
         value = quantity(value, unit)
         if kind is int and float(value).is_integer():
             value = int(value)
-    elif unit in ("ns",) and not isinstance(value, bool):
-        raise ValueError(f"{value!r} needs a unit, such as '{value} ms'")
+    elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        check_bare(value, unit)
     if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
         wanted = {"int": "a whole number", "float": "a number"}[kind.__name__]
         raise ValueError(f"expected {wanted}{f' in {unit}' if unit else ''}, not {value!r}")

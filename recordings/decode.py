@@ -222,14 +222,29 @@ class Angle:
 
     def __call__(self, message: Any) -> float:
         """The angle in radians, in our sense of sign."""
-        value: Any = message
-        for name in self.field.split("."):
-            if not hasattr(value, name):
-                raise LogError(f"the message has no field '{self.field}' ({type(value).__name__} has no '{name}')")
-            value = getattr(value, name)
-        if not isinstance(value, int | float) or not np.isfinite(value):
+        value = self.number(message)
+        if not np.isfinite(value):
             raise LogError(f"field '{self.field}' holds {value}, which is not an angle")
         return self.sign * float(np.deg2rad(value) if self.unit == "deg" else value)
+
+    def number(self, message: Any) -> float:
+        """What the field holds, a number, NaN perhaps. Raises LogError where the message's type has no such field."""
+        value: Any = message
+        for name in self.field.split("."):
+            names = list(getattr(value, "__dataclass_fields__", ()))
+            if name not in names:
+                known = ", ".join(known for known in names if not known.startswith("_"))
+                where = f"{_kind(value)} (it has {known})" if known else _kind(value)
+                raise LogError(f"the message has no field '{self.field}': no '{name}' in its {where}")
+            value = getattr(value, name)
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            raise LogError(f"field '{self.field}' holds a {_kind(value)}, which is not an angle")
+        return float(value)
+
+
+def _kind(value: Any) -> str:
+    """The type of what a message holds: a message's own, or that of a number or a text."""
+    return str(getattr(value, "__msgtype__", type(value).__name__))
 
 
 @dataclass(frozen=True)
@@ -244,6 +259,11 @@ class Angles:
     pitch: Angle
     roll: Angle
     model: Literal["axis", "euler"]
+
+    def check(self, message: Any) -> None:
+        """Raise LogError where the message has no numbers in the two fields."""
+        self.pitch.number(message)
+        self.roll.number(message)
 
     def __call__(self, message: Any, log_time: int) -> Tilt:
         """The tilt that a message's two angles tell."""

@@ -49,10 +49,15 @@ class Topic:
 @dataclass
 class Topics:
     """What was found: the topic of each role (left, right, left_info, right_info, inclinometer, odometry), and for
-    each stream without one, why, and what to do."""
+    each stream without one, why, and what to do; for each setting that names a topic the log does not have, that."""
 
     chosen: dict[str, str] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+
+    def refuse(self, stream: str, setting: str, why: str) -> None:
+        """Note that a stream is missing because of a setting of the user's, for which nothing may stand in."""
+        self.missing[stream] = self.refused[setting] = why
 
 
 class Settings(Protocol):
@@ -115,7 +120,7 @@ def _find_images(topics: Sequence[Topic], settings: Settings, found: Topics) -> 
     names = {topic.name for topic in images}
     for side, given in (("left", settings.left), ("right", settings.right)):
         if given is not None and given not in names:
-            found.missing[side] = _not_there(side, given, "image", images)
+            found.refuse(side, side, _not_there(side, given, "image", images))
     if found.missing:
         return
     told = settings.left or settings.right  # then only its partner can be the other
@@ -184,7 +189,7 @@ def _find_info(
         if given in {topic.name for topic in infos}:
             found.chosen[f"{side}_info"] = given
         else:
-            found.missing[side] = _not_there(f"{side}_info", given, "CameraInfo", infos)
+            found.refuse(side, f"{side}_info", _not_there(f"{side}_info", given, "CameraInfo", infos))
         return
     base = _TRANSPORTS.sub("", image)
     names = {topic.name for topic in infos}
@@ -212,11 +217,11 @@ def _find_tilt(
     given = settings.inclinometer
     if given is not None:
         topic = next((topic for topic in topics if topic.name == given and topic.messages), None)
-        if topic is None:
+        if topic is None or topic.schema in (*IMAGES, INFO, TRANSFORMS, *(() if bare_angles else POSES)):
             candidates = [topic for topic in topics if topic.schema in (*TILTS, BARE_TILT)]
-            found.missing["inclinometer"] = _not_there("inclinometer", given, "tilt", candidates)
+            found.refuse("inclinometer", "inclinometer", _not_there("inclinometer", given, "tilt", candidates))
         elif not bare_angles and topic.schema not in TILTS:
-            found.missing["inclinometer"] = _undefined(topic)
+            found.refuse("inclinometer", "inclinometer", _undefined(topic))
         else:
             found.chosen["inclinometer"] = given
         return
@@ -253,10 +258,12 @@ def _undefined(topic: Topic) -> str:
 def _find_pose(topics: Sequence[Topic], settings: Settings, found: Topics) -> None:
     poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
     if settings.odometry is not None:
-        if settings.odometry in {topic.name for topic in topics if topic.schema in (*POSES, TRANSFORMS)}:
+        moving = [topic for topic in topics if topic.schema == TRANSFORMS and not topic.name.endswith("tf_static")]
+        candidates = poses + [topic for topic in moving if topic.messages]
+        if settings.odometry in {topic.name for topic in candidates}:
             found.chosen["odometry"] = settings.odometry
         else:
-            found.missing["odometry"] = _not_there("odometry", settings.odometry, "pose", poses)
+            found.refuse("odometry", "odometry", _not_there("odometry", settings.odometry, "pose", candidates))
         return
     choice = [topic for topic in poses if topic.schema == ODOMETRY and not topic.name.startswith(_RESULTS)]
     if len(choice) == 1:

@@ -51,7 +51,8 @@ def describe(path: Path, source: McapSource) -> dict[str, Any]:
             },
             "transforms": log.static.listed(),
             "mount": _mount(log),
-            "missing": dict(log.missing),
+            "missing": dict(log.lacking),
+            "undecodable": log.undecodable,
             "damage": list(dict.fromkeys(damage)),
         }
 
@@ -83,16 +84,22 @@ def format_description(description: dict[str, Any]) -> str:
         )
     frames = d["frames"]
     lines.append(
-        f"frames: {frames['pairs']} pairs within {frames['slop_s'] * 1e3:g} ms of {frames['left']} left and "
-        f"{frames['right']} right images; {frames['with_tilt']} with a tilt around them"
+        f"frames: {_counted(frames['pairs'], 'pair')} within {frames['slop_s'] * 1e3:g} ms of {frames['left']} left "
+        f"and {_counted(frames['right'], 'right image')}; {frames['with_tilt']} with a tilt around them"
     )
     if d["mount"]:
         down = "unknown" if d["mount"]["base"] is None else f"in '{d['mount']['base']}' at {d['mount']['position']}"
         lines.append(f"mount: camera {down}")
     lines += [f"transform: {transform}" for transform in d["transforms"]]
-    lines += [f"missing: {stream}: {why}" for stream, why in d["missing"].items()]
+    for why in dict.fromkeys(d["missing"].values()):
+        lines.append(f"missing: {', '.join(stream for stream in d['missing'] if d['missing'][stream] == why)}: {why}")
+    lines += [d["undecodable"]] if d["undecodable"] else []
     lines += [f"damaged: {what}" for what in d["damage"]]
     return "\n".join(lines)
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _topics(log: McapLog) -> list[dict[str, Any]]:

@@ -94,9 +94,10 @@ class Reading:
 class McapLog:
     """An opened log; iterating gives (log time in ns, stream, item), an exception as item standing for a loss.
 
-    missing: stream -> why the log does not provide it, and what to do; topics: stream -> topic; frames: left images to
-    come; cameras: the calibrated pair, where both are there; static: the log's static transforms; problems: (stream,
-    loss) that opening it came upon.
+    missing: stream -> why the log does not provide it, and what to do; refused: setting of the source that the log does
+    not bear out -> why; lacking: as `missing`, without the topics that cannot be decoded, which `undecodable` lists;
+    topics: stream -> topic; frames: left images to come; cameras: the calibrated pair, where both are there; static:
+    the log's static transforms; problems: (stream, loss) that opening it came upon.
     """
 
     path: Path
@@ -104,6 +105,9 @@ class McapLog:
     start: float | None = None
     end: float | None = None
     missing: dict[str, str] = field(init=False)
+    refused: dict[str, str] = field(init=False)
+    lacking: dict[str, str] = field(init=False)
+    undecodable: str = field(init=False)
     topics: dict[str, str] = field(init=False)
     cameras: tuple[Camera, Camera] | None = field(init=False)
     static: Frames = field(init=False)
@@ -115,7 +119,8 @@ class McapLog:
         try:
             self._check_range()
             self._opening = opening = Opening(self.file, self.source)
-            self.missing, self.topics, self.problems = opening.missing, opening.topics, opening.problems
+            self.missing, self.refused, self.undecodable = opening.refusals(), opening.refused, opening.undecodable
+            self.lacking, self.topics, self.problems = opening.missing, opening.topics, opening.problems
             self.cameras, self.static, self.mount = opening.cameras, opening.static, opening.mount
         except BaseException:
             self.file.close()

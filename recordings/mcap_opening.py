@@ -18,7 +18,7 @@ from recordings.decode import camera_model, frame_of, tilt_of
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError
 from recordings.mcap_index import Lost, said
-from recordings.mcap_reader import McapFile
+from recordings.mcap_reader import CONVERT, McapFile
 from recordings.rig import Camera, Frames, calibrated_pair, mounted
 from recordings.ros2_types import decoder_for, full_name
 from stages.data import CameraModel, Mount
@@ -38,7 +38,8 @@ T = TypeVar("T")
 class Opening:
     """What a log offers.
 
-    decoders: by channel; missing: stream -> why the log does not provide it, and what to do; topics: stream -> topic;
+    decoders: by channel; missing: stream -> why the log does not provide it, and what to do; refused: setting of the
+    source that the log does not bear out -> why; undecodable: the topics that are, in words; topics: stream -> topic;
     infos: side -> topic of its calibration, and the first of it; cameras: the calibrated pair, where both are there;
     static: the log's static transforms; tilt_frame: of the inclinometer's first message; problems: (stream, loss) that
     came up.
@@ -47,6 +48,7 @@ class Opening:
     def __init__(self, file: McapFile, source: McapSource) -> None:
         self.file, self.source = file, source
         self.missing: dict[str, str] = {}
+        self.refused: dict[str, str] = {}
         self.topics: dict[str, str] = {}
         self.infos: dict[str, tuple[str, CameraModel]] = {}
         self.cameras: tuple[Camera, Camera] | None = None
@@ -56,6 +58,8 @@ class Opening:
         self.problems: list[tuple[str, LogError]] = []
         self.schemas: dict[str, str] = {}
         self.decoders: dict[int, Decoder] = {}
+        self.undecodable = ""
+        self._sought = set[str]()  # streams of which no topic was found
         self._sealed: dict[int, str] = {}  # channel -> why it cannot be decoded
         self._find_decoders()
         self._read_static()
@@ -65,6 +69,11 @@ class Opening:
         for stream in self.missing:
             self.topics.pop(stream, None)
         self._tell_sealed()
+
+    def refusals(self) -> dict[str, str]:
+        """`missing`, each as a sentence that stands alone: what was sought may be among what cannot be decoded."""
+        aside = f" ({self.undecodable})" if self.undecodable else ""
+        return {name: why + aside if name in self._sought else why for name, why in self.missing.items()}
 
     def channels_of(self, topic: str) -> set[int]:
         """The channels of a topic that can be decoded."""
@@ -80,7 +89,8 @@ class Opening:
     def _decoder(self, channel: Channel) -> Decoder:
         schema = self.file.schema(channel)
         if channel.message_encoding != "cdr":
-            raise LogError(f"its messages are in '{channel.message_encoding}', not in 'cdr' as those of ROS 2")
+            remedy = f"; convert the bag itself: {CONVERT}" if channel.message_encoding == "ros1" else ""
+            raise LogError(f"its messages are in '{channel.message_encoding}', not in 'cdr' as those of ROS 2{remedy}")
         if schema is None:
             raise LogError("its messages have no schema")
         decoder = decoder_for(schema.name, schema.encoding, schema.data)
@@ -99,15 +109,21 @@ class Opening:
     def _discover(self) -> Topics:
         topics = [Topic(name, self.schemas[name], self.file.count(self.channels_of(name))) for name in self.schemas]
         topics.sort(key=lambda topic: topic.name)
-        bare = self.source.angles() is not None
-        found = discover(topics, self.source, bare, self._frame_of, self._untilted)
+        angles = self.source.angles()
+        found = discover(topics, self.source, angles is not None, self._frame_of, self._untilted)
+        if angles is not None and (topic := found.chosen.get("inclinometer")):
+            checked = self._first(topic, angles.check)
+            if isinstance(checked, LogError):
+                del found.chosen["inclinometer"]
+                found.refuse("inclinometer", "pitch and roll", f"bare angles of {topic}: {checked}")
         sealed = {self.file.channel(n).topic: why for n, why in self._sealed.items() if self.file.count({n})}
         listed = [f"{topic}: {why}" for topic, why in sorted(sealed.items()) if topic not in self.schemas]
         if listed:
             more = f", and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-            aside = f" (topics that cannot be decoded: {'; '.join(listed[:_LISTED])}{more})"
-            found.missing = {stream: why + aside for stream, why in found.missing.items()}
+            self.undecodable = f"topics that cannot be decoded: {'; '.join(listed[:_LISTED])}{more}"
+        self._sought = set(found.missing)
         self.missing.update(found.missing)
+        self.refused.update(found.refused)
         self.topics.update({role: name for role, name in found.chosen.items() if role in _STREAMS})
         return found
 
@@ -135,9 +151,8 @@ class Opening:
 
     def _find_mount(self) -> None:
         if self.cameras is None:
-            self.missing["mount"] = (
-                f"without a calibrated left camera there is no mount: {self.missing.get('left', '')}"
-            )
+            why = next(self.missing[side] for side in CAMERAS if side in self.missing)
+            self.missing["mount"] = f"without a calibrated pair of cameras there is no mount: {why}"
         elif "inclinometer" in self.missing:
             self.missing["mount"] = f"without an inclinometer there is no mount: {self.missing['inclinometer']}"
         else:

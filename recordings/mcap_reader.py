@@ -8,7 +8,7 @@ chunk costs its own messages, a cut file what was cut.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from heapq import heapify, heappop, heappush
 from pathlib import Path
 from types import TracebackType
@@ -24,6 +24,8 @@ from recordings.mcap_chunk import LARGEST, unpacked
 from recordings.mcap_index import BROKEN, MAGIC, RECORD, Loose, Lost, Raw, from_summary, raw, read, records, said
 from recordings.mcap_walk import walk
 from recordings.ros2_types import decoder_for
+
+CONVERT = "rosbags-convert --src IN.bag --dst OUT --dst-storage mcap"  # of a ROS 1 bag; mcap convert leaves it ROS 1
 
 
 class McapFile:
@@ -215,6 +217,20 @@ def iter_decoded(path: Path, topics: Iterable[str] | None = None) -> Iterator[tu
                 raise LogError(f"{path}: {topic} at {item.log_time} ns cannot be decoded ({said(error)})") from error
 
 
+def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:
+    """What to say of a log that holds none of the topics `wanted` of a run's results; and the `remedy` if it holds any
+    that would do `instead`."""
+    with McapFile(Path(path)) as log:
+        topics = sorted({log.channel(n).topic for n in log.index.channels if log.count({n})})
+    results = [topic for topic in topics if topic.startswith("/nav/")]
+    if not results:
+        return LogError(f"{path} is not a result log: it has no /nav topics; give the log that roverflow run wrote")
+    holds = f"no {wanted[0]}" if len(wanted) == 1 else f"none of {', '.join(wanted)}"
+    why = "the run made none, or its McapSink's 'results' leave it out"
+    more = f"; {remedy}" if set(instead) & set(results) else ""
+    return LogError(f"{path} holds {holds}, only {', '.join(results)}: {why}{more}")
+
+
 def _opened(path: Path) -> BinaryIO:
     """The file, open, if it begins like an MCAP file."""
     if path.is_dir():
@@ -230,7 +246,7 @@ def _opened(path: Path) -> BinaryIO:
     if not start:
         raise LogError(f"{path} is empty (0 bytes); record it again")
     if start.startswith(b"#ROSBAG"):
-        raise LogError(f"{path} is a ROS 1 bag; convert it to MCAP first: mcap convert IN.bag OUT.mcap")
+        raise LogError(f"{path} is a ROS 1 bag; convert it to OUT/OUT.mcap first: {CONVERT}")
     if start.startswith(b"SQLite format 3"):
         raise LogError(f"{path} is a rosbag2 SQLite bag; convert it to MCAP first: mcap convert IN.db3 OUT.mcap")
     raise LogError(f"{path} is not an MCAP log (it does not begin like one); give a .mcap file")

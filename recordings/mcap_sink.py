@@ -44,26 +44,29 @@ class McapSink:
     known of the tilt's health, and at the end the findings of the run.
 
     results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each; the reasons of a
-    NavigationMap go to /nav/<stream>/reason.
+    NavigationMap go to /nav/<stream>/reason. also: further streams, for those who would keep the results as they are.
     """
 
     results: tuple[str, ...] = (
         "disparity", "points", "elevation_map", "navigation_map", "pose", "regional_map", "regional_navigation_map",
     )  # fmt: skip
 
+    also: tuple[str, ...] = ()
+
     suffix = ".mcap"
-    names_streams: ClassVar[tuple[str, ...]] = ("results",)
+    names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
     _writer: Ros2Writer | None = field(default=None, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
 
     def wants(self, stream: str, kind: type) -> bool:
         """Whether a stream of data of type `kind` is to be written. Raises LogError where it is but cannot be."""
-        if stream not in self.results:
+        if stream not in self._written:
             return issubclass(kind, TiltHealth)
         if kind not in _BUILDERS:
             known = ", ".join(builder.__name__ for builder in _BUILDERS)
+            setting = "results" if stream in self.results else "also"
             raise LogError(
-                f"McapSink cannot write '{stream}', a {kind.__name__} (it writes {known}); leave it out of results"
+                f"McapSink cannot write '{stream}', a {kind.__name__} (it writes {known}); leave it out of {setting}"
             )
         return True
 
@@ -76,7 +79,7 @@ class McapSink:
     def write(self, record: FrameRecord) -> None:
         """Write a frame that is through."""
         writer, stamp = self._opened(), record.stamp
-        for stream in self.results:
+        for stream in self._written:
             data = record.items.get(stream)
             if data is not None:
                 writer.write(f"/nav/{stream}", _BUILDERS[type(data)](data), stamp)
@@ -109,6 +112,10 @@ class McapSink:
             counts[f"findings.{stream}"] = f"{said['severity']}: {said['sentence']}"
         writer.metadata("roverflow.run", counts)
         writer.close()
+
+    @property
+    def _written(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys((*self.results, *self.also)))
 
     def _opened(self) -> Ros2Writer:
         if self._writer is None:

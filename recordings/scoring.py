@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2, terrain_measures
 from recordings.errors import LogError
+from recordings.mcap_reader import without_results
 from recordings.pose_measures import PoseTally
 from recordings.stereo_measures import StereoErrors, cropped_columns
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap
@@ -220,7 +221,7 @@ class _Tally:
         if not self.frames:
             raise LogError(f"{self.truth} has no ground truth (/truth/...); give the log that has it with --truth")
         if not self.seen_results:
-            raise LogError(f"{self.result} has no results ({', '.join(RESULTS)}); give the log that a run wrote")
+            raise without_results(self.result, RESULTS)
         if not self.compared:
             raise LogError(f"no result of {self.result} has the stamp of a true frame of {self.truth}; is it its run?")
         tilts = self.tilts

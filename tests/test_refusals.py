@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from flow.cli import main
+from recordings import McapSource
 from tests.conftest import rewrite
 
 ROOT = Path(__file__).parent.parent
@@ -119,3 +120,48 @@ def test_a_full_output_is_said_in_a_sentence():
         done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     assert done.returncode == 2
     assert done.stderr.startswith("roverflow: the output: No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("key", "topic", "there"),
+    [
+        ("odometry", "/nix", "its pose topics are /odometry"),
+        ("odometry", "/stereo/left/camera_info", "its pose topics are /odometry"),
+        ("odometry", "/tf_static", "its pose topics are /odometry"),
+        ("left", "/nix", "its image topics are /stereo/left/image_rect_color"),
+        ("right_info", "/nix", "its CameraInfo topics are /stereo/left/camera_info"),
+        ("inclinometer", "/nix", "its tilt topics are /imu"),
+        ("inclinometer", "/odometry", "its tilt topics are /imu"),
+    ],
+)
+def test_a_topic_that_is_named_but_not_there_is_refused_and_nothing_stands_in(
+    traverse, tmp_path, capsys, key, topic, there
+):
+    assert roverflow("run", traverse, "--set", f"source.{key}={topic}", "-o", tmp_path / "out.mcap") == 2
+    said = capsys.readouterr().err
+    assert f"the source's '{key}' is set to {topic}, which is not such a topic of the log ({there}" in said
+    assert said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("field", "words"),
+    [
+        ("orientation.xx", "no 'xx' in its geometry_msgs/msg/Quaternion (it has x, y, z, w)"),
+        ("orientation", "field 'orientation' holds a geometry_msgs/msg/Quaternion, which is not an angle"),
+        ("header.frame_id", "which is not an angle"),
+    ],
+)
+def test_angles_of_a_field_that_is_not_there_are_refused_before_the_first_frame(
+    traverse, tmp_path, capsys, field, words
+):
+    with McapSource().open(traverse) as opened:
+        imu = opened.topics["inclinometer"]
+    angles = ["--set", f"source.pitch={{field: {field}, unit: deg, sign: 1}}", "--set", "source.tilt_model=axis"]
+    angles += ["--set", "source.roll={field: orientation.x, unit: deg, sign: 1}"]
+    angles += ["--set", f"source.inclinometer={imu}"]
+    assert roverflow("run", traverse, *angles, "-o", tmp_path / "out.mcap") == 2
+    said = capsys.readouterr().err
+    assert f"bare angles of {imu}: " in said
+    assert words in said
+    assert not list(tmp_path.iterdir())

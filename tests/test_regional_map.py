@@ -79,7 +79,7 @@ def test_a_pipeline_that_fuses_nothing_has_its_frames_exported(traverse, tmp_pat
     assert roverflow("export", out, tmp_path / "maps") == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "the pipeline fuses nothing" in said
+    assert "holds no /nav/regional_map, only " in said
     assert "--frames" in said
     assert roverflow("export", out, tmp_path / "maps", "--frames") == 0
     assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == FRAMES

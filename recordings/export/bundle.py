@@ -22,6 +22,7 @@ from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM, Mosaic
 from recordings.export.ply import COLOURS, write_ply
+from recordings.mcap_reader import without_results
 from recordings.paint import hillshade
 from recordings.whole_file import written
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Source, Tiles, Transform
@@ -92,9 +93,8 @@ def _export_region(result: Path, out: Path) -> list[Path]:
                 region.navigation = region.navigation or _navigation_mosaic(cells, RIM)
                 _lay_navigation(region.navigation, cells)
     if not regions:
-        raise LogError(
-            f"{result} holds no {REGION[0]}: the log it was made from had no pose, or the pipeline fuses nothing; add "
-            "--frames to export the maps of every frame"
+        raise without_results(
+            result, REGION[:1], instead=(*FRAME, POINTS), remedy="add --frames to export the maps of every frame"
         )
     known = {name: region for name, region in regions.items() if region.terrain.close()}
     if not known:
@@ -127,7 +127,7 @@ def _export_frames(result: Path, out: Path) -> list[Path]:
             files.append(_write(folder / "points.ply", _write_points, points, about))
         number += len(files) > written_before
     if not files:
-        raise LogError(f"{result} holds none of {', '.join((*FRAME, POINTS))}; export a result log of roverflow run")
+        raise without_results(result, (*FRAME, POINTS))
     return files
 
 

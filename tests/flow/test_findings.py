@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from flow.report import report
+from flow.report import headline, report
 from flow.run import run
 from tests.flow.test_engine import graph, replayed, traverse
 from tests.flow.toys import Log
@@ -24,6 +24,21 @@ def test_a_note_is_one_of_the_lines_and_a_warning_the_last(tmp_path, capsys):
     assert more == ["WARNING: total: the sum is 30.0"]
 
 
+def said_of(**changes):
+    summary = {"verdict": "INCOMPLETE", "interrupted": False, "frames_in": 18, "frames_out": 18, "drops": {}}
+    return headline({**summary, "frames_per_second": 2.5, **changes}).removesuffix("; 2.50 frames/s")
+
+
+def test_the_verdict_says_what_was_lost_in_the_same_line():
+    assert said_of(verdict="COMPLETE") == "COMPLETE: 18 of 18 frames whole"
+    assert said_of(drops={"unmatched": 2}) == "INCOMPLETE: 18 frames whole, 2 lost: 2 unmatched"
+    lost = {"failed": 1, "unreadable": 2}
+    assert said_of(frames_out=17, drops=lost) == "INCOMPLETE: 17 of 18 frames whole, 3 lost: 1 failed, 2 unreadable"
+    assert said_of(interrupted=True, frames_in=1, frames_out=1) == "INCOMPLETE: interrupted after 1 frame"
+    stopped = said_of(interrupted=True, drops={"abandoned": 3})
+    assert stopped == "INCOMPLETE: interrupted after 18 frames, 3 lost: 3 abandoned"
+
+
 def test_what_a_stage_found_is_said_at_the_end_to_the_user_and_to_the_sinks(tmp_path):
     sink, summary = replayed(graph(tmp_path), traverse(5))
     said = {"total": {"severity": "note", "sentence": "the sum is 20.0"}}
@@ -36,5 +51,6 @@ def test_what_a_stage_found_is_said_at_the_end_to_the_user_and_to_the_sinks(tmp_
 
 def test_a_finding_that_breaks_down_costs_the_run_nothing(tmp_path):
     _, summary = replayed(graph(tmp_path), traverse(4))
-    said = {"total": {"severity": "warning", "sentence": "RuntimeError: unlucky"}}
-    assert (summary["verdict"], summary["findings"]) == ("COMPLETE", said)
+    found = summary["findings"]["total"]
+    assert (summary["verdict"], found["severity"]) == ("COMPLETE", "warning")
+    assert found["sentence"].startswith("RuntimeError: unlucky (toys.py, line ")

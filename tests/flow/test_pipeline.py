@@ -56,11 +56,13 @@ def test_a_setting_from_the_command_line_replaces_one_in_the_file(tmp_path):
         ("25 cm", "quick", 5, ["factor", "'quick' is not a number"]),
         ("25 cm", "25 ms", 5, ["'25 ms' is a time", "expected a length in m"]),
         ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'"]),
-        ("25 cm", "-1", 5, ["at least 0 m"]),
+        ("25 cm", "-1 m", 5, ["at least 0 m"]),
         ("25 cm", "true", 5, ["expected a number in m"]),
         ("5 ms", "-5 ms", 3, ["must be at least 0 ns"]),
         ("25 cm", ".inf", 5, ["must be finite"]),
-        ("5 ms", "5", 3, ["needs a unit"]),
+        ("5 ms", "5", 3, ["pair.slop: 5 needs a unit; write 5 ms or 5 s"]),
+        ("25 cm", "0.25", 5, ["Scale.factor: 0.25 needs a unit; write 0.25 cm or 0.25 m"]),
+        ("25 cm", "'25'", 5, ["25 needs a unit"]),
         ("[1, 2.5]", "3", 5, ["expected a list"]),
         ("a: twice", "a: thrice", 6, ["no stream 'thrice'", "did you mean 'twice'"]),
         ("a: twice, ", "", 6, ["lacks its input 'a'"]),
@@ -114,7 +116,10 @@ def test_a_setting_stands_wherever_it_is_named(tmp_path):
     (SETTINGS.replace("$stretch", "$strech"), [], r"toy.yaml:6: there is no setting 'strech'; did you mean 'stretch'"),
     (GOOD.replace("25 cm", "$stretch"), [], r"toy.yaml:5: there is no setting 'stretch'"),
     (SETTINGS.replace("$stretch", "2 m"), [], r"toy.yaml:1: the setting 'stretch' is used nowhere"),
-    (SETTINGS.replace("25 cm", "25 s"), [], r"toy.yaml:6: .*'25 s' is a time"),
+    (SETTINGS.replace("25 cm", "25 s"), [], r"toy.yaml:1: .*'25 s' is a time"),
+    (SETTINGS.replace("25 cm", "25"), [], r"toy.yaml:1: .*Scale.factor: 25 needs a unit; write 25 cm or 25 m"),
+    (SETTINGS, ["stretch=20"], r"--set stretch=20: .*Scale.factor: 20 needs a unit; write 20 cm or 20 m"),
+    (SETTINGS, ["twice.factor=20"], r"--set twice.factor=20: .*20 needs a unit; write 20 cm or 20 m"),
     (SETTINGS, ["stretch=-1 m"], r"--set stretch=-1 m: .*at least 0 m"),
     (SETTINGS, ["strech=1 m"], r"--set strech=1 m: the pipeline has no setting 'strech'; did you mean 'stretch'"),
     ("settings: 3\n" + GOOD, [], r"toy.yaml:1: 'settings' must be a mapping"),
@@ -136,6 +141,15 @@ def test_a_bad_setting_is_named(tmp_path, setting):
         loaded(tmp_path, overrides=[setting])
 
 
+def test_of_several_settings_the_one_at_fault_is_named(tmp_path):
+    source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Odd(Scale):\n"
+    source += "    __call__ = Scale.__call__\n    def __post_init__(self):\n        raise ValueError('Odd.nap: no')\n"
+    (tmp_path / "strict.py").write_text(source)
+    text = GOOD.replace("tests.flow.toys.Scale", "strict.Odd")
+    with pytest.raises(PipelineError, match=r"--set twice.nap=1 s: Odd.nap: no"):
+        loaded(tmp_path, text, overrides=["twice.nap=1 s", "twice.factor=2 m"])
+
+
 def test_stages_may_stand_beside_the_file_that_uses_them(tmp_path):
     source = "from tests.flow.toys import Scale\nclass Near(Scale):\n    __call__ = Scale.__call__\n"
     (tmp_path / "beside.py").write_text(source)
@@ -147,6 +161,21 @@ def test_a_module_that_does_not_import_is_named_with_its_line(tmp_path):
     (tmp_path / "broken.py").write_text("1 / 0\n")
     with pytest.raises(PipelineError, match=r"toy.yaml:5: cannot import 'broken': ZeroDivisionError"):
         loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", "broken.Stage"))
+
+
+def test_what_is_no_dataclass_is_not_told_to_be_itself(tmp_path):
+    (tmp_path / "plain.py").write_text("class Stage:\n    def __call__(self): ...\ndef function(): ...\n")
+    for name in ("Stage", "function"):
+        with pytest.raises(PipelineError, match=rf"toy.yaml:5: plain.{name} is no dataclass") as caught:
+            loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", f"plain.{name}"))
+        assert "did you mean" not in str(caught.value)
+
+
+def test_a_stage_that_breaks_down_as_it_is_made_is_named_with_its_line(tmp_path):
+    source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Odd(Add):\n    __call__ = Add.__call__\n"
+    (tmp_path / "odd.py").write_text(source + "    def __post_init__(self):\n        {}['nix']\n")
+    with pytest.raises(PipelineError, match=r"toy.yaml:6: KeyError: 'nix' \(odd.py, line 6; --debug"):
+        loaded(tmp_path, GOOD.replace("tests.flow.toys.Add", "odd.Odd"))
 
 
 def test_an_anchor_that_holds_itself_is_refused(tmp_path):

@@ -15,7 +15,7 @@ PIPELINE = """
 source: {use: tests.flow.toys.Source}
 streams:
   pair:     {use: flow.align.pair, left: left, right: right, slop: 1 ns}
-  scaled:   {use: tests.flow.toys.Scale, couple: pair, factor: 2, bad: [%s]}
+  scaled:   {use: tests.flow.toys.Scale, couple: pair, factor: 2 m, bad: [%s]}
   centred:  {use: tests.flow.test_survey.Centre, couple: scaled}
   doubled:  {use: tests.flow.toys.Add, a: centred, b: pair}
 sinks:
@@ -118,7 +118,8 @@ def test_a_survey_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
 
 def test_a_stage_that_remembers_cannot_stand_before_a_survey(tmp_path):
     file = tmp_path / "p.yaml"
-    file.write_text((PIPELINE % "").replace("toys.Scale, couple: pair, factor: 2, bad: []", "toys.Total, couple: pair"))
+    remembering = (PIPELINE % "").replace("toys.Scale, couple: pair, factor: 2 m, bad: []", "toys.Total, couple: pair")
+    file.write_text(remembering)
     with pytest.raises(PipelineError, match=r"p\.yaml:5: 'scaled' remembers frames"):
         run(load(str(file)), Excerpted(EVENTS, [(0, 6)]), {})
 

@@ -164,6 +164,7 @@ class Log:
 
     def __init__(self, events: list[tuple[int, str, Any]], missing: dict[str, str] | None = None) -> None:
         self.events, self.missing = events, missing or {}
+        self.refused: dict[str, str] = {}
 
     def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         yield from self.events

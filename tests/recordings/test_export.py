@@ -219,11 +219,20 @@ def test_a_log_without_a_regional_map_says_what_to_add(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
         writer.write("/nav/points", ros2.point_cloud(cloud(0)), START)
-    with pytest.raises(LogError, match=r"holds no /nav/regional_map: .* had no pose, .* add --frames"):
+    with pytest.raises(LogError, match=r"holds no /nav/regional_map, only /nav/points: .* 'results' .* add --frames"):
         export(path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     (points,) = export(path, tmp_path / "out", frames=True)
     assert points.name == "points.ply"
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_a_log_that_no_run_wrote_is_not_called_a_result(tmp_path: Path, frames: bool) -> None:
+    path = tmp_path / "raw.mcap"
+    with Ros2Writer(path) as writer:
+        writer.write("/lidar/points", ros2.point_cloud(cloud(0)), START)
+    with pytest.raises(LogError, match=r"raw\.mcap is not a result log: it has no /nav topics; give the log that "):
+        export(path, tmp_path / "out", frames)
 
 
 def regional_log(path: Path, *maps: tuple[str, float]) -> Path:

@@ -12,6 +12,7 @@ import pytest
 from recordings import McapSource
 from recordings.inventory import describe, format_description
 from tests.recordings.sample_log import BASELINE, FRAMES, LEFT, PERIOD, RIGHT, TILT, rewritten, write_sample
+from tests.recordings.test_mcap_log import copied
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +61,32 @@ def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: P
     frames = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())["frames"]
     assert frames["pairs"] == FRAMES - 1
     assert frames["with_tilt"] == 2  # the first and the last frame, which have a tilt of their own
+
+
+def test_a_missing_right_calibration_is_said_in_whole_sentences(tmp_path: Path) -> None:
+    edit = lambda topic, _, message: None if topic == "/stereo/right/camera_info" else message  # noqa: E731
+    text = format_description(describe(write_sample(tmp_path / "log.mcap", edit), McapSource()))
+    listed = "the log's CameraInfo topics are /stereo/left/camera_info"
+    why = f"no CameraInfo belongs to {RIGHT} ({listed}); set 'right_info'"
+    assert [line.partition(" of the source")[0] for line in text.splitlines() if line.startswith("missing")] == [
+        f"missing: right: {why}",
+        f"missing: mount: without a calibrated pair of cameras there is no mount: {why}",
+    ]
+
+
+def test_topics_that_cannot_be_decoded_are_listed_once(tmp_path: Path) -> None:
+    path = copied(write_sample(tmp_path / "log.mcap"), tmp_path / "odd.mcap", lambda *of: ("protobuf", of[2]))
+    text = format_description(describe(path, McapSource()))
+    assert text.count("cannot be decoded") == text.count(f"{LEFT}: its messages are in 'protobuf'") == 1
+    assert "missing: left, right: the log has no camera image" in text
+    with McapSource().open(path) as log:  # a refusal stands alone
+        assert all(f"{LEFT}: its messages" in log.missing[stream] for stream in ("left", "inclinometer", "odometry"))
+
+
+def test_one_is_not_many(tmp_path: Path) -> None:
+    edit = lambda topic, number, message: None if number else message  # noqa: E731
+    text = format_description(describe(write_sample(tmp_path / "log.mcap", edit), McapSource()))
+    assert "frames: 1 pair within 5 ms of 1 left and 1 right image; 1 with a tilt" in text
 
 
 def test_damage_is_told(tmp_path: Path) -> None:

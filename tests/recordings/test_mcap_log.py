@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,9 +11,13 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
 
 from recordings import McapSource
+from recordings.errors import LogError
 from recordings.inventory import describe
+from recordings.ros2 import iter_messages
 from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, items_of, write_sample
 
 INFO = "/stereo/left/camera_info"
@@ -147,3 +153,28 @@ def test_more_excerpts_than_frames_are_one_for_each_frame(tmp_path: Path) -> Non
     with McapSource().open(write_sample(tmp_path / "log.mcap")) as log:
         assert len(list(log.excerpts(20, {"left", "right"}))) == FRAMES
         assert len(list(log.excerpts(3, {"left", "right"}))) == 3
+
+
+def test_a_ros_1_bag_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    kind, header, stamp, point = (
+        store.types[name] for name in (
+            "geometry_msgs/msg/PointStamped", "std_msgs/msg/Header", "builtin_interfaces/msg/Time",
+            "geometry_msgs/msg/Point",
+        )
+    )  # fmt: skip
+    with BagWriter(tmp_path / "IN.bag") as writer:
+        connection = writer.add_connection("/place", kind.__msgtype__, typestore=store)
+        message = kind(header(0, stamp(1, 0), "map"), point(1.0, 2.0, 3.0))
+        writer.write(connection, 10**9, store.serialize_ros1(message, kind.__msgtype__))
+    with pytest.raises(LogError, match=r"is a ROS 1 bag; convert it to OUT/OUT\.mcap first: rosbags-convert") as caught:
+        McapSource().open(tmp_path / "IN.bag")
+    command = str(caught.value).rpartition(": ")[2].split()
+    subprocess.run([Path(sys.executable).parent / command[0], *command[1:]], cwd=tmp_path, check=True)
+    ((_, _, read),) = iter_messages(tmp_path / "OUT" / "OUT.mcap")
+    assert (read.point.x, read.point.y, read.point.z) == (1.0, 2.0, 3.0)
+
+
+def test_messages_still_in_the_encoding_of_ros_1_are_refused_with_that_command(sample: Path, tmp_path: Path) -> None:
+    with McapSource().open(copied(sample, tmp_path / "log.mcap", lambda *of: ("ros1", of[2]))) as log:
+        assert "in 'ros1', not in 'cdr' as those of ROS 2; convert the bag itself: rosbags-co" in log.missing["left"]

@@ -149,6 +149,13 @@ def test_only_what_was_asked_for_is_wanted() -> None:
         sink.wants("disparity", CameraImage)
 
 
+def test_a_stream_may_be_added_to_the_results() -> None:
+    sink = McapSink(also=("dense", "points"))
+    assert all(sink.wants(name, ElevationMap) for name in ("dense", "elevation_map"))
+    assert not sink.wants("denser", ElevationMap)
+    assert {"results", "also"} == set(sink.names_streams)
+
+
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"cannot write .*gone/out\.mcap: No such file"):
         McapSink().open(tmp_path / "gone" / "out.mcap", {}, {})

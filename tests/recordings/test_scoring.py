@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import ros2, scoring
 from recordings.errors import LogError
+from recordings.ros2 import Ros2Writer
 from recordings.score_table import format_score
 from recordings.simulator import Simulation, log
 from recordings.terrain_measures import ROWS, format_terrain
@@ -278,8 +279,13 @@ def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
     run = Run().write(tmp_path / "run.mcap", frames)
     with pytest.raises(LogError, match="no ground truth"):
         scoring.score(run, run)
-    with pytest.raises(LogError, match="has no results"):
+    with pytest.raises(LogError, match="is not a result log: it has no /nav topics"):
         scoring.score(truth, truth)
+    with Ros2Writer(tmp_path / "other.mcap") as writer:
+        ones = {"elevation": np.ones((2, 2), np.float32)}
+        writer.write("/nav/dense", ros2.grid_map(ElevationMap(1, ones, 0.05, (0, 0), "level")), 1)
+    with pytest.raises(LogError, match=r"none of /nav/disparity, .*, only /nav/dense: the run made none, or"):
+        scoring.score(tmp_path / "other.mcap", truth)
     with pytest.raises(LogError, match=r"cells of 0\.1 m, the truth has 0\.05 m"):
         scored(tmp_path, truth, frames, resolution=0.1)
 
