@@ -112,7 +112,7 @@ def _map_page(rgb: Array, resolution: float, origin: tuple[float, float], title:
         col = round(right - (y - origin[1]) / resolution * zoom)
         cv2.line(page, (col, bottom), (col, bottom + 8), INK, 2)
         _text(page, f"{y:g}", (col - 12, bottom + 30))
-    _text(page, "x forward, m", (8, MARGIN - 44))
+    _text(page, "x forward, m", (right + 32, bottom + 8))
     _text(page, "y left, m", (right + 32, bottom + 30))
     if origin[0] <= 0.0 <= origin[0] + cols * resolution and origin[1] <= 0.0 <= origin[1] + rows * resolution:
         centre = (round(right + origin[1] / resolution * zoom), round(bottom + origin[0] / resolution * zoom))

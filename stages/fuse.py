@@ -85,9 +85,8 @@ class Fuse(Stage):
 
     A frame that lies off the map unlike those before, by more than five times what is expected of its errors
     (`tilt_sigma`, `height_sigma`), is refused; with the third in succession the map begins anew, which a warning says
-    at the end. Of the plane that
-    joins a frame a small share is left in (`follow_tilt`, `follow_height`), so that in the long run the map follows
-    gravity and the pose and not the errors of its first frame.
+    at the end. Of the plane that joins a frame a small share is left in (`follow_tilt`, `follow_height`), so that in
+    the long run the map follows gravity and the pose and not the errors of its first frame.
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)

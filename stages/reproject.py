@@ -22,7 +22,7 @@ class Reproject(Stage):
     The standard deviation of a matched disparity falls geometrically with its confidence, `sigma_worst` at 0 and
     `sigma_best` at 1; a pixel of source PLANE has `sigma_plane`, of source FILLED `sigma_filled`. On simulated frames
     68 % of the errors of the matcher's pixels are within it, give or take 8, at every confidence from 0.6 to 1, where
-    `rover` has its points; below, it is only the same line drawn on.
+    `rover` has its points (tests/test_terrain_truth.py); below, it is only the same line drawn on.
     """
 
     max_depth: float = parameter(20.0, "points deeper than this are left out", unit="m", low=0.1)

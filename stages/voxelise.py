@@ -46,7 +46,7 @@ class Voxelise(Stage):
     mean square of what the points' depth errors do to a height, on a slope more or less than on the level, and the mean
     of points that share one error is as sure as one of them; shape is what the mean of some points misses of an uneven
     cell, by its scatter beyond the slope's and by its height off its neighbours; few points miss more (`sampling`^2 /
-    n). Errors have longer tails than a Gaussian's: where 93 to 94 % are within two such sigmas, 71 to 73 % are within
+    n). Errors have longer tails than a Gaussian's: where 93 to 95 % are within two such sigmas, 70 to 74 % are within
     one.
     """
 

@@ -133,6 +133,8 @@ VARIANTS: dict[str, Chain] = {
     "rover without the right view": unchecked,
     "rover without planes": refined("checked", plane_weight=0, plane_fill=False, surface=0),
     "rover without surfaces": refined("checked", surface=0),
+    "rover, planes draw more: 0.7": refined("checked", plane_weight=0.7),
+    "rover, planes draw less: 0.3": refined("checked", plane_weight=0.3),
     "rover, planes replace matches": refined("checked", near=1000, plane_weight=1, inlier_share=0),
     "rover, holes filled along rows": by_rows,
     "rover, holes filled by WLS": refined("checked", fill="wls"),
@@ -168,6 +170,21 @@ def measure(cases: list[Case]) -> dict[str, Array]:
                 parts.append(errors(pixels, truth, case.mask, case.disparities)[1])
             rows.setdefault(name, []).append(np.append(errors(pixels, case.truth, case.mask, case.disparities), parts))
     return {name: np.mean(values, axis=0) for name, values in rows.items()}
+
+
+def print_fills(cases: list[Case]) -> None:
+    """Print how often filled pixels of `rover` are off by over 1 px: where both cameras see, and what only one sees."""
+    shares = []
+    for case in cases:
+        disparity = stereo_part("rover", case.frame, case.disparities, entry="rectified")["disparity"]
+        filled = (disparity.source == Source.FILLED) & np.isfinite(case.truth)
+        filled[:, : case.disparities] = False
+        wrong, seen = np.abs(disparity.pixels - case.truth) > 1, case.mask == 255
+        shares.append([100 * wrong[filled & area].mean() for area in (seen, ~seen)])
+    both, one = np.nanmean(shares, axis=0)
+    print(
+        f"\nfilled by rover, off by over 1 px: {both:.0f} % of what both cameras see, {one:.0f} % of what only one sees"
+    )
 
 
 def print_table(title: str, means: dict[str, Array], released: Array | None) -> None:
@@ -220,10 +237,12 @@ def main(folder: Path) -> None:
         cases = list(real(data / "middlebury-q"))
         released = np.mean([RELEASED[case.name] for case in cases], axis=0)
         print_table("Middlebury scenes", measure(cases), released)
+        print_fills(cases)
         for name, frame in devon(data):
             pictures(folder, name, frame, stereo_part("rover", frame, 192)["disparity"])
     cases = simulated()
     print_table("simulated frames", measure(cases), None)
+    print_fills(cases)
     for case in cases:
         streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
         pictures(folder, case.name.replace(" ", "-"), case.frame, streams["disparity"])

@@ -133,8 +133,13 @@ def score(simulations: Sequence[Simulation], stride: int, runs: dict[str, str]) 
     found = {name: Run() for name in runs}
     others = {
         pipeline: np.concatenate([tilt_errors(pipeline, simulation) for simulation in simulations])
-        for pipeline in set(runs.values())
+        for pipeline in dict.fromkeys(runs.values())
     }
+    for pipeline, errors in others.items():
+        off = np.degrees(np.arctan(np.sqrt(np.mean(errors**2, axis=0))))
+        print(
+            f"tilt of {pipeline}: off by {off[0]:.3f} and {off[1]:.3f} degrees (RMS, {len(errors)} tilts)", flush=True
+        )
     for simulation in simulations:
         for given, exact, ground in frames(simulation, stride):
             for name, pipeline in runs.items():
