@@ -26,14 +26,13 @@ def out_of_order(inverse: Array, patch: Array) -> Array:
     there is no point. Rows run from the sky down. Returns (H, W) bool.
     """
     patch = patch.copy()
-    sizes = np.bincount(patch[patch >= 0], minlength=patch.size)
+    sizes = np.bincount(patch.ravel() + 1, minlength=patch.size + 1)[1:]
     for _ in range(ROUNDS):
-        votes = np.zeros(patch.size, np.int64)
+        votes = np.zeros(patch.size, np.int32)
         _vote(inverse, patch, sizes, np.float32(CLEAR), votes)
-        wrong = votes > 0
-        if not wrong.any():
+        if not (votes > 0).any():
             break
-        patch[(patch >= 0) & wrong[patch]] = -1
+        _drop(patch.reshape(-1), votes)
     gone: Array = (patch < 0) & (inverse > 0)
     return gone
 
@@ -54,6 +53,13 @@ def _vote(inverse, patch, sizes, clear, votes):  # type: ignore[no-untyped-def]
             other = patch[last, col]
             smaller = here if sizes[here] < sizes[other] else other
             votes[smaller] += 1 if inverse[row, col] > clear * inverse[last, col] else -1
+
+
+@kernel
+def _drop(patch, votes):  # type: ignore[no-untyped-def]
+    for i in range(patch.size):
+        if patch[i] >= 0 and votes[patch[i]] > 0:
+            patch[i] = -1
 
 
 def out_of_order_reference(inverse: Array, patch: Array) -> Array:

@@ -90,12 +90,12 @@ def pixel_rays(points: Array, pixel: Array, width: int) -> Array:
 
 @kernel
 def _inverse_depth(points, pixel, height, width, reach):  # type: ignore[no-untyped-def]
-    inverse = np.full((height, width), np.nan, np.float32)
+    inverse = np.full(height * width, np.nan, np.float32)
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if z > 0.0 and x * x + y * y + z * z <= reach * reach:
-            inverse[pixel[i] // width, pixel[i] % width] = 1.0 / z
-    return inverse
+            inverse[pixel[i]] = 1.0 / z
+    return inverse.reshape(height, width)
 
 
 @kernel
@@ -107,7 +107,8 @@ def _supported(points, sigma, pixel, inverse, offsets, deviations, slope, share,
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if not (z > 0.0 and x * x + y * y + z * z <= reach * reach):
             continue
-        row, col = pixel[i] // width, pixel[i] % width
+        row = pixel[i] // width
+        col = pixel[i] - row * width
         aside = 2.0 * abs(rays[1]) + 3.0 * sigma[i] / z
         if abs(x / z - rays[0] - rays[1] * col) > aside or abs(y / z - rays[2] - rays[3] * row) > aside:
             continue

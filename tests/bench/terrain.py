@@ -25,6 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flow.align import Token
+from flow.allocator import keep_freed_memory
 from flow.pipeline import load
 from recordings.simulator import log, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
@@ -169,6 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="all measures into this file")
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
+    keep_freed_memory()  # as a run does
     runs = {name: RUNS[name] for name in RUNS if name in options.runs or ("true" in options.runs and "true" in name)}
     everything = {}
     for rocks in options.rocks:
