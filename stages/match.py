@@ -19,7 +19,7 @@ from stages.kernels.prior import prior_costs
 from stages.kernels.semiglobal import Rule, lanes_for, match
 from stages.stage import Stage, parameter
 
-SMALLEST_SIDE = 32
+SMALLEST_SIDE = 16
 BEYOND = 2.0  # px; a prior so far outside the range says that the match is not in it
 LARGEST_BYTE = 255
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recordings.simulator import Simulation
-from stages.data import StereoFrame
+from stages.data import Source, StereoFrame
 from stages.match import Match
 from tests.bench.refining import RELEASED, stereo_part
 from tests.bench.stereo_scores import errors, rows_filled
@@ -52,6 +52,20 @@ def test_on_real_scenes_rover_beats_paper_matching_alone_and_the_released_code()
     assert (fast[:3] <= [0.76, 0.70, 0.63] * released.mean(axis=0)[:3]).all()
     assert (np.array(scores)[:, 3, :7] < released).all()  # no scene worse in any column
     assert rover[7] > 99
+
+
+@pytest.mark.parametrize("pipeline", ["rover", "fast"])
+def test_ground_up_to_four_times_nearer_than_the_range_is_known(pipeline):
+    simulation = Simulation(frames=1, width=320, height=240, seed=1, abundance=0.1)
+    camera, found = simulation.camera, simulation.frame(0)
+    truth = camera.fx * camera.baseline / found.depth
+    frame = StereoFrame(1, *found.images, camera)
+    refined = stereo_part(pipeline, frame, 16, entry="rectified")["disparity"]
+    near = (truth > 20) & (found.seen == 255)
+    assert near.mean() > 0.3
+    measured = near & (refined.source == Source.MEASURED)
+    assert measured.sum() > 0.95 * near.sum()
+    assert (np.abs(refined.pixels - truth)[measured] > 2).mean() < 0.03
 
 
 def test_confidence_is_the_share_that_is_right_on_a_frame_it_was_not_fitted_to():

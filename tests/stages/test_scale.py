@@ -123,13 +123,13 @@ def test_data_of_different_times_are_refused():
 
 
 def test_a_frame_too_small_to_halve_names_its_own_size_and_the_way_out():
-    whole = np.zeros((62, 80), np.uint8)
-    frame = StereoFrame(7, whole, whole, StereoCamera(200, 200, 40, 31, 0.2, 80, 62))
-    with pytest.raises(ValueError, match=r"Halve: images are 80x62, .* at least 63 px; .* such as paper"):
+    whole = np.zeros((30, 80), np.uint8)
+    frame = StereoFrame(7, whole, whole, StereoCamera(200, 200, 40, 15, 0.2, 80, 30))
+    with pytest.raises(ValueError, match=r"Halve: images are 80x30, .* at least 31 px; .* such as paper"):
         Halve()(frame)
-    enough = np.zeros((63, 80), np.uint8)
-    half = Halve()(StereoFrame(7, enough, enough, StereoCamera(200, 200, 40, 31, 0.2, 80, 63)))
-    assert Match(disparities=8)(half).pixels.shape == (32, 40)
+    enough = np.zeros((31, 80), np.uint8)
+    half = Halve()(StereoFrame(7, enough, enough, StereoCamera(200, 200, 40, 15, 0.2, 80, 31)))
+    assert Match(disparities=8)(half).pixels.shape == (16, 40)
 
 
 def test_what_the_prior_shows_nearer_than_the_range_is_unknown():
