@@ -25,7 +25,7 @@ LEAST_CELL = 8  # px; where grid cells are smaller, the centres settle at full r
 
 
 def superpixels(
-    image: Array, count: int, compactness: float = 10.0, iterations: int = 5, threads: int = 1
+    image: Array, count: int, compactness: float = 10.0, iterations: int = 3, threads: int = 1
 ) -> tuple[Array, int]:
     """Segment an image into about `count` connected superpixels.
 
@@ -153,16 +153,21 @@ def connect(labels: Array, smallest: int, scratch: Array, both: AtOnce = in_turn
     scratch: (3, H * W) int32, to work in. One of fewer than `smallest` pixels joins the component left of its first
     pixel, or above it at the left border.
     """
-    height, width = labels.shape
+    height = labels.shape[0]
     middle = height // 2
-    runs = scratch[0].reshape(height, width)  # of each run of equal labels in a row: where it ends
-    parent = scratch[1]  # of each run, at its first pixel: a run of its component before it
+    # Of each run of equal labels in a row: where it ends, a run of its component before it, and its component's number.
+    ends, parent, number = scratch
+    rows = np.empty((height, 2), np.int64)  # the first run of each row, and the first beyond
     both(
-        lambda: _join_runs(labels, 0, middle, runs, parent),
-        lambda: _join_runs(labels, middle, height, runs, parent),
+        lambda: _join_runs(labels, 0, middle, rows, ends, parent),
+        lambda: _join_runs(labels, middle, height, rows, ends, parent),
     )
-    scratch[2] = 0
-    return int(_number(labels, middle, smallest, runs, parent, scratch[2]))
+    total = int(_number(labels, middle, smallest, rows, ends, parent, number))
+    both(
+        lambda: _write(labels, 0, middle, rows, ends, parent, number),
+        lambda: _write(labels, middle, height, rows, ends, parent, number),
+    )
+    return total
 
 
 @kernel
@@ -174,66 +179,82 @@ def _root(parent, i):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _join(labels, y, runs, parent):  # type: ignore[no-untyped-def]
+def _join(labels, y, rows, ends, parent):  # type: ignore[no-untyped-def]
     """Join the runs of row y with those of equal label in the row above; the earliest run becomes the root."""
     width = labels.shape[1]
+    run, run_above = rows[y, 0], rows[y - 1, 0]
     here = above = 0
     while here < width and above < width:
         if labels[y, here] == labels[y - 1, above]:
-            one, other = _root(parent, y * width + here), _root(parent, (y - 1) * width + above)
+            one, other = _root(parent, run), _root(parent, run_above)
             if one < other:
                 parent[other] = one
             else:
                 parent[one] = other
-        end, end_above = runs[y, here], runs[y - 1, above]
-        here = end if end <= end_above else here
-        above = end_above if end_above <= end else above
+        end, end_above = ends[run], ends[run_above]
+        if end <= end_above:
+            here = end
+            run += 1
+        if end_above <= end:
+            above = end_above
+            run_above += 1
 
 
 @kernel
-def _join_runs(labels, first, end, runs, parent):  # type: ignore[no-untyped-def]
+def _join_runs(labels, first, end, rows, ends, parent):  # type: ignore[no-untyped-def]
+    """Find the runs of rows first to end and join those of a component; they are numbered from first * W."""
     width = labels.shape[1]
+    run = first * width
     for y in range(first, end):
-        start = 0
+        rows[y, 0] = run
         for x in range(1, width + 1):
-            if x == width or labels[y, x] != labels[y, start]:
-                runs[y, start] = x
-                parent[y * width + start] = y * width + start
-                start = x
+            if x == width or labels[y, x] != labels[y, x - 1]:
+                ends[run] = x
+                parent[run] = run
+                run += 1
+        rows[y, 1] = run
         if y > first:
-            _join(labels, y, runs, parent)
+            _join(labels, y, rows, ends, parent)
 
 
 @kernel
-def _number(labels, middle, smallest, runs, parent, size):  # type: ignore[no-untyped-def]
-    height, width = labels.shape
+def _number(labels, middle, smallest, rows, ends, parent, number):  # type: ignore[no-untyped-def]
+    """The parent of every run becomes its root, which gets the number of its component; returns how many."""
+    height = labels.shape[0]
     if 0 < middle < height:
-        _join(labels, middle, runs, parent)
+        _join(labels, middle, rows, ends, parent)
     for y in range(height):
-        x = 0
-        while x < width:
-            at = y * width + x
-            root = _root(parent, at)
-            parent[at] = root
-            size[root] += runs[y, x] - x
-            x = runs[y, x]
+        start = 0
+        for run in range(rows[y, 0], rows[y, 1]):
+            root = _root(parent, run)
+            parent[run] = root
+            if root == run:
+                number[run] = 0
+            number[root] += ends[run] - start  # its size, at first
+            start = ends[run]
     total = np.int32(0)
     for y in range(height):  # a root is the first run of its component: what lies before it has its number already
-        x = 0
-        while x < width:
-            at = y * width + x
-            end = runs[y, x]
-            if parent[at] != at:
-                number = size[parent[at]]
-            elif size[at] < smallest and at > 0:
-                number = labels[y, x - 1] if x > 0 else labels[y - 1, x]
+        for run in range(rows[y, 0], rows[y, 1]):
+            if parent[run] != run:
+                continue
+            if number[run] < smallest and run > 0:
+                before = run - 1 if run > rows[y, 0] else rows[y - 1, 0]
+                number[run] = number[parent[before]]
             else:
-                number = total
+                number[run] = total
                 total += np.int32(1)
-            size[at] = number  # its size is needed no more
-            labels[y, x:end] = number
-            x = end
     return total
+
+
+@kernel
+def _write(labels, first, end, rows, ends, parent, number):  # type: ignore[no-untyped-def]
+    for y in range(first, end):
+        start = 0
+        for run in range(rows[y, 0], rows[y, 1]):
+            of_all = number[parent[run]]
+            for x in range(start, ends[run]):
+                labels[y, x] = of_all
+            start = ends[run]
 
 
 def assign_reference(colour: Array, centres: Array, rows: int, cols: int, position_weight: float) -> Array:
