@@ -1,7 +1,7 @@
 """How far the evidence of a disparity image reaches, and which unknown pixels are within it.
 
 What lies above all that is known in a column is the sky, and what lies beyond the known ends of a row was not seen by
-both cameras: there a guess may reach a little farther, not more.
+both cameras: there a guess may reach a little farther, not more. Specks do not count: the sky is full of them.
 """
 
 from __future__ import annotations
@@ -10,9 +10,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
+
+SIDE = 15  # px, of the square about a pixel that tells evidence from a speck
+SHARE = 0.5  # of what such a square knows in the mean; what stands in one that knows less is a speck
 
 
 class Extent(NamedTuple):
@@ -24,11 +28,16 @@ class Extent(NamedTuple):
 
 
 def extent(disparity: Array) -> Extent:
-    """How far what is known reaches. disparity: (H, W) float32, NaN = unknown."""
+    """How far what is known reaches, but for specks. disparity: (H, W) float32, NaN = unknown."""
     height, width = disparity.shape
+    known = ~np.isnan(disparity)
+    around = cv2.boxFilter(
+        known.view(np.uint8), cv2.CV_16U, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_REPLICATE
+    )
+    known &= around > int(SHARE * SIDE**2 * known.mean())
     found = Extent(np.full(width, height, np.int64), np.full(height, 4 * width, np.int64), np.full(height, -4 * width))
-    _find_top(disparity, found.top)
-    _find_ends(disparity, found.first, found.last)
+    _find_top(known, found.top)
+    _find_ends(known, found.first, found.last)
     return found
 
 
@@ -42,31 +51,30 @@ def within_reach(disparity: Array, within: Extent, reach: float, margin: float) 
 
 
 @kernel
-def _find_top(disparity, top):  # type: ignore[no-untyped-def]
+def _find_top(known, top):  # type: ignore[no-untyped-def]
     missing = top.size
-    for y in range(disparity.shape[0]):
+    for y in range(known.shape[0]):
         if missing == 0:
             break
         for x in range(top.size):
-            d = disparity[y, x]
-            if d == d and y < top[x]:
+            if known[y, x] and y < top[x]:
                 top[x] = y
                 missing -= 1
 
 
 @kernel
-def _find_ends(disparity, first, last):  # type: ignore[no-untyped-def]
-    width = disparity.shape[1]
-    for y in range(disparity.shape[0]):
-        row = disparity[y]
+def _find_ends(known, first, last):  # type: ignore[no-untyped-def]
+    width = known.shape[1]
+    for y in range(known.shape[0]):
+        row = known[y]
         x = 0
-        while x < width and row[x] != row[x]:
+        while x < width and not row[x]:
             x += 1
         if x == width:
             continue
         first[y] = x
         x = width - 1
-        while row[x] != row[x]:
+        while not row[x]:
             x -= 1
         last[y] = x
 
@@ -75,6 +83,8 @@ def extent_reference(disparity: Array) -> Extent:
     """`extent` in plain numpy."""
     known = np.isfinite(disparity)
     height, width = known.shape
+    around = sliding_window_view(np.pad(known, SIDE // 2, mode="edge"), (SIDE, SIDE)).sum(axis=(2, 3))
+    known &= around > np.floor(SHARE * SIDE**2 * known.mean())
     rows, columns = known.any(axis=1), known.any(axis=0)
     last = width - 1 - known[:, ::-1].argmax(axis=1)
     return Extent(

@@ -25,3 +25,15 @@ def test_within_reach_is_near_to_something_known_and_within_the_margin():
     wider = within_reach(bay, extent(bay), reach=3, margin=9)
     assert wider[20].nonzero()[0].tolist() == [*range(7, 43)]
     assert not wider[1:12].any()  # rows of which nothing is known
+
+
+def test_specks_in_the_sky_are_no_evidence_of_how_far_the_ground_reaches():
+    scene = np.full((60, 80), np.nan, np.float32)
+    scene[40:] = 5
+    scene[3:6, 10:14] = 1
+    found = extent(scene)
+    assert (found.top == 40).all()
+    assert found.first[4] > found.last[4]
+    sparse = np.where(np.arange(60 * 80).reshape(60, 80) % 7 == 0, scene, np.float32(np.nan))  # knows little anywhere
+    assert (extent(sparse).top >= 40).all()
+    assert (extent(sparse).top < 47).all()
