@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.compiled import fast_kernel, kernel
+from stages.kernels.compiled import fast_part, kernel
 from stages.kernels.halves import AtOnce, in_turn, pairs
 
 F32 = np.float32
@@ -144,7 +144,7 @@ def _fit(  # type: ignore[no-untyped-def]
         coefficients[s, 2] = np.float64(c) - np.float64(a) * origin_x - np.float64(b) * origin_y
 
 
-@fast_kernel
+@fast_part
 def _best_hypothesis(x, y, d, limit, hypotheses, seed, segment):  # type: ignore[no-untyped-def]
     """The plane through three drawn pixels with the least truncated squared error: (cost, a, b, c)."""
     n = x.size
@@ -169,7 +169,7 @@ def _best_hypothesis(x, y, d, limit, hypotheses, seed, segment):  # type: ignore
     return best, best_a, best_b, best_c
 
 
-@fast_kernel
+@fast_part
 def _least_squares(x, y, d, weights, a, b, c, limit):  # type: ignore[no-untyped-def]
     """The weighted least-squares plane of the inliers of (a, b, c), solved for the correction, about their centroid."""
     s = sx = sy = se = F32(0)
@@ -202,7 +202,7 @@ def _least_squares(x, y, d, weights, a, b, c, limit):  # type: ignore[no-untyped
     return a + da, b + db, c + me - da * mx - db * my
 
 
-@fast_kernel
+@fast_part
 def _count_inliers(x, y, d, a, b, c, limit):  # type: ignore[no-untyped-def]
     inliers = 0
     for q in range(x.size):
