@@ -313,7 +313,7 @@ def _export(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.folder} is not empty, and maps of two runs must not mix; choose another folder")
     files = export(options.result, options.folder, options.frames)
     size = sum(file.stat().st_size for file in files)
-    say(f"{options.folder}: {len(files)} files ({size / 1e6:.1f} MB)")
+    say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")
     return COMPLETE
 
 

@@ -16,7 +16,7 @@ from mcap.records import Channel
 
 from recordings.decode import camera_model, frame_of, tilt_of
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
-from recordings.errors import LogError
+from recordings.errors import LogError, counted
 from recordings.mcap_index import Lost, said
 from recordings.mcap_reader import CONVERT, McapFile
 from recordings.rig import Camera, Frames, calibrated_pair, mounted
@@ -173,8 +173,8 @@ class Opening:
         for number, why in sorted(self._sealed.items()):
             topic, count = self.file.channel(number).topic, self.file.count({number})
             if topic in streams and count:
-                problem = LogError(f"{topic}: {count} messages of its channel {number} cannot be decoded: {why}")
-                self.problems.append((streams[topic], problem))
+                lost = f"{topic}: {counted(count, 'message')} of its channel {number} cannot be decoded: {why}"
+                self.problems.append((streams[topic], LogError(lost)))
 
     def _frame_of(self, topic: str) -> str:
         frame = self._first(topic, frame_of)

@@ -308,7 +308,7 @@ def test_losses_are_told_at_their_own_stamps(tmp_path: Path) -> None:
     assert texts[START].startswith("0.75 s of work; matched 92 % known")
     last = [value[0] for *_, value in rows(path, "/ledger", "TextLog:text")][-2:]
     assert set(last) == {
-        "left lost right: unmatched. no partner within 5 ms", "INCOMPLETE: 1 frames, 1 unaligned, 1 unmatched",
+        "left lost right: unmatched. no partner within 5 ms", "INCOMPLETE: 1 frame, 1 unaligned, 1 unmatched",
     }  # fmt: skip
     documents = [value[0] for *_, value in rows(path, "/summary", "TextDocument:text")]
     assert documents[-1].startswith("# INCOMPLETE")

@@ -341,7 +341,7 @@ def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jum
     found = fuse.finding()
     assert found is not None
     assert found.severity is Severity.WARNING
-    assert "began anew in the same frame, odom, 1 times" in found.sentence
+    assert "began anew in the same frame, odom, 1 time:" in found.sentence
 
 
 def test_a_pose_in_another_frame_begins_the_map_anew():
