@@ -27,7 +27,7 @@ class _Keyframe:
 @dataclass
 class _Memory:
     keyframe: _Keyframe | None = None
-    segment: int = 0  # 1 from the first frame on that shows enough
+    segment: int = 0  # 1 from the first frame on that shows something
     blind: int = 0
 
 
@@ -57,7 +57,8 @@ class VisualOdometry(Stage):
         step = step_between(before.view, seen, self.least) if before is not None else None
         if before is not None and step is not None and self._likely(step):
             return self._followed(frame.stamp, before, step, seen)
-        if seen.known < self.least:
+        # What all is counted from needs no more than to show something: it may be the only frame.
+        if seen.known < (1 if before is None else self.least):
             return self._blind(frame.stamp, seen)
         lost = f"less than {self.least} features agree with the frame before; segment {self._memory.segment + 1} begins"
         return self._begun(frame, seen, lost if before is not None else "")

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from recordings.simulator import Simulation
 from recordings.simulator.log import true_disparity
 from stages import CameraMotion, Disparity, StereoFrame, Transform, VisualOdometry
+from stages.tracking import view
 
 FRAMES = 5
 Input = tuple[StereoFrame, Disparity]
@@ -127,6 +128,15 @@ def test_everything_is_counted_from_the_first_frame_that_shows_something(drive):
     np.testing.assert_array_equal(camera_of(first).rotation, np.eye(3))
     true = cameras[1].inverse().after(cameras[2])
     assert np.linalg.norm(camera_of(second).translation - true.translation) < 0.02
+
+
+def test_what_everything_is_counted_from_needs_few_features(drive):
+    frame, disparity = drive[0][0]
+    patch = np.zeros_like(disparity.source)
+    patch[180:210, 150:190] = disparity.source[180:210, 150:190]
+    few = replace(disparity, source=patch)
+    assert 0 < view(frame, few).known < VisualOdometry().least
+    np.testing.assert_array_equal(camera_of(VisualOdometry()(frame, few)).rotation, np.eye(3))
 
 
 def test_a_filled_disparity_is_no_place_in_space(drive):
