@@ -10,10 +10,12 @@ import threading
 from collections import Counter
 from dataclasses import asdict, dataclass
 from enum import StrEnum
+from opcode import opmap
 from pathlib import Path
-from traceback import extract_tb
+from types import TracebackType
 
 log = logging.getLogger(__name__)
+_HOUSE = {"flow", "stages", "recordings"}
 
 
 class Reason(StrEnum):
@@ -57,20 +59,41 @@ class Absent:
 
 
 def failure(error: BaseException) -> str:
-    """What the ledger says of an exception: a ValueError speaks for itself, others need their name and place."""
+    """What the ledger says of an exception: a ValueError that a stage chose to raise speaks for itself, others need
+    their name and place."""
     log.debug("%s", error, exc_info=error)
-    if isinstance(error, ValueError):
+    calls = _calls(error)
+    if isinstance(error, ValueError) and (not calls or _chosen(calls)):
         return str(error)
-    place = _place(error)
-    return f"{type(error).__name__}: {error}{f' ({place}; --debug shows the way there)' if place else ''}"
+    own = [call for call in calls if _file(call) == _file(calls[0])]
+    place = f" ({_file(own[-1]).name}, line {own[-1].tb_lineno}; --debug shows the way there)" if own else ""
+    return f"{type(error).__name__}: {error}{place}"
 
 
-def _place(error: BaseException) -> str:
-    """Where in the file of the stage that was called an exception came up; empty where none had been called."""
-    trace = [call for call in extract_tb(error.__traceback__) if not call.filename.startswith("<")]
-    calls = [call for call in trace if Path(call.filename).parent != Path(__file__).parent]
-    own = [call for call in calls if call.filename == calls[0].filename]
-    return f"{Path(own[-1].filename).name}, line {own[-1].lineno}" if own else ""
+def _calls(error: BaseException) -> list[TracebackType]:
+    """The way from the stage that was called to where an exception came up; empty where none had been called."""
+    calls, call = list[TracebackType](), error.__traceback__
+    while call is not None:
+        if _file(call).parent != Path(__file__).parent and not _file(call).name.startswith("<"):
+            calls.append(call)
+        call = call.tb_next
+    return calls
+
+
+def _chosen(calls: list[TracebackType]) -> bool:
+    """Whether a `raise` of the stage's own package or of this house ends the way: not an operation that failed, nor a
+    library, neither of which can know what to do about it."""
+    last = calls[-1]
+    raised = last.tb_frame.f_code.co_code[last.tb_lasti] == opmap["RAISE_VARARGS"]
+    return raised and _package(last) in {*_HOUSE, _package(calls[0])}
+
+
+def _file(call: TracebackType) -> Path:
+    return Path(call.tb_frame.f_code.co_filename)
+
+
+def _package(call: TracebackType) -> str:
+    return str(call.tb_frame.f_globals.get("__name__")).partition(".")[0]
 
 
 class Ledger:

@@ -23,7 +23,7 @@ def headline(summary: dict[str, Any]) -> str:
     """The verdict of a run in a line: how many frames are whole, and what was lost, be it frames or what made none."""
     whole, of, drops = summary["frames_out"], summary["frames_in"], summary["drops"]
     all_but = summary["verdict"] == Verdict.COMPLETE or whole != of  # else "18 of 18" would hide what made no frame
-    frames = f"{whole} of {of} frames" if all_but else counted(whole, "frame")
+    frames = f"{whole} of {counted(of, 'frame')}" if all_but else counted(whole, "frame")
     said = f"interrupted after {frames}" if summary["interrupted"] else f"{frames} whole"
     lost = ", ".join(f"{number} {reason}" for reason, number in drops.items())
     count = f", {sum(drops.values())} lost: {lost}" if drops else ""

@@ -83,11 +83,13 @@ def discover(
     bare_angles: bool,
     frame_of: Callable[[str], str],
     untilted: Callable[[str], str | None],
+    unplaced: Callable[[str], str | None],
 ) -> Topics:
     """The topics of each role.
 
     bare_angles: whether the settings say how bare pitch and roll are to be read; frame_of: topic -> the frame_id of its
-    messages; untilted: Imu topic -> why it has no orientation, None where it has.
+    messages; untilted: Imu topic -> why it has no orientation, None where it has; unplaced: topic of transforms -> why
+    they tell no pose of the rover, None where they do.
     """
     told = (
         settings.left, settings.right, settings.left_info, settings.right_info, settings.inclinometer,
@@ -101,7 +103,7 @@ def discover(
         if side in found.chosen:
             _find_info(topics, settings, side, frame_of, found)
     _find_tilt(topics, settings, bare_angles, untilted, found)
-    _find_pose(topics, settings, found)
+    _find_pose(topics, settings, unplaced, found)
     return found
 
 
@@ -255,15 +257,19 @@ def _undefined(topic: Topic) -> str:
     )
 
 
-def _find_pose(topics: Sequence[Topic], settings: Settings, found: Topics) -> None:
+def _find_pose(
+    topics: Sequence[Topic], settings: Settings, unplaced: Callable[[str], str | None], found: Topics
+) -> None:
     poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
     if settings.odometry is not None:
         moving = [topic for topic in topics if topic.schema == TRANSFORMS and not topic.name.endswith("tf_static")]
         candidates = poses + [topic for topic in moving if topic.messages]
-        if settings.odometry in {topic.name for topic in candidates}:
-            found.chosen["odometry"] = settings.odometry
-        else:
+        if settings.odometry not in {topic.name for topic in candidates}:
             found.refuse("odometry", "odometry", _not_there("odometry", settings.odometry, "pose", candidates))
+        elif settings.odometry in {topic.name for topic in moving} and (why := unplaced(settings.odometry)):
+            found.refuse("odometry", "odometry", f"the source's 'odometry' is set to {settings.odometry}, where {why}")
+        else:
+            found.chosen["odometry"] = settings.odometry
         return
     choice = [topic for topic in poses if topic.schema == ODOMETRY and not topic.name.startswith(_RESULTS)]
     if len(choice) == 1:

@@ -16,6 +16,7 @@ import rerun as rr
 
 from recordings import paint
 from recordings.desk import LEDGER, Panel, Place
+from recordings.errors import counted
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -203,7 +204,7 @@ def draw_cloud(canvas: Canvas, path: str, cloud: PointCloud) -> str:
             angle = float(np.degrees(np.arcsin(np.clip(-cloud.sensor.rotation[2, axis], -1.0, 1.0))))
             canvas.log(f"{path}/{rr.escape_entity_path_part(name)}", rr.Scalars(angle))
         canvas.hung.setdefault((Panel.ANGLE, path), Place(Panel.ANGLE, path, path))
-    return f"{path} {len(cloud.points)} points"
+    return f"{path} {counted(len(cloud.points), 'point')}"
 
 
 @draws(VoxelMap)
@@ -242,7 +243,7 @@ def draw_motion(canvas: Canvas, path: str, motion: CameraMotion) -> str:
     """How many features the camera was tracked by."""
     place = Place(Panel.FEATURES, path, path)
     canvas.log(f"{path}/features", rr.Scalars(float(motion.inliers)), place)
-    return f"{path}: {motion.lost}" if motion.lost else f"{path} {motion.inliers} features"
+    return f"{path}: {motion.lost}" if motion.lost else f"{path} {counted(motion.inliers, 'feature')}"
 
 
 @draws(TiltHealth)
@@ -281,7 +282,7 @@ def draw_terrain(canvas: Canvas, path: str, terrain: ElevationMap) -> str:
         known = np.isfinite(elevation)
         mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_colors=rgb[known])
         canvas.log(f"{path}/surface", mesh, Place(Panel.TERRAIN, f"{path}/surface", path, terrain.frame_id))
-    return f"{path} {len(vertices)} cells"
+    return f"{path} {counted(len(vertices), 'cell')}"
 
 
 @draws(NavigationMap)

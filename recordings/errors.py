@@ -5,3 +5,8 @@ from __future__ import annotations
 
 class LogError(Exception):
     """One sentence: what is wrong, where (file, topic, stamp), and what to do about it."""
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things in words: "1 frame", "2 frames"."""
+    return f"{number} {what}{'' if number == 1 else 's'}"

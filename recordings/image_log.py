@@ -18,7 +18,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from recordings.discovery import SIDES
-from recordings.errors import LogError
+from recordings.errors import LogError, counted
 from recordings.rig import BODY_FROM_OPTICAL
 from recordings.ros2 import Ros2Writer, camera_info, image, imu, transform_message
 from stages.data import Array, CameraModel, StereoCamera, StereoFrame, Transform
@@ -116,9 +116,8 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
             listed = ", ".join(alone[:_LISTED])
             raise LogError(f"{folder}: {listed}{more} no partner; add it, or take the image away")
         return [names[one] for one, _ in pairs], [names[two] for _, two in pairs]
-    raise LogError(
-        f"{folder} holds no image pairs; name them alike but for left/right, l/r or 0/1 ({len(files)} images)"
-    )
+    held = counted(len(files), "image")
+    raise LogError(f"{folder} holds no image pairs; name them alike but for left/right, l/r or 0/1 ({held})")
 
 
 def _counted(name: str, side: re.Pattern[str], names: Mapping[str, Path]) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recordings.errors import counted
 from recordings.mcap_index import Lost
 from recordings.mcap_log import McapLog
 from recordings.mcap_opening import CAMERAS, peek_stamp
@@ -84,8 +85,8 @@ def format_description(description: dict[str, Any]) -> str:
         )
     frames = d["frames"]
     lines.append(
-        f"frames: {_counted(frames['pairs'], 'pair')} within {frames['slop_s'] * 1e3:g} ms of {frames['left']} left "
-        f"and {_counted(frames['right'], 'right image')}; {frames['with_tilt']} with a tilt around them"
+        f"frames: {counted(frames['pairs'], 'pair')} within {frames['slop_s'] * 1e3:g} ms of {frames['left']} left "
+        f"and {counted(frames['right'], 'right image')}; {frames['with_tilt']} with a tilt around them"
     )
     if d["mount"]:
         down = "unknown" if d["mount"]["base"] is None else f"in '{d['mount']['base']}' at {d['mount']['position']}"
@@ -96,10 +97,6 @@ def format_description(description: dict[str, Any]) -> str:
     lines += [d["undecodable"]] if d["undecodable"] else []
     lines += [f"damaged: {what}" for what in d["damage"]]
     return "\n".join(lines)
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _topics(log: McapLog) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from mcap.records import Channel
 
 from recordings.decode import camera_model, frame_of, tilt_of
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
-from recordings.errors import LogError
+from recordings.errors import LogError, counted
 from recordings.mcap_index import Lost, said
 from recordings.mcap_reader import CONVERT, McapFile
 from recordings.rig import Camera, Frames, calibrated_pair, mounted
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 CAMERAS = ("left", "right")
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
 _LOOKED_AT = 20  # messages of an Imu; an orientation filter may begin with nonsense
+_TRANSFORMS_LOOKED_AT = 100  # messages from the first one of the rover on; others may come more rarely
 _LISTED = 5  # topics in a sentence
 
 Decoder = Callable[[bytes | memoryview], Any]
@@ -110,7 +111,7 @@ class Opening:
         topics = [Topic(name, self.schemas[name], self.file.count(self.channels_of(name))) for name in self.schemas]
         topics.sort(key=lambda topic: topic.name)
         angles = self.source.angles()
-        found = discover(topics, self.source, angles is not None, self._frame_of, self._untilted)
+        found = discover(topics, self.source, angles is not None, self._frame_of, self._untilted, self._unplaced)
         if angles is not None and (topic := found.chosen.get("inclinometer")):
             checked = self._first(topic, angles.check)
             if isinstance(checked, LogError):
@@ -173,8 +174,8 @@ class Opening:
         for number, why in sorted(self._sealed.items()):
             topic, count = self.file.channel(number).topic, self.file.count({number})
             if topic in streams and count:
-                problem = LogError(f"{topic}: {count} messages of its channel {number} cannot be decoded: {why}")
-                self.problems.append((streams[topic], problem))
+                lost = f"{topic}: {counted(count, 'message')} of its channel {number} cannot be decoded: {why}"
+                self.problems.append((streams[topic], LogError(lost)))
 
     def _frame_of(self, topic: str) -> str:
         frame = self._first(topic, frame_of)
@@ -188,6 +189,30 @@ class Opening:
                 return None
             why = tilt
         return str(why)
+
+    def _unplaced(self, topic: str) -> str | None:
+        """Why the transforms of a topic tell no pose of the base frame, or more than one; None where they tell one."""
+        base, parents, looked_at = self.source.base_frame, dict[str, set[str]](), 0
+        for message in self._made(topic, lambda message: message.transforms):
+            for item in [] if isinstance(message, LogError) else message:
+                parents.setdefault(item.child_frame_id, set()).add(frame_of(item))
+            looked_at += base in parents
+            if looked_at == _TRANSFORMS_LOOKED_AT:
+                break
+        if base not in parents:
+            others = ", ".join(f"'{child}'" for child in sorted(parents)[:_LISTED]) or "nothing"
+            return f"no transform places '{base}' (they place {others}); set 'base_frame' of the source to the rover's"
+        first, *more = sorted(parents[base])
+        if more:
+            return f"'{base}' has two parents, '{first}' and '{more[0]}'; record the pose that is meant as Odometry"
+        # map <- odom <- base_link is the one chain (REP 105) in which the last link alone is a pose.
+        if first in parents and first.rpartition("/")[2] != "odom":
+            above = min(parents[first])
+            return (
+                f"'{base}' is placed in '{first}', and that in '{above}'; set 'base_frame' of the source to '{first}' "
+                "if that is the rover's frame, or record the pose that is meant as Odometry"
+            )
+        return None
 
     def _made(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
         """What `make` makes of each message of a topic; a LogError for one of which it makes nothing."""

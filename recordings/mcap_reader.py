@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
-from recordings.errors import LogError
+from recordings.errors import LogError, counted
 from recordings.mcap_chunk import LARGEST, unpacked
 from recordings.mcap_index import BROKEN, MAGIC, RECORD, Loose, Lost, Raw, from_summary, raw, read, records, said
 from recordings.mcap_walk import walk
@@ -181,7 +181,8 @@ class McapFile:
             return
         for channel, count in sorted(found.items()):
             if (expected := self.index.expected.get(channel, count)) > count:
-                yield Lost(channel, self.end, f"the log's statistics count {expected} messages, {count} were found")
+                why = f"the log's statistics count {counted(expected, 'message')}, the log itself {count}"
+                yield Lost(channel, self.end, why)
 
     def _time_range(self) -> tuple[int, int]:
         """Log time of the first and the last message, ns."""

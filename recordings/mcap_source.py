@@ -22,7 +22,8 @@ class McapSource:
     """Where the streams of a log are. Topic names are found by schema and name unless given.
 
     left, right: image topics; left_info, right_info: their CameraInfo; inclinometer: Imu, QuaternionStamped, or with
-    the angle settings any message; odometry: Odometry, PoseStamped, PoseWithCovarianceStamped.
+    the angle settings any message; odometry: Odometry, PoseStamped, PoseWithCovarianceStamped, or the
+    TFMessage that places base_frame.
 
     pitch, roll: for an inclinometer that gives bare angles, {field: vector.x, unit: deg | rad, sign: 1 | -1} each, and
     tilt_model: "axis" (angles of its axes to the horizon) or "euler"; its frame is x forward, y left, z up, and with

@@ -15,6 +15,7 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
+from recordings.errors import counted
 from recordings.mcap_chunk import HEAD, LARGEST, is_chunk, next_chunk, start_time, unpacked, unpacked_start
 from recordings.mcap_index import (
     BROKEN,
@@ -141,7 +142,7 @@ def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None,
                 else:
                     index.define(opcode, content)
     if found is None:
-        count = sum(map(len, index.times.values()))
-        index.lose(f"the log is cut or damaged at byte {position} of {size}; {count} messages were read before that")
+        held = counted(sum(map(len, index.times.values())), "message")
+        index.lose(f"the log is cut or damaged at byte {position} of {size}; before that it holds {held}")
     else:
         index.lose(f"the log is damaged at byte {position}: what is between there and byte {found} may be lost")

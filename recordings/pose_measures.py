@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recordings.errors import counted
 from stages.data import Array
 
 
@@ -85,7 +86,7 @@ def format_pose(found: dict[str, float]) -> list[str]:
         )
     for key, why in (("missing", "none is given"), ("of_another_body", "it is not base_link's, as the truth is")):
         if found[key]:
-            lines.append(f"pose         not scored in {found[key]} frames: {why}")
+            lines.append(f"pose         not scored in {counted(int(found[key]), 'frame')}: {why}")
     return lines
 
 

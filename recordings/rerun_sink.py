@@ -19,7 +19,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from recordings.desk import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, Place, desk
 from recordings.drawings import PICTURES, Canvas, same_view
-from recordings.errors import LogError
+from recordings.errors import LogError, counted
 from recordings.frame_record import FrameRecord, LossEntry
 from recordings.whole_file import give_name, temporary_name, unwritable
 from stages.data import Array, ElevationMap, Pose, StereoFrame
@@ -115,7 +115,7 @@ class RerunSink:
             self._enter(summary.get("entries", ()), last)
             self._set_clocks(self._stamp or 0, last)
             level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
-            text = f"{verdict}: {self._frames} frames{''.join(f', {drop}' for drop in drops)}"
+            text = f"{verdict}: {counted(self._frames, 'frame')}{''.join(f', {drop}' for drop in drops)}"
             self._recording.log(LEDGER, rr.TextLog(text, level=level))
             said = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
             for stream, found in said:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from recordings.errors import counted
 from recordings.pose_measures import format_pose
 from recordings.scoring import Score
 from recordings.stereo_measures import CROP_STEP, REGIONS, THRESHOLDS
@@ -25,9 +26,9 @@ def format_score(found: Score) -> str:
 def _frame_lines(found: Score) -> list[str]:
     lines = [f"frames       {found.compared} of {found.frames} have results"]
     for topic, stamps in found.missing.items():
-        lines.append(f"missing      {topic}: {len(stamps)} of {found.frames} frames, scored as all unknown")
+        lines.append(f"missing      {topic}: {len(stamps)} of {counted(found.frames, 'frame')}, scored as all unknown")
     for topic, count in found.unmatched.items():
-        lines.append(f"unmatched    {topic}: {count} messages at stamps without truth, not scored")
+        lines.append(f"unmatched    {topic}: {counted(count, 'message')} at stamps without truth, not scored")
     return lines
 
 
@@ -68,10 +69,11 @@ def _known_line(name: str, m: dict[str, float]) -> str:
 
 
 def _tilt_lines(found: Score) -> list[str]:
-    lines = [f"tilt         not scored in {count} frames: {why}" for why, count in found.untilted.items()]
+    lines = [f"tilt         not scored in {counted(count, 'frame')}: {why}" for why, count in found.untilted.items()]
     if (t := found.tilt) is not None:
         mean, worst = (math.degrees(t[name]) for name in ("mean", "max"))
-        lines = [f"tilt         mean error {mean:.3f} deg, largest {worst:.3f} deg, in {t['frames']} frames", *lines]
+        frames = counted(int(t["frames"]), "frame")
+        lines = [f"tilt         mean error {mean:.3f} deg, largest {worst:.3f} deg, in {frames}", *lines]
     return lines
 
 

@@ -18,7 +18,7 @@ from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pos
 from stages.kernels.neighbours import lie_of_cells
 from stages.kernels.rigid import transform_points
 from stages.overlap import fit_plane
-from stages.stage import Finding, Severity, Stage, parameter
+from stages.stage import Finding, Severity, Stage, counted, parameter
 from stages.voxelise import Voxelise
 
 # What is remembered of a cell, 30 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
@@ -157,7 +157,7 @@ class Fuse(Stage):
             return None
         return Finding(
             f"height or tilt jumped against the map, which began anew in the same frame, {self._map.frame_id}, "
-            f"{self._map.anew} times: maps from before and after that do not join",
+            f"{counted(self._map.anew, 'time')}: maps from before and after that do not join",
             Severity.WARNING,
         )
 

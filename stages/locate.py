@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.level import level_transform
-from stages.stage import Finding, Severity, Stage, parameter
+from stages.stage import Finding, Severity, Stage, counted, parameter
 
 VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once
 
@@ -92,8 +92,7 @@ class Locate(Stage):
         lost = "tracking was lost " + ("once" if memory.segment == 2 else f"{memory.segment - 1} times")
         if memory.state is None:
             return Finding(f"{lost} by visual odometry; the poses are the log's own") if memory.segment > 1 else None
-        poses = "1 pose" if memory.visual == 1 else f"{memory.visual} poses"
-        said = f"no pose is given: visual odometry supplies it ({poses})"
+        said = f"no pose is given: visual odometry supplies it ({counted(memory.visual, 'pose')})"
         if memory.segment < 2:
             return Finding(f"{said}, in frame {VISUAL_FRAME}")
         frames = f"{VISUAL_FRAME} {'and' if memory.segment == 2 else 'to'} {_frame_of(memory.segment)}"

@@ -27,7 +27,7 @@ class _Keyframe:
 @dataclass
 class _Memory:
     keyframe: _Keyframe | None = None
-    segment: int = 0  # 1 from the log's first frame on
+    segment: int = 0  # 1 from the first frame on that shows something
     blind: int = 0
 
 
@@ -54,15 +54,14 @@ class VisualOdometry(Stage):
                 "join the disparity with the rectified frame it was made from"
             )
         before, seen = self._memory.keyframe, view(frame, disparity)
-        if before is None:  # everything is counted from the log's first frame, whatever it shows
-            return self._begun(frame, seen)
-        step = step_between(before.view, seen, self.least)
-        if step is not None and self._likely(step):
+        step = step_between(before.view, seen, self.least) if before is not None else None
+        if before is not None and step is not None and self._likely(step):
             return self._followed(frame.stamp, before, step, seen)
-        if seen.known < self.least:
+        # What all is counted from needs no more than to show something: it may be the only frame.
+        if seen.known < (1 if before is None else self.least):
             return self._blind(frame.stamp, seen)
         lost = f"less than {self.least} features agree with the frame before; segment {self._memory.segment + 1} begins"
-        return self._begun(frame, seen, lost)
+        return self._begun(frame, seen, lost if before is not None else "")
 
     def finding(self) -> Finding | None:
         """How many frames show too little; None where all show enough. That tracking was lost is for Locate to tell,

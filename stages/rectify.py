@@ -20,7 +20,7 @@ import numpy as np
 from stages.data import Array, CameraModel, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
-from stages.stage import Finding, Severity, Stage, parameter
+from stages.stage import Finding, Severity, Stage, counted, parameter
 
 DISTORTION_SIZES = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 LARGEST_OFFSET = 64.0  # px
@@ -82,7 +82,7 @@ class Rectify(Stage):
         terms = tuple(round(term, 4) for term in offset.terms)
         found = (
             f"rows differ by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, +- {offset.error:.2f}"
-            f" ({offset.features} features of {len(plain)} frames)"
+            f" ({offset.features} features of {counted(len(plain), 'frame')})"
         )
         severity = Severity.NOTE
         if offset.crossed > MOST_CROSSED:

@@ -78,6 +78,11 @@ class Finding:
     severity: Severity = Severity.NOTE
 
 
+def counted(number: int, what: str) -> str:
+    """A number of things in words: "1 frame", "2 frames"."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def check_same_time(stage: Stage, **stamps: int) -> None:
     """Refuse data that are not of one time; stamps: by the name of the port."""
     if len(set(stamps.values())) > 1:

@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 ROOMS = {"flow", "stages", "recordings"}
-COMPOSITION_ROOT = ROOT / "flow" / "cli.py"
+COMPOSITION_ROOT = ROOT / "flow" / "commands.py"
 
 
 def imported(file):

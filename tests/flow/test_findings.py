@@ -4,8 +4,7 @@ from pathlib import Path
 
 from flow.report import headline, report
 from flow.run import run
-from tests.flow.test_engine import graph, replayed, traverse
-from tests.flow.toys import Log
+from tests.flow.toys import Log, graph, replayed, traverse
 
 
 def printed(folder, frames, capsys):

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+from flow.pipeline import load
+from flow.run import run
 from stages.stage import Finding, Severity
 
 
@@ -168,3 +170,41 @@ class Log:
 
     def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         yield from self.events
+
+
+MS = 1_000_000
+PIPELINE = """
+source: {use: tests.flow.toys.Source}
+streams:
+  both:   {use: flow.align.pair, left: left, right: right}
+  height: {use: flow.align.interpolate, stream: level, at: both}
+  twice:  {use: tests.flow.toys.Scale, couple: both, factor: 2 m, nap: %(nap)s s, bad: %(bad)s}
+  thrice: {use: tests.flow.toys.Scale, couple: both, factor: 3 m, nap: %(nap)s s}
+  sum:    {use: tests.flow.toys.Add, a: twice, b: thrice}
+  raised: {use: tests.flow.toys.Add, a: sum, b: height}
+  total:  {use: tests.flow.toys.Total, couple: twice}
+sinks:
+  - {use: tests.flow.toys.Keep, fail_at: %(fail_at)s}
+"""
+
+
+def graph(tmp_path, nap=0.0, bad=(), fail_at="null", text=PIPELINE):
+    file = tmp_path / "toy.yaml"
+    file.write_text(text % {"nap": nap, "bad": list(bad), "fail_at": fail_at})
+    return load(str(file))
+
+
+def traverse(frames, start=0):
+    """Frames each 100 ms, their number as value; the level is sampled in between and equals the time in seconds."""
+    events = [(-50 * MS, "level", Number(-50 * MS, -0.05))]
+    for index in range(start, start + frames):
+        at = index * 100 * MS
+        events += [(at, "left", Number(at, float(index))), (at, "right", Number(at, 0.0))]
+        events += [(at + 50 * MS, "level", Number(at + 50 * MS, at / 1e9 + 0.05))]
+    return events
+
+
+def replayed(graph, events, **options):
+    """(sink, summary) of a run; the sink is kept by the graph."""
+    ((use, sink),) = graph.sinks
+    return sink, run(graph, Log(events), {use: Path("unused")}, **options)

@@ -1,4 +1,4 @@
-"""The sample log, and what is read of it while it is whole."""
+"""The sample log, and what is read of it while it is whole; a rerun recording."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from tests.recordings.recorded_scene import START, STEP, Record, record_of, scene
 from tests.recordings.sample_log import items_of, write_sample
 
 
@@ -18,3 +19,10 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def whole(sample: Path) -> list[tuple[int, str, Any]]:
     return items_of(sample)
+
+
+@pytest.fixture(scope="session")
+def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rerun recording of three whole frames."""
+    path = tmp_path_factory.mktemp("rerun") / "run.rrd"
+    return record_of(path, [Record(START + n * STEP, scene(START + n * STEP)) for n in range(3)])

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from recordings import McapSource
-from recordings.ros2 import Ros2Writer, camera_info, image
-from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, model, picture, write_sample
+from recordings.ros2 import Ros2Writer, camera_info, image, transform_message
+from stages.data import Transform
+from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, items_of, model, picture, write_sample
 
 
 def images(path: Path, topics: dict[str, str], infos: dict[str, str]) -> Path:
@@ -95,6 +96,46 @@ def test_a_pose_among_results_is_named_but_not_taken(tmp_path: Path) -> None:
         assert "there is /nav/odometry; set 'odometry' of the source to use it" in log.missing["odometry"]
     with McapSource(odometry="/nav/odometry").open(path) as log:
         assert log.topics["odometry"] == "/nav/odometry"
+
+
+ODOM, MAP, WHEEL = ("odom", "base_link"), ("map", "odom"), ("base_link", "wheel")
+
+
+def moving(path: Path, *links: tuple[str, str]) -> Path:
+    """A log of transforms that move, each link (parent, child) in messages of its own."""
+    with Ros2Writer(path) as writer:
+        for stamp in range(START, START + 5 * PERIOD, PERIOD):
+            for link in links:
+                at = Transform(*link, np.eye(3), [stamp - START, 0.0, 0.0])
+                writer.write("/tf", transform_message([(at, stamp)]), stamp)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("links", "said"),
+    [
+        ([WHEEL], "no transform places 'base_link' (they place 'wheel'); set 'base_frame' of the source"),
+        ([ODOM, ("map", "base_link")], "'base_link' has two parents, 'map' and 'odom'; record"),
+        (
+            [("odom", "foot"), ("foot", "base_link")],
+            "'base_link' is placed in 'foot', and that in 'odom'; set 'base_fr",
+        ),
+    ],
+)
+def test_transforms_that_tell_no_pose_or_two_are_refused(tmp_path: Path, links: list[Any], said: str) -> None:
+    with McapSource(odometry="/tf").open(moving(tmp_path / "log.mcap", *links)) as log:
+        assert f"the source's 'odometry' is set to /tf, where {said}" in log.refused["odometry"]
+
+
+def test_of_map_odom_and_rover_the_pose_is_that_in_odom(tmp_path: Path) -> None:
+    path = moving(tmp_path / "log.mcap", WHEEL, MAP, ODOM)
+    assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
+
+
+def test_the_pose_is_that_of_the_base_frame_that_is_set(tmp_path: Path) -> None:
+    path = moving(tmp_path / "log.mcap", MAP, ("odom", "foot"))
+    poses = items_of(path, McapSource(odometry="/tf", base_frame="foot"))
+    assert [pose.position[0] for _, _, pose in poses] == [number * PERIOD for number in range(5)]
 
 
 @pytest.mark.parametrize("bad", [5, FRAMES])

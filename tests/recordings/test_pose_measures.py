@@ -60,11 +60,11 @@ def test_each_part_begins_anew_and_adds_its_own_error_and_way():
     assert (found["parts"], found["frames"], found["missing"]) == (2, 4, 1)
     first, second = format_pose(found)
     assert "off by 2.00% of 4.00 m driven, 6.0 cm and 0.00 deg at most, in 2 parts that nothing joins" in first
-    assert "not scored in 1 frames: none is given" in second
+    assert "not scored in 1 frame: none is given" in second
 
 
 def test_a_pose_of_something_else_is_not_scored():
     assert tallied([(pose([0, 0, 0]), None)]) is None
     found = tallied([(pose([0, 0, 0]), pose([0, 0, 0], child="camera"))])
     assert math.isnan(found["drift"])
-    assert format_pose(found) == ["pose         not scored in 1 frames: it is not base_link's, as the truth is"]
+    assert format_pose(found) == ["pose         not scored in 1 frame: it is not base_link's, as the truth is"]

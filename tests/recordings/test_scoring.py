@@ -270,7 +270,7 @@ def test_results_at_stamps_without_truth_are_reported_and_never_compared(tmp_pat
     found = scored(tmp_path, truth, frames, shift={1: 1})
     assert (found.frames, found.compared) == (2, 1)
     assert found.unmatched == dict.fromkeys(scoring.RESULTS, 1)
-    assert "/nav/disparity: 1 messages at stamps without truth" in format_score(found)
+    assert "/nav/disparity: 1 message at stamps without truth" in format_score(found)
     with pytest.raises(LogError, match=r"no result of .* has the stamp of a true frame"):
         scored(tmp_path, truth, frames, shift={0: 1, 1: 1})
 

@@ -116,3 +116,8 @@ def rolling_terrain(
     published["count"] = np.full((cells, cells), 16, np.float32)
     grid = ElevationMap(7, published, resolution, (-extent, -extent), "level")
     return Terrain(grid, blocks(base).mean(-1), blocks(above).mean(-1), blocks(above).max(-1), blocks(index).max(-1))
+
+
+def map_of(elevation: Array, resolution: float = 0.05, **layers: Array) -> ElevationMap:
+    named = {"elevation": elevation, **layers}
+    return ElevationMap(1, {k: v.astype(np.float32) for k, v in named.items()}, resolution, (0.0, 0.0), "level")

@@ -14,16 +14,9 @@ from scipy.ndimage import binary_dilation
 from stages.assess import Assess
 from stages.binarise import Binarise
 from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason
-from stages.kernels.footprint import fit_planes, fit_planes_reference
-from stages.kernels.relief import lowest_around, lowest_around_reference
-from tests.stages.terrain_scene import Terrain, rolling_terrain
+from tests.stages.terrain_scene import Terrain, map_of, rolling_terrain
 
 TEN_DEGREES = float(np.deg2rad(10))
-
-
-def map_of(elevation: Array, resolution: float = 0.05, **layers: Array) -> ElevationMap:
-    named = {"elevation": elevation, **layers}
-    return ElevationMap(1, {k: v.astype(np.float32) for k, v in named.items()}, resolution, (0.0, 0.0), "level")
 
 
 def grid(cells: int = 80) -> tuple[Array, Array]:
@@ -339,51 +332,6 @@ def test_the_grid_of_the_map_is_kept() -> None:
     result = decided(elevation)
     assert (result.stamp, result.resolution, result.origin, result.frame_id) == (7, 0.05, (-4.0, -4.0), "level")
     assert result.cells.shape == elevation.shape
-
-
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), radius=st.integers(1, 4), share=st.floats(0.1, 1.0))
-def test_relief_kernel_equals_the_plain_reference(seed: int, radius: int, share: float) -> None:
-    random = np.random.default_rng(seed)
-    heights, trend = random.normal(0, 1, (12, 15)), random.normal(0, 0.1, (2, 12, 15))
-    use = random.random(heights.shape) < share
-    arguments = (heights, use, trend, radius)
-    for got, want in zip(lowest_around(*arguments), lowest_around_reference(*arguments), strict=True):
-        np.testing.assert_allclose(got, want, atol=1e-12)
-
-
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), radius=st.integers(1, 4), share=st.floats(0.1, 1.0))
-def test_plane_kernel_equals_the_plain_reference(seed: int, radius: int, share: float) -> None:
-    random = np.random.default_rng(seed)
-    heights = random.normal(0, 1, (12, 15))
-    use = random.random(heights.shape) < share
-    got, want = fit_planes(heights, use, radius, 0.2503), fit_planes_reference(heights, use, radius, 0.2503)
-    np.testing.assert_array_equal(np.isnan(got), np.isnan(want))
-    np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)
-
-
-def test_the_size_of_the_grid_about_known_ground_changes_nothing() -> None:
-    terrain = rolling_terrain(3)
-    small = terrain.elevation
-    rows, cols = small.shape
-    patch = np.s_[70 : 70 + rows, 31 : 31 + cols]
-
-    def widened(layer: Array) -> Array:
-        wide = np.full((rows + 150, cols + 90), np.nan, np.float32)
-        wide[patch] = layer
-        return wide
-
-    large = replace(small, layers={name: widened(layer) for name, layer in small.layers.items()})
-    expected, found = Assess()(small).layers, Assess()(large).layers
-    for name, layer in expected.items():
-        np.testing.assert_allclose(found[name][patch], layer, atol=1e-6, err_msg=name)
-
-
-def test_a_map_of_which_nothing_is_known_is_assessed_as_unknown() -> None:
-    nothing = Assess()(map_of(np.full((60, 60), np.nan)))
-    assert all(np.isnan(layer).all() for layer in nothing.layers.values())
-    assert (Binarise()(nothing).cells == Cell.UNKNOWN).all()
 
 
 def test_a_height_on_too_few_points_is_never_free_but_may_be_a_hazard() -> None:

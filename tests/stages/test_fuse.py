@@ -9,58 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from stages import Fuse, Mount, PointCloud, Pose, Transform
+from stages import Fuse
 from stages.fuse import local_cells, placement
-from stages.stage import Severity
 from stages.tiles import Tiles
-
-SECOND = 1_000_000_000
-START = 1_700_000_000 * SECOND
-LOOKING = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
-MOUNT = Mount(START, np.eye(3), Transform("base_link", "camera", LOOKING, np.array([0.4, 0.1, 1.0])))
-
-
-def rolling(x, y):
-    """Ground that is alike in no two places or directions."""
-    return 0.2 * np.sin(0.9 * x + 0.3) * np.cos(0.5 * y) + 0.03 * x - 0.02 * y
-
-
-def flat(x, y):
-    return np.zeros_like(x)
-
-
-def drive(frame, ground=rolling, sigma=0.02, tilt=(0.0, 0.0), at=None, noise=0.0):
-    """Cloud and pose of one frame: 2 to 7 m ahead, 100 degrees wide, 6 points a cell. tilt: errors of the levelling."""
-    rng = np.random.default_rng(frame)
-    x, y, yaw = at or (0.4 * frame - 3.03, 0.1 * frame + 0.521, 0.4 + 0.1 * frame)
-    base = np.array([x, y, float(ground(np.array(x), np.array(y)))])
-    reach, bearing = np.sqrt(rng.uniform(4, 49, 100_000)), rng.uniform(-0.87, 0.87, 100_000)
-    ahead = np.column_stack([reach * np.cos(bearing), reach * np.sin(bearing)])
-    world = ahead @ Rotation.from_euler("z", yaw).as_matrix()[:2, :2].T + base[:2]
-    heights = ground(world[:, 0], world[:, 1]) - base[2] + ahead @ tilt + noise * rng.normal(size=len(ahead))
-    sensor = replace(MOUNT.base_from_camera, parent="level")
-    count = len(ahead)
-    cloud = PointCloud(
-        START + frame * SECOND, np.column_stack([ahead, heights]).astype(np.float32),
-        np.zeros((count, 3), np.uint8), np.full(count, sigma, np.float32), np.arange(count, dtype=np.int32), "level",
-        sensor=sensor,
-    )  # fmt: skip
-    return cloud, Pose(cloud.stamp, base, Rotation.from_euler("z", yaw).as_quat(), "odom", "base_link")
-
-
-def cell(terrain, x, y, layer="elevation"):
-    col, row = (
-        int(np.floor((place - start) / terrain.resolution)) for place, start in zip((x, y), terrain.origin, strict=True)
-    )
-    return float(terrain.layers[layer][row, col])
-
-
-def centres(terrain):
-    rows, cols = terrain.shape
-    x, y = ((np.arange(n) + 0.5) * terrain.resolution + at for n, at in zip((cols, rows), terrain.origin, strict=True))
-    return np.meshgrid(x, y)
+from tests.stages.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
 
 
 def test_frames_at_any_heading_make_one_map_of_the_ground():
@@ -88,47 +41,6 @@ def test_a_rock_seen_from_two_headings_stands_where_it_is():
     rock = terrain.layers["elevation"] > 0.125
     assert rock.sum() * 0.05**2 == pytest.approx(np.pi * 0.3**2, rel=0.1)
     assert (x[rock].mean(), y[rock].mean()) == (pytest.approx(1.0, abs=0.01), pytest.approx(2.0, abs=0.01))
-
-
-def heights(cloud, placed):
-    """Mean height in each cell of the square of 20 m about the origin, NaN where there is none."""
-    points = placed(cloud.points)
-    cells = (np.floor(points[:, :2] / 0.05).astype(int) + 200) @ (1, 400)
-    with np.errstate(invalid="ignore"):
-        return np.bincount(cells, points[:, 2], 160_000) / np.bincount(cells, minlength=160_000)
-
-
-def test_frames_with_errors_of_their_tilt_join_without_a_seam():
-    rng, fuse, seams, before = np.random.default_rng(3), Fuse(), [], None
-    for frame in range(12):
-        cloud, pose = drive(frame, tilt=tuple(rng.normal(0, np.radians(0.4), 2)), noise=0.01)
-        now = [heights(cloud, placed) for placed in (placement(cloud, pose, MOUNT), fuse(cloud, pose, MOUNT).level)]
-        if before is not None:
-            off = [one - other for one, other in zip(before, now, strict=True)]
-            seams.append([1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) for values in off])
-        before = now
-    raw, joined = np.median(seams, axis=0)
-    assert raw > 0.015
-    assert joined < 0.007  # 1 cm of noise in 6 points a cell, twice, is 0.6 cm
-    assert np.max(seams, axis=0)[1] < 0.008
-
-
-def test_the_tilt_error_of_the_first_frame_fades_and_does_not_swing_back():
-    fuse, lean, found = Fuse(), np.radians(0.6), []
-    for frame in range(61):
-        cloud, pose = drive(frame, flat, tilt=(lean if frame == 0 else 0.0, 0.0), at=(0.25 * frame, 0.0, 0.0))
-        placed = fuse(part(cloud, np.s_[::10]), pose, MOUNT).level
-        found.append(np.arcsin(placed.rotation[2, 0]) / lean)
-    assert 0.7 < found[1] < 1.0  # it joins the map much as that is
-    assert abs(found[40]) < 0.15
-    assert abs(found[60]) < 0.1
-    assert min(found) > -0.1
-    assert abs(placed.translation[2]) < 0.1
-
-
-def part(cloud, of):
-    """Some points of a cloud, by a slice."""
-    return replace(cloud, **{name: getattr(cloud, name)[of] for name in ("points", "colors", "sigma", "pixel")})
 
 
 def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(monkeypatch):
@@ -251,26 +163,6 @@ def test_the_windows_laid_over_each_other_are_the_whole_map():
     np.testing.assert_array_equal(whole["frames"].read(-400, -400, 900, 900), cells["frames"])
 
 
-def test_a_pose_of_the_camera_is_as_good_as_one_of_the_rover():
-    cloud, pose = drive(3)
-    base = Transform("odom", "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
-    camera = base.after(MOUNT.base_from_camera)
-    turn = Rotation.from_matrix(camera.rotation).as_quat()
-    seen = [Fuse()(cloud, pose, MOUNT), Fuse()(cloud, Pose(pose.stamp, camera.translation, turn, "odom", "camera"))]
-    np.testing.assert_allclose(seen[0].level.translation, seen[1].level.translation, atol=1e-9)
-    np.testing.assert_allclose(seen[0].layers["elevation"], seen[1].layers["elevation"], atol=1e-5)
-
-
-def test_roll_and_pitch_of_the_pose_do_not_tilt_the_map():
-    cloud, pose = drive(3)
-    tilted = Rotation.from_quat(pose.quaternion) * Rotation.from_euler("yx", [8, -5], degrees=True)
-    level = Transform("level", "base_link", Rotation.from_euler("yx", [8, -5], degrees=True).as_matrix(), np.zeros(3))
-    cloud = replace(cloud, sensor=level.after(MOUNT.base_from_camera))
-    placed = placement(cloud, replace(pose, quaternion=tilted.as_quat()), MOUNT)
-    np.testing.assert_allclose(placed.rotation, Rotation.from_quat(pose.quaternion).as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(placed.translation, pose.position, atol=1e-9)
-
-
 def test_equal_frames_give_equal_bits():
     maps = []
     for _ in range(2):
@@ -280,30 +172,6 @@ def test_equal_frames_give_equal_bits():
             terrain = fuse(cloud, pose, MOUNT)
         maps.append({name: layer.tobytes() for name, layer in terrain.layers.items()})
     assert maps[0] == maps[1]
-
-
-def upside_down(pose):
-    return replace(
-        pose, quaternion=(Rotation.from_euler("x", 180, degrees=True) * Rotation.from_quat(pose.quaternion)).as_quat()
-    )
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        (lambda cloud, pose: (replace(cloud, frame_id="camera", sensor=None), pose), "it needs Level"),
-        (lambda cloud, pose: (cloud, replace(pose, child_frame_id="mast")), "the pose is that of 'mast', and nothing"),
-        (lambda cloud, pose: (cloud, upside_down(pose)), "180 degrees off the vertical .* whose z points up"),
-        (lambda cloud, pose: (replace(cloud, stamp=START), pose), "comes after"),
-    ],
-)  # fmt: skip
-def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(change, sentence):
-    fuse = Fuse()
-    fuse(*drive(0), MOUNT)
-    before = fuse._map.cells.read(-300, -300, 600, 600)
-    with pytest.raises(ValueError, match=sentence):
-        fuse(*change(*drive(1)), MOUNT)
-    np.testing.assert_array_equal(fuse._map.cells.read(-300, -300, 600, 600), before)
 
 
 def test_an_obstacle_that_appears_is_never_stated_to_be_flat_ground():
@@ -317,42 +185,6 @@ def test_an_obstacle_that_appears_is_never_stated_to_be_flat_ground():
             assert height + np.sqrt(variance) > 0.45
     assert height == pytest.approx(0.5, abs=0.02)
     assert variance < 0.05**2
-
-
-@pytest.mark.parametrize("jump", [np.array([0, 0, 0.6]), np.array([0, 0, -0.4])])
-def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jump):
-    fuse = Fuse()
-    for frame in range(5):
-        terrain = fuse(*drive(frame), MOUNT)
-    for frame in (5, 6):
-        cloud, pose = drive(frame)
-        with pytest.raises(ValueError, match=r"m and 0\.0 degrees off the map, .* left out of the regional map"):
-            fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
-    again = fuse(*drive(7), MOUNT)  # it was a slip: the map goes on
-    assert fuse.finding() is None
-    assert again.layers["frames"].max() > terrain.layers["frames"].max()
-    for frame in (8, 9, 10):
-        cloud, pose = drive(frame)
-        try:
-            anew = fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
-        except ValueError:
-            assert frame < 10
-    assert anew.layers["frames"].max() == 1
-    found = fuse.finding()
-    assert found is not None
-    assert found.severity is Severity.WARNING
-    assert "began anew in the same frame, odom, 1 times" in found.sentence
-
-
-def test_a_pose_in_another_frame_begins_the_map_anew():
-    fuse, fresh = Fuse(), Fuse()
-    fuse(*drive(0), MOUNT)
-    cloud, pose = drive(1)
-    lost = replace(pose, frame_id="visual_odom/2")
-    begun, expected = fuse(cloud, lost, MOUNT), fresh(cloud, lost, MOUNT)
-    assert begun.frame_id == "visual_odom/2"
-    for name, layer in expected.layers.items():
-        np.testing.assert_array_equal(begun.layers[name], layer)
 
 
 def test_an_empty_cloud_changes_nothing():

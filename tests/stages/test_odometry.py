@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from recordings.simulator import Simulation
 from recordings.simulator.log import true_disparity
 from stages import CameraMotion, Disparity, StereoFrame, Transform, VisualOdometry
+from stages.tracking import view
 
 FRAMES = 5
 Input = tuple[StereoFrame, Disparity]
@@ -118,20 +119,30 @@ def test_a_blind_frame_has_no_motion_and_the_next_goes_on_from_the_last_that_saw
     assert odometry.finding().sentence == "1 frame shows too little to track"
 
 
-def test_where_everything_is_counted_from_needs_no_features(drive):
-    motion = VisualOdometry()(*blank(drive[0][0]))
-    np.testing.assert_array_equal(camera_of(motion).rotation, np.eye(3))
+def test_everything_is_counted_from_the_first_frame_that_shows_something(drive):
+    inputs, cameras = drive
+    odometry = VisualOdometry()
+    assert odometry(*blank(inputs[0])).camera is None
+    first, second = odometry(*inputs[1]), odometry(*inputs[2])
+    assert (first.segment, first.lost, second.segment) == (1, "", 1)
+    np.testing.assert_array_equal(camera_of(first).rotation, np.eye(3))
+    true = cameras[1].inverse().after(cameras[2])
+    assert np.linalg.norm(camera_of(second).translation - true.translation) < 0.02
+
+
+def test_what_everything_is_counted_from_needs_few_features(drive):
+    frame, disparity = drive[0][0]
+    patch = np.zeros_like(disparity.source)
+    patch[180:210, 150:190] = disparity.source[180:210, 150:190]
+    few = replace(disparity, source=patch)
+    assert 0 < view(frame, few).known < VisualOdometry().least
+    np.testing.assert_array_equal(camera_of(VisualOdometry()(frame, few)).rotation, np.eye(3))
 
 
 def test_a_filled_disparity_is_no_place_in_space(drive):
     frame, disparity = drive[0][0]
-    odometry = VisualOdometry()
-    odometry(frame, disparity)
     filled = replace(disparity, source=np.full_like(disparity.source, 3))
-    assert VisualOdometry()(frame, filled).inliers == 0
-    unknown = VisualOdometry()
-    unknown(frame, filled)
-    assert "segment 2 begins" in unknown(*drive[0][1]).lost
+    assert VisualOdometry()(frame, filled).lost == "only 0 features with a disparity are in view, less than 40"
 
 
 def test_disparities_of_another_size_are_refused(drive):

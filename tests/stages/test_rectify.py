@@ -241,7 +241,7 @@ def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
     broken = StereoFrame(2, frame.left, frame.right, replace(frame.camera, raw=(bad, bad)))
     stage, found = Rectify().survey([broken, frame])
     assert stage.row_offset[0] == pytest.approx(1.0, abs=0.1)
-    assert "of 1 frames" in found.sentence
+    assert "of 1 frame)" in found.sentence
 
 
 def test_a_list_of_terms_is_taken_as_the_survey_prints_it():

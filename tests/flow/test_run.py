@@ -1,0 +1,216 @@
+"""A run ends with a verdict and a ledger that hold, whatever the log lacks, whatever fails, whoever interrupts it."""
+
+import re
+import threading
+from pathlib import Path
+
+import pytest
+
+from flow.errors import SinkError, UsageError
+from flow.run import Stop, run
+from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, traverse
+
+
+def test_a_failing_frame_is_recorded_and_skipped_and_the_others_go_on(tmp_path):
+    sink, summary = replayed(graph(tmp_path, bad=[3.0, 7.0]), traverse(10), workers=3)
+    assert list(sink.values("sum").values()) == [5.0 * i for i in range(10) if i not in (3, 7)]
+    assert list(sink.values("thrice").values()) == [3.0 * i for i in range(10)]
+    assert summary["verdict"] == "INCOMPLETE"
+    assert summary["drops"] == {"failed": 2}
+    assert [(entry["stage"], entry["detail"]) for entry in summary["ledger"]] == [
+        ("twice", "cannot scale 3.0"),
+        ("twice", "cannot scale 7.0"),
+    ]
+    assert [r.index for r in sink.records if r.entries] == [3, 7]
+
+
+def test_frames_without_a_partner_in_another_stream_are_in_the_ledger(tmp_path):
+    events = [event for event in traverse(10) if not (event[1] == "level" and event[0] > 500 * MS)]
+    sink, summary = replayed(graph(tmp_path), events)
+    assert list(sink.values("raised")) == [i * 100 * MS for i in range(5)]
+    assert summary["drops"] == {"unaligned": 5}
+    assert list(sink.values("sum").values()) == [5.0 * i for i in range(10)]
+
+
+def test_an_unreadable_message_and_a_repeated_stamp_are_in_the_ledger(tmp_path):
+    events = traverse(4)
+    events.insert(3, (10 * MS, "left", OSError("chunk 7 is damaged")))
+    events.insert(3, (11 * MS, "left", Number(0, 5.0)))
+    sink, summary = replayed(graph(tmp_path), events)
+    assert summary["drops"] == {"out of order": 1, "unreadable": 1}
+    assert len(sink.values("raised")) == 4
+
+
+def test_a_stage_that_returns_something_else_fails_the_frame_not_the_run(tmp_path):
+    text = PIPELINE.replace("tests.flow.toys.Add, a: sum, b: height", "tests.flow.toys.Liar, couple: sum")
+    _, summary = replayed(graph(tmp_path, text=text), traverse(2))
+    assert summary["drops"] == {"failed": 2}
+    assert "returned a Text, not a Couple" in summary["ledger"][0]["detail"]
+
+
+def test_a_failing_sink_stops_the_run_and_is_still_closed(tmp_path):
+    pipeline = graph(tmp_path, fail_at=5)
+    ((_, sink),) = pipeline.sinks
+    with pytest.raises(SinkError, match=r"Keep could not write unused: No space left on device"):
+        replayed(pipeline, traverse(1000), workers=2)
+    assert len(sink.records) == 5
+    assert sink.summary["verdict"] == "INCOMPLETE"
+
+
+def test_a_log_that_breaks_off_keeps_what_was_read(tmp_path):
+    class Broken(Log):
+        def __iter__(self):
+            yield from self.events
+            raise OSError("input/output error")
+
+    pipeline = graph(tmp_path)
+    ((use, sink),) = pipeline.sinks
+    summary = run(pipeline, Broken(traverse(5)), {use: Path("unused")})
+    assert len(sink.values("raised")) == 5
+    assert summary["drops"] == {"unreadable": 1}
+
+
+def test_an_interrupt_finishes_the_frames_in_flight_and_closes_the_sinks(tmp_path):
+    stop = Stop()
+    pipeline = graph(tmp_path, nap=0.001)
+    ((_, sink),) = pipeline.sinks
+
+    def interrupt(whole):
+        if len(sink.records) >= 10 and not stop.finishing():
+            stop.request()
+
+    _, summary = replayed(pipeline, traverse(10_000), workers=2, stop=stop, on_frame=interrupt)
+    assert summary["interrupted"]
+    assert summary["verdict"] == "INCOMPLETE"
+    assert 10 <= summary["frames_out"] == len(sink.records) < 100
+    assert summary["messages"]["left"] == summary["frames_in"] + len(lost_frames(summary))
+    assert sink.summary["frames_out"] == summary["frames_out"]
+
+
+def lost_frames(summary):
+    return [entry for entry in summary["ledger"] if entry["stream"] in ("left", "both")]
+
+
+def test_a_second_interrupt_does_not_wait_for_a_stage_that_hangs(tmp_path, monkeypatch):
+    stop, gate = Stop(), threading.Event()
+    pipeline = graph(tmp_path)
+
+    def hang(self, couple):
+        if couple.value == 3.0:
+            stop.request()
+            stop.request()
+            gate.wait(60)
+        return couple
+
+    monkeypatch.setattr("tests.flow.toys.Scale.__call__", hang)
+    sink, summary = replayed(pipeline, traverse(20), workers=1, stop=stop)
+    assert not gate.is_set()
+    gate.set()
+    assert summary["interrupted"]
+    assert sink.summary["verdict"] == "INCOMPLETE"
+    assert summary["drops"]["abandoned"] >= 1
+
+
+def test_items_that_break_an_aligner_lose_their_frame_not_the_verdict(tmp_path, monkeypatch):
+    def broken(left, right):
+        raise TypeError("no such pair")
+
+    pipeline = graph(tmp_path)
+    monkeypatch.setattr(Number, "pair_with", broken)
+    _, summary = replayed(pipeline, traverse(3))
+    assert summary["verdict"] == "INCOMPLETE"
+    assert summary["frames_out"] == 0
+    details = [entry["detail"] for entry in lost_frames(summary)]
+    assert all(said.startswith("TypeError: no such pair (test_run.py, line ") for said in details)
+
+
+def test_a_run_that_is_torn_down_is_never_sealed_as_complete(tmp_path):
+    class Torn(Log):
+        def __iter__(self):
+            yield from self.events
+            raise SystemExit
+
+    pipeline = graph(tmp_path)
+    ((use, sink),) = pipeline.sinks
+    with pytest.raises(SystemExit):
+        run(pipeline, Torn(traverse(3)), {use: Path("unused")})
+    assert sink.summary["verdict"] == "INCOMPLETE"
+
+
+def test_a_progress_display_that_fails_does_not_stop_the_run(tmp_path):
+    def broken(whole):
+        raise BrokenPipeError
+
+    sink, summary = replayed(graph(tmp_path), traverse(10), workers=1, on_frame=broken)
+    assert summary["frames_out"] == len(sink.records) == 10
+
+
+def test_one_damaged_stamp_costs_one_message(tmp_path):
+    events = traverse(10)
+    index = next(i for i, event in enumerate(events) if event[:2] == (400 * MS, "left"))
+    events[index] = (400 * MS, "left", Number(400 * MS + 3_600_000 * MS, 4.0))
+    _, summary = replayed(graph(tmp_path), events)
+    assert summary["frames_out"] == 9
+    assert {(e["stream"], e["reason"]) for e in summary["ledger"]} == {("left", "out of order"), ("right", "unmatched")}
+
+
+def test_a_clock_that_is_set_forward_costs_one_message_of_each_stream(tmp_path):
+    hour = 3_600_000 * MS
+    jump = [
+        (at, stream, Number(item.stamp + hour, item.value)) if at > 450 * MS else (at, stream, item)
+        for at, stream, item in traverse(10)
+    ]
+    sink, summary = replayed(graph(tmp_path), jump)
+    assert len(sink.values("sum")) == 9
+    assert summary["drops"]["out of order"] == 3
+
+
+def test_patience_runs_on_the_clock_of_the_whole_log(tmp_path):
+    events = [(0, "left", Number(0, 1.0))]
+    events += [(at, "level", Number(at, 0.0)) for at in range(0, 3000 * MS, 50 * MS)]
+    _, summary = replayed(graph(tmp_path), events)
+    (entry,) = summary["ledger"]
+    assert entry["detail"] == "no partner within 1000.0 ms of log time"
+
+
+def test_a_log_that_lacks_what_a_stage_needs_is_refused_with_the_logs_own_words(tmp_path):
+    pipeline = graph(tmp_path)
+    with pytest.raises(UsageError, match="no level in it"):
+        run(pipeline, Log([], missing={"level": "no level in it"}), {})
+
+
+def test_what_is_optional_is_left_out_where_the_log_lacks_it(tmp_path):
+    text = PIPELINE
+    for line in ("at: both", "b: height"):
+        text = text.replace(line, f"{line}, optional: true")
+    pipeline = graph(tmp_path, text=text)
+    ((use, sink),) = pipeline.sinks
+    summary = run(pipeline, Log(traverse(3), missing={"level": "no level"}), {use: Path("unused")})
+    assert summary["verdict"] == "COMPLETE"
+    assert "raised" not in sink.streams
+    assert {"severity": "note", "sentence": "left out: no level"} in summary["findings"].values()
+    assert len(sink.values("sum")) == 3
+
+
+def test_a_port_that_may_stay_open_is_left_open_where_the_log_lacks_its_stream(tmp_path):
+    text = PIPELINE.replace("at: both}", "at: both, optional: true}")
+    pipeline = graph(tmp_path, text=text.replace("toys.Add, a: sum, b: h", "toys.Either, a: sum, b: h"))
+    ((use, sink),) = pipeline.sinks
+    run(pipeline, Log(traverse(3), missing={"level": "no level"}), {use: Path("unused")})
+    assert sink.values("raised") == sink.values("sum")
+
+
+def test_a_pipeline_of_which_nothing_is_left_is_refused(tmp_path):
+    text = re.sub(r"^(  \w+: +{.*)}$", r"\1, optional: true}", PIPELINE, flags=re.MULTILINE)
+    with pytest.raises(UsageError, match="no right camera"):
+        run(graph(tmp_path, text=text), Log([], missing={"right": "no right camera"}), {})
+
+
+def test_an_output_that_fails_at_its_end_makes_the_run_incomplete(tmp_path, monkeypatch):
+    def full(self, summary):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Keep, "close", full)
+    with pytest.raises(SinkError, match="No space left") as caught:
+        replayed(graph(tmp_path), traverse(3))
+    assert caught.value.summary["verdict"] == "INCOMPLETE"

@@ -1,0 +1,150 @@
+"""Every picture of a recording shows what the frame held, where it was, in its own numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rerun as rr
+
+from recordings.rerun_sink import RerunSink
+from stages.data import LEVEL_FRAME, Cell, Pose, StereoFrame, Transform
+from tests.recordings.recorded_scene import (
+    HEIGHT,
+    START,
+    STEP,
+    WIDTH,
+    Record,
+    decoded,
+    entities,
+    record_of,
+    rows,
+    scene,
+)
+
+
+def test_disparities_survive_to_an_eighth_of_a_pixel_and_unknown_is_zero(rrd: Path) -> None:
+    blob = rows(rrd, "/disparity/pixels", "EncodedDepthImage:blob")[0][2][0]
+    stored = decoded(blob, cv2.IMREAD_UNCHANGED) / 8.0
+    truth = scene()["disparity"].pixels
+    known = np.isfinite(truth)
+    assert np.abs(stored[known] - truth[known]).max() <= 1 / 16
+    assert (stored[~known] == 0).all()
+
+
+def test_superpixel_edges_lie_between_different_labels(rrd: Path) -> None:
+    edges = decoded(rows(rrd, "/disparity/superpixels", "EncodedImage:blob")[0][2][0], cv2.IMREAD_GRAYSCALE)
+    assert edges.shape == (HEIGHT, WIDTH)
+    column, row = np.arange(WIDTH) % 8 == 7, np.arange(HEIGHT) % 8 == 7
+    column[-1] = row[-1] = False  # beyond the image there is no other superpixel
+    np.testing.assert_array_equal(edges > 0, row[:, None] | column)
+
+
+def test_images_are_recognisable(rrd: Path) -> None:
+    left = decoded(rows(rrd, "/rectified/left", "EncodedImage:blob")[0][2][0], cv2.IMREAD_GRAYSCALE)
+    assert np.abs(left.astype(int) - scene()["rectified"].left).mean() < 8
+
+
+def test_the_same_pixels_are_stored_once(rrd: Path, tmp_path: Path) -> None:
+    assert "/stereo/left" not in entities(rrd)
+    items = scene()
+    raw = items["stereo"]
+    items["stereo"] = StereoFrame(raw.stamp, raw.left.copy(), raw.right, raw.camera)
+    assert {"/stereo/left", "/rectified/left"} <= entities(record_of(tmp_path / "raw.rrd", [Record(START, items)]))
+
+
+def test_clouds_are_thinned_by_a_fixed_stride(tmp_path: Path) -> None:
+    path = record_of(tmp_path / "few.rrd", [Record(START, scene())], max_points=300)
+    positions = rows(path, "/points/points", "Points3D:positions")[0][2]
+    np.testing.assert_array_equal(positions, scene()["points"].points[::4])
+
+
+def test_a_cloud_in_the_cameras_frame_is_not_put_into_level_space(rrd: Path) -> None:
+    assert not any(path.startswith("/cloud") for path in entities(rrd))
+
+
+def test_the_surface_has_no_triangle_across_a_hole(rrd: Path) -> None:
+    vertices = np.array(rows(rrd, "/elevation_map/surface", "Mesh3D:vertex_positions")[0][2])
+    triangles = np.array(rows(rrd, "/elevation_map/surface", "Mesh3D:triangle_indices")[0][2])
+    terrain = scene()["elevation_map"]
+    assert len(vertices) == np.isfinite(terrain.layers["elevation"]).sum()
+    assert np.isfinite(vertices).all()
+    corners = vertices[triangles][..., :2]
+    assert np.ptp(corners, axis=1).max() == pytest.approx(terrain.resolution, abs=1e-5)
+    # 29 x 39 squares, of which the 5 x 6 that touch the 4 x 5 hole are gone, but for the halves at two of its corners.
+    assert len(triangles) == 2 * (29 * 39 - 5 * 6) + 2
+
+
+def test_maps_are_seen_from_above_with_forward_up_and_left_left(rrd: Path) -> None:
+    """The one hazard is at row 2 (right, y small) and column 3 (near, x small): lower right in the picture."""
+    blob = bytes(rows(rrd, "/navigation_map/cells/labels", "SegmentationImage:buffer")[0][2][0])
+    picture = np.frombuffer(blob, np.uint8).reshape(40, 30)
+    assert np.argwhere(picture == Cell.HAZARD).tolist() == [[40 - 1 - 3, 30 - 1 - 2]]
+
+
+def test_hazards_stand_on_the_ground_where_they_are(rrd: Path) -> None:
+    position = rows(rrd, "/navigation_map/hazards", "Points3D:positions")[0][2]
+    ground = scene()["elevation_map"].layers["elevation"][2, 3]
+    np.testing.assert_allclose(position, [[0.35, -1.25, ground + 0.03]], atol=1e-6)
+
+
+def test_a_regional_map_is_drawn_beside_the_frame_s_own(tmp_path: Path) -> None:
+    items = scene()
+    near, cells = items["elevation_map"], items["navigation_map"]
+    level = Transform("odom", LEVEL_FRAME, np.eye(3), [6.0, 0.0, 2.0])
+    layers = {name: layer + np.float32(2.0) for name, layer in near.layers.items()}
+    items["regional_map"] = replace(near, layers=layers, origin=(5.0, -1.5), frame_id="odom", level=level)
+    items["regional_navigation_map"] = replace(cells, origin=(5.0, -1.5), frame_id="odom")
+    sink = RerunSink()
+    sink.open(tmp_path / "run.rrd", dict.fromkeys(items, object), {})
+    sink.write(Record(START, items))
+    sink.close({"verdict": "COMPLETE"})
+    ground = near.layers["elevation"][2, 3]
+    for stream, place in (("navigation_map", (0.35, -1.25, 0)), ("regional_navigation_map", (5.35, -1.25, 2))):
+        position = rows(tmp_path / "run.rrd", f"/{stream}/hazards", "Points3D:positions")[0][2]
+        np.testing.assert_allclose(position, [np.add(place, (0, 0, ground + 0.03))], atol=1e-6)
+    assert len(rows(tmp_path / "run.rrd", "/regional_map/surface", "Mesh3D:vertex_positions")) == 1
+    names, spots = (
+        rows(tmp_path / "run.rrd", "/regional_map/relief/lines/distances", f"Points2D:{part}")[0][2]
+        for part in ("labels", "positions")
+    )
+    # 40 columns from x = 5: the rover, at x = 6, is 10 columns from the lower edge, and in the middle of 30 rows.
+    assert spots[names.index("rover")] == [15.0, 30.0]
+
+
+def test_the_camera_stands_where_the_cloud_was_seen_from(rrd: Path) -> None:
+    assert rows(rrd, "/rectified/camera", "Transform3D:translation")[0][2] == [pytest.approx([0.0, 0.0, 0.9])]
+
+
+def test_scalars_are_those_of_the_frame(rrd: Path) -> None:
+    assert [value for *_, value in rows(rrd, "/seconds/disparity", "Scalars:scalars")] == [[0.5]] * 3
+    assert [value for *_, value in rows(rrd, "/queues/matched", "Scalars:scalars")] == [[3.0]] * 3
+    tilt = rows(rrd, "/tilt/x\\ axis\\ up", "Scalars:scalars")[0][2]
+    assert tilt == [pytest.approx(np.degrees(0.1))]
+
+
+def test_the_tilt_check_is_a_plot_and_says_once_what_is_wrong(rrd: Path, tmp_path: Path) -> None:
+    (_, _, turn), *_ = rows(rrd, "/health/" + rr.escape_entity_path_part("tilt off turn"), "Scalars:scalars")
+    assert turn[0] == pytest.approx(np.degrees(0.01))
+    assert rows(rrd, "/motion/features", "Scalars:scalars")[0][2] == [321.0]
+    path = record_of(
+        tmp_path / "run.rrd", [Record(START, scene()), Record(START + STEP, scene(START + STEP))],
+        {
+            "verdict": "COMPLETE",
+            "findings": {"health": {"severity": "warning", "sentence": "the sign of pitch is flipped"}},
+        },
+    )  # fmt: skip
+    assert [value for *_, value in rows(path, "/ledger/health", "TextLog:text")] == [["turn it round"]]
+    assert rows(path, "/ledger", "TextLog:text")[-1][2] == ["health: the sign of pitch is flipped"]
+    assert rows(path, "/ledger", "TextLog:level")[-1][2] == ["WARN"]
+
+
+def test_the_logs_own_pose_is_drawn_once(tmp_path: Path) -> None:
+    sink, items = RerunSink(), scene()
+    sink.open(tmp_path / "run.rrd", {"logged": Pose, "pose": Pose}, {})
+    sink.write(Record(START, {"logged": items["pose"], "pose": items["pose"]}))
+    sink.close({"verdict": "COMPLETE"})
+    assert [path for path in entities(tmp_path / "run.rrd") if "trajectory" in path] == ["/pose/trajectory"]

@@ -1,0 +1,130 @@
+"""Where a frame lies on the regional map: joined to what is there, refused where it fits nowhere, begun anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stages import Fuse, Pose, Transform
+from stages.fuse import placement
+from stages.stage import Severity
+from tests.stages.region_scene import MOUNT, START, drive, flat, part
+
+
+def heights(cloud, placed):
+    """Mean height in each cell of the square of 20 m about the origin, NaN where there is none."""
+    points = placed(cloud.points)
+    cells = (np.floor(points[:, :2] / 0.05).astype(int) + 200) @ (1, 400)
+    with np.errstate(invalid="ignore"):
+        return np.bincount(cells, points[:, 2], 160_000) / np.bincount(cells, minlength=160_000)
+
+
+def test_frames_with_errors_of_their_tilt_join_without_a_seam():
+    rng, fuse, seams, before = np.random.default_rng(3), Fuse(), [], None
+    for frame in range(12):
+        cloud, pose = drive(frame, tilt=tuple(rng.normal(0, np.radians(0.4), 2)), noise=0.01)
+        now = [heights(cloud, placed) for placed in (placement(cloud, pose, MOUNT), fuse(cloud, pose, MOUNT).level)]
+        if before is not None:
+            off = [one - other for one, other in zip(before, now, strict=True)]
+            seams.append([1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) for values in off])
+        before = now
+    raw, joined = np.median(seams, axis=0)
+    assert raw > 0.015
+    assert joined < 0.007  # 1 cm of noise in 6 points a cell, twice, is 0.6 cm
+    assert np.max(seams, axis=0)[1] < 0.008
+
+
+def test_the_tilt_error_of_the_first_frame_fades_and_does_not_swing_back():
+    fuse, lean, found = Fuse(), np.radians(0.6), []
+    for frame in range(61):
+        cloud, pose = drive(frame, flat, tilt=(lean if frame == 0 else 0.0, 0.0), at=(0.25 * frame, 0.0, 0.0))
+        placed = fuse(part(cloud, np.s_[::10]), pose, MOUNT).level
+        found.append(np.arcsin(placed.rotation[2, 0]) / lean)
+    assert 0.7 < found[1] < 1.0  # it joins the map much as that is
+    assert abs(found[40]) < 0.15
+    assert abs(found[60]) < 0.1
+    assert min(found) > -0.1
+    assert abs(placed.translation[2]) < 0.1
+
+
+def test_a_pose_of_the_camera_is_as_good_as_one_of_the_rover():
+    cloud, pose = drive(3)
+    base = Transform("odom", "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
+    camera = base.after(MOUNT.base_from_camera)
+    turn = Rotation.from_matrix(camera.rotation).as_quat()
+    seen = [Fuse()(cloud, pose, MOUNT), Fuse()(cloud, Pose(pose.stamp, camera.translation, turn, "odom", "camera"))]
+    np.testing.assert_allclose(seen[0].level.translation, seen[1].level.translation, atol=1e-9)
+    np.testing.assert_allclose(seen[0].layers["elevation"], seen[1].layers["elevation"], atol=1e-5)
+
+
+def test_roll_and_pitch_of_the_pose_do_not_tilt_the_map():
+    cloud, pose = drive(3)
+    tilted = Rotation.from_quat(pose.quaternion) * Rotation.from_euler("yx", [8, -5], degrees=True)
+    level = Transform("level", "base_link", Rotation.from_euler("yx", [8, -5], degrees=True).as_matrix(), np.zeros(3))
+    cloud = replace(cloud, sensor=level.after(MOUNT.base_from_camera))
+    placed = placement(cloud, replace(pose, quaternion=tilted.as_quat()), MOUNT)
+    np.testing.assert_allclose(placed.rotation, Rotation.from_quat(pose.quaternion).as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(placed.translation, pose.position, atol=1e-9)
+
+
+def upside_down(pose):
+    return replace(
+        pose, quaternion=(Rotation.from_euler("x", 180, degrees=True) * Rotation.from_quat(pose.quaternion)).as_quat()
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda cloud, pose: (replace(cloud, frame_id="camera", sensor=None), pose), "it needs Level"),
+        (lambda cloud, pose: (cloud, replace(pose, child_frame_id="mast")), "the pose is that of 'mast', and nothing"),
+        (lambda cloud, pose: (cloud, upside_down(pose)), "180 degrees off the vertical .* whose z points up"),
+        (lambda cloud, pose: (replace(cloud, stamp=START), pose), "comes after"),
+    ],
+)  # fmt: skip
+def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(change, sentence):
+    fuse = Fuse()
+    fuse(*drive(0), MOUNT)
+    before = fuse._map.cells.read(-300, -300, 600, 600)
+    with pytest.raises(ValueError, match=sentence):
+        fuse(*change(*drive(1)), MOUNT)
+    np.testing.assert_array_equal(fuse._map.cells.read(-300, -300, 600, 600), before)
+
+
+@pytest.mark.parametrize("jump", [np.array([0, 0, 0.6]), np.array([0, 0, -0.4])])
+def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jump):
+    fuse = Fuse()
+    for frame in range(5):
+        terrain = fuse(*drive(frame), MOUNT)
+    for frame in (5, 6):
+        cloud, pose = drive(frame)
+        with pytest.raises(ValueError, match=r"m and 0\.0 degrees off the map, .* left out of the regional map"):
+            fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
+    again = fuse(*drive(7), MOUNT)  # it was a slip: the map goes on
+    assert fuse.finding() is None
+    assert again.layers["frames"].max() > terrain.layers["frames"].max()
+    for frame in (8, 9, 10):
+        cloud, pose = drive(frame)
+        try:
+            anew = fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
+        except ValueError:
+            assert frame < 10
+    assert anew.layers["frames"].max() == 1
+    found = fuse.finding()
+    assert found is not None
+    assert found.severity is Severity.WARNING
+    assert "began anew in the same frame, odom, 1 time:" in found.sentence
+
+
+def test_a_pose_in_another_frame_begins_the_map_anew():
+    fuse, fresh = Fuse(), Fuse()
+    fuse(*drive(0), MOUNT)
+    cloud, pose = drive(1)
+    lost = replace(pose, frame_id="visual_odom/2")
+    begun, expected = fuse(cloud, lost, MOUNT), fresh(cloud, lost, MOUNT)
+    assert begun.frame_id == "visual_odom/2"
+    for name, layer in expected.layers.items():
+        np.testing.assert_array_equal(begun.layers[name], layer)
