@@ -56,8 +56,8 @@ class Assess(Stage):
                                    low=0.05)  # fmt: skip
     wheel: float = parameter(0.3, "diameter of a wheel: its reach, and the window of steepness", unit="m", low=0.05)
     surroundings: float = parameter(2.5, "width of the window in which an obstacle stands out", unit="m", low=0.05)
-    max_step: float = parameter(0.2, "height of a step that is a hazard: what reaches most of it is no ground", unit="m",
-                                low=0.01)  # fmt: skip
+    max_step: float = parameter(0.2, "height of a step that is a hazard; what reaches most of it is no ground",
+                                unit="m", low=0.01)  # fmt: skip
     skirt: float = parameter(
         0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.01
     )

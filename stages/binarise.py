@@ -38,9 +38,9 @@ class Binarise(Stage):
     `max_sigma`, within `rim` of an obstacle, at a brink, or where a wheel might stand too steeply. The rest is free
     (CLEAR).
 
-    A brink is a cell within half a `wheel` of hidden ground that falls away: that lies, within `fall_reach` through what
-    is hidden, at least `fall` below the ground about it (layer `drop`, if the map has it). Behind a bump one sees the
-    ground go on where it was; behind the edge of a cliff or ditch, lower, or not at all.
+    A brink is a cell within half a `wheel` of hidden ground that falls away: that lies, within `fall_reach` through
+    what is hidden, at least `fall` below the ground about it (layer `drop`, if the map has it). Behind a bump one sees
+    the ground go on where it was; behind the edge of a cliff or ditch, lower, or not at all.
 
     The plane under a wheel rests on few cells: near the limit, steepness is off by 2 degrees (RMS, simulated ground).
     So a spot is UNSURE if it would be too steep were the difference of its steepness from the footprint's slope larger
