@@ -1,11 +1,14 @@
-"""The pictures of docs/terrain.md: `make pictures` draws them anew, of simulated traverses.
+"""The pictures of docs/terrain.md and of the Devon Island pairs in docs/refinement.md: `make pictures` draws them anew.
 
 terrain.jpg: for three frames the left image, the elevation, the navigation map by its reasons, and what was true of
 the cells that a pixel of both cameras hits. region.jpg: the regional map of a traverse, beside it its navigation map.
+Both are of simulated traverses. devon.jpg, where ROVERFLOW_DATA names the data: of each pair disparity and source; the
+images are not ours to print.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -18,7 +21,9 @@ from flow.cli import main as roverflow
 from recordings import paint
 from recordings.simulator import Simulation
 from stages.data import Array, Cell, ElevationMap, Reason
+from tests.bench.refining import DISPARITIES, stereo_part
 from tests.bench.terrain import frames, measured_tilt, through
+from tests.study import devon
 
 VIEWS = ((11, 0.05, 15), (12, 0.15, 0), (13, 0.15, 15))  # seed, rocks k, frame of 30: the first or the middle one
 SHOWN = (Reason.CLEAR, Reason.STEP, Reason.BESIDE, Reason.SLOPE, Reason.OCCLUDED, Reason.UNSURE, Reason.UNOBSERVED)
@@ -29,10 +34,12 @@ INK = (225, 225, 225)
 
 
 def main(folder: Path) -> None:
-    """Draw both into a folder."""
+    """Draw them into a folder."""
     cv2.setNumThreads(1)
     _write(folder / "terrain.jpg", terrain_picture())
     _write(folder / "region.jpg", region_picture())
+    if "ROVERFLOW_DATA" in os.environ:
+        _write(folder / "devon.jpg", devon_picture(Path(os.environ["ROVERFLOW_DATA"])))
 
 
 def terrain_picture() -> Array:
@@ -71,6 +78,17 @@ def region_picture() -> Array:
     painted = np.hstack([paint.paint_elevation(terrain)[::-1], paint.legend_colours(cells, paint.CELLS)])
     framed = cv2.copyMakeBorder(painted, 8, 8, 8, 8, cv2.BORDER_CONSTANT, value=paint.UNKNOWN_RGB)
     return framed.repeat(ZOOM, 0).repeat(ZOOM, 1)
+
+
+def devon_picture(data: Path) -> Array:
+    """Disparity and source of the Devon Island pairs in a folder of real data, a row for each, RGB."""
+    rows = []
+    for _, frame in devon(data):
+        disparity = stereo_part("rover", frame, DISPARITIES, threads=2)["disparity"]
+        known = np.where(np.isfinite(disparity.pixels)[..., None], paint.paint_disparity(disparity.pixels), 0)
+        pictures = known.astype(np.uint8), paint.legend_colours(disparity.source, paint.SOURCES)
+        rows.append(np.hstack([cv2.resize(picture, None, fx=0.5, fy=0.5) for picture in pictures]))
+    return np.vstack(rows)
 
 
 def _ahead(painted: Array, terrain: ElevationMap) -> Array:
