@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from flow.arguments import check_outputs, count, magnitude, seconds, size
+from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, size
 from flow.cli import INTERRUPTED
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.replay import as_json, product_version, replay
@@ -329,8 +329,10 @@ def _demo(options: argparse.Namespace) -> int:
     from recordings.scoring import score
 
     folder = options.out
+    check_demo(folder)
     folder.mkdir(parents=True, exist_ok=True)
     log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
+    check_outputs([log, out, rrd, folder / "summary.json"], [])
     say("Simulating a traverse ...")
     simulate(log, frames=options.frames)
     say("Replaying it through the pipeline 'rover' (a first run compiles, too, and its frames/s count that) ...")

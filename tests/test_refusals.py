@@ -9,11 +9,15 @@ from pathlib import Path
 
 import pytest
 
+from flow.arguments import check_demo
 from flow.cli import main
+from flow.errors import UsageError
 from recordings import McapSource
 from tests.conftest import rewrite
+from tests.recordings.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
+TAKEN = "is there already and no output of roverflow; choose another name or remove it"
 SMALL = ("--set", "disparities=64")
 
 
@@ -65,6 +69,44 @@ def test_what_is_read_is_never_overwritten(traverse, tmp_path, capsys, option):
         assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, name) == 2
         assert "is what is being read" in capsys.readouterr().err
     assert traverse.stat() == before
+
+
+def test_a_log_that_others_recorded_is_never_replaced(traverse, tmp_path, capsys):
+    raw = rewrite(traverse, tmp_path / "raw.mcap", lambda topic, index, data: data)
+    (tmp_path / "noise.mcap").write_bytes(b"noise")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    scene = write_scene(tmp_path / "scenes" / "Box")
+    for log in before:
+        for command in (
+            ("run", traverse, "-o", log), ("run", traverse, "-o", tmp_path / "out.mcap", "--summary", log),
+            ("simulate", log, "--frames", 1), ("import", "middlebury", scene, log),
+        ):  # fmt: skip
+            assert roverflow(*command) == 2
+            said = capsys.readouterr().err
+            assert said == f"roverflow: {log} {TAKEN}\n"
+    assert {path: path.read_bytes() for path in before} == before
+    raw.write_bytes(traverse.read_bytes())  # one of our own
+    assert roverflow("import", "middlebury", scene, raw) == 0
+
+
+def test_the_demo_takes_no_folder_that_holds_anything_else(traverse, tmp_path, capsys):
+    for name, content in (("notes.txt", b"mine"), ("traverse.mcap", b"theirs"), ("maps/mine.tif", b"mine")):
+        folder = tmp_path / name.replace("/", "-")
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_bytes(content)
+        assert roverflow("demo", "--out", folder, "--frames", 1) == 2
+        assert "not of an earlier demo; choose another folder" in capsys.readouterr().err
+        assert (folder / name).read_bytes() == content
+    folder = tmp_path / "earlier"
+    folder.mkdir()
+    check_demo(folder)
+    (folder / "traverse.mcap").write_bytes(traverse.read_bytes())
+    check_demo(folder)
+    (folder / "maps").mkdir()
+    with pytest.raises(UsageError):
+        check_demo(folder)
+    (folder / "summary.json").touch()
+    check_demo(folder)
 
 
 @pytest.mark.parametrize("options", [("--rrd", "out.mcap"), ("--summary", "out.mcap")])
