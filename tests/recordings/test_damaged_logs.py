@@ -170,6 +170,26 @@ def test_a_chunk_that_states_more_than_any_may_is_broken() -> None:
         unpacked(content)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("layout", ["small chunks", "no message index", "no index", "no chunks"])
+def test_a_log_time_that_no_clock_can_show_costs_its_message(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str
+) -> None:
+    third = [time for time, stream, _ in whole if stream == "left"][2]
+
+    def damage(topic: str, time: int) -> int:
+        return time | 1 << 63 if (topic, time) == (LEFT, third) else time
+
+    path = rewritten(sample, tmp_path / "log.mcap", damage, **LAYOUTS[layout])
+    *events, (time, stream, error) = items_of(path)
+    assert [essence(item) for _, _, item in events] == [
+        essence(item) for at, stream, item in whole if (at, stream) != (third, "left")
+    ]
+    assert (time, stream) == (whole[-1][0], "left")
+    assert "log time is damaged" in str(error)
+    assert describe(path, McapSource())["end"] == whole[-1][0]
+
+
 def test_many_losses_take_their_time_from_the_last_message_before_them() -> None:
     index = Index()
     for time in (5, 9, 7):
