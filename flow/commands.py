@@ -51,9 +51,11 @@ def _sentence(error: Exception) -> str:
 
 
 def _exit_code(error: Exception) -> int:
+    from recordings.errors import UnwritableError
+
     if isinstance(error, RoverflowError):
         return error.exit_code
-    return UNUSABLE if _is_log_error(error) or isinstance(error, OSError) else FAILED
+    return UNUSABLE if _is_log_error(error) and not isinstance(error, UnwritableError) else FAILED
 
 
 def _is_log_error(error: Exception) -> bool:
@@ -275,7 +277,7 @@ def _import_middlebury(options: argparse.Namespace) -> int:
             broken.append(error)
     if broken:
         more = f" ({len(broken)} of {len(scenes)} scenes could not be imported)" if len(scenes) > 1 else ""
-        raise LogError(f"{broken[0]}{more}")
+        raise type(broken[0])(f"{broken[0]}{more}")
     return COMPLETE
 
 
