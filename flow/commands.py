@@ -14,6 +14,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from flow.arguments import check_demo, check_outputs, count, magnitude, seconds,
 from flow.cli import INTERRUPTED
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.replay import as_json, product_version, replay
-from flow.report import counted, report, say
+from flow.report import counted, headline, report, say
 
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE = 0, 1, 2, 3
 
@@ -147,7 +148,9 @@ def _run(options: argparse.Namespace) -> int:
             overrides=options.set, workers=options.workers, start=options.start, end=options.end,
         )  # fmt: skip
     except SinkError as error:
-        keep(as_json(error.summary))
+        say(headline(error.summary))
+        with suppress(OSError):  # the log's own fault is the one to tell
+            keep(as_json(error.summary))
         raise
     keep(summary)
     report(summary)

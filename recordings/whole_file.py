@@ -26,14 +26,10 @@ def temporary_name(path: Path) -> Path:
 
 
 def give_name(temporary: Path, path: Path) -> None:
-    """Give a finished file its name once the disk has its content. Raises OSError; then the temporary file is gone."""
-    try:
-        _settle(temporary)
-        temporary.replace(path)
-        _settle(path.parent)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
+    """Give a finished file its name once the disk has its content. Raises OSError."""
+    _settle(temporary)
+    temporary.replace(path)
+    _settle(path.parent)
 
 
 @contextmanager
@@ -49,9 +45,10 @@ def written(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def unwritable(path: Path, reason: str) -> UnwritableError:
-    """The error of a file that cannot be written."""
-    return UnwritableError(f"cannot write {path}: {reason}; choose another place for the output or make room there")
+def unwritable(path: Path, reason: str, kept: str = "") -> UnwritableError:
+    """The error of a file that cannot be written. kept: what there is of it all the same."""
+    remedy = "choose another place for the output or make room there"
+    return UnwritableError(f"cannot write {path}: {reason}{kept}; {remedy}")
 
 
 def _settle(path: Path) -> None:
