@@ -316,6 +316,7 @@ def test_graph_draws_every_stream(form, capsys):
     drawn = capsys.readouterr().out
     for stream in ("stereo", "tilt", "matched", "disparity", "points", "elevation_map", "navigation_map"):
         assert stream in drawn
+    assert drawn.count("every stream of the frame") == (0 if form == "text" else 2)  # to the two sinks
 
 
 def test_graph_shows_what_is_set(capsys):
