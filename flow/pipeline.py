@@ -214,7 +214,7 @@ class _Builder:
             node = self._node(name, streams[name], wiring[name], kinds, clocks)
             kinds[name], clocks[name] = node.output, node.clock
             nodes.append(node)
-        self._check_clock(nodes, clocks)
+        self._check_clock(nodes)
         for (_, sink), entry in zip(sinks, top["sinks"].value, strict=True):
             self._check_streams(sink, entry, kinds)
         source_use = self._use(top["source"], "the source")
@@ -246,7 +246,7 @@ class _Builder:
                 if name not in streams:
                     raise entry.value[key].place.error(f"there is no stream '{name}'{_nearest(str(name), streams)}")
 
-    def _check_clock(self, nodes: list[Node], clocks: dict[str, str]) -> None:
+    def _check_clock(self, nodes: list[Node]) -> None:
         stages = [node for node in nodes if not node.aligns]
         if not stages:
             raise self.tree.value["streams"].place.error("the pipeline has no stage")
