@@ -300,7 +300,7 @@ def _score(options: argparse.Namespace) -> int:
     if options.json:
         options.json.write_text(result.to_json() + "\n")
     say(format_score(result))
-    return COMPLETE
+    return INCOMPLETE if result.lost else COMPLETE
 
 
 def _export_arguments(sub: argparse.ArgumentParser) -> None:

@@ -8,6 +8,7 @@ chunk costs its own messages, a cut file what was cut.
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from heapq import heapify, heappop, heappush
 from pathlib import Path
@@ -218,11 +219,20 @@ class McapFile:
         return min(ends), max(ends)
 
 
-def iter_decoded(path: Path, topics: Iterable[str] | None = None) -> Iterator[tuple[str, int, Any]]:
+def iter_decoded(
+    path: Path, topics: Iterable[str] | None = None, lost: Counter[str] | None = None
+) -> Iterator[tuple[str, int, Any]]:
     """(topic, log time in ns, decoded message) of a log's ROS 2 CDR channels, in log-time order.
 
-    topics: which (None: all that are in CDR). Raises LogError at the first thing that cannot be read.
+    topics: which (None: all that are in CDR). Without `lost`, raises LogError at the first thing that cannot be read;
+    else counts there why messages were lost.
     """
+
+    def lose(why: str) -> None:
+        if lost is None:
+            raise LogError(f"{path}: {why}")
+        lost[why] += 1
+
     wanted = None if topics is None else set(topics)
     with McapFile(Path(path)) as log:
         decoders: dict[int, Callable[[bytes | memoryview], Any]] = {}
@@ -232,12 +242,15 @@ def iter_decoded(path: Path, topics: Iterable[str] | None = None) -> Iterator[tu
                 decoders[number] = decoder_for(schema.name, schema.encoding, schema.data)
         for item in log.messages(set(decoders)):
             if isinstance(item, Lost):
-                raise LogError(f"{path}: {item.reason}")
+                lose(item.reason)
+                continue
             topic = log.channel(item.channel).topic
             try:
-                yield topic, item.log_time, decoders[item.channel](item.data)
+                message = decoders[item.channel](item.data)
             except Exception as error:  # foreign bytes may fail a codec in any way
-                raise LogError(f"{path}: {topic} at {item.log_time} ns cannot be decoded ({said(error)})") from error
+                lose(f"{topic} at {item.log_time} ns cannot be decoded ({said(error)})")
+                continue
+            yield topic, item.log_time, message
 
 
 def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:
