@@ -138,8 +138,9 @@ class _Sampler:
         """A running aligner; `inputs` maps ports to stream names."""
         return SamplerState(self, name, inputs)
 
-    def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
-        """The value at `stamp`, or a sentence (str) why there is none, or None to wait (never when `final`)."""
+    def choose(self, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
+        """The value at `stamp`, or a sentence (str) why there is none, or None to wait (never when `final`, which tells
+        of the stream that what is not there yet does not come)."""
         raise NotImplementedError
 
 
@@ -167,7 +168,7 @@ class Interpolate(_Sampler):
                 raise TypeError(f"a {kinds['stream'].__name__} cannot be {method}")
         return kinds["stream"]
 
-    def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
+    def choose(self, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         before, after = _neighbours(samples, stamp)
         exact = before is not None and before.stamp == stamp
         if not final and (after is None or samples[-1].stamp < stamp + self.smooth) and (self.smooth or not exact):
@@ -175,7 +176,7 @@ class Interpolate(_Sampler):
         if before is not None and exact and (after is None or not self.smooth):
             return before.value
         if before is None or after is None:
-            return f"no {name} sample {'before' if before is None else 'after'} it"
+            return f"no {name} sample before it" if before is None else f"{name} {final}"
         if after.stamp - before.stamp > self.max_gap:
             return f"{name} has a gap of {_ms(after.stamp - before.stamp)}, more than {_ms(self.max_gap)}"
         near = self._near(samples, stamp)
@@ -198,7 +199,7 @@ class Nearest(_Sampler):
     slop: int = _parameter(50_000_000, "largest distance from the stamp")
     patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for a nearer sample")
 
-    def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
+    def choose(self, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         before, after = _neighbours(samples, stamp)
         if after is None and not final and not (before is not None and before.stamp == stamp):
             return None
@@ -215,7 +216,7 @@ class Latest(_Sampler):
     max_age: int | None = _parameter(None, "oldest sample that still counts; none: any age")
     patience: int = _parameter(0, "how long on the log's clock to wait for samples that are logged late")
 
-    def choose(self, name: str, stamp: int, samples: deque[Token], final: bool) -> Any:
+    def choose(self, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         before, after = _neighbours(samples, stamp)
         if after is None and not final and self.patience:
             return None
@@ -258,7 +259,11 @@ class SamplerState:
     def _answer(self, log_time: int | None) -> Answers:
         while self.wanted:
             arrived, token = self.wanted[0]
-            final = log_time is None or arrived + self.rule.patience < log_time
+            final = ""
+            if log_time is None:
+                final = "has no sample after it"
+            elif arrived + self.rule.patience < log_time:
+                final = f"has a gap: no sample after it within {_ms(self.rule.patience)} of log time"
             value = self.rule.choose(self.stream, token.stamp, self.samples, final)
             if value is None:
                 return

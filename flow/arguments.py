@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import math
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
 from flow.errors import UsageError
 
 _OF_OTHERS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pfm", ".txt", ".py", ".yaml", ".yml", ".bag", ".db3"}
+_MCAP = b"\x89MCAP0\r\n"
+_OWN = _MCAP + struct.pack("<BQI4sI9s", 1, 21, 4, b"ros2", 9, b"roverflow")  # header: its length, profile and library
 
 
 def count(text: str) -> int:
@@ -58,8 +61,26 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path]) -> Non
         for given in inputs:
             if path.exists() and given.exists() and path.samefile(given):
                 raise UsageError(f"{path} is what is being read; choose another name for the output")
-        if path.exists() and path.suffix.lower() in _OF_OTHERS:
-            raise UsageError(f"{path} is there already, and not the output of an earlier run; choose another name")
+        if path.exists() and path.stat().st_size and _is_of_others(path):
+            raise UsageError(f"{path} is there already and no output of roverflow; choose another name or remove it")
         if path.resolve() in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
         taken.append(path.resolve())
+
+
+def check_demo(folder: Path) -> None:
+    """Refuse a folder for the demo that holds what no earlier demo wrote: its log and its maps are replaced."""
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    log = folder / "traverse.mcap"
+    finished = (folder / "summary.json").is_file() or not (folder / "maps").exists()
+    if not log.is_file() or _is_of_others(log) or not finished:
+        raise UsageError(f"{folder} is not empty, and not of an earlier demo; choose another folder with --out")
+
+
+def _is_of_others(path: Path) -> bool:
+    """Whether a file is, by its name or its first bytes, nothing that roverflow wrote."""
+    with path.open("rb") as file:
+        start = file.read(len(_OWN))
+    suffix = path.suffix.lower()
+    return suffix in _OF_OTHERS or ((suffix == ".mcap" or start.startswith(_MCAP)) and start != _OWN)

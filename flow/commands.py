@@ -14,14 +14,15 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flow.arguments import check_outputs, count, magnitude, seconds, size
+from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, size
 from flow.cli import INTERRUPTED
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.replay import as_json, product_version, replay
-from flow.report import counted, report, say
+from flow.report import counted, headline, report, say
 
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE = 0, 1, 2, 3
 
@@ -51,9 +52,11 @@ def _sentence(error: Exception) -> str:
 
 
 def _exit_code(error: Exception) -> int:
+    from recordings.errors import UnwritableError
+
     if isinstance(error, RoverflowError):
         return error.exit_code
-    return UNUSABLE if _is_log_error(error) or isinstance(error, OSError) else FAILED
+    return UNUSABLE if _is_log_error(error) and not isinstance(error, UnwritableError) else FAILED
 
 
 def _is_log_error(error: Exception) -> bool:
@@ -145,7 +148,9 @@ def _run(options: argparse.Namespace) -> int:
             overrides=options.set, workers=options.workers, start=options.start, end=options.end,
         )  # fmt: skip
     except SinkError as error:
-        keep(as_json(error.summary))
+        say(headline(error.summary))
+        with suppress(OSError):  # the log's own fault is the one to tell
+            keep(as_json(error.summary))
         raise
     keep(summary)
     report(summary)
@@ -275,7 +280,7 @@ def _import_middlebury(options: argparse.Namespace) -> int:
             broken.append(error)
     if broken:
         more = f" ({len(broken)} of {len(scenes)} scenes could not be imported)" if len(scenes) > 1 else ""
-        raise LogError(f"{broken[0]}{more}")
+        raise type(broken[0])(f"{broken[0]}{more}")
     return COMPLETE
 
 
@@ -295,7 +300,7 @@ def _score(options: argparse.Namespace) -> int:
     if options.json:
         options.json.write_text(result.to_json() + "\n")
     say(format_score(result))
-    return COMPLETE
+    return INCOMPLETE if result.lost else COMPLETE
 
 
 def _export_arguments(sub: argparse.ArgumentParser) -> None:
@@ -329,8 +334,10 @@ def _demo(options: argparse.Namespace) -> int:
     from recordings.scoring import score
 
     folder = options.out
+    check_demo(folder)
     folder.mkdir(parents=True, exist_ok=True)
     log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
+    check_outputs([log, out, rrd, folder / "summary.json"], [])
     say("Simulating a traverse ...")
     simulate(log, frames=options.frames)
     say("Replaying it through the pipeline 'rover' (a first run compiles, too, and its frames/s count that) ...")

@@ -11,6 +11,8 @@ from flow.graph import Graph
 
 _BOX_WIDTH, _BOX_HEIGHT, _GAP_X, _GAP_Y, _MARGIN = 168, 44, 76, 22, 16
 
+_TO_SINKS = "every stream of the frame"
+
 
 def draw(graph: Graph, form: str) -> str:
     """The graph in the given form: "text", "mermaid" or "svg"."""
@@ -48,7 +50,10 @@ def _mermaid(graph: Graph) -> str:
     lines = ["flowchart LR", f"  source[({graph.source_use})]"]
     lines += [f"  {node.name}[{node.name}<br/>{node.use}]" for node in graph.nodes]
     lines += [f"  {start} -- {stream}: {kind} --> {end}" for start, end, stream, kind in _edges(graph)]
-    return "\n".join([*lines, *(f"  frames{i}[/{use}/]" for i, (use, _) in enumerate(graph.sinks))])
+    lines += [
+        f"  {graph.nodes[-1].name} -- {_TO_SINKS} --> frames{i}[/{use}/]" for i, (use, _) in enumerate(graph.sinks)
+    ]
+    return "\n".join(lines)
 
 
 def _svg(graph: Graph) -> str:
@@ -71,7 +76,7 @@ def _svg(graph: Graph) -> str:
     width = 2 * _MARGIN + last * (_BOX_WIDTH + _GAP_X) + _BOX_WIDTH
     height = 2 * _MARGIN + max(rows.values()) * (_BOX_HEIGHT + _GAP_Y)
     arrows = [_arrow(place[start], place[end], f"{stream}: {kind}") for start, end, stream, kind in _edges(graph)]
-    arrows += [_arrow(place[graph.nodes[-1].name], place[use], "every stream of the frame") for use, _ in graph.sinks]
+    arrows += [_arrow(place[graph.nodes[-1].name], place[use], _TO_SINKS) for use, _ in graph.sinks]
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif">'
     paper = f'<rect width="{width}" height="{height}" fill="white"/>'
     return "\n".join([head, paper, *arrows, *(_box(place[name], *boxes[name]) for name in boxes), "</svg>"])

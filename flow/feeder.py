@@ -46,7 +46,7 @@ class Feeder:
         self._entry_streams = [stream for stream in graph.frame_streams if stream not in made]
         self._waiting: dict[str, deque[Token]] = {stream: deque() for stream in self._entry_streams}
         self._last: dict[str, tuple[int, int]] = {}  # stamp, and how far it ran ahead of the log's clock
-        self._suspect: dict[str, int] = {}
+        self._suspect: dict[str, int] = {}  # how far ahead the last one was that was taken for damaged
         self._entries: list[Entry] = []
         self.messages: Counter[str] = Counter()
 
@@ -91,9 +91,9 @@ class Feeder:
         """Whether a stamp may follow the one before it; the ledger says why not."""
         ahead = stamp - log_time
         last, last_ahead = self._last.get(stream, (stamp - 1, ahead))
-        jumps = ahead - last_ahead > JUMP
-        # One damaged stamp must not shut out all that follow; two that agree are a clock that was set.
-        if jumps and abs(self._suspect.get(stream, log_time) - ahead) > JUMP:
+        suspect = self._suspect.get(stream)
+        # One damaged stamp must not shut out all that follow; two in a row that agree are a clock that was set.
+        if ahead - last_ahead > JUMP and (suspect is None or abs(suspect - ahead) > JUMP):
             self._suspect[stream] = ahead
             detail = f"its stamp jumps {(ahead - last_ahead) / 1e9:.1f} s ahead of the log's clock"
         elif stamp == last:
@@ -102,6 +102,7 @@ class Feeder:
             detail = f"its stamp is {(last - stamp) / 1e6:.1f} ms before that of the {stream} message read before it"
         else:
             self._last[stream] = (stamp, ahead)
+            self._suspect.pop(stream, None)
             return True
         self._lose(Entry(stream, stamp, "source", Reason.OUT_OF_ORDER, detail))
         return False

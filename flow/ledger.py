@@ -1,6 +1,7 @@
 """The ledger: every message or frame that did not make it, with stream, stamp, stage and reason.
 
-A run is COMPLETE when the ledger is empty. Nothing is ever dropped without an entry here.
+Nothing is ever dropped without an entry here. A run is COMPLETE when there is none, its log was read to the end and its
+outputs are whole.
 """
 
 from __future__ import annotations
@@ -121,8 +122,3 @@ class Ledger:
 
     def __len__(self) -> int:
         return len(self._entries)
-
-    @property
-    def verdict(self) -> Verdict:
-        """COMPLETE if nothing was lost."""
-        return Verdict.INCOMPLETE if self._entries else Verdict.COMPLETE

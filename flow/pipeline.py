@@ -55,6 +55,7 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))  # stages may stand beside the file that uses them
     tree = _parse(text, path.name)
+    _check_keys(tree)
     named = set(_texts(tree))
     for setting in overrides:
         _override(tree, setting)
@@ -112,6 +113,14 @@ def _located(node: yaml.Node, file: str, loader: yaml.SafeLoader) -> _Value:
     if isinstance(node, yaml.SequenceNode):
         return _Value([_located(item, file, loader) for item in node.value], place)
     return _Value(loader.construct_object(node), place)
+
+
+def _check_keys(tree: _Value) -> None:
+    """Refuse an unknown key at the top: what it should have been would else be missed elsewhere first."""
+    valid = ("settings", "source", "streams", "sinks")
+    for key, value in tree.value.items() if isinstance(tree.value, dict) else ():
+        if key not in valid:
+            raise value.place.error(f"a pipeline has no '{key}'{_nearest(key, valid)}")
 
 
 def _override(tree: _Value, setting: str) -> None:
@@ -182,7 +191,6 @@ class _Builder:
     def graph(self) -> Graph:
         """The checked graph."""
         top = self._mapping(self.tree, "the pipeline")
-        self._only(top, ("settings", "source", "streams", "sinks"), "a pipeline")
         for key in ("source", "streams", "sinks"):
             if key not in top:
                 raise self.tree.place.error(f"the pipeline has no '{key}'")
@@ -206,7 +214,7 @@ class _Builder:
             node = self._node(name, streams[name], wiring[name], kinds, clocks)
             kinds[name], clocks[name] = node.output, node.clock
             nodes.append(node)
-        self._check_clock(nodes, clocks)
+        self._check_clock(nodes)
         for (_, sink), entry in zip(sinks, top["sinks"].value, strict=True):
             self._check_streams(sink, entry, kinds)
         source_use = self._use(top["source"], "the source")
@@ -238,7 +246,7 @@ class _Builder:
                 if name not in streams:
                     raise entry.value[key].place.error(f"there is no stream '{name}'{_nearest(str(name), streams)}")
 
-    def _check_clock(self, nodes: list[Node], clocks: dict[str, str]) -> None:
+    def _check_clock(self, nodes: list[Node]) -> None:
         stages = [node for node in nodes if not node.aligns]
         if not stages:
             raise self.tree.value["streams"].place.error("the pipeline has no stage")
@@ -319,7 +327,11 @@ class _Builder:
             if hasattr(module, name):
                 raise place.error(f"{use} is no dataclass, as what a pipeline uses must be{_nearest(name, known)}")
             raise place.error(f"'{module_name}' has no '{name}' that a pipeline can use{_nearest(name, known)}")
-        if what.startswith("stream") and not is_aligner(kind) and "__call__" not in vars(kind):
+        if (
+            what.startswith("stream")
+            and not is_aligner(kind)
+            and not any("__call__" in vars(base) for base in kind.__mro__)
+        ):
             raise place.error(f"{use} is no stage: it has no __call__")
         return kind
 
@@ -334,12 +346,6 @@ class _Builder:
         if not isinstance(item.value, dict):
             raise item.place.error(f"{what} must be a mapping of names to values")
         return item.value
-
-    @staticmethod
-    def _only(mapping: Mapping[str, _Value], valid: Iterable[str], what: str) -> None:
-        for key, value in mapping.items():
-            if key not in valid:
-                raise value.place.error(f"{what} has no '{key}'{_nearest(key, valid)}")
 
 
 def _parameters(kind: type) -> dict[str, Field[Any]]:

@@ -7,6 +7,7 @@ and the inclinometer, fixed to the rover, reads level.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from recordings.discovery import SIDES
 from recordings.errors import LogError, counted
 from recordings.rig import BODY_FROM_OPTICAL
 from recordings.ros2 import Ros2Writer, camera_info, image, imu, transform_message
+from recordings.ros2_writer import LAST_STAMP
 from stages.data import Array, CameraModel, StereoCamera, StereoFrame, Transform
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
@@ -55,8 +57,10 @@ def import_images(
         raise LogError(
             f"{len(left)} left and {len(right)} right images are not pairs; give as many of both, at least one"
         )
-    if not rate > 0 or not height > 0:
-        raise LogError(f"rate ({rate} Hz) and height ({height} m) must be positive")
+    if not 0 < height < math.inf:
+        raise LogError(f"the camera's height must be positive and finite, not {height} m")
+    if not 0 < rate <= 1e9 or FIRST_STAMP + (len(left) + 1) * 1e9 / rate >= LAST_STAMP:
+        raise LogError(f"no log has {counted(len(left), 'pair')} at {rate} Hz: stamps are whole ns and end in 2038")
     if not abs(pitch_down) <= 90 or not abs(roll) <= 180:
         raise LogError(f"no camera looks {pitch_down} degrees down, rolled by {roll}; give degrees up to 90 and 180")
     period = round(1e9 / rate)

@@ -24,6 +24,8 @@ from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 MAGIC = b"\x89MCAP0\r\n"
 BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError, OSError)
 
+LAST_TIME = (1 << 63) - 1  # ns; a log time after it is damage, which no clock can show
+
 RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER_LENGTH = 20
@@ -81,7 +83,8 @@ class Index:
     def seen(self, channel: int, log_time: int) -> None:
         """Count one message."""
         self.times.setdefault(channel, array("Q")).append(log_time)
-        self.latest = max(self.latest, log_time)
+        if log_time <= LAST_TIME:
+            self.latest = max(self.latest, log_time)
 
     def define(self, opcode: int, content: bytes | memoryview) -> None:
         """Take note of a schema or channel; other records do not matter."""

@@ -182,10 +182,6 @@ class McapLog:
         """The channels that a stream is read from."""
         return self._opening.channels_of(self.topics[stream])
 
-    def schema(self, topic: str) -> str:
-        """The schema of a topic, its full ROS 2 name."""
-        return self._opening.schemas[topic]
-
     def close(self) -> None:
         """Close the file."""
         self.file.close()

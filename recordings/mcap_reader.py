@@ -8,6 +8,7 @@ chunk costs its own messages, a cut file what was cut.
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from heapq import heapify, heappop, heappush
 from pathlib import Path
@@ -21,7 +22,20 @@ from numpy.typing import NDArray
 
 from recordings.errors import LogError, counted
 from recordings.mcap_chunk import LARGEST, unpacked
-from recordings.mcap_index import BROKEN, MAGIC, RECORD, Loose, Lost, Raw, from_summary, raw, read, records, said
+from recordings.mcap_index import (
+    BROKEN,
+    LAST_TIME,
+    MAGIC,
+    RECORD,
+    Loose,
+    Lost,
+    Raw,
+    from_summary,
+    raw,
+    read,
+    records,
+    said,
+)
 from recordings.mcap_walk import walk
 from recordings.ros2_types import decoder_for
 
@@ -63,7 +77,7 @@ class McapFile:
     def messages(self, channels: set[int], start: int | None = None, end: int | None = None) -> Iterator[Raw | Lost]:
         """The messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
 
-        What is lost of them, or may be, comes in its place.
+        What is lost of them, or may be, comes in its place; where its log time is damaged, behind all others.
         """
         low, high = (0 if start is None else start), (1 << 64 if end is None else end)
         queue = self._queue(channels)
@@ -77,7 +91,10 @@ class McapFile:
             elif item.channel is None or item.channel in channels:
                 if item.channel is not None:
                     found[item.channel] += 1
-                if log_time >= low:
+                if log_time > LAST_TIME:
+                    damage = f"a message's log time is damaged ({log_time} ns), so the message is lost"
+                    yield Lost(item.channel, self.end, item.reason if isinstance(item, Lost) else damage)
+                elif log_time >= low:
                     yield self._loose_message(item) if isinstance(item, Loose) else item
         if start is None and end is None:
             yield from self._unaccounted(found)
@@ -91,7 +108,7 @@ class McapFile:
         else:
             for chunk in self._chunks(channels):
                 found.extend(item.log_time for item in self._contents(chunk) if item.channel in channels)
-        return np.sort(np.array(found, dtype=np.uint64).astype(np.int64))
+        return np.sort(np.array([time for time in found if time <= LAST_TIME], dtype=np.int64))
 
     def count(self, channels: set[int]) -> int:
         """How many messages of the channels the file holds, by its statistics or by the walk."""
@@ -191,16 +208,31 @@ class McapFile:
             damage = f" that can be read: {index.lost[0].reason}" if index.lost else "; record it again"
             raise LogError(f"{self.path} holds no messages{damage}")
         if index.walked:
-            return min(map(min, index.times.values())), max(map(max, index.times.values()))
-        filled = [chunk for chunk in index.chunks if chunk.message_end_time] or index.chunks
-        return min(c.message_start_time for c in filled), max(c.message_end_time for c in filled)
+            ends = [end for times in index.times.values() for end in (min(times), max(times))]
+        else:
+            filled = [chunk for chunk in index.chunks if chunk.message_end_time] or index.chunks
+            ends = [end for chunk in filled for end in (chunk.message_start_time, chunk.message_end_time)]
+        if max(ends) > LAST_TIME:
+            ends = self.times(set(index.channels)).tolist()
+        if not ends:
+            raise LogError(f"{self.path} holds no messages whose log times are whole; record it again")
+        return min(ends), max(ends)
 
 
-def iter_decoded(path: Path, topics: Iterable[str] | None = None) -> Iterator[tuple[str, int, Any]]:
+def iter_decoded(
+    path: Path, topics: Iterable[str] | None = None, lost: Counter[str] | None = None
+) -> Iterator[tuple[str, int, Any]]:
     """(topic, log time in ns, decoded message) of a log's ROS 2 CDR channels, in log-time order.
 
-    topics: which (None: all that are in CDR). Raises LogError at the first thing that cannot be read.
+    topics: which (None: all that are in CDR). Without `lost`, raises LogError at the first thing that cannot be read;
+    else counts there why messages were lost.
     """
+
+    def lose(why: str) -> None:
+        if lost is None:
+            raise LogError(f"{path}: {why}")
+        lost[why] += 1
+
     wanted = None if topics is None else set(topics)
     with McapFile(Path(path)) as log:
         decoders: dict[int, Callable[[bytes | memoryview], Any]] = {}
@@ -210,12 +242,15 @@ def iter_decoded(path: Path, topics: Iterable[str] | None = None) -> Iterator[tu
                 decoders[number] = decoder_for(schema.name, schema.encoding, schema.data)
         for item in log.messages(set(decoders)):
             if isinstance(item, Lost):
-                raise LogError(f"{path}: {item.reason}")
+                lose(item.reason)
+                continue
             topic = log.channel(item.channel).topic
             try:
-                yield topic, item.log_time, decoders[item.channel](item.data)
+                message = decoders[item.channel](item.data)
             except Exception as error:  # foreign bytes may fail a codec in any way
-                raise LogError(f"{path}: {topic} at {item.log_time} ns cannot be decoded ({said(error)})") from error
+                lose(f"{topic} at {item.log_time} ns cannot be decoded ({said(error)})")
+                continue
+            yield topic, item.log_time, message
 
 
 def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:

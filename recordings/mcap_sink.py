@@ -73,7 +73,7 @@ class McapSink:
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: what it was made from and with, kept as its metadata record "roverflow"."""
         self._last_stamp = None
-        self._writer = Ros2Writer(Path(path))
+        self._writer = Ros2Writer(Path(path), keep=True)
         self._writer.metadata("roverflow", about)
 
     def write(self, record: FrameRecord) -> None:

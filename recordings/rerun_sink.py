@@ -108,29 +108,34 @@ class RerunSink:
         if self._closed:
             return
         self._closed = True
+        try:
+            with catch_and_log_exceptions(strict=True):
+                self._conclude(summary)
+            self._publish()
+        except (OSError, RuntimeError) as error:  # rerun says RuntimeError where its file could not be written
+            raise unwritable(self._path, getattr(error, "strerror", None) or str(error)) from error
+        finally:
+            self._partial.unlink(missing_ok=True)
+
+    def _conclude(self, summary: Mapping[str, Any]) -> None:
+        """Enter what there is to say of the whole run."""
         verdict = str(summary.get("verdict", "INCOMPLETE"))
         last = max(0, self._frames - 1)
         drops = [f"{count} {reason}" for reason, count in dict(summary.get("drops", {})).items()]
-        with catch_and_log_exceptions(strict=True):
-            self._enter(summary.get("entries", ()), last)
-            self._set_clocks(self._stamp or 0, last)
-            level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
-            text = f"{verdict}: {counted(self._frames, 'frame')}{''.join(f', {drop}' for drop in drops)}"
-            self._recording.log(LEDGER, rr.TextLog(text, level=level))
-            said = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
-            for stream, found in said:
-                level = rr.TextLogLevel.WARN if found["severity"] == "warning" else rr.TextLogLevel.INFO
-                self._recording.log(LEDGER, rr.TextLog(f"{stream}: {found['sentence']}", level=level))
-            facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
-            for key in {"surveys", "findings"} & facts.keys():
-                facts[key] = {name: f"{found['severity']}: {found['sentence']}" for name, found in summary[key].items()}
-            self._recording.log(SUMMARY, _document(verdict, self._about, facts), static=True)
-            self._arrange()
-        try:
-            self._publish()
-        except (OSError, RuntimeError) as error:  # rerun says RuntimeError where its file could not be written
-            self._partial.unlink(missing_ok=True)
-            raise unwritable(self._path, getattr(error, "strerror", None) or str(error)) from error
+        self._enter(summary.get("entries", ()), last)
+        self._set_clocks(self._stamp or 0, last)
+        level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
+        text = f"{verdict}: {counted(self._frames, 'frame')}{''.join(f', {drop}' for drop in drops)}"
+        self._recording.log(LEDGER, rr.TextLog(text, level=level))
+        said = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
+        for stream, found in said:
+            level = rr.TextLogLevel.WARN if found["severity"] == "warning" else rr.TextLogLevel.INFO
+            self._recording.log(LEDGER, rr.TextLog(f"{stream}: {found['sentence']}", level=level))
+        facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
+        for key in {"surveys", "findings"} & facts.keys():
+            facts[key] = {name: f"{found['severity']}: {found['sentence']}" for name, found in summary[key].items()}
+        self._recording.log(SUMMARY, _document(verdict, self._about, facts), static=True)
+        self._arrange()
 
     def _publish(self) -> None:
         """Finish the file, and name it if its end is there: of a disk that is full rerun tells late, or nobody."""

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable
 from functools import lru_cache
 from importlib import import_module
+from textwrap import shorten
 from threading import RLock
 from typing import Any
 
@@ -35,6 +36,7 @@ float64 length_y
 geometry_msgs/Pose pose
 """
 
+_SAID = 100  # characters of what the parser says, which may hold the whole schema
 _registering = RLock()  # rosbags builds classes and codecs in module-wide state
 
 
@@ -95,7 +97,8 @@ def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable
         store = _store_of(name, schema_encoding, text.decode())
         store.get_msgdef(name)
     except Exception as error:  # a parser of foreign text may fail in any way; all mean the same here
-        raise LogError(f"schema '{schema_name}' cannot be parsed ({type(error).__name__}: {error})") from error
+        why = shorten(f"{type(error).__name__}: {error}", _SAID, placeholder=" ...")
+        raise LogError(f"schema '{schema_name}' cannot be parsed ({why})") from error
     return lambda data: store.deserialize_cdr(data, name)
 
 

@@ -1,4 +1,4 @@
-"""Writes ROS 2 messages into an MCAP log that either is whole or is not there.
+"""Writes ROS 2 messages into an MCAP log that has its name only when it is whole.
 
 Its one trick: a large message is a chunk of its own, so whoever wants only the small topics (tilt, calibration,
 transforms) decompresses no images.
@@ -14,7 +14,8 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from recordings.errors import LogError
+from recordings.errors import LogError, counted
+from recordings.mcap_reader import McapFile
 from recordings.ros2_types import TYPES
 from recordings.whole_file import give_name, temporary_name, unwritable
 
@@ -25,11 +26,12 @@ LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are 32 b
 class Ros2Writer:
     """Writes messages as `ros2msg` / CDR, log time = publish time = stamp. Same calls, same bytes.
 
-    Use as a context manager: leaving it closes the log, leaving it by an exception discards it.
+    Use as a context manager: leaving it closes the log, leaving it by an exception discards it. keep: if the place is
+    full, or fails otherwise, keep under another name what it holds by then.
     """
 
-    def __init__(self, path: Path, profile: str = "ros2") -> None:
-        self.path = Path(path)
+    def __init__(self, path: Path, keep: bool = False) -> None:
+        self.path, self._keep = Path(path), keep
         self._partial = temporary_name(self.path)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, tuple[int, str]] = {}
@@ -39,7 +41,7 @@ class Ros2Writer:
         except OSError as error:
             raise self._unwritable(error) from error
         self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=CompressionType.ZSTD)
-        self._writer.start(profile=profile, library="roverflow")
+        self._writer.start(profile="ros2", library="roverflow")
 
     @property
     def closed(self) -> bool:
@@ -114,7 +116,15 @@ class Ros2Writer:
         return channel
 
     def _unwritable(self, error: OSError) -> LogError:
-        """Close and remove what is half there, and say why."""
+        """Close what is half there, keep it if it shall be and holds anything, and say so."""
+        held = 0
         if hasattr(self, "_file"):
-            self.abort()
-        return unwritable(self.path, error.strerror or str(error))
+            with suppress(OSError):  # what could not be flushed is lost
+                self._file.close()
+            if self._keep:
+                with suppress(LogError), McapFile(self._partial) as log:
+                    held = log.count(set(log.index.channels))
+            if not held:
+                self._partial.unlink(missing_ok=True)
+        kept = f" (the {counted(held, 'message')} that it took are in {self._partial})" if held else ""
+        return unwritable(self.path, error.strerror or str(error), kept)

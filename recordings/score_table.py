@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from textwrap import wrap
 from typing import Any
 
 from recordings.errors import counted
@@ -29,6 +30,10 @@ def _frame_lines(found: Score) -> list[str]:
         lines.append(f"missing      {topic}: {len(stamps)} of {counted(found.frames, 'frame')}, scored as all unknown")
     for topic, count in found.unmatched.items():
         lines.append(f"unmatched    {topic}: {counted(count, 'message')} at stamps without truth, not scored")
+    for log, reasons in found.lost.items():
+        for why, count in reasons.items():
+            told = f"lost         {counted(count, 'message')} of {log}: {why}"
+            lines += wrap(told, 100, subsequent_indent=" " * 13, break_long_words=False, break_on_hyphens=False)
     return lines
 
 

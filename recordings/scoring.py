@@ -11,6 +11,7 @@ from __future__ import annotations
 import heapq
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -21,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2, terrain_measures
 from recordings.errors import LogError
-from recordings.mcap_reader import without_results
+from recordings.mcap_reader import McapFile, iter_decoded, without_results
 from recordings.pose_measures import PoseTally
 from recordings.stereo_measures import StereoErrors, cropped_columns
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap
@@ -40,6 +41,7 @@ class Score:
 
     frames: in the truth; compared: those with at least one result; missing: result topic -> stamps of true frames that
     it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without truth;
+    lost: log -> why -> messages that could not be read; a true frame that lacks one is scored as far as it goes;
     disparity: `StereoErrors.measures`, cropped by the truth's max_disparity (the data set's range where it has one,
     else the frame's largest), rounded up to 16;
     terrain: `terrain_measures.TerrainTally.measures`;
@@ -52,6 +54,7 @@ class Score:
     compared: int
     missing: dict[str, list[int]]
     unmatched: dict[str, int]
+    lost: dict[str, dict[str, int]] = field(default_factory=dict)
     disparity: dict[str, Any] | None = None
     terrain: dict[str, Any] | None = None
     tilt: dict[str, float] | None = None
@@ -78,8 +81,8 @@ def score(result: Path, truth: Path) -> Score:
 def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dict[str, Any]]]:
     """(stamp, {topic: message}) of all frames of both logs, each when it is complete."""
     streams = [
-        ros2.iter_messages(result, [*RESULTS, "/nav/pose", "/tf"]),
-        ros2.iter_messages(truth, [*TRUTHS, "/tf_static"]),
+        iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)]),
+        iter_decoded(truth, [*TRUTHS, "/tf_static"], tally.lost[str(truth)]),
     ]
     waiting: dict[int, dict[str, Any]] = {}
     for topic, log_time, message in heapq.merge(*streams, key=lambda item: item[1]):
@@ -106,6 +109,9 @@ class _Tally:
         self.frames = self.compared = 0
         self.missing: dict[str, list[int]] = {topic: [] for topic in RESULTS}
         self.unmatched: dict[str, int] = {}
+        self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
+        with McapFile(truth) as log:
+            self.truths = {log.channel(number).topic for number in log.index.channels}
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
         self.terrain: terrain_measures.TerrainTally | None = None
@@ -127,15 +133,20 @@ class _Tally:
             if topic not in frame and topic.replace("/nav/", "/truth/") in frame:
                 self.missing[topic].append(stamp)
         row: dict[str, float] = {"stamp": stamp}
-        if "/truth/disparity" in frame:
+        if self._has({"/truth/disparity"}, {"/truth/occlusion"}, frame):
             row |= self._add_disparity(stamp, frame)
-        if {"/truth/elevation_map", "/truth/navigation_map"} <= frame.keys():
+        if self._has({"/truth/elevation_map", "/truth/navigation_map"}, {"/truth/rocks"}, frame):
             row |= self._add_terrain(stamp, frame)
         if "/truth/tilt" in frame:
             row |= self._add_tilt(frame)
         if "/truth/pose" in frame:
             row |= self.pose.add(frame["/truth/pose"], frame.get("/nav/pose"))
         self.per_frame.append(row)
+
+    def _has(self, needed: set[str], besides: set[str], frame: dict[str, Any]) -> bool:
+        """Whether a frame has the truth `needed`, and `besides` what the log has of this: no rocks there were is one
+        thing, rocks that were lost another."""
+        return needed | (besides & self.truths) <= frame.keys()
 
     def _add_disparity(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
         true = ros2.read_disparity(frame["/truth/disparity"])
@@ -219,7 +230,10 @@ class _Tally:
     def score(self) -> Score:
         """The tally as a score; LogError if there was nothing to compare."""
         if not self.frames:
-            raise LogError(f"{self.truth} has no ground truth (/truth/...); give the log that has it with --truth")
+            damage = "".join(f", as {why}" for why in self.lost[str(self.truth)])
+            raise LogError(
+                f"{self.truth} has no ground truth (/truth/...){damage}; give the log that has it with --truth"
+            )
         if not self.seen_results:
             raise without_results(self.result, RESULTS)
         if not self.compared:
@@ -229,6 +243,7 @@ class _Tally:
             self.frames, self.compared,
             missing={topic: stamps for topic, stamps in self.missing.items() if stamps},
             unmatched=self.unmatched,
+            lost={log: dict(why) for log, why in self.lost.items() if why},
             disparity=self.disparity.measures() if self.disparity else None,
             terrain=self.terrain.measures() if self.terrain else None,
             tilt={"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)} if tilts else None,

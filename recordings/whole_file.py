@@ -11,34 +11,30 @@ from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
-from recordings.errors import LogError
+from recordings.errors import UnwritableError
 
 _numbers = count()
 
 
 def temporary_name(path: Path) -> Path:
-    """A name beside `path` that no other writer has. Raises LogError where no file can take the name `path`."""
+    """A name beside `path` that no other writer has. Raises UnwritableError where no file can take the name `path`."""
     if path.is_dir():
-        raise LogError(f"cannot write {path}: it is a folder; give the name of a file in it")
+        raise UnwritableError(f"cannot write {path}: it is a folder; give the name of a file in it")
     if path.exists() and not path.is_file():
-        raise LogError(f"cannot write {path}: it is a device or the like; give the name of a file")
+        raise UnwritableError(f"cannot write {path}: it is a device or the like; give the name of a file")
     return path.with_name(f"{path.name}.{os.getpid()}-{next(_numbers)}.partial")
 
 
 def give_name(temporary: Path, path: Path) -> None:
-    """Give a finished file its name once the disk has its content. Raises OSError; then the temporary file is gone."""
-    try:
-        _settle(temporary)
-        temporary.replace(path)
-        _settle(path.parent)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
+    """Give a finished file its name once the disk has its content. Raises OSError."""
+    _settle(temporary)
+    temporary.replace(path)
+    _settle(path.parent)
 
 
 @contextmanager
 def written(path: Path) -> Iterator[Path]:
-    """A temporary name to write to, which becomes `path` at the end, or goes. Raises LogError where that cannot be."""
+    """A temporary name to write to; it becomes `path` at the end, or goes. Raises UnwritableError where it cannot."""
     temporary = temporary_name(path)
     try:
         yield temporary
@@ -49,9 +45,10 @@ def written(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def unwritable(path: Path, reason: str) -> LogError:
-    """The error of a file that cannot be written."""
-    return LogError(f"cannot write {path}: {reason}; choose another place for the output or make room there")
+def unwritable(path: Path, reason: str, kept: str = "") -> UnwritableError:
+    """The error of a file that cannot be written. kept: what there is of it all the same."""
+    remedy = "choose another place for the output or make room there"
+    return UnwritableError(f"cannot write {path}: {reason}{kept}; {remedy}")
 
 
 def _settle(path: Path) -> None:

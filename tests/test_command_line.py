@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -20,6 +21,8 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from flow.cli import main
+from recordings.mcap_index import Raw
+from recordings.mcap_reader import McapFile
 from recordings.ros2 import iter_messages
 from recordings.simulator import Simulation
 from recordings.simulator.traverse import level_pose
@@ -232,6 +235,29 @@ def test_a_score_never_overwrites_what_it_reads(traverse, result, capsys):
     assert traverse.stat() == before
 
 
+def test_what_a_full_disk_took_is_kept_and_so_is_the_result_before(traverse, tmp_path, capsys):
+    out = tmp_path / "out.mcap"
+    command = ("run", traverse, *SMALL, "-o", out, "--no-rrd", "--workers", 1)
+    assert roverflow(*command) == 0
+    before, limits = out.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    capsys.readouterr()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
+    try:
+        assert roverflow(*command) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = capsys.readouterr()
+    assert said.out.startswith("INCOMPLETE: ")
+    (kept,) = set(tmp_path.iterdir()) - {out}
+    with McapFile(kept) as log:
+        held = [item for item in log.messages(set(log.index.channels)) if isinstance(item, Raw)]
+        topics = {log.channel(item.channel).topic for item in held}
+    assert f"File too large (the {len(held)} messages that it took are in {kept}); " in said.err
+    assert said.err.count("\n") == 1
+    assert topics >= {"/nav/disparity", "/nav/points", "/nav/elevation_map"}
+    assert out.read_bytes() == before
+
+
 def test_a_reader_that_leaves_does_not_change_the_exit_code(traverse):
     command = f"{sys.executable} -m flow.cli info {traverse} | true; exit ${{PIPESTATUS[0]}}"
     assert subprocess.run(["bash", "-c", command], cwd=ROOT, stderr=subprocess.PIPE).returncode == 0
@@ -290,6 +316,7 @@ def test_graph_draws_every_stream(form, capsys):
     drawn = capsys.readouterr().out
     for stream in ("stereo", "tilt", "matched", "disparity", "points", "elevation_map", "navigation_map"):
         assert stream in drawn
+    assert drawn.count("every stream of the frame") == (0 if form == "text" else 2)  # to the two sinks
 
 
 def test_graph_shows_what_is_set(capsys):

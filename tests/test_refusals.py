@@ -9,11 +9,15 @@ from pathlib import Path
 
 import pytest
 
+from flow.arguments import check_demo
 from flow.cli import main
+from flow.errors import UsageError
 from recordings import McapSource
 from tests.conftest import rewrite
+from tests.recordings.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
+TAKEN = "is there already and no output of roverflow; choose another name or remove it"
 SMALL = ("--set", "disparities=64")
 
 
@@ -67,6 +71,44 @@ def test_what_is_read_is_never_overwritten(traverse, tmp_path, capsys, option):
     assert traverse.stat() == before
 
 
+def test_a_log_that_others_recorded_is_never_replaced(traverse, tmp_path, capsys):
+    raw = rewrite(traverse, tmp_path / "raw.mcap", lambda topic, index, data: data)
+    (tmp_path / "noise.mcap").write_bytes(b"noise")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    scene = write_scene(tmp_path / "scenes" / "Box")
+    for log in before:
+        for command in (
+            ("run", traverse, "-o", log), ("run", traverse, "-o", tmp_path / "out.mcap", "--summary", log),
+            ("simulate", log, "--frames", 1), ("import", "middlebury", scene, log),
+        ):  # fmt: skip
+            assert roverflow(*command) == 2
+            said = capsys.readouterr().err
+            assert said == f"roverflow: {log} {TAKEN}\n"
+    assert {path: path.read_bytes() for path in before} == before
+    raw.write_bytes(traverse.read_bytes())  # one of our own
+    assert roverflow("import", "middlebury", scene, raw) == 0
+
+
+def test_the_demo_takes_no_folder_that_holds_anything_else(traverse, tmp_path, capsys):
+    for name, content in (("notes.txt", b"mine"), ("traverse.mcap", b"theirs"), ("maps/mine.tif", b"mine")):
+        folder = tmp_path / name.replace("/", "-")
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_bytes(content)
+        assert roverflow("demo", "--out", folder, "--frames", 1) == 2
+        assert "not of an earlier demo; choose another folder" in capsys.readouterr().err
+        assert (folder / name).read_bytes() == content
+    folder = tmp_path / "earlier"
+    folder.mkdir()
+    check_demo(folder)
+    (folder / "traverse.mcap").write_bytes(traverse.read_bytes())
+    check_demo(folder)
+    (folder / "maps").mkdir()
+    with pytest.raises(UsageError):
+        check_demo(folder)
+    (folder / "summary.json").touch()
+    check_demo(folder)
+
+
 @pytest.mark.parametrize("options", [("--rrd", "out.mcap"), ("--summary", "out.mcap")])
 def test_one_file_is_never_two_outputs(traverse, tmp_path, capsys, options):
     assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", options[0], tmp_path / options[1]) == 2
@@ -113,12 +155,32 @@ def test_a_simulation_of_less_than_nothing_is_refused(tmp_path, option, value, c
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder in which nobody can write")
+def test_a_place_that_cannot_be_written_is_the_same_fault_of_every_command(traverse, tmp_path, capsys):
+    scene, result = write_scene(tmp_path / "scenes" / "Box"), tmp_path / "out.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", result, "--no-rrd") == 0
+    (tmp_path / "cam.yaml").write_text("{fx: 100, cx: 10, cy: 10, baseline: 0.1}")
+    images = ("images", scene, "/proc/x.mcap", "--calibration", tmp_path / "cam.yaml", "--pitch-down", 20)
+    for command in (
+        ("run", traverse, *SMALL, "-o", "/proc/x.mcap", "--no-rrd"), ("simulate", "/proc/x.mcap", "--frames", 1),
+        ("import", *images, "--height", 1), ("import", "middlebury", scene, "/proc/x.mcap"),
+        ("import", "middlebury", scene.parent, "/proc/x"),
+        ("score", result, "--truth", traverse, "--json", "/proc/x.json"),
+        ("export", result, "/proc/x"), ("demo", "--out", "/proc/x"),
+    ):  # fmt: skip
+        capsys.readouterr()
+        assert roverflow(*command) == 1, command
+        said = capsys.readouterr().err
+        assert "/proc/x" in said
+        assert said.count("\n") == 1
+
+
 def test_a_full_output_is_said_in_a_sentence():
     """A disk that is full where the drawing of a graph is sent to."""
     code = "import sys; from flow.cli import main; sys.exit(main(['graph']))"
     with Path("/dev/full").open("w") as full:
         done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
-    assert done.returncode == 2
+    assert done.returncode == 1
     assert done.stderr.startswith("roverflow: the output: No space left on device")
 
 

@@ -23,6 +23,7 @@ from stages.data import Array, Pose, StereoCamera, Transform
 SECOND = 1_000_000_000
 EPOCH = 1_700_000_000 * SECOND
 DAY = 86_400 * SECOND
+DAYS = 4000  # from the epoch on; the seconds of a ROS time have no room for many more
 MARGIN = SECOND // 2  # the slow sensors run this long before the first frame and after the last
 BLOCK = 32  # rows a thread takes at a time
 # The Devon Island rover's rectified camera (1280 pixels wide).
@@ -156,8 +157,8 @@ class Simulation:
 
     @property
     def start(self) -> int:
-        """Nominal start of the drive, ns; every seed has its own day, so that no log passes for another's truth."""
-        return EPOCH + self.seed * DAY
+        """Nominal start of the drive, ns; seeds have days of their own, so that no log passes for another's truth."""
+        return EPOCH + self.seed % DAYS * DAY
 
     def stamp(self, frame: int) -> int:
         """Stamp of a frame, ns."""

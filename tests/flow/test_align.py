@@ -100,6 +100,18 @@ def test_interpolation_refuses_a_gap_and_says_how_long_it_is():
     assert "80.0 ms" in answers[0].value.cause.detail
 
 
+def test_a_gap_longer_than_the_patience_is_a_gap_for_every_frame_in_it():
+    frames = [("at", at * MS, 0.0) for at in (100, 900, 1500)]
+    samples = [("stream", at * MS, 0.0) for at in (50, 1450)]
+    messages = sorted([*frames, *samples], key=lambda message: message[1])
+    details = [answer.value.cause.detail for answer in sampling(Interpolate(), *messages)]
+    assert details == [
+        "level has a gap: no sample after it within 1000.0 ms of log time",
+        "level has a gap of 1400.0 ms, more than 200.0 ms",
+        "level has no sample after it",
+    ]
+
+
 def test_interpolation_never_extrapolates():
     early = sampling(Interpolate(), ("at", 0, 0.0), ("stream", 10, 1.0), ("stream", 20, 1.0))
     late = sampling(Interpolate(), ("stream", 10, 1.0), ("at", 30, 0.0))

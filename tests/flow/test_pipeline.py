@@ -122,6 +122,7 @@ def test_a_setting_stands_wherever_it_is_named(tmp_path):
     (SETTINGS, ["twice.factor=20"], r"--set twice.factor=20: .*20 needs a unit; write 20 cm or 20 m"),
     (SETTINGS, ["stretch=-1 m"], r"--set stretch=-1 m: .*at least 0 m"),
     (SETTINGS, ["strech=1 m"], r"--set strech=1 m: the pipeline has no setting 'strech'; did you mean 'stretch'"),
+    (SETTINGS.replace("settings", "setings"), [], r"toy.yaml:1: a pipeline has no 'setings'; did you mean 'settings'"),
     ("settings: 3\n" + GOOD, [], r"toy.yaml:1: 'settings' must be a mapping"),
 ])  # fmt: skip
 def test_a_setting_that_cannot_be_is_named(tmp_path, text, overrides, message):
@@ -151,7 +152,7 @@ def test_of_several_settings_the_one_at_fault_is_named(tmp_path):
 
 
 def test_stages_may_stand_beside_the_file_that_uses_them(tmp_path):
-    source = "from tests.flow.toys import Scale\nclass Near(Scale):\n    __call__ = Scale.__call__\n"
+    source = "from tests.flow.toys import Scale\nclass Near(Scale):\n    pass\n"
     (tmp_path / "beside.py").write_text(source)
     text = GOOD.replace("tests.flow.toys.Scale", "beside.Near")
     assert {node.name: node.use for node in loaded(tmp_path, text).nodes}["twice"] == "beside.Near"

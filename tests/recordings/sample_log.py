@@ -100,8 +100,10 @@ def write_sample(
     return path
 
 
-def rewritten(path: Path, out: Path, **options: Any) -> Path:
-    """The same messages as another kind of MCAP file; options as of mcap.writer.Writer."""
+def rewritten(
+    path: Path, out: Path, time: Callable[[str, int], int] = lambda topic, log_time: log_time, **options: Any
+) -> Path:
+    """The same messages as another kind of MCAP file; options as of mcap.writer.Writer. time: changes a log time."""
     with path.open("rb") as source, out.open("wb") as target:
         writer = Writer(target, **options)
         writer.start(profile="ros2", library="test")
@@ -110,7 +112,8 @@ def rewritten(path: Path, out: Path, **options: Any) -> Path:
             if channel.id not in channels:
                 known = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+            log_time = time(channel.topic, message.log_time)
+            writer.add_message(channels[channel.id], log_time, message.data, message.publish_time)
         writer.finish()
     return out
 

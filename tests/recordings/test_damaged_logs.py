@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import re
 import struct
 from contextlib import suppress
@@ -32,8 +33,21 @@ def record(opcode: int, content: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(content)) + content
 
 
-def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]]) -> None:
-    """What comes of a damaged log is what was recorded; what does not come is told of."""
+def times_of(full: Path, first: int, last: float) -> tuple[float, float]:
+    """The first and last time in the chunks that lie, even in part, between two bytes; any, where none are indexed."""
+    with full.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    chunks = summary.chunk_indexes if summary else []
+    if not chunks or first < len(MAGIC):
+        return 0, math.inf
+    harmed = [c for c in chunks if c.chunk_start_offset < last and first < c.chunk_start_offset + c.chunk_length]
+    starts, ends = [c.message_start_time for c in harmed], [c.message_end_time for c in harmed]
+    return min(starts, default=math.inf), max(ends, default=0)
+
+
+def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]], harmed: tuple[float, float]) -> None:
+    """What comes of a damaged log is what was recorded, and all of it but for the times that were harmed; what does not
+    come is told of."""
     told: set[str] = set()
     events: list[tuple[int, str, Any]] = []
     try:
@@ -49,7 +63,9 @@ def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]]
     assert len(set(good)) == len(good)
     losses = [item for _, _, item in events if isinstance(item, Exception)]
     assert all(isinstance(item, LogError) for item in losses)
-    absent = {stream for _, stream, _ in known - set(good)}
+    missing = known - set(good)
+    assert not [stream for time, stream, _ in missing if stream not in told and not harmed[0] <= time <= harmed[1]]
+    absent = {stream for _, stream, _ in missing}
     lossy = {stream for _, stream, item in events if isinstance(item, Exception)}
     assert "log" in lossy or absent <= told | lossy
 
@@ -66,7 +82,7 @@ def test_a_log_cut_anywhere_loses_only_what_was_cut(
     content = full.read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(content[: int(share * len(content))])
-    check_nothing_is_lost_silently(cut, whole)
+    check_nothing_is_lost_silently(cut, whole, times_of(full, int(share * len(content)), math.inf))
 
 
 def test_a_cut_chunk_still_gives_the_messages_before_the_cut(
@@ -92,10 +108,11 @@ def test_a_flipped_bit_anywhere_is_never_taken_for_data(
     if not full.exists():
         rewritten(sample, full, **LAYOUTS[layout])
     content = bytearray(full.read_bytes())
-    content[int(share * len(content))] ^= 1 << bit
+    place = int(share * len(content))
+    content[place] ^= 1 << bit
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(content)
-    check_nothing_is_lost_silently(damaged, whole)
+    check_nothing_is_lost_silently(damaged, whole, times_of(full, place, place + 1))
 
 
 def test_a_broken_chunk_costs_its_own_messages_each_with_its_time(
@@ -168,6 +185,26 @@ def test_a_chunk_that_states_more_than_any_may_is_broken() -> None:
     content = struct.pack("<QQQII", 0, 1, 1 << 50, 0, 4) + b"zstd" + struct.pack("<Q", 1) + b"x"
     with pytest.raises(ValueError, match="more than a chunk may"):
         unpacked(content)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("layout", ["small chunks", "no message index", "no index", "no chunks"])
+def test_a_log_time_that_no_clock_can_show_costs_its_message(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str
+) -> None:
+    third = [time for time, stream, _ in whole if stream == "left"][2]
+
+    def damage(topic: str, time: int) -> int:
+        return time | 1 << 63 if (topic, time) == (LEFT, third) else time
+
+    path = rewritten(sample, tmp_path / "log.mcap", damage, **LAYOUTS[layout])
+    *events, (time, stream, error) = items_of(path)
+    assert [essence(item) for _, _, item in events] == [
+        essence(item) for at, stream, item in whole if (at, stream) != (third, "left")
+    ]
+    assert (time, stream) == (whole[-1][0], "left")
+    assert "log time is damaged" in str(error)
+    assert describe(path, McapSource())["end"] == whole[-1][0]
 
 
 def test_many_losses_take_their_time_from_the_last_message_before_them() -> None:

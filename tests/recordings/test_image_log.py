@@ -147,6 +147,20 @@ def test_an_attitude_that_no_camera_has_is_refused(tmp_path: Path, pitch_down: f
         import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=pitch_down, roll=roll, height=1)
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("height", value) for value in (0.0, np.inf, np.nan)]
+    + [("rate", value) for value in (0.0, np.inf, np.nan, 1e-12, 1e10)],
+)
+def test_a_rate_or_height_that_nothing_has_is_refused(tmp_path: Path, option: str, value: float) -> None:
+    left, right = make_pairs(tmp_path, 1)
+    options = {"pitch_down": 0.0, "height": 1.0, option: value}
+    with pytest.raises(LogError, match=option if option == "height" else "stamps are whole ns"):
+        import_images(left, right, CALIBRATION, tmp_path / "out.mcap", **options)
+    assert not list(tmp_path.glob("out*"))
+    import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1, rate=1e9)
+
+
 def test_the_calibration_may_be_a_file(tmp_path: Path) -> None:
     left, right = make_pairs(tmp_path, 1)
     file = tmp_path / "camera.yaml"

@@ -132,6 +132,15 @@ def test_a_picture_that_fails_is_an_error_and_not_a_warning(tmp_path: Path) -> N
     sink.close({})
 
 
+def test_an_end_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    sink = RerunSink()
+    sink.open(tmp_path / "run.rrd", STREAMS, {})
+    sink.write(Record(START, scene(START)))
+    with pytest.raises(OverflowError):
+        sink.close({"entries": [Loss("left", 1 << 63, "source", "unreadable", "gone")]})
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="nowhere"):
         RerunSink().open(tmp_path / "nowhere" / "run.rrd", STREAMS, {})

@@ -377,3 +377,11 @@ def test_a_point_cloud_tells_which_points_are_filled() -> None:
     cloud = PointCloud(1, points, black, np.ones(3, np.float32), index, "level", source=source)
     assert read_point_cloud(point_cloud(cloud))["source"].tolist() == source.tolist()
     assert "source" not in read_point_cloud(point_cloud(replace(cloud, source=None)))
+
+
+def test_a_schema_that_cannot_be_parsed_is_not_told_whole() -> None:
+    text = b"MSG: what is this\n" + b"int64 number\n" * 200
+    with pytest.raises(LogError, match="schema 'vendor_msgs/msg/Long' cannot be parsed") as caught:
+        decoder_for("vendor_msgs/msg/Long", "ros2msg", text)
+    assert len(str(caught.value)) < 200
+    assert "\n" not in str(caught.value)

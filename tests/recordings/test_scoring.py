@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
+from flow.cli import main
 from recordings import ros2, scoring
 from recordings.errors import LogError
 from recordings.ros2 import Ros2Writer
@@ -288,6 +290,33 @@ def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
         scoring.score(tmp_path / "other.mcap", truth)
     with pytest.raises(LogError, match=r"cells of 0\.1 m, the truth has 0\.05 m"):
         scored(tmp_path, truth, frames, resolution=0.1)
+
+
+def test_a_damaged_truth_costs_what_it_held_and_nothing_is_scored_against_it(tmp_path, truth, frames):
+    run = Run().write(tmp_path / "run.mcap", frames)
+    with truth.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    numbers = {channel.topic: number for number, channel in summary.channels.items()}
+    for topic in ("/truth/disparity", "/truth/rocks"):
+        content = bytearray(truth.read_bytes())
+        chunk = next(c for c in summary.chunk_indexes if numbers[topic] in c.message_index_offsets)
+        content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+        damaged = tmp_path / "damaged.mcap"
+        damaged.write_bytes(content)
+        found = scoring.score(run, damaged)
+        assert found.frames == found.compared == 2
+        held = len(chunk.message_index_offsets.keys() & {numbers[name] for name in scoring.TRUTHS if name in numbers})
+        (why,) = found.lost[str(damaged)]
+        assert why.startswith(f"the chunk at byte {chunk.chunk_start_offset} is broken")
+        assert found.lost[str(damaged)][why] >= held
+        rows = [row for row in found.per_frame if row.keys() != found.per_frame[-1].keys()]
+        assert len(rows) == 1
+        assert rows[0].keys() < found.per_frame[-1].keys()
+        whole = scoring.score(run, truth).per_frame[0]
+        assert rows[0] == {name: whole[name] for name in rows[0]}
+        assert f" of {damaged}: the chunk at byte" in " ".join(format_score(found).split())
+        assert main(["score", str(run), "--truth", str(damaged)]) == 3
+    assert main(["score", str(run), "--truth", str(truth)]) == 0
 
 
 def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):

@@ -386,6 +386,13 @@ def test_equal_simulations_write_equal_bytes_whatever_the_threads(tmp_path: Path
     assert written[0] != written[2]
 
 
+@pytest.mark.parametrize("seed", [0, 3999, 6000, 1 << 40])
+def test_a_log_of_any_seed_has_stamps_that_can_be_written(seed):
+    start = Simulation(seed=seed).start
+    assert 1_700_000_000 <= start / 1e9 < (1 << 31) - 1e8
+    assert start != Simulation(seed=seed + 1).start
+
+
 def test_an_impossible_simulation_is_refused_with_the_parameters_name():
     with pytest.raises(ValueError, match="relief_cells must be a power of two"):
         Simulation(relief_cells=1000)
