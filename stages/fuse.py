@@ -48,7 +48,7 @@ class Region:
     them, its cells, the plane that joined the last frame, how many in succession did not join, and how often the map
     began anew for that."""
 
-    frame_id: str = ""
+    frame_id: str | None = None  # a pose may be in a frame without a name
     epoch: int = 0
     last: int = -1
     hides: bool = False
@@ -270,7 +270,7 @@ class Fuse(Stage):
             layers["occluded"] = np.where(known, 0, np.where(hidden, 1, np.nan)).astype(np.float32)
             layers["ceiling"] = np.where(hidden, cells["height"], np.nan).astype(np.float32)
         origin = (col * self.resolution, row * self.resolution)
-        return ElevationMap(stamp, layers, self.resolution, origin, self._map.frame_id, level=placed)
+        return ElevationMap(stamp, layers, self.resolution, origin, placed.parent, level=placed)
 
 
 def _sum(numbers: Array, more: Array | int) -> Array:
