@@ -97,7 +97,13 @@ class Pose:
             raise ValueError(f"Pose.quaternion must be a unit quaternion, not {self.quaternion.tolist()}")
 
     def interpolated(self, later: Pose, stamp: int) -> Pose:
-        """The pose at `stamp`, ns, between this one and a later one; the earlier covariance is kept."""
+        """The pose at `stamp`, ns, between this one and a later one in the same frames; the earlier covariance is
+        kept."""
+        if (self.frame_id, self.child_frame_id) != (later.frame_id, later.child_frame_id):
+            raise ValueError(
+                f"the pose of '{self.child_frame_id}' in '{self.frame_id}' is followed by one of "
+                f"'{later.child_frame_id}' in '{later.frame_id}'; nothing lies between two frames"
+            )
         share = _share(self.stamp, later.stamp, stamp)
         position = (1 - share) * self.position + share * later.position
         near = later.quaternion if self.quaternion @ later.quaternion >= 0 else -later.quaternion
