@@ -166,6 +166,8 @@ class StereoFrame:
         publish_image(self, "right")
         if self.left.shape != self.right.shape:
             raise ValueError(f"StereoFrame: left is {self.left.shape}, right is {self.right.shape}")
+        if self.left.dtype != self.right.dtype:
+            raise ValueError(f"StereoFrame: left is {self.left.dtype}, right is {self.right.dtype}; record both alike")
         if self.left.shape[:2] != (self.camera.height, self.camera.width):
             raise ValueError(
                 f"StereoFrame: images are {self.left.shape[1]}x{self.left.shape[0]}, "
