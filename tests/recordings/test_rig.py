@@ -116,6 +116,22 @@ def test_a_calibration_that_cannot_be_is_told_as_such(tmp_path: Path, values: di
         raise LogError(log.missing["left"])
 
 
+@pytest.mark.parametrize("names", [RAW, RECTIFIED])
+@pytest.mark.parametrize(("place", "value", "said"), [((0, 0), 18.6, "fx is 20 and 18.6"), ((1, 2), 8.5, "cy is 7.5")])
+def test_a_stereo_calibration_whose_projections_differ_is_refused(
+    tmp_path: Path, names: tuple[str, str], place: tuple[int, int], value: float, said: str
+) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == "/right/camera_info":
+            p = np.array(message.p).reshape(3, 4)
+            p[place] = value
+            message.p = p.reshape(-1)
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=names)) as log:
+        assert f"are not those of a rectified pair: {said}" in log.missing["left"]
+
+
 def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if hasattr(message, "header"):
