@@ -67,6 +67,14 @@ def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
     return _raw_pixels(message, size) if hasattr(message, "encoding") else _compressed_pixels(message, size)
 
 
+def unread_encoding(message: Any) -> str:
+    """What to say of an Image in an encoding that `pixels_of` does not read; empty for any other message."""
+    encoding = getattr(message, "encoding", None)
+    if encoding is None or encoding in _ENCODINGS:
+        return ""
+    return f"image encoding '{encoding}' is not one of those that can be read ({', '.join(_ENCODINGS)})"
+
+
 def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
     if width == 0 or height == 0:
         raise LogError(f"the image is empty ({width}x{height})")
@@ -75,9 +83,8 @@ def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
 
 
 def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
-    if message.encoding not in _ENCODINGS:
-        known = ", ".join(_ENCODINGS)
-        raise LogError(f"image encoding '{message.encoding}' is not one of those that can be read ({known})")
+    if unread := unread_encoding(message):
+        raise LogError(unread)
     kind, channels, conversion = _ENCODINGS[message.encoding]
     height, width, data = int(message.height), int(message.width), np.asarray(message.data, np.uint8)
     row = width * channels * int(kind[1])
