@@ -55,7 +55,7 @@ def items(stamp: int) -> dict[str, Any]:
     camera = StereoCamera(20.0, 20.0, 4.0, 3.0, 0.25, 8, 6, frame_id="left_optical")
     sensor = Transform("level", "left_optical", np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.5, 0, 0.9])
     return {
-        "disparity": Disparity(stamp, pixels, np.ones((6, 8), np.uint8), np.ones((6, 8), np.float32), camera=camera),
+        "disparity": Disparity(stamp, pixels, rng.integers(0, 4, (6, 8), dtype=np.uint8), np.ones((6, 8), np.float32), camera=camera),
         "points": PointCloud(
             stamp, rng.normal(size=(5, 3)).astype(np.float32), rng.integers(0, 255, (5, 3), dtype=np.uint8),
             np.ones(5, np.float32), np.arange(5, dtype=np.int32), "level", sensor=sensor,
@@ -88,12 +88,22 @@ def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path: Path) -> N
     read = list(iter_messages(write(tmp_path / "out.mcap")))
     topics = [(topic, stamp - START) for topic, stamp, _ in read]
     results = [f"/nav/{name}" for name in ("disparity", "points", "elevation_map", "navigation_map")]
-    frame = [*results, "/nav/navigation_map/reason", "/tf", "/nav/diagnostics"]
+    frame = [
+        "/nav/disparity",
+        "/nav/disparity/source",
+        *results[1:],
+        "/nav/navigation_map/reason",
+        "/tf",
+        "/nav/diagnostics",
+    ]
     second = [topic for topic in frame if topic != "/nav/elevation_map"]
     assert topics == [(t, 0) for t in frame] + [(t, 100) for t in second] + [("/nav/diagnostics", 100)]
     first = {topic: message for topic, stamp, message in read if stamp == START}
     sent = items(START)
     np.testing.assert_array_equal(read_disparity(first["/nav/disparity"]), sent["disparity"].pixels)
+    source = first["/nav/disparity/source"]
+    assert (source.encoding, stamp_of(source.header), source.header.frame_id) == ("mono8", START, "left_optical")
+    np.testing.assert_array_equal(source.data.reshape(source.height, source.width), sent["disparity"].source)
     elevation = read_grid_map(first["/nav/elevation_map"]).layers["elevation"]
     np.testing.assert_array_equal(elevation, sent["elevation_map"].layers["elevation"])
     navigation = read_occupancy_grid(first["/nav/navigation_map"], first["/nav/navigation_map/reason"])
