@@ -200,23 +200,23 @@ def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
     )  # fmt: skip
 
 
-def tilt_of(message: Any, log_time: int, frame_id: str | None = None) -> Tilt:
+def tilt_of(message: Any, log_time: int) -> Tilt:
     """The tilt of a sensor_msgs/Imu, geometry_msgs/QuaternionStamped or Quaternion.
 
     The quaternion turns the sensor's frame into a world whose z is up (REP 145), so up in the sensor's frame is the
-    third row of its matrix. frame_id: the sensor's frame, where the message's own is not to be used.
+    third row of its matrix.
     """
     if hasattr(message, "orientation_covariance") and message.orientation_covariance[0] == -1:
         raise LogError("the Imu says that it has no orientation (orientation_covariance[0] is -1)")
     quaternion = next((q for name in ("orientation", "quaternion") if (q := getattr(message, name, None))), message)
     up = rotation_of(quaternion, "the inclinometer").as_matrix()[2]
-    return _tilt(message, log_time, frame_id, up)
+    return _tilt(message, log_time, up)
 
 
-def _tilt(message: Any, log_time: int, frame_id: str | None, up: Array) -> Tilt:
+def _tilt(message: Any, log_time: int, up: Array) -> Tilt:
     header = getattr(message, "header", None)
     stamp = stamp_or(header, log_time) if header is not None else log_time
-    return Tilt(stamp, up / np.linalg.norm(up), frame_id or frame_of(message) or "inclinometer")
+    return Tilt(stamp, up / np.linalg.norm(up), frame_of(message) or "inclinometer")
 
 
 @dataclass(frozen=True)
@@ -274,7 +274,7 @@ class Angles:
 
     def __call__(self, message: Any, log_time: int) -> Tilt:
         """The tilt that a message's two angles tell."""
-        return _tilt(message, log_time, None, up_of(self.pitch(message), self.roll(message), self.model))
+        return _tilt(message, log_time, up_of(self.pitch(message), self.roll(message), self.model))
 
 
 def up_of(pitch: float, roll: float, model: Literal["axis", "euler"]) -> Array:

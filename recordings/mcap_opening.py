@@ -169,7 +169,7 @@ class Opening:
                 self.mount = mount
 
     def _check_encodings(self) -> None:
-        """A camera whose first image is in an encoding that cannot be read is missing; the others will be in it, too."""
+        """A camera whose first image is in an encoding that cannot be read is missing; the others are in it, too."""
         for side in CAMERAS:
             if side in self.topics and side not in self.missing:
                 unread = self._first(self.topics[side], unread_encoding)

@@ -124,7 +124,7 @@ class Fuse(Stage):
 
         mount: how the camera sits on the frame whose pose is given; may be left out where that is the camera itself.
         """
-        self._check(cloud, pose)
+        self._check(cloud)
         placed = placement(cloud, pose, mount)
         local, row, col = local_cells(cloud, placed, self.resolution, self.region)
         if pose.frame_id != self._map.frame_id:
@@ -166,7 +166,7 @@ class Fuse(Stage):
         """Memory of the map so far, bytes."""
         return self._map.cells.nbytes
 
-    def _check(self, cloud: PointCloud, pose: Pose) -> None:
+    def _check(self, cloud: PointCloud) -> None:
         if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
             raise ValueError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
         if cloud.stamp <= self._map.last:

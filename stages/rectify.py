@@ -81,8 +81,9 @@ class Rectify(Stage):
             return replace(self, row_offset=0.0), Finding(unclear)
         if offset.crossed > MOST_CROSSED:
             swapped = (
-                f"{offset.crossed:.0%} of the features that both images show look farther than infinity: left and right "
-                "are swapped, or the calibration is not that of these images; exchange 'left' and 'right' of the source"
+                f"{offset.crossed:.0%} of the features that both images show look farther than infinity: left and "
+                "right are swapped, or the calibration is not that of these images; exchange 'left' and 'right' of the "
+                "source"
             )
             return replace(self, row_offset=0.0), Finding(swapped, Severity.WARNING)
         terms = tuple(round(term, 4) for term in offset.terms)

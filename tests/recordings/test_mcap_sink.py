@@ -52,10 +52,11 @@ def items(stamp: int) -> dict[str, Any]:
     rng = np.random.default_rng(stamp % 1000)
     pixels = rng.uniform(1, 60, (6, 8)).astype(np.float32)
     pixels[0, 0] = np.nan
+    source = rng.integers(0, 4, (6, 8), dtype=np.uint8)
     camera = StereoCamera(20.0, 20.0, 4.0, 3.0, 0.25, 8, 6, frame_id="left_optical")
     sensor = Transform("level", "left_optical", np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.5, 0, 0.9])
     return {
-        "disparity": Disparity(stamp, pixels, rng.integers(0, 4, (6, 8), dtype=np.uint8), np.ones((6, 8), np.float32), camera=camera),
+        "disparity": Disparity(stamp, pixels, source, np.ones((6, 8), np.float32), camera=camera),
         "points": PointCloud(
             stamp, rng.normal(size=(5, 3)).astype(np.float32), rng.integers(0, 255, (5, 3), dtype=np.uint8),
             np.ones(5, np.float32), np.arange(5, dtype=np.int32), "level", sensor=sensor,
