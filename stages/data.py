@@ -249,7 +249,8 @@ class ElevationMap:
 
     layers: name -> (rows, cols) float32, NaN = unknown, all of one shape, among them "elevation" (m);
     resolution: cell size, m; origin: (x, y) of the lower-left corner of cell [0, 0], m; level: for a map in another
-    frame, where the frame `level` of that stamp lies in it.
+    frame, where the frame `level` of that stamp lies in it; epoch: for a map of many frames, the stamp, ns, from which
+    its layers "first" and "last" count seconds.
     """
 
     stamp: int
@@ -258,6 +259,7 @@ class ElevationMap:
     origin: tuple[float, float]
     frame_id: str
     level: Transform | None = None
+    epoch: int | None = None
     shape: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:

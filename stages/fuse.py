@@ -72,8 +72,9 @@ class Fuse(Stage):
     - variance, m^2: of the elevation against what lies about it. A frame that is misplaced by `position` is off by that
       times the slope, where its cell has one, and by `alignment` anywhere. Frames see a cell alike and err alike: the
       share `shared` of the smallest variance stays, however many frames there are;
-    - count (points); first, last: when the evidence in the cell was gathered, s since the map's first frame;
-      frames: how many it is from (at most 65535); contradictions: how often the height was contradicted;
+    - count (points); first, last: when the evidence in the cell was gathered, s since the map's first frame,
+      whose stamp is the map's `epoch` (float32 holds no stamps), another once the map began anew; frames: how many it
+      is from (at most 65535); contradictions: how often the height was contradicted;
     - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere; and
       ceiling, m: the lowest line of sight over the hidden ones.
 
@@ -270,7 +271,7 @@ class Fuse(Stage):
             layers["occluded"] = np.where(known, 0, np.where(hidden, 1, np.nan)).astype(np.float32)
             layers["ceiling"] = np.where(hidden, cells["height"], np.nan).astype(np.float32)
         origin = (col * self.resolution, row * self.resolution)
-        return ElevationMap(stamp, layers, self.resolution, origin, placed.parent, level=placed)
+        return ElevationMap(stamp, layers, self.resolution, origin, placed.parent, placed, self._map.epoch)
 
 
 def _sum(numbers: Array, more: Array | int) -> Array:

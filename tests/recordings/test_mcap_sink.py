@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from recordings import McapSink
 from recordings.errors import LogError
 from recordings.ros2 import iter_messages, read_disparity, read_grid_map, read_occupancy_grid, stamp_of
+from stages import Fuse
 from stages.data import (
     CameraImage,
     Disparity,
@@ -24,6 +25,8 @@ from stages.data import (
     TiltHealth,
     Transform,
 )  # fmt: skip
+from tests.stages.region_scene import MOUNT, SECOND, drive
+from tests.stages.region_scene import START as DRIVE
 
 START = 1_700_000_000_000_000_000
 STREAMS = {"disparity": Disparity, "points": PointCloud, "elevation_map": ElevationMap, "navigation_map": NavigationMap}
@@ -126,6 +129,25 @@ def test_losses_are_in_the_diagnostics_of_their_frame_and_the_late_ones_at_the_e
     assert [(s.level, s.name, s.message) for s in lost] == [(2, "match/elevation_map", "no texture")]
     assert {v.key: v.value for v in lost[0].values}["reason"] == "failed"
     assert late[0].message == "the log is cut"
+
+
+def test_the_stamps_in_a_regional_map_s_cells_can_be_told_from_the_diagnostics_beside_it(tmp_path: Path) -> None:
+    fuse, sink = Fuse(), McapSink()
+    sink.open(tmp_path / "out.mcap", {"regional_map": ElevationMap}, ABOUT)
+    for frame in range(3):
+        cloud, pose = drive(frame)
+        pose = replace(pose, frame_id="odom" if frame == 0 else "odom/2")  # the map begins anew
+        sink.write(Record(cloud.stamp, {"regional_map": fuse(cloud, pose, MOUNT)}))
+    sink.close({})
+    told = {}
+    for topic, stamp, message in iter_messages(tmp_path / "out.mcap"):
+        if topic == "/nav/diagnostics":
+            epochs = [v.value for s in message.status if s.name == "regional_map" for v in s.values if v.key == "epoch"]
+            told[stamp] = int(epochs[0])
+    assert list(told.values()) == [DRIVE, DRIVE + SECOND, DRIVE + SECOND]
+    for topic, stamp, message in iter_messages(tmp_path / "out.mcap"):
+        if topic == "/nav/regional_map":
+            assert told[stamp] + np.nanmax(read_grid_map(message).layers["last"]) * SECOND == stamp
 
 
 def test_the_log_says_what_it_was_made_from_and_how_the_run_ended(tmp_path: Path) -> None:
