@@ -47,6 +47,7 @@ class Panel(Enum):
     REASON = auto()
     ANGLE = auto()
     HEALTH = auto()
+    MATCHES = auto()
     FEATURES = auto()
     STAGE = auto()
 
@@ -86,12 +87,12 @@ def _at(drawn: Places, *panels: Panel) -> list[Place]:
     return [place for place in drawn if place.panel in panels]
 
 
-def _tabs(views: Iterable[_Part | None], active: int = -1) -> _Part | None:
-    """One view as it stands, several as tabs of which one is shown; None for none."""
+def _tabs(views: Iterable[_Part | None]) -> _Part | None:
+    """One view as it stands, several as tabs of which the first is shown; None for none."""
     parts = [view for view in views if view is not None]
     if len(parts) < 2:
         return parts[0] if parts else None
-    return rrb.Tabs(*parts, active_tab=active % len(parts))
+    return rrb.Tabs(*parts, active_tab=0)
 
 
 def _stack(parts: Iterable[_Part | None]) -> _Part | None:
@@ -118,18 +119,18 @@ def _images(drawn: Places) -> _Part | None:
     """Two columns: left and right image; last disparity but one and last; superpixels and where each disparity comes
     from.
 
-    Of several stereo streams the last that a camera took so (the rectified one) is on top, of other streams the last;
-    the others are tabs.
+    Of several stereo streams the last that a camera took so (the rectified one) is shown, of other streams the last;
+    the others are tabs behind it.
     """
     left, right = _pictures(drawn, Panel.LEFT), _pictures(drawn, Panel.RIGHT)
     disparities = _pictures(drawn, Panel.DISPARITY)
     parts = [
-        _tabs([*_pictures(drawn, Panel.LEFT_DERIVED), *left]),
-        _tabs([*_pictures(drawn, Panel.RIGHT_DERIVED), *right]),
-        _tabs(disparities[:-1]),
+        _tabs([*reversed(left), *_pictures(drawn, Panel.LEFT_DERIVED)]),
+        _tabs([*reversed(right), *_pictures(drawn, Panel.RIGHT_DERIVED)]),
+        _tabs(disparities[-2::-1]),
         _tabs(disparities[-1:]),
-        _tabs(_superpixels(drawn)),
-        _tabs(_pictures(drawn, Panel.SOURCE)),
+        _tabs(reversed(_superpixels(drawn))),
+        _tabs(reversed(_pictures(drawn, Panel.SOURCE))),
     ]
     present = [part for part in parts if part is not None]
     return rrb.Grid(*present, grid_columns=2) if present else None
@@ -146,14 +147,14 @@ def _superpixels(drawn: Places) -> list[_View]:
 
 def _space(drawn: Places) -> _Part | None:
     """Per frame of reference the clouds and the terrains, each with the cameras; and the trajectory so far."""
-    clouds = _tabs([*_spaces(drawn, Panel.VOXELS, "voxels"), *_spaces(drawn, Panel.CLOUD, "cloud")])
-    terrains = _tabs([*_trajectories(drawn), *_spaces(drawn, Panel.TERRAIN, "terrain")])
+    clouds = _tabs([*_spaces(drawn, Panel.CLOUD, "cloud"), *_spaces(drawn, Panel.VOXELS, "voxels")])
+    terrains = _tabs([*_spaces(drawn, Panel.TERRAIN, "terrain"), *_trajectories(drawn)])
     return _stack([clouds, terrains])
 
 
 def _spaces(drawn: Places, panel: Panel, name: str) -> list[_View]:
     views: list[_View] = []
-    for frame_id in sorted({place.frame_id for place in _at(drawn, panel)}, key=lambda frame: frame == LEVEL_FRAME):
+    for frame_id in sorted({place.frame_id for place in _at(drawn, panel)}, key=lambda frame: frame != LEVEL_FRAME):
         seen = [place.path for place in _at(drawn, panel, Panel.CAMERA) if place.frame_id == frame_id]
         # Behind the rover's right shoulder, looking down on the ground ahead; other frames have no such place.
         eye = rrb.EyeControls3D(position=(-2.2, -4.0, 3.5), look_target=(3.4, 0.1, -0.1), eye_up=(0, 0, 1))
@@ -181,7 +182,7 @@ def _trajectories(drawn: Places) -> list[_View]:
 def _maps(drawn: Places) -> _Part | None:
     layers, reliefs = _pictures(drawn, Panel.LAYER), _pictures(drawn, Panel.RELIEF)
     reasons, maps = _pictures(drawn, Panel.REASON), _pictures(drawn, Panel.MAP)
-    return _stack([_tabs([*reliefs, *layers], active=0), _tabs([*maps, *reasons], active=0)])
+    return _stack([_tabs([*reliefs, *layers]), _tabs([*maps, *reasons])])
 
 
 def _series(drawn: Places, panel: Panel, title: str) -> _View | None:
@@ -202,8 +203,13 @@ def _below(drawn: Places) -> _Part:
             name = title if few else f"{title}: hover for names"
             plots.append(rrb.TimeSeriesView(origin=root, name=name, plot_legend=rrb.PlotLegend("LeftTop", visible=few)))
             shares.append(1.4)
-    panels = ((Panel.ANGLE, "tilt (degrees)"), (Panel.HEALTH, "tilt check (degrees)"), (Panel.FEATURES, "odometry"))
-    angles = _tabs((_series(drawn, panel, title) for panel, title in panels), active=0)
+    panels = (
+        (Panel.ANGLE, "tilt (degrees)"),
+        (Panel.HEALTH, "tilt check (degrees)"),
+        (Panel.MATCHES, "matched (%)"),
+        (Panel.FEATURES, "odometry"),
+    )
+    angles = _tabs((_series(drawn, panel, title) for panel, title in panels))
     if angles is not None:
         plots.append(angles)
         shares.append(1.1)

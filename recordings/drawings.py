@@ -24,6 +24,7 @@ from stages.data import (
     Cell,
     Disparity,
     ElevationMap,
+    MatchHealth,
     NavigationMap,
     PointCloud,
     Pose,
@@ -244,6 +245,13 @@ def draw_motion(canvas: Canvas, path: str, motion: CameraMotion) -> str:
     place = Place(Panel.FEATURES, path, path)
     canvas.log(f"{path}/features", rr.Scalars(float(motion.inliers)), place)
     return f"{path}: {motion.lost}" if motion.lost else f"{path} {counted(motion.inliers, 'feature')}"
+
+
+@draws(MatchHealth)
+def draw_matches(canvas: Canvas, path: str, health: MatchHealth) -> None:
+    """How much is matched, in percent: of all pixels, and of the nearest ground."""
+    for name, part in (("all", health.all), ("near", health.near)):
+        canvas.log(f"{path}/{name}", rr.Scalars(100 * part), Place(Panel.MATCHES, path, path))
 
 
 @draws(TiltHealth)

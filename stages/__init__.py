@@ -11,6 +11,7 @@ from stages.data import (
     Cell,
     Disparity,
     ElevationMap,
+    MatchHealth,
     Mount,
     NavigationMap,
     PointCloud,
@@ -28,6 +29,7 @@ from stages.fuse import Fuse
 from stages.level import Level
 from stages.locate import Locate
 from stages.match import Match
+from stages.match_check import CheckMatches
 from stages.match_opencv import MatchOpenCV
 from stages.odometry import VisualOdometry
 from stages.rectify import Rectify
@@ -45,6 +47,7 @@ __all__ = [
     "CameraModel",
     "CameraMotion",
     "Cell",
+    "CheckMatches",
     "CheckTilt",
     "Clean",
     "CrossCheck",
@@ -56,6 +59,7 @@ __all__ = [
     "Level",
     "Locate",
     "Match",
+    "MatchHealth",
     "MatchOpenCV",
     "Mount",
     "NavigationMap",

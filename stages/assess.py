@@ -18,6 +18,7 @@ from stages.kernels.footprint import fit_planes
 from stages.kernels.relief import lowest_around
 from stages.stage import Stage, parameter
 
+MOST = 0.85  # share of `max_step`: cells blunt a peak
 # A plane's height at the cell must be known at least as well as the mean of four cells.
 _LEVERAGE = 0.25
 # Under a wheel there are few cells, and it is the slope that counts.
@@ -55,13 +56,19 @@ class Assess(Stage):
                                    low=0.05)  # fmt: skip
     wheel: float = parameter(0.3, "diameter of a wheel: its reach, and the window of steepness", unit="m", low=0.05)
     surroundings: float = parameter(2.5, "width of the window in which an obstacle stands out", unit="m", low=0.05)
-    obstacle: float = parameter(0.17, "what reaches farther from the ground is no part of it", unit="m", low=0.01)
+    max_step: float = parameter(0.2, "height of a step that is a hazard; what reaches most of it is no ground",
+                                unit="m", low=0.01)  # fmt: skip
     skirt: float = parameter(
         0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.01
     )
-    steepest: float = parameter(
+    max_slope: float = parameter(
         0.349, "slope of the surroundings up to which it is no step (20 degrees)", unit="rad", low=0.0, high=1.5
     )
+
+    @property
+    def obstacle(self) -> float:
+        """How far from the ground that is, m."""
+        return MOST * self.max_step
 
     def __call__(self, elevation: ElevationMap) -> ElevationMap:
         """The map with the layers added."""
@@ -128,8 +135,8 @@ class Assess(Stage):
         return level, around[0], self._trend(around[1:3], resolution), _slope(under, resolution)
 
     def _trend(self, slopes: Array, resolution: float) -> Array:
-        """The slopes (2, rows, cols), rise per cell, cut to `steepest`; 0 where they are not known."""
-        steep = np.hypot(*slopes) / (np.tan(self.steepest) * resolution + 1e-12)
+        """The slopes (2, rows, cols), rise per cell, cut to `max_slope`; 0 where they are not known."""
+        steep = np.hypot(*slopes) / (np.tan(self.max_slope) * resolution + 1e-12)
         return np.where(np.isfinite(steep), slopes / np.maximum(steep, 1.0), 0.0)
 
     def _step(

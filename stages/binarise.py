@@ -38,9 +38,9 @@ class Binarise(Stage):
     `max_sigma`, within `rim` of an obstacle, at a brink, or where a wheel might stand too steeply. The rest is free
     (CLEAR).
 
-    A brink is a cell within `brink` of hidden ground that falls away: that lies, within `fall_reach` through what is
-    hidden, at least `fall` below the ground about it (layer `drop`, if the map has it). Behind a bump one sees the
-    ground go on where it was; behind the edge of a cliff or ditch, lower, or not at all.
+    A brink is a cell within half a `wheel` of hidden ground that falls away: that lies, within `fall_reach` through
+    what is hidden, at least `fall` below the ground about it (layer `drop`, if the map has it). Behind a bump one sees
+    the ground go on where it was; behind the edge of a cliff or ditch, lower, or not at all.
 
     The plane under a wheel rests on few cells: near the limit, steepness is off by 2 degrees (RMS, simulated ground).
     So a spot is UNSURE if it would be too steep were the difference of its steepness from the footprint's slope larger
@@ -74,7 +74,8 @@ class Binarise(Stage):
         "shows of a ditch", unit="m", low=0.0,
     )  # fmt: skip
     fall_reach: float = parameter(1.0, "how far from there it may begin to fall", unit="m", low=0.0)
-    brink: float = parameter(0.15, "cells this near to where it may fall are not free: half a wheel", unit="m", low=0.0)
+    wheel: float = parameter(0.3, "diameter of a wheel: half of it from where it may fall nothing is free", unit="m",
+                             low=0.0)  # fmt: skip
     steepness_error: float = parameter(
         0.25, "share of the difference of steepness and slope that may be missing from it", low=0.0
     )
@@ -136,7 +137,7 @@ class Binarise(Stage):
         reach = int(self.fall_reach / elevation.resolution + 1e-6)
         if reach and falls.any():
             falls = binary_dilation(falls, np.ones((3, 3)), iterations=reach, mask=hidden)
-        return _near(falls, self.brink / elevation.resolution)
+        return _near(falls, self.wheel / 2 / elevation.resolution)
 
 
 def _near(cells: Array, distance: float) -> Array:

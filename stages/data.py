@@ -315,3 +315,12 @@ class NavigationMap:
     def __post_init__(self) -> None:
         publish(self, "cells", (None, None), np.int8)
         publish(self, "reason", self.cells.shape, np.uint8)
+
+
+@dataclass(frozen=True)
+class MatchHealth:
+    """How much of a frame is matched: shares of all pixels and of those of the nearest ground in view."""
+
+    stamp: int
+    all: float
+    near: float

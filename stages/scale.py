@@ -1,7 +1,7 @@
 """Half size and back: how a coarse result becomes the prior of a fine one, and the pair as the right camera sees it.
 
-At half size the search range is half as long and the pixels are a quarter as many, so a coarse match costs an eighth;
-noise averages out and weak texture gains contrast. What it finds guides the search at full size.
+At half size the pixels are a quarter as many, and as long a range reaches twice as near. Noise averages out and weak
+texture gains contrast. What is found there guides the search at full size.
 """
 
 from __future__ import annotations

@@ -33,13 +33,15 @@ SOURCE_COLOURS = np.array([[40, 40, 40], [70, 160, 70], [70, 110, 210], [230, 15
 
 
 class Case(NamedTuple):
-    """A frame, rectified, with its truth: (H, W) float32 disparity, NaN = unknown, and mask, 255 = seen by both."""
+    """A frame, rectified, with its truth: (H, W) float32 disparity, NaN = unknown, and mask, 255 = seen by both; and
+    the frame as it was given, for pipelines that rectify it in their own way."""
 
     name: str
     frame: StereoFrame
     truth: Array
     mask: Array
     disparities: int
+    given: StereoFrame
 
 
 Chain = Callable[[dict[str, Any], Case], Disparity]
@@ -54,7 +56,8 @@ def simulated(width: int = 640, height: int = 480) -> list[Case]:
         truth = (camera.fx * camera.baseline / found.depth).astype(np.float32)
         disparities = 192 * width // 1280
         truth[(truth <= 0) | (truth > disparities - 2)] = np.nan
-        cases.append(Case(f"seed {seed}", StereoFrame(seed, *found.images, camera), truth, found.seen, disparities))
+        frame = StereoFrame(seed, *found.images, camera)
+        cases.append(Case(f"seed {seed}", frame, truth, found.seen, disparities, frame))
     return cases
 
 
@@ -62,7 +65,7 @@ def real(folder: Path) -> Iterator[Case]:
     """The scenes of a folder, rectified as a pipeline does."""
     rectify = Rectify()
     for name, frame, truth, mask, disparities in scenes(folder):
-        yield Case(name, rectify(frame), truth, mask, disparities)
+        yield Case(name, rectify(frame), truth, mask, disparities, frame)
 
 
 def refined(stream: str, **parameters: Any) -> Chain:
@@ -113,7 +116,7 @@ def by_rows(streams: dict[str, Any], case: Case) -> Disparity:
 
 def whole(pipeline: str) -> Chain:
     """A pipeline as it ships, on the frame as given."""
-    return lambda _, case: stereo_part(pipeline, case.frame, case.disparities, entry="rectified")["disparity"]
+    return lambda _, case: stereo_part(pipeline, case.given, case.disparities)["disparity"]
 
 
 STEPS: dict[str, Chain] = {

@@ -81,8 +81,8 @@ kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrappe
 part: Any = _njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)
 # The same for arithmetic in which no NaN or infinity occurs and sums may be taken in any order; as deterministic.
 fast_kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True, fastmath=True)
-# Inlined into its callers: of two compiled copies, one for each, one that is loaded may stand in for the other, and sums
-# in another order round differently.
+# Inlined into its callers: of several compiled copies the one that came first stands in for the others, and each may
+# take its sums in an order of its own.
 fast_part: Any = _njit(
     nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True, fastmath=True, forceinline=True
 )

@@ -111,7 +111,7 @@ def test_tilting_and_raising_the_scene_changes_no_step_and_no_roughness(
 ) -> None:
     terrain = rolling_terrain(seed, rocks=5, cells=80)
     plain, moved = (
-        Binarise(max_slope=1.3)(Assess(steepest=1.0)(elevation))
+        Binarise(max_slope=1.3)(Assess(max_slope=1.0)(elevation))
         for elevation in (terrain.elevation, with_plane(terrain.elevation, gx, gy, offset))
     )
     # float32 heights round; a cell that lies on a threshold may fall to the other side, and its neighbours with it.
@@ -146,7 +146,7 @@ def test_an_edge_is_a_step_if_and_only_if_it_is_higher_than_the_limit(
     """A terrace across a slope, seen from below or above: its edge is a step, the rest of it is not."""
     x, y = grid()
     scene = map_of(np.tan(np.deg2rad(degrees)) * x + np.where(y > 2, step, 0.0))
-    result = Binarise(max_step=limit, margin=0.0, max_slope=1.5, max_roughness=1.0)(Assess(obstacle=limit)(scene))
+    result = Binarise(max_step=limit, margin=0.0, max_slope=1.5, max_roughness=1.0)(Assess(max_step=limit)(scene))
     assert (result.reason[np.abs(y - 2.05) < 0.05] == Reason.STEP).all() == (step > limit)
     assert not (result.reason[np.abs(y - 2) > 0.6] == Reason.STEP).any()
 

@@ -86,6 +86,13 @@ def test_the_edge_of_a_drop_whose_foot_is_hidden_is_not_free_and_the_way_to_it_i
     assert (blind.cells[brink] == Cell.FREE).mean() > 0.5  # so the rest of the rules does not see it
 
 
+def test_nothing_is_free_within_half_a_wheel_of_a_drop() -> None:
+    for wheel in (0.3, 0.6, 1.0):
+        ahead, cliff = profiled(lambda x: np.where(x < 4.5, 0.0, -3.0), wheel=wheel)
+        assert not (cliff.cells[(ahead > 4.5 - wheel / 2 + 0.05) & (ahead < 4.5)] == Cell.FREE).any()
+        assert (cliff.cells[(ahead > 2.0) & (ahead < 4.35 - wheel / 2)] == Cell.FREE).mean() > 0.98
+
+
 @pytest.mark.parametrize(("near", "width"), [(2.5, 0.5), (4.0, 0.6), (5.5, 1.0)])
 def test_the_near_edge_of_a_ditch_whose_bottom_is_hidden_is_not_free(near: float, width: float) -> None:
     def ditched(x: Array) -> Array:

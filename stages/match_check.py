@@ -1,0 +1,47 @@
+"""CheckMatches: is the ground right before the rover matched?
+
+It is the ground with the most texture and the largest disparities. Where it is not matched, the search ends short of
+it, or something is wrong with the images; and what is found there all the same is noise, which makes pits in a map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from stages.data import Disparity, MatchHealth, Source
+from stages.stage import Finding, Severity, Stage, counted, parameter
+
+
+@dataclass(frozen=True)
+class CheckMatches(Stage):
+    """Counts matches, and warns at the end if in most frames the ground before the rover had few; it remembers."""
+
+    lowest: float = parameter(0.125, "share of the rows that show that ground: the lowest", low=0.01, high=1.0)
+    least: float = parameter(0.7, "share of it that must be matched", low=0.0, high=1.0)
+    _near: list[float] = field(default_factory=list, init=False, repr=False, compare=False)
+
+    ordered: ClassVar[bool] = True
+
+    def __call__(self, disparity: Disparity) -> MatchHealth:
+        """What is matched, of the right half of the image: part of the left one no other camera sees."""
+        height, width = disparity.pixels.shape
+        source = disparity.source[:, width // 2 :]
+        matched = (source == Source.MEASURED) | (source == Source.PLANE)
+        near = float(matched[height - max(1, round(self.lowest * height)) :].mean())
+        self._near.append(near)
+        return MatchHealth(disparity.stamp, float(matched.mean()), near)
+
+    def finding(self) -> Finding | None:
+        """A warning where that is less than `least` in the median of the frames."""
+        if not self._near or np.median(self._near) >= self.least:
+            return None
+        return Finding(
+            f"of the nearest ground in view {100 * np.median(self._near):.0f} % is matched (median of "
+            f"{counted(len(self._near), 'frame')}), what else the map has there may be wrong: set `disparities` larger "
+            "if that ground is nearer than the search reaches; or else the images are dark, blurred, bare, or left for "
+            "right",
+            Severity.WARNING,
+        )
