@@ -15,7 +15,7 @@ from recordings.mcap_index import Lost
 from recordings.mcap_log import McapLog
 from recordings.mcap_opening import CAMERAS, peek_stamp
 from recordings.mcap_source import McapSource
-from stages.data import Tilt
+from stages.data import StereoCamera, Tilt
 
 SLOP = 5_000_000  # ns between the two images of a frame
 TILT_GAP = 200_000_000  # ns between the tilts around a frame
@@ -87,6 +87,7 @@ def format_description(description: dict[str, Any]) -> str:
             f"camera: {camera['width']}x{camera['height']}, fx {camera['fx']:.3f} px, "
             f"baseline {camera['baseline']:.4f} m, {state}, frame '{camera['frame_id']}'"
         )
+        lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
     frames = d["frames"]
     lines.append(
         f"frames: {counted(frames['pairs'], 'pair')} within {frames['slop_s'] * 1e3:g} ms of {frames['left']} left "
@@ -192,6 +193,7 @@ def _calibration(log: McapLog) -> dict[str, Any] | None:
         "cx": float(left.p[0, 2]), "cy": float(left.p[1, 2]), "cx_right": float(right.p[0, 2]),
         "baseline": float(left.p[0, 3] / left.p[0, 0] - right.p[0, 3] / right.p[0, 0]),
         "rectified": log.cameras[0].rectified, "frame_id": log.cameras[0].frame_id,
+        "doubts": list(StereoCamera.from_models(left, right, "", log.cameras[0].rectified).doubts),
     }  # fmt: skip
 
 

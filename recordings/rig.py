@@ -145,6 +145,12 @@ def _checked(model: CameraModel, topic: str) -> CameraModel:
         raise LogError(f"the focal lengths in P of {whose} are not positive; calibrate the camera again")
     if model.width <= 0 or model.height <= 0:
         raise LogError(f"{whose} is for images of {model.width}x{model.height}; calibrate the camera again")
+    cx, cy = model.p[0, 2], model.p[1, 2]
+    if not (0 <= cx < model.width and 0 <= cy < model.height):
+        raise LogError(
+            f"the principal point ({cx:g}, {cy:g}) in P of {whose} lies outside its {model.width}x{model.height} "
+            "images; record the calibration of images of this size"
+        )
     return model
 
 

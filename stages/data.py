@@ -126,6 +126,18 @@ class StereoCamera:
             raw=None if rectified else (left, right),
         )  # fmt: skip
 
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the calibration says that hardly any camera has, a sentence each: it may be of another image size."""
+        size, said = f"{self.width}x{self.height}", []
+        for name, extent in (("cx", self.width), ("cx_right", self.width), ("cy", self.height)):
+            if not 0.2 * extent <= getattr(self, name) <= 0.8 * extent:
+                outer = f"{name} of {getattr(self, name):g} px lies in the outer fifth of {size} images"
+                said.append(f"{outer}: check that the calibration is for this size")
+        if self.baseline > 5:
+            said.append(f"the baseline is {self.baseline:g} m: check that it is not given in centimetres")
+        return tuple(said)
+
 
 @dataclass(frozen=True, eq=False)
 class CameraImage:

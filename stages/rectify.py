@@ -75,6 +75,13 @@ class Rectify(Stage):
         for each in frame:
             with suppress(ValueError):  # the run will meet the frame again, and say what is the matter with it
                 plain.append(_rectified(each, ()))
+        stage, found = self._fitted(plain)
+        if plain and (doubts := plain[0].camera.doubts):
+            found = Finding("; ".join((*doubts, found.sentence)), Severity.WARNING)
+        return stage, found
+
+    def _fitted(self, plain: Sequence[StereoFrame]) -> tuple[Rectify, Finding]:
+        """The stage with the row offset of frames that are rectified but for it, and what there is to say of that."""
         offset = _measured(plain)
         if offset is None:
             unclear = "the row offset is not clear from the images; none is corrected"

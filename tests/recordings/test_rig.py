@@ -101,6 +101,8 @@ def test_exchanged_cameras_are_named_so(tmp_path: Path, names: tuple[str, str]) 
         ({"d": np.full(5, np.nan)}, "must be finite"),
         ({"p": np.full(12, np.nan)}, "must be finite"),
         ({"p": np.hstack([np.diag([0.0, 20, 1]), np.zeros((3, 1))]).reshape(-1)}, "focal lengths in P .* not positive"),
+        ({"width": 11}, r"principal point \(11.5, 7.5\) in P of the CameraInfo of .* lies outside its 11x16 images"),
+        ({"height": 7}, "lies outside its 24x7 images"),
         ({"width": 0}, "is for images of 0x16"),
         ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "tells no baseline"),
     ],

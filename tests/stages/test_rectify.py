@@ -243,6 +243,21 @@ def test_images_that_are_infinitely_far_at_another_disparity_are_not_called_swap
     assert "swapped" not in found.sentence
 
 
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"cx": 120.0, "cx_right": 320.0}, "cx of 120 px lies in the outer fifth of 640x480 images: check that"),
+    ({"cy": 400.0}, "cy of 400 px lies in the outer fifth of 640x480 images: check that"),
+    ({"baseline": 12.0}, "the baseline is 12 m: check that it is not given in centimetres; "),
+])  # fmt: skip
+def test_a_calibration_that_hardly_any_camera_has_is_a_warning(changes, words):
+    camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE)
+    frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), camera)
+    plain, sound = Rectify().survey([frame])
+    stage, found = Rectify().survey([replace(frame, camera=replace(camera, **changes))])
+    assert found.sentence.startswith(words)
+    assert (sound.severity, found.severity) == ("note", "warning")
+    assert stage == plain
+
+
 def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
     frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), StereoCamera(500, 500, 320, 240, 0.1, *LARGE))
     bad = CameraModel(*LARGE, K, np.zeros(5), np.eye(3), P_LEFT, "pinhole")
