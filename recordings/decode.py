@@ -67,6 +67,14 @@ def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
     return _raw_pixels(message, size) if hasattr(message, "encoding") else _compressed_pixels(message, size)
 
 
+def unread_encoding(message: Any) -> str:
+    """What to say of an Image in an encoding that `pixels_of` does not read; empty for any other message."""
+    encoding = getattr(message, "encoding", None)
+    if encoding is None or encoding in _ENCODINGS:
+        return ""
+    return f"image encoding '{encoding}' is not one of those that can be read ({', '.join(_ENCODINGS)})"
+
+
 def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
     if width == 0 or height == 0:
         raise LogError(f"the image is empty ({width}x{height})")
@@ -75,9 +83,8 @@ def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
 
 
 def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
-    if message.encoding not in _ENCODINGS:
-        known = ", ".join(_ENCODINGS)
-        raise LogError(f"image encoding '{message.encoding}' is not one of those that can be read ({known})")
+    if unread := unread_encoding(message):
+        raise LogError(unread)
     kind, channels, conversion = _ENCODINGS[message.encoding]
     height, width, data = int(message.height), int(message.width), np.asarray(message.data, np.uint8)
     row = width * channels * int(kind[1])
@@ -193,23 +200,23 @@ def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
     )  # fmt: skip
 
 
-def tilt_of(message: Any, log_time: int, frame_id: str | None = None) -> Tilt:
+def tilt_of(message: Any, log_time: int) -> Tilt:
     """The tilt of a sensor_msgs/Imu, geometry_msgs/QuaternionStamped or Quaternion.
 
     The quaternion turns the sensor's frame into a world whose z is up (REP 145), so up in the sensor's frame is the
-    third row of its matrix. frame_id: the sensor's frame, where the message's own is not to be used.
+    third row of its matrix.
     """
     if hasattr(message, "orientation_covariance") and message.orientation_covariance[0] == -1:
         raise LogError("the Imu says that it has no orientation (orientation_covariance[0] is -1)")
     quaternion = next((q for name in ("orientation", "quaternion") if (q := getattr(message, name, None))), message)
     up = rotation_of(quaternion, "the inclinometer").as_matrix()[2]
-    return _tilt(message, log_time, frame_id, up)
+    return _tilt(message, log_time, up)
 
 
-def _tilt(message: Any, log_time: int, frame_id: str | None, up: Array) -> Tilt:
+def _tilt(message: Any, log_time: int, up: Array) -> Tilt:
     header = getattr(message, "header", None)
     stamp = stamp_or(header, log_time) if header is not None else log_time
-    return Tilt(stamp, up / np.linalg.norm(up), frame_id or frame_of(message) or "inclinometer")
+    return Tilt(stamp, up / np.linalg.norm(up), frame_of(message) or "inclinometer")
 
 
 @dataclass(frozen=True)
@@ -267,7 +274,7 @@ class Angles:
 
     def __call__(self, message: Any, log_time: int) -> Tilt:
         """The tilt that a message's two angles tell."""
-        return _tilt(message, log_time, None, up_of(self.pitch(message), self.roll(message), self.model))
+        return _tilt(message, log_time, up_of(self.pitch(message), self.roll(message), self.model))
 
 
 def up_of(pitch: float, roll: float, model: Literal["axis", "euler"]) -> Array:

@@ -9,15 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import counted
 from recordings.mcap_index import Lost
 from recordings.mcap_log import McapLog
 from recordings.mcap_opening import CAMERAS, peek_stamp
 from recordings.mcap_source import McapSource
-from stages.data import Tilt
+from stages.data import StereoCamera, Tilt
 
 SLOP = 5_000_000  # ns between the two images of a frame
 TILT_GAP = 200_000_000  # ns between the tilts around a frame
+
+_STAMPED = {*IMAGES, *TILTS, *POSES, BARE_TILT} - {"geometry_msgs/msg/Quaternion"}  # begin with a header
 
 Stamps = NDArray[np.int64]
 
@@ -40,6 +43,7 @@ def describe(path: Path, source: McapSource) -> dict[str, Any]:
             "end": log.file.end,
             "duration_s": (log.file.end - log.file.start) / 1e9,
             "topics": _topics(log),
+            "unstamped": _unstamped(log),
             "streams": dict(log.topics),
             "calibration": _calibration(log),
             "frames": {
@@ -83,6 +87,7 @@ def format_description(description: dict[str, Any]) -> str:
             f"camera: {camera['width']}x{camera['height']}, fx {camera['fx']:.3f} px, "
             f"baseline {camera['baseline']:.4f} m, {state}, frame '{camera['frame_id']}'"
         )
+        lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
     frames = d["frames"]
     lines.append(
         f"frames: {counted(frames['pairs'], 'pair')} within {frames['slop_s'] * 1e3:g} ms of {frames['left']} left "
@@ -94,6 +99,8 @@ def format_description(description: dict[str, Any]) -> str:
     lines += [f"transform: {transform}" for transform in d["transforms"]]
     for why in dict.fromkeys(d["missing"].values()):
         lines.append(f"missing: {', '.join(stream for stream in d['missing'] if d['missing'][stream] == why)}: {why}")
+    for stream in d["unstamped"]:
+        lines.append(f"stamps: {stream}: header stamps are 0: log times are used")
     lines += [d["undecodable"]] if d["undecodable"] else []
     lines += [f"damaged: {what}" for what in d["damage"]]
     return "\n".join(lines)
@@ -116,6 +123,18 @@ def _topics(log: McapLog) -> list[dict[str, Any]]:
                 "largest_gap_s": float(gaps.max()) / 1e9 if gaps.size else None,
             }
         )
+    return found
+
+
+def _unstamped(log: McapLog) -> list[str]:
+    """The streams whose messages have the time they were logged for a stamp: in the first one's header it is 0."""
+    found = []
+    for stream, topic in log.topics.items():
+        if log.schema(topic) in _STAMPED:
+            raws = log.file.messages(log.channels(stream))
+            first = next((raw for raw in raws if not isinstance(raw, Lost)), None)
+            if first is not None and len(first.data) >= 12 and not peek_stamp(first.data):
+                found.append(stream)
     return found
 
 
@@ -174,6 +193,7 @@ def _calibration(log: McapLog) -> dict[str, Any] | None:
         "cx": float(left.p[0, 2]), "cy": float(left.p[1, 2]), "cx_right": float(right.p[0, 2]),
         "baseline": float(left.p[0, 3] / left.p[0, 0] - right.p[0, 3] / right.p[0, 0]),
         "rectified": log.cameras[0].rectified, "frame_id": log.cameras[0].frame_id,
+        "doubts": list(StereoCamera.from_models(left, right, "", log.cameras[0].rectified).doubts),
     }  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from mcap.records import Channel
 
-from recordings.decode import camera_model, frame_of, tilt_of
+from recordings.decode import camera_model, frame_of, tilt_of, unread_encoding
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError, counted
 from recordings.mcap_index import Lost, said
@@ -67,6 +67,7 @@ class Opening:
         found = self._discover()
         self._find_cameras(found)
         self._find_mount()
+        self._check_encodings()
         for stream in self.missing:
             self.topics.pop(stream, None)
         self._tell_sealed()
@@ -166,6 +167,14 @@ class Opening:
                 self.missing["mount"] = str(mount)
             else:
                 self.mount = mount
+
+    def _check_encodings(self) -> None:
+        """A camera whose first image is in an encoding that cannot be read is missing; the others are in it, too."""
+        for side in CAMERAS:
+            if side in self.topics and side not in self.missing:
+                unread = self._first(self.topics[side], unread_encoding)
+                if unread and not isinstance(unread, LogError):
+                    self.missing[side] = f"{self.topics[side]}: {unread}; record it in one of these"
 
     def _tell_sealed(self) -> None:
         """Messages of a chosen topic that came in another encoding, or by another schema, are lost."""

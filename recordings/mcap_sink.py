@@ -23,6 +23,7 @@ from recordings.ros2 import (
     odometry,
     point_cloud,
     reason_map,
+    source_image,
     transform_message,
 )
 from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
@@ -34,6 +35,11 @@ _BUILDERS: dict[type, Callable[[Any], Any]] = {
     NavigationMap: occupancy_grid,
     Pose: odometry,
 }
+# What a message has no room for, and so is told beside it: a guess must not look like a measurement.
+_BESIDE: dict[type, tuple[str, Callable[[Any], Any]]] = {
+    Disparity: ("source", source_image),
+    NavigationMap: ("reason", reason_map),
+}
 _OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/DiagnosticStatus
 _COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
 
@@ -41,10 +47,12 @@ _COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
 @dataclass
 class McapSink:
     """Writes streams to /nav/<stream>, the frame's transforms to /tf, its losses to /nav/diagnostics; there too what is
-    known of the tilt's health, and at the end the findings of the run.
+    known of the tilt's health, the stamp from which the cells of a regional map count their times, and at the end the
+    findings of the run.
 
-    results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each; the reasons of a
-    NavigationMap go to /nav/<stream>/reason. also: further streams, for those who would keep the results as they are.
+    results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each; where each pixel of
+    a Disparity comes from goes to /nav/<stream>/source, why each cell of a NavigationMap has its state to
+    /nav/<stream>/reason. also: further streams, for those who would keep the results as they are.
     """
 
     results: tuple[str, ...] = (
@@ -83,13 +91,17 @@ class McapSink:
             data = record.items.get(stream)
             if data is not None:
                 writer.write(f"/nav/{stream}", _BUILDERS[type(data)](data), stamp)
-            if isinstance(data, NavigationMap):  # OccupancyGrid has no room for why
-                writer.write(f"/nav/{stream}/reason", reason_map(data), stamp)
+            if type(data) in _BESIDE:
+                name, build = _BESIDE[type(data)]
+                writer.write(f"/nav/{stream}/{name}", build(data), stamp)
         transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)
         health = [_health(name, item) for name, item in record.items.items() if isinstance(item, TiltHealth)]
-        writer.write("/nav/diagnostics", diagnostics(stamp, [*_statuses(record.entries), *health]), stamp)
+        written = {name: record.items[name] for name in self._written if name in record.items}
+        begun = [_begun(name, item) for name, item in written.items() if getattr(item, "epoch", None) is not None]
+        statuses = [*_statuses(record.entries), *health, *begun]
+        writer.write("/nav/diagnostics", diagnostics(stamp, statuses), stamp)
         self._last_stamp = stamp
 
     def close(self, summary: Mapping[str, Any]) -> None:
@@ -135,6 +147,12 @@ def _finding(stream: str, said: Mapping[str, str]) -> tuple[int, str, str, dict[
     """The diagnostic status of something that a run found."""
     level = _WARN if said["severity"] == "warning" else _OK
     return level, stream, said["sentence"], {"finding": said["sentence"], "severity": said["severity"]}
+
+
+def _begun(stream: str, terrain: ElevationMap) -> tuple[int, str, str, dict[str, str]]:
+    """The diagnostic status of a map of many frames: from which stamp on its layers "first" and "last" count."""
+    text = f"layers first and last count seconds from {terrain.epoch} ns"
+    return _OK, stream, text, {"epoch": str(terrain.epoch)}
 
 
 def _health(stream: str, health: TiltHealth) -> tuple[int, str, str, dict[str, str]]:

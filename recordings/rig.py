@@ -26,6 +26,7 @@ BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 _SAME = 1e-6  # m and matrix elements; two transforms of the same frames that differ by more contradict each other
 _PARALLEL = 1e-3  # rad; cameras turned against each other by less need no rectification: a pixel at 1000 px
 _BESIDE = 0.01  # of the baseline; and so for cameras that are shifted against each other by less in y and z
+_ALIKE = 1e-3  # of a focal length or of cy; and so for lenses that differ by less: a pixel at 1000 px
 
 
 @dataclass
@@ -118,6 +119,11 @@ def calibrated_pair(
             f"the baseline is {baseline:.4g} m, so {topics[0]} is the right camera: exchange 'left' and 'right' "
             "of the source"
         )
+    if differing := _unlike(left, right):
+        raise LogError(
+            f"P of the CameraInfo of {topics[0]} and {topics[1]} are not those of a rectified pair: {differing}; "
+            "record the stereo calibration"
+        )
     return Camera(left, rectified, names[0]), Camera(right, rectified, names[1])
 
 
@@ -139,6 +145,12 @@ def _checked(model: CameraModel, topic: str) -> CameraModel:
         raise LogError(f"the focal lengths in P of {whose} are not positive; calibrate the camera again")
     if model.width <= 0 or model.height <= 0:
         raise LogError(f"{whose} is for images of {model.width}x{model.height}; calibrate the camera again")
+    cx, cy = model.p[0, 2], model.p[1, 2]
+    if not (0 <= cx < model.width and 0 <= cy < model.height):
+        raise LogError(
+            f"the principal point ({cx:g}, {cy:g}) in P of {whose} lies outside its {model.width}x{model.height} "
+            "images; record the calibration of images of this size"
+        )
     return model
 
 
@@ -166,12 +178,15 @@ def _beside(left: CameraModel, right: CameraModel, placed: Transform) -> bool:
     """
     turned = Rotation.from_matrix(left.r @ placed.rotation @ right.r.T).magnitude()
     x, y, z = left.r @ placed.translation
-    lenses = ([0, 1, 1], [0, 1, 2])  # fx, fy, cy
-    return bool(
-        turned < _PARALLEL
-        and max(abs(y), abs(z)) < _BESIDE * abs(x)
-        and np.allclose(left.p[lenses], right.p[lenses], rtol=1e-3)
-    )
+    return turned < _PARALLEL and max(abs(y), abs(z)) < _BESIDE * abs(x) and not _unlike(left, right)
+
+
+def _unlike(left: CameraModel, right: CameraModel) -> str:
+    """By what the projections of two cameras differ that a rectified pair has in common; empty where by nothing."""
+    shared = {"fx": (0, 0), "fy": (1, 1), "cy": (1, 2)}
+    pairs = {name: (float(left.p[place]), float(right.p[place])) for name, place in shared.items()}
+    differing = [name for name, pair in pairs.items() if not np.isclose(*pair, rtol=_ALIKE, atol=0)]
+    return " and ".join(f"{name} is {pairs[name][0]:.6g} and {pairs[name][1]:.6g} px" for name in differing)
 
 
 def _joined(left: CameraModel, right: CameraModel, placed: Transform) -> tuple[CameraModel, CameraModel]:

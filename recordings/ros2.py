@@ -34,7 +34,8 @@ from stages.data import (
 __all__ = [
     "TYPES", "Ros2Writer", "camera_info", "diagnostics", "disparity_image", "grid_map", "header", "image", "imu",
     "iter_messages", "make", "occupancy_grid", "odometry", "point_cloud", "read_disparity", "read_grid_map",
-    "read_occupancy_grid", "read_point_cloud", "reason_map", "stamp_of", "transform_message",
+    "read_occupancy_grid", "read_point_cloud", "reason_map", "source_image", "stamp_of",
+    "transform_message",
 ]  # fmt: skip
 
 REASON_UNTOLD = 255  # in a map read back: a hazard, of which an OccupancyGrid alone cannot say why
@@ -89,12 +90,11 @@ def disparity_image(disparity: Disparity) -> Any:
     continuous; min_disparity and max_disparity are the image's own range (NaN where it has no value).
     """
     camera = disparity.camera
-    pixels = disparity.pixels
+    pixels, frame_id = disparity.pixels, _frame_of(disparity)
     if camera is not None and camera.cx_right != camera.cx:
         pixels = pixels + np.float32(camera.cx_right - camera.cx)
     known = pixels[np.isfinite(pixels)]
     height, width = pixels.shape
-    frame_id = camera.frame_id if camera is not None else "camera"
     return make(
         "stereo_msgs/msg/DisparityImage", header=header(disparity.stamp, frame_id),
         image=image(disparity.stamp, frame_id, pixels),
@@ -103,6 +103,16 @@ def disparity_image(disparity: Disparity) -> Any:
         min_disparity=float(known.min()) if known.size else np.nan,
         max_disparity=float(known.max()) if known.size else np.nan, delta_d=0.0,
     )  # fmt: skip
+
+
+def source_image(disparity: Disparity) -> Any:
+    """sensor_msgs/Image, mono8, of where each pixel of a disparity image comes from: the codes of `Source`, 0 unknown,
+    1 measured, 2 plane, 3 filled."""
+    return image(disparity.stamp, _frame_of(disparity), disparity.source)
+
+
+def _frame_of(disparity: Disparity) -> str:
+    return disparity.camera.frame_id if disparity.camera is not None else "camera"
 
 
 def read_disparity(message: Any) -> NDArray[np.float32]:

@@ -126,6 +126,18 @@ class StereoCamera:
             raw=None if rectified else (left, right),
         )  # fmt: skip
 
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the calibration says that hardly any camera has, a sentence each: it may be of another image size."""
+        size, said = f"{self.width}x{self.height}", []
+        for name, extent in (("cx", self.width), ("cx_right", self.width), ("cy", self.height)):
+            if not 0.2 * extent <= getattr(self, name) <= 0.8 * extent:
+                outer = f"{name} of {getattr(self, name):g} px lies in the outer fifth of {size} images"
+                said.append(f"{outer}: check that the calibration is for this size")
+        if self.baseline > 5:
+            said.append(f"the baseline is {self.baseline:g} m: check that it is not given in centimetres")
+        return tuple(said)
+
 
 @dataclass(frozen=True, eq=False)
 class CameraImage:
@@ -166,6 +178,8 @@ class StereoFrame:
         publish_image(self, "right")
         if self.left.shape != self.right.shape:
             raise ValueError(f"StereoFrame: left is {self.left.shape}, right is {self.right.shape}")
+        if self.left.dtype != self.right.dtype:
+            raise ValueError(f"StereoFrame: left is {self.left.dtype}, right is {self.right.dtype}; record both alike")
         if self.left.shape[:2] != (self.camera.height, self.camera.width):
             raise ValueError(
                 f"StereoFrame: images are {self.left.shape[1]}x{self.left.shape[0]}, "
@@ -247,7 +261,8 @@ class ElevationMap:
 
     layers: name -> (rows, cols) float32, NaN = unknown, all of one shape, among them "elevation" (m);
     resolution: cell size, m; origin: (x, y) of the lower-left corner of cell [0, 0], m; level: for a map in another
-    frame, where the frame `level` of that stamp lies in it.
+    frame, where the frame `level` of that stamp lies in it; epoch: for a map of many frames, the stamp, ns, from which
+    its layers "first" and "last" count seconds.
     """
 
     stamp: int
@@ -256,6 +271,7 @@ class ElevationMap:
     origin: tuple[float, float]
     frame_id: str
     level: Transform | None = None
+    epoch: int | None = None
     shape: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -48,7 +48,7 @@ class Region:
     them, its cells, the plane that joined the last frame, how many in succession did not join, and how often the map
     began anew for that."""
 
-    frame_id: str = ""
+    frame_id: str | None = None  # a pose may be in a frame without a name
     epoch: int = 0
     last: int = -1
     hides: bool = False
@@ -72,8 +72,9 @@ class Fuse(Stage):
     - variance, m^2: of the elevation against what lies about it. A frame that is misplaced by `position` is off by that
       times the slope, where its cell has one, and by `alignment` anywhere. Frames see a cell alike and err alike: the
       share `shared` of the smallest variance stays, however many frames there are;
-    - count (points); first, last: when the evidence in the cell was gathered, s since the map's first frame;
-      frames: how many it is from (at most 65535); contradictions: how often the height was contradicted;
+    - count (points); first, last: when the evidence in the cell was gathered, s since the map's first frame,
+      whose stamp is the map's `epoch` (float32 holds no stamps), another once the map began anew; frames: how many it
+      is from (at most 65535); contradictions: how often the height was contradicted;
     - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere; and
       ceiling, m: the lowest line of sight over the hidden ones.
 
@@ -124,7 +125,7 @@ class Fuse(Stage):
 
         mount: how the camera sits on the frame whose pose is given; may be left out where that is the camera itself.
         """
-        self._check(cloud, pose)
+        self._check(cloud)
         placed = placement(cloud, pose, mount)
         local, row, col = local_cells(cloud, placed, self.resolution, self.region)
         if pose.frame_id != self._map.frame_id:
@@ -166,7 +167,7 @@ class Fuse(Stage):
         """Memory of the map so far, bytes."""
         return self._map.cells.nbytes
 
-    def _check(self, cloud: PointCloud, pose: Pose) -> None:
+    def _check(self, cloud: PointCloud) -> None:
         if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
             raise ValueError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
         if cloud.stamp <= self._map.last:
@@ -270,7 +271,7 @@ class Fuse(Stage):
             layers["occluded"] = np.where(known, 0, np.where(hidden, 1, np.nan)).astype(np.float32)
             layers["ceiling"] = np.where(hidden, cells["height"], np.nan).astype(np.float32)
         origin = (col * self.resolution, row * self.resolution)
-        return ElevationMap(stamp, layers, self.resolution, origin, self._map.frame_id, level=placed)
+        return ElevationMap(stamp, layers, self.resolution, origin, placed.parent, placed, self._map.epoch)
 
 
 def _sum(numbers: Array, more: Array | int) -> Array:

@@ -97,7 +97,13 @@ class Pose:
             raise ValueError(f"Pose.quaternion must be a unit quaternion, not {self.quaternion.tolist()}")
 
     def interpolated(self, later: Pose, stamp: int) -> Pose:
-        """The pose at `stamp`, ns, between this one and a later one; the earlier covariance is kept."""
+        """The pose at `stamp`, ns, between this one and a later one in the same frames; the earlier covariance is
+        kept."""
+        if (self.frame_id, self.child_frame_id) != (later.frame_id, later.child_frame_id):
+            raise ValueError(
+                f"the pose of '{self.child_frame_id}' in '{self.frame_id}' is followed by one of "
+                f"'{later.child_frame_id}' in '{later.frame_id}'; nothing lies between two frames"
+            )
         share = _share(self.stamp, later.stamp, stamp)
         position = (1 - share) * self.position + share * later.position
         near = later.quaternion if self.quaternion @ later.quaternion >= 0 else -later.quaternion
@@ -128,8 +134,8 @@ class CameraMotion:
     camera: the camera in the camera of the frame that began its segment, None where the images do not tell; segment:
     counts from 1, 0 before anything was seen; a new one begins wherever tracking was lost, and nothing ties it to the
     one before; covariance: (6, 6) of `camera`, of position (m) and of a turn (rad) about the fixed axes, which grows
-    from step to step; inliers: features that agree on the last step; error: their root mean square reprojection error,
-    px (NaN for none); lost: what to say where tracking was lost at this frame, else empty.
+    from step to step; inliers: features that agree on the last step; lost: what to say where tracking
+    was lost at this frame, else empty.
     """
 
     stamp: int
@@ -137,7 +143,6 @@ class CameraMotion:
     camera: Transform | None
     covariance: Array
     inliers: int = 0
-    error: float = float("nan")
     lost: str = ""
 
     def __post_init__(self) -> None:

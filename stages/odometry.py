@@ -83,7 +83,7 @@ class VisualOdometry(Stage):
         # A keyframe that shows too little to go on from is no better than the old one.
         if (far or few) and seen.known >= self.least:
             memory.keyframe = _Keyframe(seen, camera, covariance)
-        return CameraMotion(stamp, memory.segment, camera, covariance, step.inliers, step.error)
+        return CameraMotion(stamp, memory.segment, camera, covariance, step.inliers)
 
     def _blind(self, stamp: int, seen: View) -> CameraMotion:
         """No motion; the keyframe stays, so that the next frame that shows enough goes on from it."""

@@ -75,21 +75,32 @@ class Rectify(Stage):
         for each in frame:
             with suppress(ValueError):  # the run will meet the frame again, and say what is the matter with it
                 plain.append(_rectified(each, ()))
+        stage, found = self._fitted(plain)
+        if plain and (doubts := plain[0].camera.doubts):
+            found = Finding("; ".join((*doubts, found.sentence)), Severity.WARNING)
+        return stage, found
+
+    def _fitted(self, plain: Sequence[StereoFrame]) -> tuple[Rectify, Finding]:
+        """The stage with the row offset of frames that are rectified but for it, and what there is to say of that."""
         offset = _measured(plain)
         if offset is None:
             unclear = "the row offset is not clear from the images; none is corrected"
             return replace(self, row_offset=0.0), Finding(unclear)
+        if offset.crossed > MOST_CROSSED:
+            swapped = (
+                f"{offset.crossed:.0%} of the features that both images show look farther than infinity: left and "
+                "right are swapped, or the calibration is not that of these images; exchange 'left' and 'right' of the "
+                "source"
+            )
+            return replace(self, row_offset=0.0), Finding(swapped, Severity.WARNING)
         terms = tuple(round(term, 4) for term in offset.terms)
         found = (
             f"rows differ by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, +- {offset.error:.2f}"
             f" ({offset.features} features of {counted(len(plain), 'frame')})"
         )
-        severity = Severity.NOTE
-        if offset.crossed > MOST_CROSSED:
-            severity = Severity.WARNING
-            found += f"; {offset.crossed:.0%} of the features look farther than infinity: are left and right swapped?"
         if not offset.clear:
-            return replace(self, row_offset=0.0), Finding(f"{found}: too little to correct", severity)
+            return replace(self, row_offset=0.0), Finding(f"{found}: too little to correct")
+        severity = Severity.NOTE
         if offset.largest > UNUSUAL:
             severity = Severity.WARNING
             found += "; so much is unusual: are the images rectified, and with this calibration?"
@@ -106,7 +117,8 @@ class Rectify(Stage):
 
 def _measured(frames: Sequence[StereoFrame]) -> RowOffset | None:
     pairs = [tuple(gray(image) for image in eight_bit(frame.left, frame.right)) for frame in frames]
-    return measure(cast(list[tuple[Array, Array]], pairs))
+    infinity = frames[0].camera.cx - frames[0].camera.cx_right if frames else 0.0
+    return measure(cast(list[tuple[Array, Array]], pairs), infinity)
 
 
 def _rectified(frame: StereoFrame, row_terms: tuple[float, ...]) -> StereoFrame:

@@ -35,6 +35,7 @@ CLEAR = 0.25  # px, largest error, anywhere in the image, of a fit that counts
 DEPENDENT = 3.0  # how much larger errors are, held against exact truth, than if tracked patches erred independently
 CELL = 1 / 128  # of the image's sizes: what is seen at one place in many frames errs alike, and counts once
 NEGLIGIBLE = 0.1  # px, root mean square: less is not worth an interpolation; exactly aligned images measure up to 0.05
+BEYOND = 1.0  # px; features of the far horizon lie about infinity
 ROUNDS = 20  # of reweighting
 THREADS = 2  # the frames wait for the survey, so that nothing else keeps the cores busy
 TUKEY = 4.685  # standard deviations, beyond which an outlier has no weight
@@ -48,7 +49,7 @@ class RowOffset:
     terms: weights, px, of 1, x, y, xy, y^2, where x and y are the place in the right image from its centre, in widths
     and heights; features: pairs that agree on it; error: the largest standard deviation in the image that the terms
     have by the scatter of the features, px: what a model of few terms cannot express is not in it; crossed: the share
-    of features that lie farther right in the right image than in the left, as behind infinity.
+    of features that lie farther right in the right image than what is infinitely far, by more than `BEYOND`.
     """
 
     terms: tuple[float, ...]
@@ -101,9 +102,10 @@ def _moving_maps(width: int, height: int, terms: tuple[float, ...]) -> tuple[Arr
     return maps[0], maps[1]
 
 
-def measure(pairs: Sequence[tuple[Array, Array]]) -> RowOffset | None:
+def measure(pairs: Sequence[tuple[Array, Array]], infinity: float = 0.0) -> RowOffset | None:
     """The row offset that all pairs of images, (H, W) uint8, left and right, have in common; None where they show none.
 
+    infinity: the disparity of what is infinitely far, px.
     The richest model is taken that the features determine to `CLEAR` everywhere in the image. Tracking draws fractions
     of a pixel towards one half, by up to 0.03 px; so what remains after a first correction is measured once more.
     """
@@ -117,7 +119,9 @@ def measure(pairs: Sequence[tuple[Array, Array]]) -> RowOffset | None:
             again = list(threads.map(_offsets_after, repeat(first), seen))
             rest = _fit(again, count)
             if rest is not None and rest.error <= CLEAR:
-                return replace(rest, terms=tuple(np.add(first.terms, rest.terms).tolist()), crossed=_crossed(seen))
+                return replace(
+                    rest, terms=tuple(np.add(first.terms, rest.terms).tolist()), crossed=_crossed(seen, infinity)
+                )
     return None
 
 
@@ -127,9 +131,9 @@ def _view(pair: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
     return left, right, *_near_the_most_common(*_paired_features(left, right))
 
 
-def _crossed(seen: Sequence[tuple[Array, Array, Array, Array]]) -> float:
+def _crossed(seen: Sequence[tuple[Array, Array, Array, Array]], infinity: float) -> float:
     """`RowOffset.crossed`, of the views with their features."""
-    return float(np.mean(np.concatenate([here[:, 0] < there[:, 0] for _, _, here, there in seen])))
+    return float(np.mean(np.concatenate([here[:, 0] - there[:, 0] < infinity - BEYOND for _, _, here, there in seen])))
 
 
 def _as_bright(image: Array, model: Array) -> Array:

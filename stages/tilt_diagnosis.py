@@ -57,12 +57,11 @@ class Evidence:
 @dataclass(frozen=True)
 class Diagnosis:
     """fault: in a word or two, empty where none is found; sentence: what to tell the user; clear: whether there was
-    motion enough to see every fault; residual: rad, what is left between tilt and camera once the fault is undone."""
+    motion enough to see every fault."""
 
     fault: str
     sentence: str
     clear: bool
-    residual: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,7 @@ def diagnose(evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_off
         return wild
     free = 2 * (n - len(np.unique(evidence.segments)))
     if n < LEAST_FRAMES or free < LEAST_FRAMES:
-        return Diagnosis("", f"too few frames to judge the tilt ({n})", False, np.nan)
+        return Diagnosis("", f"too few frames to judge the tilt ({n})", False)
     fit = _Fit(evidence)
     sound = _Cause("", "", fit.misfit(np.eye(3)), fit.slope(np.eye(3)))
     mount, offset = _mount(fit, least_angle), _offset(evidence, sound, least_offset)
@@ -129,7 +128,7 @@ def off_level(least: float, frames: int) -> Diagnosis | None:
         "whole; look at the sign of pitch, the inclinometer's axes and its mount (source.pitch.sign, "
         "source.camera_from_inclinometer, --pitch-down of an import)"
     )
-    return Diagnosis(OFF_GROUND, sentence, False, np.nan)
+    return Diagnosis(OFF_GROUND, sentence, False)
 
 
 def _named(best: _Cause, rivals: list[_Cause], n: int, before: float, after: float) -> Diagnosis:
@@ -140,7 +139,7 @@ def _named(best: _Cause, rivals: list[_Cause], n: int, before: float, after: flo
         f"{fault}: undone, tilt and camera agree to {_deg(after)}, as they stand to {_deg(before)} ({n} frames); "
         f"{best.remedy}"
     )
-    return Diagnosis(fault, sentence, True, after)
+    return Diagnosis(fault, sentence, True)
 
 
 def _inconsistent(n: int, residual: float) -> Diagnosis:
@@ -148,7 +147,7 @@ def _inconsistent(n: int, residual: float) -> Diagnosis:
         f"tilt and camera disagree by {_deg(residual)} ({n} frames), and no single fault of the inclinometer explains "
         "it; check its axes, its unit, its mount, its clock, and whether it is shaken"
     )
-    return Diagnosis(INCONSISTENT, sentence, True, residual)
+    return Diagnosis(INCONSISTENT, sentence, True)
 
 
 def _same(one: _Cause, other: _Cause) -> bool:
@@ -170,7 +169,7 @@ def _passed(
             f"up is {_deg(slope)} off the ground's own normal ({n} frames): check the inclinometer's axes and "
             "source.camera_from_inclinometer; the rover has moved too little to tell which"
         )
-        return Diagnosis(OFF_GROUND, sentence, False, residual)
+        return Diagnosis(OFF_GROUND, sentence, False)
     open_ = [c.fault for c in axes if c.score(variance) - sound.score(variance) < MARGIN]
     hidden = ["exchanged or flipped axes"] if open_ else []
     if mount.error * np.sqrt(variance) > HIDDEN:
@@ -179,8 +178,8 @@ def _passed(
         hidden.append("a time offset")
     if hidden:
         which = " or ".join([", ".join(hidden[:-1]), hidden[-1]] if len(hidden) > 1 else hidden)
-        return Diagnosis("", f"not enough motion in {n} frames to rule out {which}", False, residual)
-    return Diagnosis("", f"tilt and camera agree to {_deg(residual)} ({n} frames)", True, residual)
+        return Diagnosis("", f"not enough motion in {n} frames to rule out {which}", False)
+    return Diagnosis("", f"tilt and camera agree to {_deg(residual)} ({n} frames)", True)
 
 
 class _Fit:
@@ -278,7 +277,7 @@ def _wild(evidence: Evidence) -> Diagnosis | None:
         f"{_deg(turn)} ({len(near)} pairs of frames); check the unit of source.pitch and source.roll (deg, not rad), "
         "or the inclinometer's driver"
     )
-    return Diagnosis("degrees are taken for radians", sentence, True, swing)
+    return Diagnosis("degrees are taken for radians", sentence, True)
 
 
 @cache

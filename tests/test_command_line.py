@@ -23,9 +23,10 @@ from scipy.spatial.transform import Rotation
 from flow.cli import main
 from recordings.mcap_index import Raw
 from recordings.mcap_reader import McapFile
-from recordings.ros2 import iter_messages
+from recordings.ros2 import iter_messages, read_disparity, stamp_of
 from recordings.simulator import Simulation
 from recordings.simulator.traverse import level_pose
+from stages.data import Source
 from tests.conftest import FRAMES, rewrite
 
 ROOT = Path(__file__).parent.parent
@@ -33,7 +34,7 @@ SMALL = ("--set", "disparities=64")
 RESULTS = {
     "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/nav/pose", "/nav/regional_map",
     "/nav/regional_navigation_map", "/tf", "/nav/diagnostics", "/nav/navigation_map/reason",
-    "/nav/regional_navigation_map/reason",
+    "/nav/regional_navigation_map/reason", "/nav/disparity/source",
 }  # fmt: skip
 
 
@@ -62,6 +63,20 @@ def test_every_frame_leaves_every_result(result):
     assert set(counts) == RESULTS
     assert all(counts[topic] >= FRAMES for topic in RESULTS)
     assert not list(result.parent.glob("*.partial"))
+
+
+def test_every_known_disparity_says_whether_it_was_measured_or_guessed(result):
+    disparities, sources = (
+        [message for _, _, message in iter_messages(result, [topic])]
+        for topic in ("/nav/disparity", "/nav/disparity/source")
+    )
+    assert len(disparities) == len(sources) == FRAMES
+    for disparity, source in zip(disparities, sources, strict=True):
+        assert stamp_of(source.header) == stamp_of(disparity.header)
+        assert source.header.frame_id == disparity.header.frame_id
+        codes = source.data.reshape(source.height, source.width)
+        np.testing.assert_array_equal(codes != Source.UNKNOWN, np.isfinite(read_disparity(disparity)))
+        assert set(np.unique(codes)) == set(Source)
 
 
 def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
@@ -287,7 +302,7 @@ def test_an_interrupt_leaves_a_readable_result_and_exits_130(traverse, tmp_path)
     _, said = child.communicate(timeout=60)
     assert child.returncode == 130, said
     assert b"Traceback" not in said
-    assert 1 <= len(raw_messages(out)) < 2 * FRAMES + 1
+    assert 1 <= len(raw_messages(out)) < 3 * FRAMES + 1
     assert not list(tmp_path.glob("*.partial"))
 
 

@@ -37,8 +37,9 @@ def drop(*parts: str):
         (drop("/right"), "one image topic only"),
         (drop("/tf_static"), "tf_static"),
         (drop("/"), "no messages"),
+        (lambda topic, index, data: data.replace(b"\0rgb8\0", b"\0uyvy\0"), "encoding 'uyvy' is not one of those that"),
     ],
-    ids=["no tilt", "no calibration", "one camera", "no mounting", "nothing"],
+    ids=["no tilt", "no calibration", "one camera", "no mounting", "nothing", "an encoding nobody reads"],
 )
 def test_a_log_that_lacks_something_is_refused_in_one_sentence(traverse, tmp_path, capsys, change, words):
     log = rewrite(traverse, tmp_path / "lacking.mcap", change)

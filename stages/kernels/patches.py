@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
+from stages.kernels.union import join, root
 
 # Pixels looked ahead for the next point: a cloud may hold every 4th only.
 _GAP = 4
@@ -69,14 +70,6 @@ def _linked(inverse, tolerance, slope, row, col, up, left):  # type: ignore[no-u
 
 
 @kernel
-def _root(parent, i):  # type: ignore[no-untyped-def]
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@kernel
 def _patches(inverse, tolerance, slope):  # type: ignore[no-untyped-def]
     height, width = inverse.shape
     parent = np.empty(height * width, np.int32)
@@ -89,10 +82,9 @@ def _patches(inverse, tolerance, slope):  # type: ignore[no-untyped-def]
             left = _linked(inverse, tolerance, slope, row, col, 0, 1)
             above = _linked(inverse, tolerance, slope, row, col, 1, 0)
             if left >= 0:
-                parent[i] = _root(parent, left)
+                parent[i] = root(parent, left)
             if above >= 0:
-                one, other = parent[i], _root(parent, above)
-                parent[max(one, other)] = min(one, other)
+                join(parent, i, above)
     # Parents come before their children, so one pass in order reaches every root.
     for i in range(height * width):
         parent[i] = parent[parent[i]]

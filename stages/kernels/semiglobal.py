@@ -71,7 +71,6 @@ class Matches(NamedTuple):
     pixels: Array  # float32, px, NaN = unknown
     source: Array  # uint8: 1 where known, else 0, as `stages.data.Source`
     confidence: Array  # float32
-    evidence: Array  # uint8, of which the confidence is a function; 0 where unknown
 
 
 class Scratch(NamedTuple):
@@ -114,7 +113,7 @@ def match(
         drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, both)
         confidence, source = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
         both(*(functools.partial(_grade, evidence[at], rule.calibration, confidence[at], source[at]) for at in parts))
-    return Matches(pixels, source, confidence, evidence)
+    return Matches(pixels, source, confidence)
 
 
 def _sweep_all(

@@ -17,6 +17,7 @@ from stages.data import Array
 from stages.kernels.compiled import fast_kernel, kernel
 from stages.kernels.halves import AtOnce, in_turn, pairs
 from stages.kernels.scaling import halved
+from stages.kernels.union import join, root
 from stages.kernels.workspace import Workspaces
 
 F32 = np.float32
@@ -171,14 +172,6 @@ def connect(labels: Array, smallest: int, scratch: Array, both: AtOnce = in_turn
 
 
 @kernel
-def _root(parent, i):  # type: ignore[no-untyped-def]
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@kernel
 def _join(labels, y, rows, ends, parent):  # type: ignore[no-untyped-def]
     """Join the runs of row y with those of equal label in the row above; the earliest run becomes the root."""
     width = labels.shape[1]
@@ -186,11 +179,7 @@ def _join(labels, y, rows, ends, parent):  # type: ignore[no-untyped-def]
     here = above = 0
     while here < width and above < width:
         if labels[y, here] == labels[y - 1, above]:
-            one, other = _root(parent, run), _root(parent, run_above)
-            if one < other:
-                parent[other] = one
-            else:
-                parent[one] = other
+            join(parent, run, run_above)
         end, end_above = ends[run], ends[run_above]
         if end <= end_above:
             here = end
@@ -226,11 +215,11 @@ def _number(labels, middle, smallest, rows, ends, parent, number):  # type: igno
     for y in range(height):
         start = 0
         for run in range(rows[y, 0], rows[y, 1]):
-            root = _root(parent, run)
-            parent[run] = root
-            if root == run:
+            first = root(parent, run)
+            parent[run] = first
+            if first == run:
                 number[run] = 0
-            number[root] += ends[run] - start  # its size, at first
+            number[first] += ends[run] - start  # its size, at first
             start = ends[run]
     total = np.int32(0)
     for y in range(height):  # a root is the first run of its component: what lies before it has its number already

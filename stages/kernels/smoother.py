@@ -15,11 +15,10 @@ from stages.kernels.compiled import fast_kernel, kernel
 
 F32 = np.float32
 BLOCK = 320  # columns solved together: their working set stays in the second-level cache
+PASSES = 3
 
 
-def smooth(
-    values: Array, weights: Array, guide: Array, strength: float, sigma: float, passes: int = 3
-) -> tuple[Array, Array]:
+def smooth(values: Array, weights: Array, guide: Array, strength: float, sigma: float) -> tuple[Array, Array]:
     """Smooth values along the image, across edges of the guide as little as possible.
 
     values: (H, W) float32, finite where weights > 0; weights: (H, W) float32 >= 0, 0 = unknown; guide: (H, W) uint8;
@@ -34,7 +33,7 @@ def smooth(
     _couple(cv2.transpose(guide), coupling, across)
     mass: Array = np.ascontiguousarray(weights, np.float32)
     moment: Array = np.where(mass > 0, values, F32(0)) * mass
-    for index in range(passes):
+    for index in range(PASSES):
         step = F32(strength * 0.25**index)
         moment, mass = cv2.transpose(moment), cv2.transpose(mass)
         _solve_in_blocks(moment, mass, across, step)
@@ -93,13 +92,11 @@ def _solve(moment, mass, coupling, strength, upper, start, stop):  # type: ignor
             g[i] += c[i] * g_after[i]
 
 
-def smooth_reference(
-    values: Array, weights: Array, guide: Array, strength: float, sigma: float, passes: int = 3
-) -> tuple[Array, Array]:
+def smooth_reference(values: Array, weights: Array, guide: Array, strength: float, sigma: float) -> tuple[Array, Array]:
     """`smooth` in float64, every line a sparse system handed to scipy."""
     mass = weights.astype(np.float64)
     moment = np.where(mass > 0, values, 0.0) * mass
-    for index in range(passes):
+    for index in range(PASSES):
         for turn in (np.transpose, np.asarray):
             lines = turn(guide).astype(np.float64)
             for array in (moment, mass):

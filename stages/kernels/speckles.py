@@ -14,8 +14,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from stages.data import Array
-from stages.kernels.compiled import kernel, part
+from stages.kernels.compiled import kernel
 from stages.kernels.halves import in_turn
+from stages.kernels.union import join, root
 
 
 def drop_speckles(
@@ -75,7 +76,7 @@ def _find_runs(disparity, first_row, end_row, step, runs, counts, seam, half, id
                 if over[i] and above[i] != joined:
                     joined = above[i]
                     if joined >= 0:
-                        _join(parent, count, joined)
+                        join(parent, count, joined)
             count += 1
         if y == (end_row - 1 if half == 0 else first_row):
             for x in range(columns):
@@ -89,33 +90,16 @@ def _drop(disparity, evidence, middle, step, largest, runs, area, counts, seam):
     columns = disparity.shape[1]
     for x in range(columns):
         if seam[0, x] >= 0 and seam[1, x] >= 0 and abs(disparity[middle, x] - disparity[middle - 1, x]) <= step:
-            _join(parent, seam[0, x], seam[1, x])
+            join(parent, seam[0, x], seam[1, x])
     for first, count in ((0, counts[0]), (middle * columns, counts[1])):
         for run in range(first, count):
-            area[_root(parent, run)] += end[run] - start[run]
+            area[root(parent, run)] += end[run] - start[run]
     pixels, strength = disparity.reshape(-1), evidence.reshape(-1)
     for first, count in ((0, counts[0]), (middle * columns, counts[1])):
         for run in range(first, count):
-            if area[_root(parent, run)] <= largest:
+            if area[root(parent, run)] <= largest:
                 for i in range(start[run], end[run]):
                     pixels[i], strength[i] = np.nan, 0
-
-
-@part
-def _root(parent, run):  # type: ignore[no-untyped-def]
-    while parent[run] != run:
-        parent[run] = parent[parent[run]]
-        run = parent[run]
-    return run
-
-
-@part
-def _join(parent, one, other):  # type: ignore[no-untyped-def]
-    one, other = _root(parent, one), _root(parent, other)
-    if one < other:
-        parent[other] = one
-    else:
-        parent[one] = other
 
 
 def drop_speckles_reference(disparity: Array, evidence: Array, step: float, largest: int) -> None:

@@ -15,13 +15,13 @@ from stages.data import Array
 from stages.kernels.compiled import kernel
 from stages.kernels.halves import pairs
 
+ITERATIONS = 3
 AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])
 
 
 def surfaces(
-    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, iterations: int = 3,
-    threads: int = 1,
-) -> tuple[Array, int]:  # fmt: skip
+    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, threads: int = 1
+) -> tuple[Array, int]:
     """Group superpixels into about `groups` surfaces.
 
     image: (H, W) gray or (H, W, 3) RGB, uint8; labels: (H, W) int32 in 0..count-1; compactness: weight of position
@@ -37,7 +37,7 @@ def surfaces(
     inside = ((near >= 0) & (near < [rows, cols])).all(axis=2)
     near = np.where(inside, near[..., 0] * cols + near[..., 1], 0)
     nearest = near[:, len(AROUND) // 2]
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         mass = np.bincount(nearest, size, rows * cols)
         sums = [np.bincount(nearest, size * values, rows * cols) for values in points.T]
         centres = np.stack(sums, axis=1) / np.maximum(mass, 1)[:, None]
@@ -79,7 +79,7 @@ def _sum_up(image, labels, first, sums):  # type: ignore[no-untyped-def]
 
 
 def surfaces_reference(
-    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, iterations: int = 3
+    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0
 ) -> tuple[Array, int]:
     """`surfaces` in plain numpy, superpixel after superpixel."""
     height, width = image.shape[:2]
@@ -96,7 +96,7 @@ def surfaces_reference(
         place = points[s, 3:] / (compactness / step)
         home[s] = np.minimum(np.floor(place * [rows / height, cols / width]), [rows - 1, cols - 1])
     nearest = home[:, 0] * cols + home[:, 1]
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         members = [nearest == k for k in range(rows * cols)]
         centres = [(points[m] * sizes[m, None]).sum(axis=0) / sizes[m].sum() if m.any() else None for m in members]
         for s in range(count):

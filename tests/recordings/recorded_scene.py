@@ -89,7 +89,7 @@ def scene(stamp: int = START) -> dict[str, Any]:
         "rectified": frame, "matched": matched, "disparity": replace(matched, segments=segments), "cloud": cloud,
         "points": replace(cloud, frame_id=LEVEL_FRAME, sensor=sensor), "elevation_map": terrain,
         "navigation_map": NavigationMap(stamp, cells, reason, 0.1, (0.0, -1.5), LEVEL_FRAME),
-        "motion": CameraMotion(stamp, 1, Transform("start", "camera", np.eye(3), np.zeros(3)), np.eye(6), 321, 0.4),
+        "motion": CameraMotion(stamp, 1, Transform("start", "camera", np.eye(3), np.zeros(3)), np.eye(6), 321),
         "health": TiltHealth(stamp, 0.01, 0.05, 50, "the sign of pitch is flipped", "turn it round"),
     }  # fmt: skip
 

@@ -63,6 +63,33 @@ def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: P
     assert frames["with_tilt"] == 2  # the first and the last frame, which have a tilt of their own
 
 
+def test_streams_whose_headers_have_no_stamp_are_told_to_go_by_the_time_of_the_log(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic in (LEFT, "/odom"):
+            message.header.stamp.sec = message.header.stamp.nanosec = 0
+        return message
+
+    described = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())
+    assert described["unstamped"] == ["left", "odometry"]
+    assert [line for line in format_description(described).splitlines() if line.startswith("stamps: ")] == [
+        "stamps: left: header stamps are 0: log times are used",
+        "stamps: odometry: header stamps are 0: log times are used",
+    ]
+
+
+def test_a_calibration_that_may_be_of_another_image_size_is_doubted(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic.endswith("camera_info"):
+            message.width, message.height = 2 * message.width + 12, 2 * message.height
+        return message
+
+    path = write_sample(tmp_path / "log.mcap", edit)
+    assert (
+        "doubtful: cx of 11.5 px lies in the outer fifth of 60x32 images: check that the calibration is for this size"
+        in (format_description(describe(path, McapSource())))
+    )
+
+
 def test_a_missing_right_calibration_is_said_in_whole_sentences(tmp_path: Path) -> None:
     edit = lambda topic, _, message: None if topic == "/stereo/right/camera_info" else message  # noqa: E731
     text = format_description(describe(write_sample(tmp_path / "log.mcap", edit), McapSource()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from recordings import McapSink
 from recordings.errors import LogError
 from recordings.ros2 import iter_messages, read_disparity, read_grid_map, read_occupancy_grid, stamp_of
+from stages import Fuse
 from stages.data import (
     CameraImage,
     Disparity,
@@ -24,6 +25,8 @@ from stages.data import (
     TiltHealth,
     Transform,
 )  # fmt: skip
+from tests.stages.region_scene import MOUNT, SECOND, drive
+from tests.stages.region_scene import START as DRIVE
 
 START = 1_700_000_000_000_000_000
 STREAMS = {"disparity": Disparity, "points": PointCloud, "elevation_map": ElevationMap, "navigation_map": NavigationMap}
@@ -52,10 +55,11 @@ def items(stamp: int) -> dict[str, Any]:
     rng = np.random.default_rng(stamp % 1000)
     pixels = rng.uniform(1, 60, (6, 8)).astype(np.float32)
     pixels[0, 0] = np.nan
+    source = rng.integers(0, 4, (6, 8), dtype=np.uint8)
     camera = StereoCamera(20.0, 20.0, 4.0, 3.0, 0.25, 8, 6, frame_id="left_optical")
     sensor = Transform("level", "left_optical", np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.5, 0, 0.9])
     return {
-        "disparity": Disparity(stamp, pixels, np.ones((6, 8), np.uint8), np.ones((6, 8), np.float32), camera=camera),
+        "disparity": Disparity(stamp, pixels, source, np.ones((6, 8), np.float32), camera=camera),
         "points": PointCloud(
             stamp, rng.normal(size=(5, 3)).astype(np.float32), rng.integers(0, 255, (5, 3), dtype=np.uint8),
             np.ones(5, np.float32), np.arange(5, dtype=np.int32), "level", sensor=sensor,
@@ -88,12 +92,22 @@ def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path: Path) -> N
     read = list(iter_messages(write(tmp_path / "out.mcap")))
     topics = [(topic, stamp - START) for topic, stamp, _ in read]
     results = [f"/nav/{name}" for name in ("disparity", "points", "elevation_map", "navigation_map")]
-    frame = [*results, "/nav/navigation_map/reason", "/tf", "/nav/diagnostics"]
+    frame = [
+        "/nav/disparity",
+        "/nav/disparity/source",
+        *results[1:],
+        "/nav/navigation_map/reason",
+        "/tf",
+        "/nav/diagnostics",
+    ]
     second = [topic for topic in frame if topic != "/nav/elevation_map"]
     assert topics == [(t, 0) for t in frame] + [(t, 100) for t in second] + [("/nav/diagnostics", 100)]
     first = {topic: message for topic, stamp, message in read if stamp == START}
     sent = items(START)
     np.testing.assert_array_equal(read_disparity(first["/nav/disparity"]), sent["disparity"].pixels)
+    source = first["/nav/disparity/source"]
+    assert (source.encoding, stamp_of(source.header), source.header.frame_id) == ("mono8", START, "left_optical")
+    np.testing.assert_array_equal(source.data.reshape(source.height, source.width), sent["disparity"].source)
     elevation = read_grid_map(first["/nav/elevation_map"]).layers["elevation"]
     np.testing.assert_array_equal(elevation, sent["elevation_map"].layers["elevation"])
     navigation = read_occupancy_grid(first["/nav/navigation_map"], first["/nav/navigation_map/reason"])
@@ -115,6 +129,25 @@ def test_losses_are_in_the_diagnostics_of_their_frame_and_the_late_ones_at_the_e
     assert [(s.level, s.name, s.message) for s in lost] == [(2, "match/elevation_map", "no texture")]
     assert {v.key: v.value for v in lost[0].values}["reason"] == "failed"
     assert late[0].message == "the log is cut"
+
+
+def test_the_stamps_in_a_regional_map_s_cells_can_be_told_from_the_diagnostics_beside_it(tmp_path: Path) -> None:
+    fuse, sink = Fuse(), McapSink()
+    sink.open(tmp_path / "out.mcap", {"regional_map": ElevationMap}, ABOUT)
+    for frame in range(3):
+        cloud, pose = drive(frame)
+        pose = replace(pose, frame_id="odom" if frame == 0 else "odom/2")  # the map begins anew
+        sink.write(Record(cloud.stamp, {"regional_map": fuse(cloud, pose, MOUNT)}))
+    sink.close({})
+    told = {}
+    for topic, stamp, message in iter_messages(tmp_path / "out.mcap"):
+        if topic == "/nav/diagnostics":
+            epochs = [v.value for s in message.status if s.name == "regional_map" for v in s.values if v.key == "epoch"]
+            told[stamp] = int(epochs[0])
+    assert list(told.values()) == [DRIVE, DRIVE + SECOND, DRIVE + SECOND]
+    for topic, stamp, message in iter_messages(tmp_path / "out.mcap"):
+        if topic == "/nav/regional_map":
+            assert told[stamp] + np.nanmax(read_grid_map(message).layers["last"]) * SECOND == stamp
 
 
 def test_the_log_says_what_it_was_made_from_and_how_the_run_ended(tmp_path: Path) -> None:

@@ -243,6 +243,21 @@ def test_one_bad_message_is_lost_alone(tmp_path: Path) -> None:
     assert len(events) == 4 * FRAMES + 1
 
 
+def test_a_camera_whose_images_nobody_can_read_is_missing_before_the_run(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == RIGHT:
+            message.encoding = "yuv422_yuy2"
+        return message
+
+    path = write_sample(tmp_path / "log.mcap", edit)
+    with McapSource().open(path) as log:
+        assert list(log.missing) == ["right"]
+        assert log.missing["right"].startswith(f"{RIGHT}: image encoding 'yuv422_yuy2' is not one of those that can be")
+        assert "(mono8, 8UC1, " in log.missing["right"]
+    described = describe(path, McapSource())
+    assert (described["frames"]["pairs"], described["missing"]) == (0, log.missing)
+
+
 # Bare angles
 
 

@@ -101,6 +101,8 @@ def test_exchanged_cameras_are_named_so(tmp_path: Path, names: tuple[str, str]) 
         ({"d": np.full(5, np.nan)}, "must be finite"),
         ({"p": np.full(12, np.nan)}, "must be finite"),
         ({"p": np.hstack([np.diag([0.0, 20, 1]), np.zeros((3, 1))]).reshape(-1)}, "focal lengths in P .* not positive"),
+        ({"width": 11}, r"principal point \(11.5, 7.5\) in P of the CameraInfo of .* lies outside its 11x16 images"),
+        ({"height": 7}, "lies outside its 24x7 images"),
         ({"width": 0}, "is for images of 0x16"),
         ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "tells no baseline"),
     ],
@@ -114,6 +116,22 @@ def test_a_calibration_that_cannot_be_is_told_as_such(tmp_path: Path, values: di
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log, pytest.raises(LogError, match=said):
         raise LogError(log.missing["left"])
+
+
+@pytest.mark.parametrize("names", [RAW, RECTIFIED])
+@pytest.mark.parametrize(("place", "value", "said"), [((0, 0), 18.6, "fx is 20 and 18.6"), ((1, 2), 8.5, "cy is 7.5")])
+def test_a_stereo_calibration_whose_projections_differ_is_refused(
+    tmp_path: Path, names: tuple[str, str], place: tuple[int, int], value: float, said: str
+) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == "/right/camera_info":
+            p = np.array(message.p).reshape(3, 4)
+            p[place] = value
+            message.p = p.reshape(-1)
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=names)) as log:
+        assert f"are not those of a rectified pair: {said}" in log.missing["left"]
 
 
 def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:

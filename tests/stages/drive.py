@@ -91,6 +91,6 @@ def motions(cameras: list[Transform], stamps: list[int], segment: int = 1) -> li
     """The exact motion of a camera, since the first."""
     start = cameras[0].inverse()
     return [
-        CameraMotion(stamp, segment, start.after(camera), np.eye(6) * 1e-9 * count, 100, 0.3)
+        CameraMotion(stamp, segment, start.after(camera), np.eye(6) * 1e-9 * count, 100)
         for count, (stamp, camera) in enumerate(zip(stamps, cameras, strict=True))
     ]

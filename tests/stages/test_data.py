@@ -119,6 +119,20 @@ def test_an_image_of_another_size_than_its_calibration_is_refused() -> None:
         StereoFrame(0, small, small, CAMERA)
 
 
+def test_a_pair_of_images_of_which_one_has_more_bits_is_refused() -> None:
+    left = np.zeros((480, 640), U8)
+    with pytest.raises(ValueError, match="left is uint8, right is uint16"):
+        StereoFrame(0, left, left.astype(np.uint16), CAMERA)
+
+
+@pytest.mark.parametrize("frames", [("map", "base"), ("odom", "mast")])
+def test_between_poses_of_different_frames_there_is_no_pose(frames: tuple[str, str]) -> None:
+    first = Pose(0, np.zeros(3), QUATERNION, "odom", "base")
+    assert first.interpolated(Pose(4, np.array([8.0, 0, 0]), QUATERNION, "odom", "base"), 1).position[0] == 2.0
+    with pytest.raises(ValueError, match=f"of 'base' in 'odom' is followed by one of '{frames[1]}' in '{frames[0]}'"):
+        first.interpolated(Pose(4, np.array([8.0, 0, 0]), QUATERNION, *frames), 1)
+
+
 @dataclass(frozen=True)
 class Free(Stage):
     """A stage whose parameter has no range."""

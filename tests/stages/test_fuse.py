@@ -118,6 +118,18 @@ def test_cells_know_when_and_by_how_many_frames_they_were_seen():
     assert cell(terrain, 1.0, 0.02, "frames") == 0
 
 
+def test_a_pose_whose_frame_has_no_name_makes_the_map_that_a_named_one_does():
+    maps = {}
+    for name in ("odom", ""):
+        fuse = Fuse()
+        for frame in range(3):
+            cloud, pose = drive(frame)
+            maps[name] = fuse(cloud, replace(pose, frame_id=name), MOUNT)
+    assert maps[""].frame_id == ""
+    for layer, values in maps["odom"].layers.items():
+        np.testing.assert_array_equal(maps[""].layers[layer], values)
+
+
 def with_box(x, y):
     return np.where((np.abs(x - 4) < 0.4) & (np.abs(y) < 0.4), 0.5, 0.0)
 

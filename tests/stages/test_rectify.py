@@ -223,7 +223,8 @@ def test_a_survey_measures_what_its_frames_have_in_common(rectified):
 
 
 @pytest.mark.parametrize(("rows", "swapped", "words"), [
-    (0.0, True, "100% of the features look farther than infinity: are left and right swapped?"),
+    (0.0, True, "100% of the features that both images show look farther than infinity: left and right are swapped"),
+    (20.0, True, "100% of the features that both images show look farther than infinity: left and right are swapped"),
     (20.0, False, "so much is unusual: are the images rectified"),
 ])  # fmt: skip
 def test_a_survey_tells_of_images_that_cannot_be_a_rectified_pair(rows, swapped, words):
@@ -231,8 +232,30 @@ def test_a_survey_tells_of_images_that_cannot_be_a_rectified_pair(rows, swapped,
     pair = (right, left) if swapped else (left, right)
     _, found = Rectify().survey([StereoFrame(1, *pair, StereoCamera(500, 500, 320, 240, 0.1, *LARGE))])
     assert words in found.sentence
-    assert ("swapped" in found.sentence) == swapped
+    assert ("swapped" in found.sentence, "rows differ" in found.sentence) == (swapped, not swapped)
     assert found.severity == "warning"
+
+
+def test_images_that_are_infinitely_far_at_another_disparity_are_not_called_swapped():
+    left, right = a_pair((0.0,), size=LARGE)
+    camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE, cx_right=380)
+    _, found = Rectify().survey([StereoFrame(1, right, left, camera)])
+    assert "swapped" not in found.sentence
+
+
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"cx": 120.0, "cx_right": 320.0}, "cx of 120 px lies in the outer fifth of 640x480 images: check that"),
+    ({"cy": 400.0}, "cy of 400 px lies in the outer fifth of 640x480 images: check that"),
+    ({"baseline": 12.0}, "the baseline is 12 m: check that it is not given in centimetres; "),
+])  # fmt: skip
+def test_a_calibration_that_hardly_any_camera_has_is_a_warning(changes, words):
+    camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE)
+    frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), camera)
+    plain, sound = Rectify().survey([frame])
+    stage, found = Rectify().survey([replace(frame, camera=replace(camera, **changes))])
+    assert found.sentence.startswith(words)
+    assert (sound.severity, found.severity) == ("note", "warning")
+    assert stage == plain
 
 
 def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
