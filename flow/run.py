@@ -17,7 +17,7 @@ from typing import Any
 from flow.engine import Engine
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.feeder import Event, Feeder
-from flow.findings import Finding, findings
+from flow.findings import NOTE, Finding, finding, findings
 from flow.graph import Graph, Sink
 from flow.ledger import Ledger, Verdict
 from flow.survey import surveyed
@@ -109,7 +109,8 @@ def run(
     """Run an opened log through `graph`; returns the summary.
 
     log: iterates over (log time, stream, item), has `missing` (stream -> why the log cannot provide it) and
-    `refused` (setting of the source -> why the log cannot be read so, whatever the graph needs), and where
+    `refused` (setting of the source -> why the log cannot be read so, whatever the graph needs), `notes()` (stream
+    -> what is to be said of it, as a note of the run), and where
     stages survey it `excerpts` (see flow.survey). What stages found is asked at the end (see flow.findings).
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
@@ -153,11 +154,16 @@ def run(
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
             "surveys": surveys,
-            "findings": findings(graph),
+            "findings": _notes(log, graph) | findings(graph),
             "outputs": [str(outputs[use]) for use in used],
         }
         sinks.close(summary)
     return summary
+
+
+def _notes(log: Any, graph: Graph) -> dict[str, Finding]:
+    """What the log says of the streams that the graph reads."""
+    return {name: finding(NOTE, why) for name, why in log.notes().items() if name in graph.source_streams}
 
 
 class _StoppedError(Exception):

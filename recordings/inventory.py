@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import counted
 from recordings.mcap_index import Lost
 from recordings.mcap_log import McapLog
@@ -19,8 +18,6 @@ from stages.data import StereoCamera, Tilt
 
 SLOP = 5_000_000  # ns between the two images of a frame
 TILT_GAP = 200_000_000  # ns between the tilts around a frame
-
-_STAMPED = {*IMAGES, *TILTS, *POSES, BARE_TILT} - {"geometry_msgs/msg/Quaternion"}  # begin with a header
 
 Stamps = NDArray[np.int64]
 
@@ -43,7 +40,7 @@ def describe(path: Path, source: McapSource) -> dict[str, Any]:
             "end": log.file.end,
             "duration_s": (log.file.end - log.file.start) / 1e9,
             "topics": _topics(log),
-            "unstamped": _unstamped(log),
+            "notes": log.notes(),
             "streams": dict(log.topics),
             "calibration": _calibration(log),
             "frames": {
@@ -99,8 +96,7 @@ def format_description(description: dict[str, Any]) -> str:
     lines += [f"transform: {transform}" for transform in d["transforms"]]
     for why in dict.fromkeys(d["missing"].values()):
         lines.append(f"missing: {', '.join(stream for stream in d['missing'] if d['missing'][stream] == why)}: {why}")
-    for stream in d["unstamped"]:
-        lines.append(f"stamps: {stream}: header stamps are 0: log times are used")
+    lines += [f"note: {stream}: {said}" for stream, said in d["notes"].items()]
     lines += [d["undecodable"]] if d["undecodable"] else []
     lines += [f"damaged: {what}" for what in d["damage"]]
     return "\n".join(lines)
@@ -123,18 +119,6 @@ def _topics(log: McapLog) -> list[dict[str, Any]]:
                 "largest_gap_s": float(gaps.max()) / 1e9 if gaps.size else None,
             }
         )
-    return found
-
-
-def _unstamped(log: McapLog) -> list[str]:
-    """The streams whose messages have the time they were logged for a stamp: in the first one's header it is 0."""
-    found = []
-    for stream, topic in log.topics.items():
-        if log.schema(topic) in _STAMPED:
-            raws = log.file.messages(log.channels(stream))
-            first = next((raw for raw in raws if not isinstance(raw, Lost)), None)
-            if first is not None and len(first.data) >= 12 and not peek_stamp(first.data):
-                found.append(stream)
     return found
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from recordings.decode import camera_model, pixels_of, pose_of, stamp_or, tilt_of
+from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import LogError
 from recordings.mcap_index import Lost, Raw, said
 from recordings.mcap_opening import CAMERAS, Decoder, Opening, peek_stamp
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 LEAD = 1_000_000_000  # ns; tilt and pose are read this much beyond the ends of a range, to interpolate at its frames
 AHEAD = 100_000_000  # ns; so much later a calibration may be logged than the image it is for
 EXCERPT = 4  # frames in an excerpt, so that one that is broken is not missed
+STAMPED = {*IMAGES, *TILTS, *POSES, BARE_TILT} - {"geometry_msgs/msg/Quaternion"}  # begin with a header
+UNSTAMPED = "header stamps are 0: log times are used"
 STREAMS = (*CAMERAS, "inclinometer", "mount", "odometry")
 
 
@@ -177,6 +180,15 @@ class McapLog:
                 item = noted if raw.channel in infos else reading(raw)
                 if item is not None:
                     yield raw.log_time, reading.stream, item
+
+    def notes(self) -> dict[str, str]:
+        """Stream -> what there is to say of it: that its messages, going by the first, have no stamps of their own."""
+        return {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
+
+    def _is_unstamped(self, stream: str, topic: str) -> bool:
+        raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, Lost))
+        first = next(raws, None) if self.schema(topic) in STAMPED else None
+        return first is not None and len(first.data) >= 12 and not peek_stamp(first.data)
 
     def channels(self, stream: str) -> set[int]:
         """The channels that a stream is read from."""

@@ -65,6 +65,17 @@ def test_every_frame_leaves_every_result(result):
     assert not list(result.parent.glob("*.partial"))
 
 
+def test_a_run_notes_once_which_streams_go_by_the_time_of_the_log(traverse, tmp_path, capsys):
+    def unstamped(topic, index, data):
+        return data[:4] + bytes(8) + data[12:] if topic == "/odometry" else data
+
+    log, summary = rewrite(traverse, tmp_path / "log.mcap", unstamped), tmp_path / "out.json"
+    assert roverflow("run", log, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--summary", summary) == 0
+    said = {"severity": "note", "sentence": "header stamps are 0: log times are used"}
+    assert json.loads(summary.read_text())["findings"]["odometry"] == said
+    assert capsys.readouterr().out.count("odometry: header stamps are 0: log times are used") == 1
+
+
 def test_every_known_disparity_says_whether_it_was_measured_or_guessed(result):
     disparities, sources = (
         [message for _, _, message in iter_messages(result, [topic])]

@@ -171,6 +171,9 @@ class Log:
     def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         yield from self.events
 
+    def notes(self) -> dict[str, str]:
+        return {}
+
 
 MS = 1_000_000
 PIPELINE = """

@@ -70,10 +70,10 @@ def test_streams_whose_headers_have_no_stamp_are_told_to_go_by_the_time_of_the_l
         return message
 
     described = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())
-    assert described["unstamped"] == ["left", "odometry"]
-    assert [line for line in format_description(described).splitlines() if line.startswith("stamps: ")] == [
-        "stamps: left: header stamps are 0: log times are used",
-        "stamps: odometry: header stamps are 0: log times are used",
+    assert list(described["notes"]) == ["left", "odometry"]
+    assert [line for line in format_description(described).splitlines() if line.startswith("note: ")] == [
+        "note: left: header stamps are 0: log times are used",
+        "note: odometry: header stamps are 0: log times are used",
     ]
 
 
