@@ -1,32 +1,360 @@
-"""Where the program begins: so little is imported here that an interrupt finds it ready from the first moment on."""
+"""The command line's commands, and the one place where runtime, stages and recordings meet.
+
+Heavy modules are imported by the command that needs them, so that `roverflow --help` answers at once.
+"""
 
 from __future__ import annotations
 
+import argparse
+import json
+import logging
+import math
+import os
+import shlex
+import shutil
 import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
-INTERRUPTED = 130
+from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, size
+from flow.errors import RoverflowError, SinkError, UsageError
+from flow.replay import as_json, product_version, replay
+from flow.report import counted, headline, report, say
+
+COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Do what the command line asks for; returns the exit code."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Do what the command line asks for, and say why where it cannot be done; returns the exit code."""
+    options = parser().parse_args(arguments)
+    logging.basicConfig(level=logging.DEBUG if options.debug else logging.ERROR, format="%(message)s")
+    logging.getLogger("numba").setLevel(logging.WARNING)
     try:
-        from flow.commands import perform
-
-        return perform(arguments)
+        return int(options.command(options))
     except KeyboardInterrupt:
         print("roverflow: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except Exception as error:
+        if options.debug:
+            raise
+        print(f"roverflow: {_sentence(error)}", file=sys.stderr)
+        return _exit_code(error)
 
 
-def program() -> int:
-    """`main` for a process of its own: when it is through, an interrupt ends the interpreter, too, without a word."""
+def _sentence(error: Exception) -> str:
+    if isinstance(error, RoverflowError) or _is_log_error(error):
+        return str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'the output'}: {error.strerror}"
+    if "cannot cache function" in str(error):  # numba, whose own words name neither the reason nor the remedy
+        return "there is no folder to keep compiled kernels in; set NUMBA_CACHE_DIR to one that can be written"
+    return f"internal failure, {type(error).__name__}: {error} (--debug shows where)"
+
+
+def _exit_code(error: Exception) -> int:
+    from recordings.errors import UnwritableError
+
+    if isinstance(error, RoverflowError):
+        return error.exit_code
+    return UNUSABLE if _is_log_error(error) and not isinstance(error, UnwritableError) else FAILED
+
+
+def _is_log_error(error: Exception) -> bool:
+    from recordings.errors import LogError
+
+    return isinstance(error, LogError)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line's grammar: every command brings its own arguments."""
+    top = argparse.ArgumentParser(
+        prog="roverflow",
+        description="Replay rover traverses into terrain one can trust.",
+        epilog="Exit codes: 0 complete; 1 an output or the program failed; 2 usage, or a log that cannot be used; "
+        "3 finished but incomplete; 130 interrupted, with the outputs closed and readable.",
+    )
+    top.add_argument("--version", action="version", version=f"roverflow {product_version()}")
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+    short = "simulate a short traverse, run it and score it against the truth"
+    _command(commands, "demo", short, _demo_arguments, _demo)
+    _command(commands, "run", "replay a log through a pipeline", _run_arguments, _run)
+    _command(commands, "info", "what a log holds, and what is missing", _info_arguments, _info)
+    _command(commands, "graph", "draw the dataflow of a pipeline", _graph_arguments, _graph)
+    truth = "make a synthetic traverse with ground truth topics under /truth"
+    _command(commands, "simulate", truth, _simulate_arguments, _simulate)
+    make = "make a log out of other recordings"
+    kinds = commands.add_parser("import", help=make, description=_titled(make)).add_subparsers(
+        required=True, metavar="KIND"
+    )
+    images = "a folder of rectified left and right images"
+    _command(kinds, "images", images, _import_images_arguments, _import_images)
+    scenes = "a Middlebury scene with its truth; how its camera stood is not told: it is taken to look level from 1 m"
+    _command(kinds, "middlebury", scenes, _import_middlebury_arguments, _import_middlebury)
+    _command(commands, "score", "errors of a result log against ground truth", _score_arguments, _score)
+    maps = "a result log's maps as GeoTIFF, PGM with YAML (map_server), PLY and PNG"
+    _command(commands, "export", maps, _export_arguments, _export)
+    return top
+
+
+def _command(
+    among: Any,
+    name: str,
+    help: str,
+    add_arguments: Callable[[argparse.ArgumentParser], None],
+    work: Callable[[argparse.Namespace], int],
+) -> None:
+    sub: argparse.ArgumentParser = among.add_parser(name, help=help, description=_titled(help))
+    add_arguments(sub)
+    sub.add_argument("--debug", action="store_true", help="show tracebacks")
+    sub.set_defaults(command=work)
+
+
+def _titled(help: str) -> str:
+    return f"{help[0].upper()}{help[1:]}."
+
+
+def _pipeline_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("-p", "--pipeline", default="rover", help="rover, fast, paper, or a YAML file (rover)")
+    sub.add_argument(
+        "--set", action="append", default=[], metavar="STREAM.PARAM=VALUE", help="change a parameter of the pipeline"
+    )
+
+
+def _run_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("log", type=Path, metavar="LOG.mcap")
+    _pipeline_arguments(sub)
+    sub.add_argument("-o", "--out", type=Path, metavar="OUT.mcap", help="result log (LOG-nav.mcap)")
+    recording = sub.add_mutually_exclusive_group()
+    recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
+    recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
+    sub.add_argument("--start", type=seconds, metavar="T", help="begin T seconds after the log's first message")
+    sub.add_argument("--end", type=seconds, metavar="T", help="stop T seconds after the log's first message")
+    sub.add_argument("--workers", type=count, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
+    sub.add_argument("--summary", type=Path, metavar="OUT.json", help="counts, drops, times and verdict as JSON")
+
+
+def _run(options: argparse.Namespace) -> int:
+    out = options.out or options.log.with_name(f"{options.log.stem}-nav.mcap")
+    rrd = None if options.no_rrd else options.rrd or out.with_suffix(".rrd")
+    check_outputs([out, rrd, options.summary], [options.log, Path(options.pipeline)])
+
+    def keep(summary: dict[str, Any]) -> None:
+        if options.summary:
+            options.summary.write_text(json.dumps(summary, indent=2) + "\n")
+
     try:
-        return main()
-    finally:
-        import signal
+        summary = replay(
+            options.log, options.pipeline, out, rrd,
+            overrides=options.set, workers=options.workers, start=options.start, end=options.end,
+        )  # fmt: skip
+    except SinkError as error:
+        say(headline(error.summary))
+        with suppress(OSError):  # the log's own fault is the one to tell
+            keep(as_json(error.summary))
+        raise
+    keep(summary)
+    report(summary)
+    return _exit_code_of(summary)
 
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+def _exit_code_of(summary: dict[str, Any]) -> int:
+    if summary["interrupted"]:
+        return INTERRUPTED
+    return COMPLETE if summary["verdict"] == "COMPLETE" else INCOMPLETE
+
+
+def _info_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("log", type=Path, metavar="LOG.mcap")
+    sub.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _info(options: argparse.Namespace) -> int:
+    from recordings import McapSource
+    from recordings.inventory import describe, format_description
+
+    description = describe(options.log, McapSource())
+    say(json.dumps(description, indent=2) if options.json else format_description(description))
+    return COMPLETE
+
+
+def _graph_arguments(sub: argparse.ArgumentParser) -> None:
+    _pipeline_arguments(sub)
+    sub.add_argument("--format", choices=("text", "mermaid", "svg"), default="text")
+
+
+def _graph(options: argparse.Namespace) -> int:
+    from flow.draw import draw
+    from flow.pipeline import load
+
+    say(draw(load(options.pipeline, options.set), options.format))
+    return COMPLETE
+
+
+def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("out", type=Path, metavar="OUT.mcap")
+    sub.add_argument("--frames", type=count, help="stereo frames (default 12)")
+    sub.add_argument("--seed", type=int, help="another seed, another terrain (1)")
+    sub.add_argument("--size", type=size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
+    sub.add_argument("--rocks", type=magnitude, metavar="K", help="share of ground under rocks (Golombek's k, 0.1)")
+    sub.add_argument("--slope", type=magnitude, metavar="DEG", help="RMS slope of the terrain (4)")
+    sub.add_argument("--tilt-noise", type=magnitude, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
+    scale = "by how much odometry overstates the way (1); 0, with --odometry-turn 0, is exact"
+    sub.add_argument("--odometry-scale", type=float, metavar="PERCENT", help=scale)
+    turn = "drift of odometry's heading, one sigma after 1 m; it grows with the root of the way (0.2)"
+    sub.add_argument("--odometry-turn", type=magnitude, metavar="DEG", help=turn)
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    check_outputs([options.out], [])
+    settings = {"frames": options.frames, "seed": options.seed, "abundance": options.rocks}
+    for name in ("slope", "tilt_noise", "odometry_turn"):
+        degrees = getattr(options, name)
+        settings[name] = None if degrees is None else math.radians(degrees)
+    settings["odometry_scale"] = None if options.odometry_scale is None else options.odometry_scale / 100
+    width, height = options.size
+    simulate(options.out, width=width, height=height, **{k: v for k, v in settings.items() if v is not None})
+    return COMPLETE
+
+
+def simulate(out: Path, **settings: Any) -> None:
+    """Write a simulated traverse; `settings` are fields of `recordings.simulator.Simulation`."""
+    from tqdm import tqdm
+
+    from recordings.simulator import Simulation
+
+    try:
+        simulation = Simulation(**settings)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    with tqdm(total=simulation.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.update(done - bar.n)
+
+        simulation.write(out, progress)
+    say(f"{out}: {counted(simulation.frames, 'frame')} with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
+
+
+def _import_images_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
+    sub.add_argument("out", type=Path, metavar="OUT.mcap")
+    camera = "of the rectified pair: fx, cx, cy (px), baseline (m), and fy, cx_right, width, height if need be"
+    sub.add_argument("--calibration", type=Path, required=True, metavar="CAM.yaml", help=camera)
+    sub.add_argument("--pitch-down", type=float, required=True, metavar="DEG", help="how far the camera looks down")
+    sub.add_argument("--roll", type=float, default=0.0, metavar="DEG", help="camera roll, right side down positive")
+    sub.add_argument("--height", type=float, required=True, metavar="M", help="camera height above the ground")
+    sub.add_argument("--rate", type=float, default=1.0, metavar="HZ", help="frames per second of the log (1)")
+
+
+def _import_images(options: argparse.Namespace) -> int:
+    from recordings.image_log import import_images, pair_images
+
+    left, right = pair_images(options.source)
+    check_outputs([options.out], [options.calibration, *left, *right])
+    frames = import_images(
+        left, right, options.calibration, options.out,
+        pitch_down=options.pitch_down, roll=options.roll, height=options.height, rate=options.rate,
+    )  # fmt: skip
+    say(f"{options.out}: {counted(frames, 'stereo frame')} ({options.out.stat().st_size / 1e6:.1f} MB)")
+    return COMPLETE
+
+
+def _import_middlebury_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("source", type=Path, metavar="SOURCE", help="a scene's folder, or a folder of scenes")
+    sub.add_argument("out", type=Path, metavar="OUT", help="log; of a folder of scenes, folder for their logs")
+
+
+def _import_middlebury(options: argparse.Namespace) -> int:
+    from recordings.errors import LogError
+    from recordings.middlebury import import_scene, logs_of
+
+    scenes, broken = logs_of(options.source, options.out), list[LogError]()
+    for folder, log in scenes:
+        if log != options.out and not options.out.exists():
+            check_outputs([options.out], [])
+            options.out.mkdir()
+        check_outputs([log], list(folder.iterdir()))
+        try:
+            say(f"{log}: {import_scene(folder, log)}")
+        except LogError as error:  # the other scenes can still be had
+            broken.append(error)
+    if broken:
+        more = f" ({len(broken)} of {len(scenes)} scenes could not be imported)" if len(scenes) > 1 else ""
+        raise type(broken[0])(f"{broken[0]}{more}")
+    return COMPLETE
+
+
+def _score_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("result", type=Path, metavar="OUT.mcap")
+    sub.add_argument("--truth", type=Path, metavar="LOG.mcap", help="log with the /truth topics (the result itself)")
+    sub.add_argument("--json", type=Path, metavar="FILE", help="write every figure as JSON")
+
+
+def _score(options: argparse.Namespace) -> int:
+    from recordings.score_table import format_score
+    from recordings.scoring import score
+
+    truth = options.truth or options.result
+    check_outputs([options.json], [options.result, truth])
+    result = score(options.result, truth)
+    if options.json:
+        options.json.write_text(result.to_json() + "\n")
+    say(format_score(result))
+    return INCOMPLETE if result.lost else COMPLETE
+
+
+def _export_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("result", type=Path, metavar="OUT.mcap")
+    sub.add_argument("folder", type=Path, metavar="DIR", help="folder for the files, made where it is missing")
+    sub.add_argument("--frames", action="store_true", help="maps and points of every frame, not the regional map")
+
+
+def _export(options: argparse.Namespace) -> int:
+    from recordings.export.bundle import export
+
+    if options.folder.exists() and not options.folder.is_dir():
+        raise UsageError(f"{options.folder} is a file; give the name of a folder")
+    if options.folder.exists() and any(options.folder.iterdir()):
+        raise UsageError(f"{options.folder} is not empty, and maps of two runs must not mix; choose another folder")
+    files = export(options.result, options.folder, options.frames)
+    size = sum(file.stat().st_size for file in files)
+    say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")
+    return COMPLETE
+
+
+def _demo_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder for the results (demo)")
+    sub.add_argument("--frames", type=count, default=8, metavar="N", help="frames to simulate (8)")
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from recordings.export.bundle import export
+    from recordings.pictures import draw
+    from recordings.score_table import format_score
+    from recordings.scoring import score
+
+    folder = options.out
+    check_demo(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
+    check_outputs([log, out, rrd, folder / "summary.json"], [])
+    say("Simulating a traverse ...")
+    simulate(log, frames=options.frames)
+    say("Replaying it through the pipeline 'rover' (a first run compiles, too, and its frames/s count that) ...")
+    summary = replay(log, "rover", out, rrd, workers=os.cpu_count() or 1)
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    report(summary)
+    say(f"\n{format_score(score(out, log))}")
+    shutil.rmtree(folder / "maps", ignore_errors=True)
+    pictures, maps = draw(out, folder / "pictures"), export(out, folder / "maps")
+    say(f"\n{len(pictures)} pictures in {folder / 'pictures'}, {len(maps)} files of the map in {folder / 'maps'}")
+    say(f"the timeline: rerun {shlex.quote(str(rrd))}")
+    return _exit_code_of(summary)
 
 
 if __name__ == "__main__":
+    from flow.program import program
+
     sys.exit(program())

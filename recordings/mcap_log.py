@@ -187,7 +187,7 @@ class McapLog:
 
     def _is_unstamped(self, stream: str, topic: str) -> bool:
         raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, Lost))
-        first = next(raws, None) if self.schema(topic) in STAMPED else None
+        first = next(raws, None) if self._opening.schemas[topic] in STAMPED else None
         return first is not None and len(first.data) >= 12 and not peek_stamp(first.data)
 
     def channels(self, stream: str) -> set[int]:

@@ -325,14 +325,14 @@ AT_EXIT = "atexit.register(os.kill, os.getpid(), signal.SIGINT)"
 
 @pytest.mark.parametrize("moment", [ON_IMPORT.format("flow.report"), ON_IMPORT.format("rerun"), AT_EXIT])
 def test_an_interrupt_while_the_program_begins_or_ends_is_no_traceback(moment):
-    code = f"import atexit, os, signal, sys\n{moment}\nfrom flow.cli import program\nsys.exit(program())"
+    code = f"import atexit, os, signal, sys\n{moment}\nfrom flow.program import program\nsys.exit(program())"
     done = subprocess.run([sys.executable, "-c", code, "graph"], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode in (130, -signal.SIGINT)  # to a shell both are 130
     assert done.stderr == ("" if moment == AT_EXIT else "roverflow: interrupted\n")
 
 
 def test_help_imports_nothing_heavy():
-    code = "import sys; from flow.commands import parser; parser().format_help(); print('numpy' in sys.modules)"
+    code = "import sys; from flow.cli import parser; parser().format_help(); print('numpy' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "False"
 
 

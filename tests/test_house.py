@@ -10,7 +10,7 @@ from flow.pipeline import load
 
 ROOT = Path(__file__).parent.parent
 ROOMS = {"flow", "stages", "recordings"}
-COMPOSITION_ROOT = ROOT / "flow" / "commands.py"
+COMPOSITION_ROOT = ROOT / "flow" / "cli.py"
 
 
 def imported(file):
