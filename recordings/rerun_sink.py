@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from resource import RLIM_INFINITY, RLIMIT_FSIZE, getrlimit
 from shutil import disk_usage
 from typing import Any
 
@@ -75,7 +76,7 @@ class RerunSink:
 
     def _check_room(self) -> None:
         """Raise LogError before the disk is full: rerun's writer does not return from a full one."""
-        if disk_usage(self._partial.parent).free < RESERVE:
+        if _room(self._partial) < RESERVE:
             raise unwritable(self._path, f"less than {RESERVE >> 20} MB are free")
 
     def _begin(self) -> None:
@@ -246,3 +247,11 @@ def _document(verdict: str, *tables: Mapping[str, Any]) -> rr.TextDocument:
     ]
     text = "\n".join([f"# {verdict}", "", "| | |", "|---|---|", *rows])
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+
+
+def _room(file: Path) -> int:
+    """By how many bytes a file may still grow: what the disk has, and what a process is allowed to write into one."""
+    free, (allowed, _) = disk_usage(file.parent).free, getrlimit(RLIMIT_FSIZE)
+    if allowed == RLIM_INFINITY:
+        return free
+    return min(free, allowed - (file.stat().st_size if file.exists() else 0))
