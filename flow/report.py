@@ -15,8 +15,10 @@ def say(text: str) -> None:
     """Print to stdout; a reader that has left does not stop the work."""
     try:
         print(text, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or what is left would fail again at the end
+        if not isinstance(error, BrokenPipeError):
+            raise
 
 
 def headline(summary: dict[str, Any]) -> str:

@@ -6,11 +6,13 @@ import resource
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 import rerun as rr
 
+from recordings import rerun_sink
 from recordings.desk import CLOCK, FRAME
 from recordings.errors import LogError
 from recordings.rerun_sink import RerunSink
@@ -147,20 +149,26 @@ def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
-    """Told by rerun only to its log: the sink has to find out."""
+@pytest.mark.parametrize("reserve", [0, rerun_sink.RESERVE])
+def test_a_full_disk_is_an_error_and_leaves_nothing(
+    tmp_path: Path, reserve: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is foreseen; and where it is not, told by rerun only to its log, the sink finds out."""
+    monkeypatch.setattr(rerun_sink, "RESERVE", reserve)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = RerunSink()
     sink.open(tmp_path / "run.rrd", STREAMS, {})
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
     try:
-        for n in range(3):
-            sink.write(Record(START + n, scene(START + n)))
         with pytest.raises(LogError, match="cannot write"):
+            for n in range(3):
+                sink.write(Record(START + n, scene(START + n)))
             sink.close({"verdict": "COMPLETE"})
     finally:
+        with suppress(LogError):
+            sink.close({"verdict": "INCOMPLETE"})
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.glob("*.partial"))
 
 
 def test_it_wants_what_it_has_a_picture_for() -> None:
