@@ -149,6 +149,12 @@ def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def fill_and_close(sink: RerunSink) -> None:
+    for n in range(3):
+        sink.write(Record(START + n, scene(START + n)))
+    sink.close({"verdict": "COMPLETE"})
+
+
 @pytest.mark.parametrize("reserve", [0, rerun_sink.RESERVE])
 def test_a_full_disk_is_an_error_and_leaves_nothing(
     tmp_path: Path, reserve: int, monkeypatch: pytest.MonkeyPatch
@@ -161,9 +167,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
     try:
         with pytest.raises(LogError, match="cannot write"):
-            for n in range(3):
-                sink.write(Record(START + n, scene(START + n)))
-            sink.close({"verdict": "COMPLETE"})
+            fill_and_close(sink)
     finally:
         with suppress(LogError):
             sink.close({"verdict": "INCOMPLETE"})
