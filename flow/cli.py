@@ -1,4 +1,4 @@
-"""The command line's commands, and the one place where runtime, stages and recordings meet.
+"""The command line, and the one place where runtime, stages and recordings meet.
 
 Heavy modules are imported by the command that needs them, so that `roverflow --help` answers at once.
 """

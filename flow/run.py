@@ -110,8 +110,8 @@ def run(
 
     log: iterates over (log time, stream, item), has `missing` (stream -> why the log cannot provide it) and
     `refused` (setting of the source -> why the log cannot be read so, whatever the graph needs), `notes()` (stream
-    -> what is to be said of it, as a note of the run), and where
-    stages survey it `excerpts` (see flow.survey). What stages found is asked at the end (see flow.findings).
+    -> what is to be said of it, as a note of the run), and where stages survey it `excerpts` (see flow.survey). What
+    stages found is asked at the end (see flow.findings).
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
     closed and readable by then. In the summary, start_seconds are those of wall_seconds that the survey and the opening

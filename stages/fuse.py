@@ -21,18 +21,17 @@ from stages.overlap import fit_plane
 from stages.stage import Finding, Severity, Stage, counted, parameter
 from stages.voxelise import Voxelise
 
-# What is remembered of a cell, 30 bytes. weight: sum of 1 / variance over its frames, zero where nothing is known;
-# best: the smallest standard deviation among them; below, above: from the height to the cell's extremes; first, last:
-# ms since the first frame; numbers stop at the largest of their type. hidden: 1 where nothing is known, but a frame
-# looked and could not see it, and then height is what it must lie below; doubt: by how much the newest frame
-# contradicts it, where that is not settled.
+# What is remembered of a cell, 29 bytes. weight: sum of 1 / variance over its frames; best: the smallest standard
+# deviation among them; below, above: from the height to the cell's extremes; first, last: ms since the first frame;
+# numbers stop at the largest of their type; doubt: by how much the newest frame contradicts it, where that is not
+# settled. Where no frame saw it, but one looked, weight is HIDDEN and height what it must lie below.
 CELL = np.dtype(
     [
         ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u2"),
-        ("first", "u4"), ("last", "u4"), ("frames", "u2"), ("contradictions", "u1"),
-        ("hidden", "u1"), ("doubt", "f2"),
+        ("first", "u4"), ("last", "u4"), ("frames", "u2"), ("contradictions", "u1"), ("doubt", "f2"),
     ]
 )  # fmt: skip
+HIDDEN = -1.0
 MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that no map ends where they still change
 _MS = 1_000_000
 LARGEST_JUMP = 5.0  # standard deviations, from one frame to the next, of what joins them to the map
@@ -267,7 +266,7 @@ class Fuse(Stage):
         for name in ("frames", "contradictions"):
             layers[name] = cells[name].astype(np.float32)
         if self._map.hides:
-            hidden = cells["hidden"] == 1
+            hidden = cells["weight"] == HIDDEN
             layers["occluded"] = np.where(known, 0, np.where(hidden, 1, np.nan)).astype(np.float32)
             layers["ceiling"] = np.where(hidden, cells["height"], np.nan).astype(np.float32)
         origin = (col * self.resolution, row * self.resolution)
@@ -283,8 +282,8 @@ def _sum(numbers: Array, more: Array | int) -> Array:
 def _below(cells: Array, ceiling: Array) -> Array:
     """Hidden cells (n,) that lie below the heights `ceiling`, too."""
     cells = cells.copy()
-    cells["height"] = np.where(cells["hidden"] == 1, np.minimum(cells["height"], ceiling), ceiling)
-    cells["hidden"] = 1
+    cells["height"] = np.where(cells["weight"] == HIDDEN, np.minimum(cells["height"], ceiling), ceiling)
+    cells["weight"] = HIDDEN
     return cells
 
 

@@ -134,8 +134,8 @@ class CameraMotion:
     camera: the camera in the camera of the frame that began its segment, None where the images do not tell; segment:
     counts from 1, 0 before anything was seen; a new one begins wherever tracking was lost, and nothing ties it to the
     one before; covariance: (6, 6) of `camera`, of position (m) and of a turn (rad) about the fixed axes, which grows
-    from step to step; inliers: features that agree on the last step; lost: what to say where tracking
-    was lost at this frame, else empty.
+    from step to step; inliers: features that agree on the last step; lost: what to say where tracking was lost at this
+    frame, else empty.
     """
 
     stamp: int

@@ -147,6 +147,24 @@ def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it was not foreseen, rerun tells it only to its log: the sink has to find out."""
+    monkeypatch.setattr("recordings.rerun_sink._room", lambda file: RESERVE)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    sink = RerunSink()
+    sink.open(tmp_path / "run.rrd", STREAMS, {})
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        for n in range(3):
+            sink.write(Record(START + n, scene(START + n)))
+        with pytest.raises(LogError, match="cannot write"):
+            sink.close({"verdict": "COMPLETE"})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_full_disk_is_foreseen_and_the_recording_ends_in_what_room_is_left(tmp_path: Path) -> None:
     """rerun's writer does not return from a disk that is full, or a file that may grow no more."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -18,15 +18,27 @@ census(np.arange(120, dtype=np.uint8).reshape(3, 40) // 2, planes)
 print(planes[:, :, :40].sum())
 """
 
+PLANES = """
+import numpy as np
+from stages.kernels.planes import fit_planes
+random = np.random.default_rng(0)
+y, x = np.mgrid[:120, :160]
+labels = (y // 11 * 15 + x // 11).astype(np.int32)
+disparity = random.normal(0, 0.3, y.shape) + 0.01 * x + 0.1 * y + 3 * (random.random(y.shape) < 0.2)
+weights = random.random(y.shape).astype(np.float32)
+found = fit_planes(disparity.astype(np.float32), labels, labels.max() + 1, 0.5, 16, 7, weights)
+print(found.coefficients.tobytes().hex())
+"""
+
 
 @pytest.fixture
 def run(tmp_path):
     shutil.copytree(ROOT / "stages", tmp_path / "stages", ignore=shutil.ignore_patterns("__pycache__"))
 
-    def call():
+    def call(script=SCRIPT):
         environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
         done = subprocess.run(
-            [sys.executable, "-c", SCRIPT], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+            [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
         )
         return done.stdout, done.stderr
 
@@ -46,3 +58,9 @@ def test_kernels_are_announced_once_kept_and_made_again_after_a_change_anywhere(
     after, said = run()
     assert after != first
     assert "compiling kernels" in said
+
+
+def test_what_was_compiled_just_now_gives_the_same_bits_as_what_is_loaded(run):
+    first, said = run(PLANES)
+    assert "compiling kernels" in said
+    assert run(PLANES) == (first, "")

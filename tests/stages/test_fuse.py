@@ -250,5 +250,5 @@ def test_a_kilometre_of_20_metres_width_fits_into_500_megabytes(metres):
     done = subprocess.run([sys.executable, "-c", TRACK, str(metres)], capture_output=True, text=True, check=True)
     cells, map_size, process_size = (float(value) for value in done.stdout.split())
     assert cells == pytest.approx(metres * 20 / 0.05**2, rel=0.01)
-    assert map_size < 0.28 * metres + 2
+    assert map_size < 0.26 * metres + 2
     assert process_size < 500 - 0.26 * (1000 - metres)
