@@ -107,7 +107,7 @@ class Canvas:
         pixels = paint.eight_bit(pixels)
         stored = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
         _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
-        self.log(path, rr.EncodedImage(contents=blob.tobytes(), media_type="image/jpeg"), place)
+        self.log(path, rr.EncodedImage(contents=blob, media_type="image/jpeg"), place)
 
     def labels(self, path: str, codes: Array, legend: Mapping[int, tuple[str, paint.Rgb]], place: Place) -> None:
         """A label image (H, W); its names stand above it and appear on hover."""
@@ -173,7 +173,7 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     _, blob = cv2.imencode(".png", steps, FAST_PNG)
     limit = paint.disparity_limit(disparity.pixels)
     image = rr.EncodedDepthImage(
-        blob.tobytes(), media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
+        blob, media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
         depth_range=(0.0, limit * DISPARITY_STEPS),
     )  # fmt: skip
     canvas.log(f"{path}/pixels", image, Place(Panel.DISPARITY, f"{path}/pixels", path))
@@ -186,7 +186,7 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     if disparity.segments is not None:
         edges = paint.segment_edges(disparity.segments).astype(np.uint8) * 255
         _, blob = cv2.imencode(".png", edges, [*FAST_PNG, cv2.IMWRITE_PNG_BILEVEL, 1])
-        overlay = rr.EncodedImage(contents=blob.tobytes(), media_type="image/png", opacity=0.4, draw_order=10.0)
+        overlay = rr.EncodedImage(contents=blob, media_type="image/png", opacity=0.4, draw_order=10.0)
         place = Place(Panel.SUPERPIXELS, f"{path}/superpixels", f"{path}: superpixels")
         canvas.log(place.path, overlay, place)
     shares = (f"{percent[kind]:.0f} % {kind.name.lower()}" for kind in made)

@@ -26,6 +26,7 @@ from recordings.ros2 import (
     source_image,
     transform_message,
 )
+from recordings.ros2_writer import COMPRESSIONS
 from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
 
 _BUILDERS: dict[type, Callable[[Any], Any]] = {
@@ -52,7 +53,8 @@ class McapSink:
 
     results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each; where each pixel of
     a Disparity comes from goes to /nav/<stream>/source, why each cell of a NavigationMap has its state to
-    /nav/<stream>/reason. also: further streams, for those who would keep the results as they are.
+    /nav/<stream>/reason. also: further streams, for those who would keep the results as they are. compression: of the
+    log, lz4, zstd or none; zstd takes a fifth less room than lz4, and four times as long.
     """
 
     results: tuple[str, ...] = (
@@ -60,11 +62,16 @@ class McapSink:
     )  # fmt: skip
 
     also: tuple[str, ...] = ()
+    compression: str = "lz4"
 
     suffix = ".mcap"
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
     _writer: Ros2Writer | None = field(default=None, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.compression not in COMPRESSIONS:
+            raise ValueError(f"McapSink.compression must be {', '.join(COMPRESSIONS)}, not {self.compression}")
 
     def wants(self, stream: str, kind: type) -> bool:
         """Whether a stream of data of type `kind` is to be written. Raises LogError where it is but cannot be."""
@@ -81,7 +88,7 @@ class McapSink:
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: what it was made from and with, kept as its metadata record "roverflow"."""
         self._last_stamp = None
-        self._writer = Ros2Writer(Path(path), keep=True)
+        self._writer = Ros2Writer(Path(path), keep=True, compression=self.compression)
         self._writer.metadata("roverflow", about)
 
     def write(self, record: FrameRecord) -> None:

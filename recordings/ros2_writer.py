@@ -20,6 +20,7 @@ from recordings.ros2_types import TYPES
 from recordings.whole_file import give_name, temporary_name, unwritable
 
 LARGE = 64 * 1024  # bytes; from here a message gets a chunk of its own
+COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
 LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are 32 bits, with a sign
 
 
@@ -27,10 +28,10 @@ class Ros2Writer:
     """Writes messages as `ros2msg` / CDR, log time = publish time = stamp. Same calls, same bytes.
 
     Use as a context manager: leaving it closes the log, leaving it by an exception discards it. keep: if the place is
-    full, or fails otherwise, keep under another name what it holds by then.
+    full, or fails otherwise, keep under another name what it holds by then. compression: lz4, zstd or none.
     """
 
-    def __init__(self, path: Path, keep: bool = False) -> None:
+    def __init__(self, path: Path, keep: bool = False, compression: str = "zstd") -> None:
         self.path, self._keep = Path(path), keep
         self._partial = temporary_name(self.path)
         self._schemas: dict[str, int] = {}
@@ -40,7 +41,7 @@ class Ros2Writer:
             self._file = self._partial.open("wb")
         except OSError as error:
             raise self._unwritable(error) from error
-        self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=CompressionType.ZSTD)
+        self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=COMPRESSIONS[compression])
         self._writer.start(profile="ros2", library="roverflow")
 
     @property

@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 SIZES = {"1280x960": 192, "640x480": 96}
-FRAMES = 16
+FRAMES = 30
 
 
 def main() -> None:

@@ -77,8 +77,8 @@ SUMMARY = {
 }  # fmt: skip
 
 
-def write(path: Path, seconds: float = 0.1) -> Path:
-    sink = McapSink()
+def write(path: Path, seconds: float = 0.1, compression: str = "lz4") -> Path:
+    sink = McapSink(compression=compression)
     sink.open(path, STREAMS, ABOUT)
     sink.write(Record(START, items(START), seconds={"match": seconds}))
     lost = (Entry("elevation_map", START + 100),)
@@ -162,6 +162,18 @@ def test_the_log_says_what_it_was_made_from_and_how_the_run_ended(tmp_path: Path
 def test_runs_that_differ_in_their_timing_only_give_the_same_bytes(tmp_path: Path) -> None:
     one, other = write(tmp_path / "a.mcap", 0.1), write(tmp_path / "b.mcap", 2.7)
     assert hashlib.sha256(one.read_bytes()).digest() == hashlib.sha256(other.read_bytes()).digest()
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd", "none"])
+def test_the_log_is_compressed_as_asked_for_and_holds_the_same(tmp_path: Path, compression: str) -> None:
+    log = write(tmp_path / "out.mcap", compression=compression)
+    with log.open("rb") as file:
+        used = {index.compression for index in make_reader(file).get_summary().chunk_indexes}
+    assert used == {"" if compression == "none" else compression}
+    sent = [(topic, stamp, repr(message)) for topic, stamp, message in iter_messages(write(tmp_path / "usual.mcap"))]
+    assert [(topic, stamp, repr(message)) for topic, stamp, message in iter_messages(log)] == sent
+    with pytest.raises(ValueError, match=r"compression must be lz4, zstd, none, not gzip"):
+        McapSink(compression="gzip")
 
 
 def test_a_run_without_frames_leaves_a_readable_log(tmp_path: Path) -> None:
