@@ -121,14 +121,18 @@ def _fit(  # type: ignore[no-untyped-def]
             continue
         # Coordinates from the segment's first pixel keep float32 sums exact enough.
         origin_y, origin_x = index[start[s]] // width, index[start[s]] % width
-        n = 0
+        n, down, row = 0, 0, origin_y * width + origin_x
         for j in range(start[s], start[s + 1]):
-            d = flat[index[j]]
+            at = index[j]
+            while at >= row + width - origin_x:
+                down += 1
+                row += width
+            d = flat[at]
             if d == d:
-                points[0, n] = index[j] % width - origin_x
-                points[1, n] = index[j] // width - origin_y
+                points[0, n] = at - row
+                points[1, n] = down
                 points[2, n] = d
-                points[3, n] = flat_weights[index[j]] if weighted else F32(1)
+                points[3, n] = flat_weights[at] if weighted else F32(1)
                 n += 1
         valid_share[s] = F32(n / total)
         if n < LEAST_SUPPORT:

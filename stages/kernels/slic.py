@@ -1,7 +1,7 @@
 """SLIC superpixels (Achanta et al., 2012; section 3.2 of the paper): k-means over colour and position.
 
-Each pixel looks only at the nine centres around its own grid cell, so all pixels of a cell share their candidates and
-the inner loop runs over a short row of pixels with one centre in registers. The centres settle at half resolution, at
+Each pixel looks only at the nine centres around its own grid cell. Those of a grid row are laid out as rows of pixels
+once, so that the inner loop runs over whole rows of the image without a branch. The centres settle at half resolution, at
 a quarter of the work; the last assignment is of the full image. What is not connected then is found by runs of pixels
 in a row, not pixel by pixel.
 """
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.compiled import fast_kernel, kernel
+from stages.kernels.compiled import fast_kernel, fast_part, kernel
 from stages.kernels.halves import AtOnce, in_turn, pairs
 from stages.kernels.scaling import halved
 from stages.kernels.union import join, root
@@ -22,6 +22,8 @@ from stages.kernels.workspace import Workspaces
 
 F32 = np.float32
 _workspaces = Workspaces()
+LIGHTNESS = F32(100 / 255)  # of L in 0..100, to what 8 bits hold of it
+FAR = F32(1e30)
 LEAST_CELL = 8  # px; where grid cells are smaller, the centres settle at full resolution
 
 
@@ -40,112 +42,131 @@ def superpixels(
     grid = max(1, round(height / step)), max(1, round(width / step))
     smallest = int(0.25 * height * width / count)
     with pairs(threads) as both, _workspaces.one() as space:
-        space.reserve(28 * height * width + 4096)
-        colour = _colour_planes(image, space.array((3, height, width), np.float32), both)
+        space.reserve(16 * height * width + 4096)
+        colour = _colours(image, both)
         scale = 2 if min(height // grid[0], width // grid[1]) >= LEAST_CELL and min(height, width) > 1 else 1
-        small = colour
-        if scale == 2:
-            half = halved(image[: height // 2 * 2, : width // 2 * 2])
-            small = _colour_planes(half, space.array((3, *half.shape[:2]), np.float32), both)
+        small = colour if scale == 1 else _colours(halved(image[: height // 2 * 2, : width // 2 * 2]), both)
         centres = _grid_centres(small, *grid)
         for _ in range(iterations - 1):
             _move(small, centres, grid, compactness / step * scale, both)
         if scale == 2:
             centres[:, 3:] = centres[:, 3:] * 2 + F32(0.5)
-        labels = _labels(colour, centres, grid, compactness / step, both)[0]
+        labels = np.empty((height, width), np.int32)
+        _label(colour, centres, grid, compactness / step, labels, both)
         total = connect(labels, smallest, space.array((3, height * width), np.int32), both)
     return labels, total
 
 
+def _colours(image: Array, both: AtOnce = in_turn) -> Array:
+    """The image in CIELAB with 8 bits each, (H, W, 3) uint8; a gray one as it is, (H, W, 1)."""
+    if image.ndim == 2:
+        return image[..., None]
+    colour, middle = np.empty_like(image), image.shape[0] // 2
+    both(
+        lambda: cv2.cvtColor(image[:middle], cv2.COLOR_RGB2LAB, dst=colour[:middle]) if middle else None,
+        lambda: cv2.cvtColor(image[middle:], cv2.COLOR_RGB2LAB, dst=colour[middle:]),
+    )
+    return colour
+
+
+def _grid_centres(colour: Array, rows: int, cols: int) -> Array:
+    """Start centres (rows * cols, 5) float32: three colours (L in 0..100; of gray the second and third 0), y, x."""
+    height, width, channels = colour.shape
+    y, x = np.meshgrid((np.arange(rows) + 0.5) * height / rows, (np.arange(cols) + 0.5) * width / cols, indexing="ij")
+    centres = np.zeros((rows * cols, 5), np.float32)
+    centres[:, :channels] = colour[y.astype(int).ravel(), x.astype(int).ravel()]
+    centres[:, 0] *= LIGHTNESS
+    centres[:, 3], centres[:, 4] = y.ravel(), x.ravel()
+    return centres
+
+
 def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: AtOnce) -> None:
     """One k-means step: `centres` becomes the means of what is nearest to each."""
-    sums = _labels(colour, centres, grid, weight, both)[1]
+    sums = _label(colour, centres, grid, weight, np.empty((0, 0), np.int32), both)
     seen = sums[:, 5] > 0
     centres[seen] = sums[seen, :5] / sums[seen, 5:]
 
 
-def _labels(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: AtOnce) -> tuple[Array, Array]:
-    """The nearest centre of each pixel, (H, W) int32, and the sums of `_assign`."""
+def _label(
+    colour: Array, centres: Array, grid: tuple[int, int], weight: float, labels: Array, both: AtOnce = in_turn
+) -> Array:
+    """`_assign` for all rows of the grid; returns the sums."""
     rows, cols = grid
-    labels = np.empty(colour.shape[1:], np.int32)
     upper, lower = np.zeros((2, rows * cols, 6))
     square, middle = F32(weight**2), rows // 2
     both(
         lambda: _assign(colour, centres, rows, cols, square, 0, middle, labels, upper),
         lambda: _assign(colour, centres, rows, cols, square, middle, rows, labels, lower),
     )
-    return labels, upper + lower
-
-
-def _colour_planes(image: Array, planes: Array, both: AtOnce = in_turn) -> Array:
-    """`planes`, (3, H, W) float32, with the image in CIELAB (L in 0..100); a gray image has a = b = 0."""
-    middle = image.shape[0] // 2
-    both(
-        lambda: _fill_colour_planes(image[:middle], planes[:, :middle]),
-        lambda: _fill_colour_planes(image[middle:], planes[:, middle:]),
-    )
-    return planes
-
-
-def _fill_colour_planes(image: Array, planes: Array) -> None:
-    if image.size == 0:
-        return
-    channels = [image] if image.ndim == 2 else cv2.split(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
-    planes[len(channels) :] = 0
-    for plane, channel, scale in zip(planes, channels, (100 / 255, 1.0, 1.0), strict=False):
-        np.multiply(channel, F32(scale), out=plane)
-
-
-def _grid_centres(colour: Array, rows: int, cols: int) -> Array:
-    """Start centres (rows * cols, 5) float32: three colours, y, x."""
-    _, height, width = colour.shape
-    y, x = np.meshgrid((np.arange(rows) + 0.5) * height / rows, (np.arange(cols) + 0.5) * width / cols, indexing="ij")
-    centres = np.empty((rows * cols, 5), np.float32)
-    centres[:, :3] = colour[:, y.astype(int).ravel(), x.astype(int).ravel()].T
-    centres[:, 3], centres[:, 4] = y.ravel(), x.ravel()
-    return centres
+    return upper + lower
 
 
 @fast_kernel
 def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, labels, sums):  # type: ignore[no-untyped-def]
-    """Label the pixels of grid rows first_row to end_row with the nearest of nine centres.
+    """Find the nearest of nine centres for the pixels of grid rows first_row to end_row.
 
-    sums: (rows * cols, 6) float64, to which colour, y, x and count of each label are added.
+    They become the `labels`, (H, W) int32; or, where those are empty, colour, y, x and count of each centre's pixels
+    are added to `sums`, (rows * cols, 6) float64.
     """
-    _, height, width = colour.shape
-    first, second, third = colour[0], colour[1], colour[2]
-    best = np.empty(width, np.float32)
-    nearest = np.empty(width, np.int32)
+    height, width, channels = colour.shape
+    # Arrays of their own, not rows of one: so the compiler sees that they do not overlap.
+    first, second, third = np.zeros(width, np.float32), np.zeros(width, np.float32), np.zeros(width, np.float32)
+    least, nearest, col = np.empty(width, np.float32), np.empty(width, np.int32), np.empty(width, np.int32)
+    for k in range(cols):
+        col[k * width // cols : (k + 1) * width // cols] = k
+    candidates = np.empty((9, 5, width), np.float32)
     for row in range(first_row, end_row):
+        for place in range(9):
+            _lay_out(centres, rows, cols, row + place // 3 - 1, place % 3 - 1, position_weight, candidates[place])
         for y in range(row * height // rows, (row + 1) * height // rows):
-            for col in range(cols):
-                start, stop = col * width // cols, (col + 1) * width // cols
-                n = stop - start
-                a, b, c = first[y, start:stop], second[y, start:stop], third[y, start:stop]
-                distances, winners = best[:n], nearest[:n]
-                distances[:] = F32(1e30)
-                for near_row in range(max(0, row - 1), min(rows, row + 2)):
-                    for near_col in range(max(0, col - 1), min(cols, col + 2)):
-                        k = np.int32(near_row * cols + near_col)
-                        ka, kb, kc = centres[k, 0], centres[k, 1], centres[k, 2]
-                        dy = F32(y) - centres[k, 3]
-                        dy2 = dy * dy * position_weight
-                        x0 = F32(start) - centres[k, 4]
-                        for i in range(n):
-                            da, db, dc, dx = a[i] - ka, b[i] - kb, c[i] - kc, x0 + F32(np.int32(i))
-                            d = da * da + db * db + dc * dc + dx * dx * position_weight + dy2
-                            closer = d < distances[i]
-                            distances[i] = d if closer else distances[i]
-                            winners[i] = k if closer else winners[i]
-                for i in range(n):
-                    k = winners[i]
-                    labels[y, start + i] = k
-                    sums[k, 0] += a[i]
-                    sums[k, 1] += b[i]
-                    sums[k, 2] += c[i]
-                    sums[k, 3] += y
-                    sums[k, 4] += start + i
-                    sums[k, 5] += 1
+            for x in range(width):
+                first[x] = F32(colour[y, x, 0]) * LIGHTNESS
+            if channels == 3:
+                for x in range(width):
+                    second[x] = colour[y, x, 1]
+                    third[x] = colour[y, x, 2]
+            least[:] = FAR
+            for place in range(9):
+                beside = np.int32((place // 3 - 1) * cols + place % 3 - 1)
+                for x in range(width):
+                    da, db = first[x] - candidates[place, 0, x], second[x] - candidates[place, 1, x]
+                    dc, dy = third[x] - candidates[place, 2, x], F32(y) - candidates[place, 3, x]
+                    d = da * da + db * db + dc * dc + dy * dy * position_weight + candidates[place, 4, x]
+                    closer = d < least[x]
+                    least[x] = d if closer else least[x]
+                    nearest[x] = beside if closer else nearest[x]
+            for x in range(width):
+                nearest[x] += row * cols + col[x]
+            if labels.size:
+                labels[y] = nearest
+                continue
+            for x in range(width):
+                k = nearest[x]
+                sums[k, 0] += first[x]
+                sums[k, 1] += second[x]
+                sums[k, 2] += third[x]
+                sums[k, 3] += y
+                sums[k, 4] += x
+                sums[k, 5] += 1
+
+
+@fast_part
+def _lay_out(centres, rows, cols, row, beside, position_weight, laid):  # type: ignore[no-untyped-def]
+    """Each pixel's candidate in grid row `row`, `beside` its own column: laid, (5, W), becomes three colours, y, and
+    the weighted square of the distance along x; `FAR` where there is no such centre."""
+    width = laid.shape[1]
+    for col in range(cols):
+        start, stop = col * width // cols, (col + 1) * width // cols
+        if 0 <= row < rows and 0 <= col + beside < cols:
+            k = row * cols + col + beside
+            for i in range(4):
+                laid[i, start:stop] = centres[k, i]
+            for x in range(start, stop):
+                dx = F32(x) - centres[k, 4]
+                laid[4, x] = dx * dx * position_weight
+        else:
+            laid[:4, start:stop] = 0
+            laid[4, start:stop] = FAR
 
 
 def connect(labels: Array, smallest: int, scratch: Array, both: AtOnce = in_turn) -> int:
@@ -248,7 +269,10 @@ def _write(labels, first, end, rows, ends, parent, number):  # type: ignore[no-u
 
 def assign_reference(colour: Array, centres: Array, rows: int, cols: int, position_weight: float) -> Array:
     """What `_assign` labels, in plain numpy: the nearest of the nine centres around each pixel's grid cell."""
-    _, height, width = colour.shape
+    height, width, channels = colour.shape
+    values = np.zeros((height, width, 3))
+    values[..., :channels] = colour
+    values[..., 0] = colour[..., 0] * LIGHTNESS
     y, x = np.mgrid[:height, :width]
     row_edges = np.arange(1, rows) * height // rows
     col_edges = np.arange(1, cols) * width // cols
@@ -260,7 +284,7 @@ def assign_reference(colour: Array, centres: Array, rows: int, cols: int, positi
             inside = (r >= 0) & (r < rows) & (c >= 0) & (c < cols)
             k = np.where(inside, r * cols + c, 0)
             centre = centres[k].astype(np.float64)
-            distance = ((colour.transpose(1, 2, 0) - centre[..., :3]) ** 2).sum(axis=2)
+            distance = ((values - centre[..., :3]) ** 2).sum(axis=2)
             distance += ((y - centre[..., 3]) ** 2 + (x - centre[..., 4]) ** 2) * position_weight
             closer = inside & (distance < best)
             best[closer], labels[closer] = distance[closer], k[closer]
