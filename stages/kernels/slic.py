@@ -1,9 +1,9 @@
 """SLIC superpixels (Achanta et al., 2012; section 3.2 of the paper): k-means over colour and position.
 
 Each pixel looks only at the nine centres around its own grid cell. Those of a grid row are laid out as rows of pixels
-once, so that the inner loop runs over whole rows of the image without a branch. The centres settle at half resolution, at
-a quarter of the work; the last assignment is of the full image. What is not connected then is found by runs of pixels
-in a row, not pixel by pixel.
+once, so that the inner loop runs over whole rows of the image without a branch. The centres settle at half resolution,
+at a quarter of the work; the last assignment is of the full image. What is not connected then is found by runs of
+pixels in a row, not pixel by pixel.
 """
 
 from __future__ import annotations
