@@ -2,7 +2,7 @@
 
 Run as `python -m tests.bench.matching`. Times are medians of interleaved rounds, so that whatever else the machine does
 slows all of them; every matcher removes speckles and checks left against right. The pair is a Middlebury scene enlarged
-to 1280x960 where ROVERFLOW_DATA names the data, else a textured slope.
+to 1280x960 where ROVERFLOW_DATA names the data, else a simulated view of ground with many rocks.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from recordings.simulator import Simulation
 from stages import Match, Rectify, StereoCamera, StereoFrame
 from stages.data import Array
 
@@ -27,20 +29,23 @@ ROUNDS = 9
 COSTS = ("census", "census+gradient")
 
 
-def pair() -> StereoFrame:
-    """The frame that is timed, gray."""
+def colour_pair() -> StereoFrame:
+    """The frame that is timed."""
     data = os.environ.get("ROVERFLOW_DATA")
-    if data:
-        scene = Path(data) / "middlebury-q" / "Motorcycle"
-        images = [cv2.imread(str(scene / f"im{i}.png"), cv2.IMREAD_GRAYSCALE) for i in (0, 1)]
-        left, right = (cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for image in images)
-    else:
-        noise = np.random.default_rng(0).uniform(0, 255, (HEIGHT, WIDTH + 160)).astype(np.float32)
-        texture = np.clip((cv2.GaussianBlur(noise, (0, 0), 1.2) - 127) * 3 + 127, 0, 255)
-        y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
-        left = cv2.remap(texture, x + 130 - 120 * y / HEIGHT, y, cv2.INTER_LINEAR).astype(np.uint8)
-        right = cv2.remap(texture, x + 130, y, cv2.INTER_LINEAR).astype(np.uint8)
+    if not data:
+        simulation = Simulation(frames=2, width=WIDTH, height=HEIGHT, abundance=0.15)
+        return StereoFrame(0, *simulation.frame(1).images, simulation.camera)
+    scene = Path(data) / "middlebury-q" / "Motorcycle"
+    images = [cv2.cvtColor(cv2.imread(str(scene / f"im{i}.png")), cv2.COLOR_BGR2RGB) for i in (0, 1)]
+    left, right = (cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for image in images)
     return StereoFrame(0, left, right, StereoCamera(1000, 1000, WIDTH / 2, HEIGHT / 2, 0.2, WIDTH, HEIGHT))
+
+
+def gray_pair() -> StereoFrame:
+    """The same in gray."""
+    frame = colour_pair()
+    left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.left, frame.right))
+    return replace(frame, left=left, right=right)
 
 
 def opencv(mode: int, disparities: int, frame: StereoFrame) -> Callable[[], object]:
@@ -63,7 +68,7 @@ def medians(contestants: dict[str, Callable[[], object]], rounds: int = ROUNDS) 
 
 def speed() -> None:
     """Print times and ratios of the matchers."""
-    frame = pair()
+    frame = gray_pair()
     contestants: dict[str, Callable[[], object]] = {
         "OpenCV HH": opencv(cv2.STEREO_SGBM_MODE_HH, 128, frame),
         "OpenCV 3WAY": opencv(cv2.STEREO_SGBM_MODE_SGBM_3WAY, 128, frame),
@@ -92,10 +97,11 @@ def speed() -> None:
 MEASURE = """
 import json, re, sys, time
 start = time.perf_counter()
-from tests.bench.matching import pair
-from stages import Match
+import numpy as np
+from stages import Match, StereoCamera, StereoFrame
 cost, disparities, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-frame = pair()
+left, right = np.load(sys.argv[4])
+frame = StereoFrame(0, left, right, StereoCamera(1000, 1000, 640, 480, 0.2, left.shape[1], left.shape[0]))
 peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1])
 before = peak()
 start = time.perf_counter()
@@ -108,9 +114,9 @@ print(json.dumps([first, time.perf_counter() - start, (after - before) / 1024]))
 """
 
 
-def first_call(cost: str, disparities: int, cache: Path) -> tuple[float, float, float]:
+def first_call(cost: str, disparities: int, images: Path, cache: Path) -> tuple[float, float, float]:
     """Seconds of the first call in a new process, of the second, and MB that both added."""
-    command = [sys.executable, "-c", MEASURE, cost, str(disparities), "2"]
+    command = [sys.executable, "-c", MEASURE, cost, str(disparities), "2", str(images)]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     output = subprocess.check_output(command, env=environment, stderr=subprocess.DEVNULL)
     first, second, megabytes = json.loads(output)
@@ -120,9 +126,11 @@ def first_call(cost: str, disparities: int, cache: Path) -> tuple[float, float, 
 def start_up(cache: Path) -> None:
     """Print how long the first call takes without and with compiled kernels, and how much memory it needs."""
     print(f"\n{'first call in a new process':34} {'cold s':>8} {'warm s':>7} {'next s':>7} {'MB':>6}")
+    frame, images = gray_pair(), cache / "pair.npy"  # not made by the process whose memory is measured
+    np.save(images, np.stack([frame.left, frame.right]))
     for cost in COSTS:
-        cold, _, _ = first_call(cost, 192, cache / cost)
-        warm, following, megabytes = first_call(cost, 192, cache / cost)
+        cold, _, _ = first_call(cost, 192, images, cache / cost)
+        warm, following, megabytes = first_call(cost, 192, images, cache / cost)
         print(f"{cost + ' 192 x2':34} {cold:8.2f} {warm:7.2f} {following:7.2f} {megabytes:6.0f}")
 
 

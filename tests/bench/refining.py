@@ -24,7 +24,7 @@ from stages import Match, StereoFrame
 from stages.data import Array
 from stages.kernels.planes import fit_planes
 from stages.kernels.slic import superpixels
-from tests.bench.matching import HEIGHT, WIDTH, medians, pair
+from tests.bench.matching import colour_pair, medians
 from tests.bench.stereo_scores import errors, load_scene
 
 DISPARITIES = 192
@@ -111,18 +111,6 @@ class _Plane:
 
     def residuals(self, points: Array) -> Array:
         return np.abs(points[:, :2] @ self.params[:2] + self.params[2] - points[:, 2])  # type: ignore[no-any-return]
-
-
-def colour_pair() -> StereoFrame:
-    """The frame that is timed, in colour where it is a real one."""
-    frame = pair()
-    data = os.environ.get("ROVERFLOW_DATA")
-    if data:
-        scene = Path(data) / "middlebury-q" / "Motorcycle"
-        images = [cv2.cvtColor(cv2.imread(str(scene / f"im{i}.png")), cv2.COLOR_BGR2RGB) for i in (0, 1)]
-        left, right = (cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for image in images)
-        return replace(frame, left=left, right=right)
-    return replace(frame, left=np.dstack([frame.left] * 3), right=np.dstack([frame.right] * 3))
 
 
 def speed() -> None:
