@@ -21,19 +21,19 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.census import differing_bits, seen_costs
 from stages.kernels.compiled import kernel, part
+from stages.kernels.halves import AtOnce, in_turn
 from stages.kernels.vectors import (
     Width,
+    above_smallest,
     byte,
     either,
     lanes_in,
     lesser,
     load,
-    minus,
     minus_capped,
     plus_capped,
     shifted,
     shifted_in_memory,
-    smallest,
     spread,
     store,
 )  # fmt: skip
@@ -43,25 +43,29 @@ FAR = 255  # beyond either end of the search range
 SIDES = ((0, -1), (-1, -1), (-1, 0), (-1, 1))  # (dy, dx) to q of a sweep down; of a sweep up their opposites
 
 
-def brightness_steps(image: Array) -> Array:
+def brightness_steps(image: Array, both: AtOnce = in_turn) -> Array:
     """Absolute differences to the four neighbours of `SIDES`.
 
-    image: (H, W) uint8. Returns (4, H + 1, S) uint8 with S >= W + 2: pixel (y, x) is at [:, y, x + 1], differences to
-    pixels outside the image are arbitrary.
+    image: (H, W) uint8; both: calls two functions, for the upper and for the lower half. Returns (4, H + 1, S) uint8
+    with S >= W + 2: pixel (y, x) is at [:, y, x + 1], differences to pixels outside the image are arbitrary.
     """
     height, columns = image.shape
     stride = -(-(columns + 2) // BLOCK) * BLOCK
     padded = cv2.copyMakeBorder(image, 1, 1, 2, 1 + stride - columns, cv2.BORDER_REPLICATE)
     steps = np.empty((len(SIDES), height + 1, stride), np.uint8)
-    _brightness_steps(padded.reshape(-1), padded.shape[1], steps.reshape(-1), height + 1, stride, Width(BLOCK))
+    given, middle = (padded.reshape(-1), padded.shape[1], steps.reshape(-1), height + 1, stride), height // 2
+    both(
+        lambda: _brightness_steps(*given, 0, middle, Width(BLOCK)),
+        lambda: _brightness_steps(*given, middle, height + 1, Width(BLOCK)),
+    )
     return steps
 
 
 @kernel
-def _brightness_steps(image, image_stride, steps, rows, stride, width):  # type: ignore[no-untyped-def]
+def _brightness_steps(image, image_stride, steps, rows, stride, first, end, width):  # type: ignore[no-untyped-def]
     for side in range(len(SIDES)):
         dy, dx = SIDES[side]
-        for y in range(rows):
+        for y in range(first, end):
             for i in range(0, stride, lanes_in(width)):
                 here = (y + 1) * image_stride + i + 1
                 one, other = load(image, here, width), load(image, here + dy * image_stride + dx, width)
@@ -144,8 +148,7 @@ def _continued_at(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-de
 
 @part
 def _next(path, near, cost, p1, p2, width):  # type: ignore[no-untyped-def]
-    after = plus_capped(cost, lesser(lesser(plus_capped(near, p1), path), spread(p2, width)))
-    return minus(after, spread(smallest(after), width))
+    return above_smallest(plus_capped(cost, lesser(lesser(plus_capped(near, p1), path), spread(p2, width))))
 
 
 @part

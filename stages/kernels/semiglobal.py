@@ -21,6 +21,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.aggregation import aggregate_row, brightness_steps
+from stages.kernels.blank import blank_windows, drop_blank
 from stages.kernels.census import census, census_costs
 from stages.kernels.compiled import kernel
 from stages.kernels.gradient import gradients, smoothed_costs
@@ -107,9 +108,10 @@ def match(
     with pairs(threads) as both:
         _sweep_all(left, right, rule, width, prior, memory, pixels, evidence, both)
         blank, partner = both(lambda: blank_windows(left), lambda: blank_windows(right))
-        blank = blank if excluded is None else blank | excluded
+        if excluded is not None:
+            blank[:, :columns] |= excluded
         parts = slice(height // 2), slice(height // 2, height)
-        both(*(functools.partial(_drop_blank, blank[at], partner[at], pixels[at], evidence[at]) for at in parts))
+        both(*(functools.partial(drop_blank, blank[at], partner[at], pixels[at], evidence[at]) for at in parts))
         drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, both)
         confidence, source = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
         both(*(functools.partial(_grade, evidence[at], rule.calibration, confidence[at], source[at]) for at in parts))
@@ -122,29 +124,12 @@ def _sweep_all(
 ) -> None:  # fmt: skip
     """Fill in disparities and evidence; what that takes but the workspace is given back."""
     with _workspaces.one() as space:
-        (left_planes, steps), right_planes = both(
-            lambda: (_described(left, rule), brightness_steps(left)), lambda: _described(right, rule, width)
-        )
+        left_planes, right_planes = both(lambda: _described(left, rule), lambda: _described(right, rule, width))
+        steps = brightness_steps(left, both)
         pair = Pair(left_planes, right_planes, steps, *_view(left.shape[1], rule, width), *(prior or NO_PRIOR))
         upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
         both(upper.arrive, lower.arrive)
         both(lambda: upper.cross(lower), lambda: lower.cross(upper))
-
-
-def blank_windows(image: Array) -> Array:
-    """Where the census window of a pixel shows one gray value only, (H, W) bool: nothing can be matched there, and what
-    the paths carry into it (a burnt-out sky, say) is no measurement."""
-    return cv2.morphologyEx(image, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) == 0  # type: ignore[no-any-return]
-
-
-@kernel
-def _drop_blank(blank, partner, pixels, evidence):  # type: ignore[no-untyped-def]
-    """Forget matches of pixels that are blank, or whose partner is."""
-    last = pixels.shape[1] - 1
-    for y in range(pixels.shape[0]):
-        for x in range(pixels.shape[1]):
-            if evidence[y, x] > 0 and (blank[y, x] or partner[y, min(max(round(x - pixels[y, x]), 0), last)]):
-                pixels[y, x], evidence[y, x] = np.nan, 0
 
 
 @kernel
