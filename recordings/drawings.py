@@ -44,6 +44,7 @@ if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # from OpenCV 4.12 on; else it tries all
     FAST_PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 AMBER: paint.Rgb = (255, 210, 60)
 TEXT: paint.Rgb = (225, 228, 235)
+CURVES: tuple[paint.Rgb, ...] = ((255, 210, 60), (95, 175, 255), (245, 120, 95), (125, 215, 140), (205, 145, 245))
 THUMBNAIL = 0.25  # size of the image in the camera's frustum
 
 Draw = Callable[..., str | None]
@@ -76,6 +77,7 @@ class Canvas:
     max_points: int
     hung: dict[tuple[Panel, str], Place] = field(default_factory=dict)
     camera: StereoCamera | None = None
+    _curves: dict[Panel, list[str]] = field(default_factory=dict)
     _said: dict[str, str] = field(default_factory=dict)
     _kept: dict[str, Hashable] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
@@ -95,6 +97,14 @@ class Canvas:
         else:
             self._kept[path] = content
             self.log(path, draw())
+
+    def curve(self, path: str, name: str, value: float, place: Place) -> None:
+        """A value over time; the curves of one panel differ in colour."""
+        at, drawn = f"{path}/{rr.escape_entity_path_part(name)}", self._curves.setdefault(place.panel, [])
+        if at not in drawn:
+            self.recording.log(at, rr.SeriesLines(colors=[CURVES[len(drawn) % len(CURVES)]]), static=True)
+            drawn.append(at)
+        self.log(at, rr.Scalars(float(value)), place)
 
     def say(self, path: str, text: str, level: rr.TextLogLevel) -> None:
         """A line in the ledger, where it is not what `path` said last."""
@@ -203,8 +213,7 @@ def draw_cloud(canvas: Canvas, path: str, cloud: PointCloud) -> str:
         # An optical axis (z) below the horizon is pitch down, the image's right side (x) below it roll to the right.
         for name, axis in (("camera pitch down", 2), ("camera roll right", 0)):
             angle = float(np.degrees(np.arcsin(np.clip(-cloud.sensor.rotation[2, axis], -1.0, 1.0))))
-            canvas.log(f"{path}/{rr.escape_entity_path_part(name)}", rr.Scalars(angle))
-        canvas.hung.setdefault((Panel.ANGLE, path), Place(Panel.ANGLE, path, path))
+            canvas.curve(path, name, angle, Place(Panel.ANGLE, path, path))
     return f"{path} {counted(len(cloud.points), 'point')}"
 
 
@@ -225,8 +234,7 @@ def draw_tilt(canvas: Canvas, path: str, tilt: Tilt) -> None:
     """The angles of the inclinometer's axes to the horizon, up positive, in degrees."""
     for name, along in (("x axis up", tilt.up[0]), ("y axis up", tilt.up[1])):
         angle = float(np.degrees(np.arcsin(np.clip(along, -1.0, 1.0))))
-        place = Place(Panel.ANGLE, path, path)
-        canvas.log(f"{path}/{rr.escape_entity_path_part(name)}", rr.Scalars(angle), place)
+        canvas.curve(path, name, angle, Place(Panel.ANGLE, path, path))
 
 
 @draws(Pose)
@@ -242,8 +250,7 @@ def draw_pose(canvas: Canvas, path: str, pose: Pose) -> None:
 @draws(CameraMotion)
 def draw_motion(canvas: Canvas, path: str, motion: CameraMotion) -> str:
     """How many features the camera was tracked by."""
-    place = Place(Panel.FEATURES, path, path)
-    canvas.log(f"{path}/features", rr.Scalars(float(motion.inliers)), place)
+    canvas.curve(path, "features", motion.inliers, Place(Panel.FEATURES, path, path))
     return f"{path}: {motion.lost}" if motion.lost else f"{path} {counted(motion.inliers, 'feature')}"
 
 
@@ -251,7 +258,7 @@ def draw_motion(canvas: Canvas, path: str, motion: CameraMotion) -> str:
 def draw_matches(canvas: Canvas, path: str, health: MatchHealth) -> None:
     """How much is matched, in percent: of all pixels, and of the nearest ground."""
     for name, part in (("all", health.all), ("near", health.near)):
-        canvas.log(f"{path}/{name}", rr.Scalars(100 * part), Place(Panel.MATCHES, path, path))
+        canvas.curve(path, name, 100 * part, Place(Panel.MATCHES, path, path))
 
 
 @draws(TiltHealth)
@@ -259,8 +266,7 @@ def draw_health(canvas: Canvas, path: str, health: TiltHealth) -> str:
     """Tilt against the camera's own turns and against the ground in view, in degrees; what is wrong, in words."""
     for name, angle in (("tilt off turn", health.turn), ("ground off level", health.ground)):
         if np.isfinite(angle):
-            place = Place(Panel.HEALTH, path, path)
-            canvas.log(f"{path}/{rr.escape_entity_path_part(name)}", rr.Scalars(float(np.degrees(angle))), place)
+            canvas.curve(path, name, np.degrees(angle), Place(Panel.HEALTH, path, path))
     canvas.say(path, health.judgement, rr.TextLogLevel.ERROR if health.fault else rr.TextLogLevel.INFO)
     return f"{path}: {health.fault}" if health.fault else ""
 

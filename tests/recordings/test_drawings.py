@@ -126,6 +126,17 @@ def test_scalars_are_those_of_the_frame(rrd: Path) -> None:
     assert tilt == [pytest.approx(np.degrees(0.1))]
 
 
+def test_curves_of_one_plot_differ_in_colour(rrd: Path) -> None:
+    names = [
+        *("/tilt/" + axis for axis in ("x axis up", "y axis up")),
+        *("/points/camera " + way for way in ("pitch down", "roll right")),
+    ]
+    escaped = ["/".join(map(rr.escape_entity_path_part, name.split("/"))) for name in names]
+    colours = [rows(rrd, name, "SeriesLines:colors") for name in escaped]
+    assert [len(found) for found in colours] == [1] * 4  # said once, for all frames
+    assert len({found[0][2][0] for found in colours}) == 4
+
+
 def test_the_tilt_check_is_a_plot_and_says_once_what_is_wrong(rrd: Path, tmp_path: Path) -> None:
     (_, _, turn), *_ = rows(rrd, "/health/" + rr.escape_entity_path_part("tilt off turn"), "Scalars:scalars")
     assert turn[0] == pytest.approx(np.degrees(0.01))
