@@ -24,7 +24,8 @@ from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stereo_part
 from tests.bench.stereo_scores import errors, rows_filled
 
 PLAIN: dict[str, Any] = {
-    "median": 0, "plane_weight": 0, "plane_fill": False, "surface": 0, "bilateral_radius": 0, "trusted": 0,
+    "median": 0, "plane_weight": 0, "plane_fill": False, "surface": 0, "bilateral_radius": 0, "edge_radius": 0,
+    "trusted": 0,
 }  # fmt: skip
 SEEDS = (1, 2, 3)
 ABUNDANCES = (0.05, 0.15, 0.10)
@@ -125,10 +126,11 @@ STEPS: dict[str, Chain] = {
     "+ view from the right": refined("checked", **PLAIN),
     "+ doubtful matches dropped": refined("checked", **{**PLAIN, "trusted": 0.5}),
     "+ median": refined("checked", **{**PLAIN, "trusted": 0.5, "median": 5}),
-    "+ planes of superpixels": refined("checked", surface=0, plane_fill=False, bilateral_radius=0),
-    "+ they fill holes": refined("checked", surface=0, bilateral_radius=0),
-    "+ planes of surfaces": refined("checked", bilateral_radius=0),
-    "+ bilateral filter: rover": lambda streams, _: streams["disparity"],
+    "+ planes of superpixels": refined("checked", surface=0, plane_fill=False, bilateral_radius=0, edge_radius=0),
+    "+ they fill holes": refined("checked", surface=0, bilateral_radius=0, edge_radius=0),
+    "+ planes of surfaces": refined("checked", bilateral_radius=0, edge_radius=0),
+    "+ bilateral filter": refined("checked", edge_radius=0),
+    "+ edges as in the image: rover": lambda streams, _: streams["disparity"],
 }
 VARIANTS: dict[str, Chain] = {
     "rover without the coarse match": unguided,
@@ -142,6 +144,7 @@ VARIANTS: dict[str, Chain] = {
     "rover, holes filled along rows": by_rows,
     "rover, holes filled by WLS": refined("checked", fill="wls"),
     "rover, bilateral radius 6": refined("checked", bilateral_radius=6),
+    "rover, edges of radius 5": refined("checked", edge_radius=5),
     "rover, 64 planes tried": refined("checked", hypotheses=64),
     "rover with 8 paths": eight,
     "rover, matched once more": twice,

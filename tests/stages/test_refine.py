@@ -94,7 +94,7 @@ def test_a_match_that_is_replaced_is_called_plane_and_loses_its_confidence(media
     assert replaced.source[60, 80] == Source.PLANE
     assert replaced.confidence[60, 80] < 0.85
     assert (replaced.source == Source.MEASURED).sum() == HEIGHT * WIDTH - 1
-    kept = Refine(median=median, bilateral_radius=0)(frame, matches)
+    kept = Refine(median=median, bilateral_radius=0, edge_radius=0)(frame, matches)
     assert (kept.pixels[60, 80], kept.source[60, 80]) == (30, Source.MEASURED)
     assert kept.confidence[60, 80] == np.float32(0.97)
 
@@ -223,17 +223,35 @@ def test_planes_of_surfaces_reach_where_superpixels_have_no_match():
     assert np.abs(wide.pixels[hole] - truth).max() < 0.05
 
 
+# No median and no plane: nothing else smooths.
+BARE = {"superpixels": 200, "smallest": 1, "median": 0, "plane_weight": 0, "plane_fill": False, "fill": "none"}
+
+
 def test_the_bilateral_filter_takes_noise_and_leaves_the_step(box):
     frame, matches, truth = box
-    # no median and no plane: nothing else smooths
-    only = {"superpixels": 200, "smallest": 1, "median": 0, "plane_weight": 0, "plane_fill": False, "fill": "none"}
-    raw, smooth = (Refine(bilateral_radius=radius, **only)(frame, matches) for radius in (0, 3))
+    raw, smooth = (Refine(bilateral_radius=radius, edge_radius=0, **BARE)(frame, matches) for radius in (0, 3))
     known = np.isfinite(matches.pixels)
     assert np.array_equal(raw.pixels, matches.pixels, equal_nan=True)
     assert np.array_equal(np.isfinite(smooth.pixels), known)
     error = np.abs(smooth.pixels - truth)[known]
     assert np.sqrt(np.mean(error**2)) < 0.4 * np.sqrt(np.mean((raw.pixels - truth)[known] ** 2))
     assert error.max() < 1
+
+
+def test_edges_of_depth_go_where_the_image_has_them(box):
+    frame, matches, truth = box
+    known = np.isfinite(matches.pixels)
+    moved = replace(matches, pixels=np.where(known, np.roll(truth, 1, axis=1), np.nan).astype(np.float32))
+    wrong = []
+    for radius in (0, 3):
+        refined = Refine(bilateral_radius=0, edge_radius=radius, **BARE)(frame, moved)
+        error = np.abs(refined.pixels - truth)
+        wrong.append(np.count_nonzero(error[known] > 1))
+        assert np.array_equal(np.isfinite(refined.pixels), known)
+        replaced = np.abs(refined.pixels - moved.pixels) > 0.5
+        assert (refined.source[replaced] == Source.PLANE).all()
+    assert wrong[0] > 80
+    assert wrong[1] < 0.1 * wrong[0]
 
 
 # No superpixel with a hole has a plane then, a surface may have: half of it is to be matched.
@@ -247,7 +265,7 @@ def test_a_plane_counts_matches_by_their_confidence(parameters):
     pixels[doubted], confidence[doubted] = 8.4, 0.5
     hole = np.s_[50:55, 70:75]
     pixels[hole], source[hole], confidence[hole] = np.nan, 0, 0
-    refine = Refine(median=0, bilateral_radius=0, **parameters)
+    refine = Refine(median=0, bilateral_radius=0, edge_radius=0, **parameters)
     filled = refine(frame, Disparity(5, pixels, source, confidence))
     half = doubted[np.isfinite(pixels)].mean()
     mean = (8 * (1 - half) + 8.4 * half * 0.5) / (1 - half + half * 0.5)
@@ -259,7 +277,7 @@ def test_a_surface_draws_half_as_far_as_a_superpixel_and_what_it_agrees_with_is_
     pixels[60, 80], pixels[60, 90] = 8.4, 8.7
     pixels[30, 30], source[30, 30] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
-    drawn = Refine(median=0, bilateral_radius=0, plane_weight=1, near=1, **SURFACES_ONLY)(frame, matches)
+    drawn = Refine(median=0, bilateral_radius=0, edge_radius=0, plane_weight=1, near=1, **SURFACES_ONLY)(frame, matches)
     assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert drawn.pixels[60, 90] == np.float32(8.7)
     assert drawn.confidence[60, 70] > drawn.confidence[60, 90] > 0.9
@@ -271,7 +289,7 @@ def test_what_a_superpixel_filled_is_no_evidence_for_a_surface():
     holes = np.random.default_rng(6).random(SHAPE) < 0.3
     holes[:, 60:] = True  # the rest is three eighths of the image, and matched by seven tenths
     pixels[holes], source[holes] = np.nan, 0
-    refine = Refine(superpixels=48, smallest=1, surface=48, fill="none", bilateral_radius=0)
+    refine = Refine(superpixels=48, smallest=1, surface=48, fill="none", bilateral_radius=0, edge_radius=0)
     filled = refine(frame, Disparity(5, pixels, source, confidence))
     assert np.isfinite(filled.pixels[:, :59]).mean() > 0.95
     assert np.isnan(filled.pixels[:, 62:]).all()
@@ -280,7 +298,7 @@ def test_what_a_superpixel_filled_is_no_evidence_for_a_surface():
 def test_a_match_moves_to_its_median_where_that_is_near():
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80], pixels[60, 100] = 8.9, 11
-    bare = {"plane_weight": 0, "surface": 0, "bilateral_radius": 0}
+    bare = {"plane_weight": 0, "surface": 0, "bilateral_radius": 0, "edge_radius": 0}
     moved = Refine(median=5, near=1, **bare)(frame, Disparity(5, pixels, source, confidence))
     assert (moved.pixels[60, 80], moved.pixels[60, 100]) == (8, 11)
 
@@ -290,7 +308,9 @@ def test_wls_counts_matches_by_their_confidence():
     hole = np.s_[1:, 70:90]
     pixels[hole], source[hole], confidence[hole] = np.nan, 0, 0
     pixels[:, 90:], confidence[:, 90:] = 9, 0.5
-    doubted = Refine(fill="wls", plane_weight=0, plane_fill=False, surface=0, median=0, bilateral_radius=0)
+    doubted = Refine(
+        fill="wls", plane_weight=0, plane_fill=False, surface=0, median=0, bilateral_radius=0, edge_radius=0
+    )
     middle = doubted(frame, Disparity(5, pixels, source, confidence)).pixels[60, 79:81]
     equal = np.where(confidence > 0, np.float32(1), np.float32(0))
     halfway = doubted(frame, Disparity(5, pixels, source, equal)).pixels[60, 79:81]
@@ -303,14 +323,16 @@ def test_wls_fills_no_farther_than_evidence_reaches():
     hole = np.s_[30:, 60:150]
     pixels[hole], source[hole] = np.nan, 0
     pixels[:20, 10:150], source[:20, 10:150] = np.nan, 0
-    refine = Refine(fill="wls", fill_reach=20, fill_margin=6, plane_fill=False, bilateral_radius=0)
+    refine = Refine(fill="wls", fill_reach=20, fill_margin=6, plane_fill=False, bilateral_radius=0, edge_radius=0)
     known = np.isfinite(refine(frame, Disparity(5, pixels, source, confidence)).pixels)
     row = known[70].nonzero()[0]
     assert row.tolist() == [*range(80), *range(130, 160)]
     assert known[:, 30].nonzero()[0].tolist() == [*range(14, HEIGHT)]
 
 
-@pytest.mark.parametrize("refine", [Refine(), paper_stages()[1], Refine(fill="none", bilateral_radius=0, median=0)])
+@pytest.mark.parametrize(
+    "refine", [Refine(), paper_stages()[1], Refine(fill="none", bilateral_radius=0, edge_radius=0, median=0)]
+)
 def test_no_match_at_all_stays_no_disparity(box, refine):
     frame, matches, _ = box
     empty = np.full(SHAPE, np.nan, np.float32)

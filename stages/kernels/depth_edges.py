@@ -1,0 +1,136 @@
+"""Depth edges put where the image has them: a weighted median of what lies about them (Ma et al., 2013).
+
+A match at the edge of a rock is one pixel off as often as not, or between rock and ground, where there is nothing. The
+median of a window, each pixel weighing by how much it looks like the one in the middle, is a disparity of the side it
+belongs to, and never one between. Only pixels next to a jump are looked at, and of their windows every other pixel, as
+on a chessboard. The median is found by halving a range of values: nothing is sorted, each step is one sum over the
+window, and the sums are of whole numbers, exact in any order.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stages.data import Array
+from stages.kernels.compiled import fast_part, kernel, part
+from stages.kernels.halves import pairs
+
+F32 = np.float32
+FINE = 16  # parts of a pixel, to which a median is found
+UNIT = 1000  # weight of a pixel as bright as the one in the middle
+LANES = 32
+
+
+def sharpen_edges(
+    disparity: Array, guide: Array, radius: int, jump: float, brightness: float, threads: int = 1
+) -> Array:
+    """Each known disparity next to a jump becomes the weighted median of its window; all others stay.
+
+    disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: of the window, px; jump: difference, px,
+    within 3x3 pixels beyond which there is an edge; brightness: difference, gray levels, at which a weight falls to
+    1/e; threads: 2 share the work, to the same result. Returns (H, W) float32.
+    """
+    sharp, middle = np.empty_like(disparity), disparity.shape[0] // 2
+    border = radius, radius, radius, radius, cv2.BORDER_CONSTANT
+    padded = cv2.copyMakeBorder(disparity, *border, value=np.nan)
+    given = padded, cv2.copyMakeBorder(guide, *border, value=0), _taps(radius) @ [padded.shape[1], 1], radius
+    rule = F32(jump), _weights(brightness)
+    with pairs(threads) as both:
+        both(
+            lambda: _sharpen(*given, *rule, sharp, 0, middle),
+            lambda: _sharpen(*given, *rule, sharp, middle, disparity.shape[0]),
+        )
+    return sharp
+
+
+def _taps(radius: int) -> Array:
+    """Rows and columns, (n, 2), from the middle of a window to every other pixel of it."""
+    taps = np.indices((2 * radius + 1,) * 2).reshape(2, -1).T - radius
+    return np.asarray(taps[taps.sum(axis=1) % 2 == 0])
+
+
+def _weights(brightness: float) -> Array:
+    """Weight of each difference of brightness, (256,) float32, whole numbers."""
+    return np.round(UNIT * np.exp(-np.arange(256) / brightness)).astype(np.float32)
+
+
+@kernel
+def _sharpen(disparity, guide, taps, radius, jump, table, sharp, first, end):  # type: ignore[no-untyped-def]
+    """Rows first to end; disparity and guide are framed by `radius` pixels, taps are steps in memory."""
+    width, stride = sharp.shape[1], disparity.shape[1]
+    flat, levels = disparity.reshape(-1), guide.reshape(-1)
+    size = (taps.size + LANES - 1) // LANES * LANES  # whole vectors; what is over has no weight
+    values, weights = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    highest, lowest = np.empty(width + 2, np.float32), np.empty(width + 2, np.float32)
+    for y in range(first, end):
+        highest[:], lowest[:] = F32(-np.inf), F32(np.inf)
+        for row in range(y + radius - 1, y + radius + 2):
+            for x in range(width + 2):
+                value = disparity[row, x + radius - 1]
+                highest[x] = value if value > highest[x] else highest[x]
+                lowest[x] = value if value < lowest[x] else lowest[x]
+        for x in range(width):
+            at = np.uint64((y + radius) * stride + x + radius)
+            middle = flat[at]
+            sharp[y, x] = middle
+            high = max(highest[x], highest[x + 1], highest[x + 2])
+            if high - min(lowest[x], lowest[x + 1], lowest[x + 2]) > jump and middle == middle:
+                lowest_here, highest_here = _compare(flat, levels, taps, table, at, values, weights)
+                median = _median(values, weights, lowest_here, highest_here) / F32(FINE)
+                if abs(median - middle) > F32(1 / FINE):
+                    sharp[y, x] = median
+
+
+@part
+def _compare(flat, levels, taps, table, at, values, weights):  # type: ignore[no-untyped-def]
+    """Disparities at the taps, in steps, and their weights, 0 where none is known; returns the extremes."""
+    low, high = F32(np.inf), F32(-np.inf)
+    for i in range(taps.size):
+        place = np.uint64(np.int64(at) + taps[i])
+        value, step = flat[place], np.int32(levels[place]) - np.int32(levels[at])
+        known = value == value
+        steps = np.floor(value * F32(FINE) + F32(0.5))
+        values[i], weights[i] = (steps, table[abs(step)]) if known else (F32(0), F32(0))
+        low, high = steps if steps < low else low, steps if steps > high else high
+    return low, high
+
+
+@fast_part
+def _median(values, weights, low, high):  # type: ignore[no-untyped-def]
+    """The smallest whole number within low and high that, with all below it, has half of the weight."""
+    below, total = low - F32(1), _weight_up_to(values, weights, high)
+    while high - below > F32(1):
+        half = np.floor(F32(0.5) * (below + high))
+        enough = F32(2) * _weight_up_to(values, weights, half) >= total
+        below, high = below if enough else half, half if enough else high
+    return high
+
+
+@fast_part
+def _weight_up_to(values, weights, limit):  # type: ignore[no-untyped-def]
+    total = F32(0)
+    for i in range(values.size):
+        total += weights[i] if values[i] <= limit else F32(0)
+    return total
+
+
+def sharpen_edges_reference(disparity: Array, guide: Array, radius: int, jump: float, brightness: float) -> Array:
+    """`sharpen_edges` in plain numpy, pixel by pixel."""
+    height, width = disparity.shape
+    table, taps, sharp = _weights(brightness), _taps(radius), disparity.copy()
+    for y, x in np.argwhere(np.isfinite(disparity)):
+        near = disparity[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+        if not np.nanmax(near) - np.nanmin(near) > np.float32(jump):
+            continue
+        rows, cols = (taps + np.array([y, x])).T
+        inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+        rows, cols = rows[inside], cols[inside]
+        known = np.isfinite(disparity[rows, cols])
+        values = np.floor(disparity[rows, cols][known] * FINE + 0.5)
+        weights = table[np.abs(guide[rows, cols].astype(int) - int(guide[y, x]))][known]
+        order = np.argsort(values, kind="stable")
+        median = values[order][np.argmax(2 * np.cumsum(weights[order]) >= weights.sum())] / FINE
+        if abs(median - disparity[y, x]) > 1 / FINE:
+            sharp[y, x] = median
+    return sharp
