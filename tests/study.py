@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ import numpy as np
 from recordings.simulator import Simulation
 from stages import CrossCheck, Disparity, Enlarge, Match, Rectify, Refine, Source, StereoCamera, StereoFrame
 from stages.data import Array
+from stages.refine import TRUST
 from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stereo_part
 from tests.bench.stereo_scores import errors, rows_filled
 
@@ -193,6 +195,34 @@ def print_fills(cases: list[Case]) -> None:
     )
 
 
+def print_worth(cases: list[Case]) -> None:
+    """Print what share of the pixels of an origin is right within 1 px, beside the confidence that `rover` states."""
+    origins: dict[str, Callable[[Disparity], Array]] = {
+        f"measured, {low} to {high}": lambda found, low=low, high=high: (
+            (found.source == Source.MEASURED) & (found.confidence >= low) & (found.confidence < high)
+        )
+        for low, high in pairwise((0.6, 0.8, 0.9, 0.95, 1.01))
+    }
+    for name, source in (("replaced", 2), ("plane", 2), ("mismatch", 3), ("occlusion", 3)):
+        value = np.float32(getattr(TRUST, name))
+        origins[name] = lambda found, source=source, value=value: (found.source == source) & (found.confidence == value)
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    for case in cases:
+        found = stereo_part("rover", case.frame, case.disparities, entry="rectified")["disparity"]
+        scored = np.isfinite(case.truth) & np.isfinite(found.pixels)
+        scored[:, : case.disparities] = False
+        right = np.abs(found.pixels - case.truth) <= 1
+        for name, origin in origins.items():
+            here = scored & origin(found)
+            rows.setdefault(name, []).append(
+                (here.sum() / scored.sum(), found.confidence[here].mean(), right[here].mean())
+            )
+    print(f"\n{'origin, and confidence stated':32} share %  stated  right within 1 px")
+    for name, values in rows.items():
+        share, stated, true = np.nanmean(values, axis=0)
+        print(f"{name:32} {100 * share:7.1f} {stated:7.2f} {true:18.2f}")
+
+
 def print_table(title: str, means: dict[str, Array], released: Array | None) -> None:
     """Print the errors in percent (RMS in px); with `released` also their ratios to the released code's."""
     print(f"\n{title:32} {COLUMNS}  known %  bad-1 at edges  elsewhere")
@@ -244,11 +274,13 @@ def main(folder: Path) -> None:
         released = np.mean([RELEASED[case.name] for case in cases], axis=0)
         print_table("Middlebury scenes", measure(cases), released)
         print_fills(cases)
+        print_worth(cases)
         for name, frame in devon(data):
             pictures(folder, name, frame, stereo_part("rover", frame, 192)["disparity"])
     cases = simulated()
     print_table("simulated frames", measure(cases), None)
     print_fills(cases)
+    print_worth(cases)
     for case in cases:
         streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
         pictures(folder, case.name.replace(" ", "-"), case.frame, streams["disparity"])

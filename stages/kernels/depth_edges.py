@@ -2,9 +2,10 @@
 
 A match at the edge of a rock is one pixel off as often as not, or between rock and ground, where there is nothing. The
 median of a window, each pixel weighing by how much it looks like the one in the middle, is a disparity of the side it
-belongs to, and never one between. Only pixels next to a jump are looked at, and of their windows every other pixel, as
-on a chessboard. The median is found by halving a range of values: nothing is sorted, each step is one sum over the
-window, and the sums are of whole numbers, exact in any order.
+belongs to, and never one between. A pixel that has company on the side where it is stays: else what is narrow would go.
+Only pixels next to a jump are looked at, and of their windows every other pixel, as on a chessboard. The median is
+found by halving a range of values: nothing is sorted, each step is one sum over the window, and the sums are of whole
+numbers, exact in any order.
 """
 
 from __future__ import annotations
@@ -19,17 +20,18 @@ from stages.kernels.halves import pairs
 F32 = np.float32
 FINE = 16  # parts of a pixel, to which a median is found
 UNIT = 1000  # weight of a pixel as bright as the one in the middle
+COMPANY = F32(0.4)  # share of the weight on a pixel's own side with which it stays there
 LANES = 32
 
 
 def sharpen_edges(
     disparity: Array, guide: Array, radius: int, jump: float, brightness: float, threads: int = 1
 ) -> Array:
-    """Each known disparity next to a jump becomes the weighted median of its window; all others stay.
+    """Each known disparity next to a jump, if alone, becomes the weighted median of its window; all others stay.
 
     disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: of the window, px; jump: difference, px,
-    within 3x3 pixels beyond which there is an edge; brightness: difference, gray levels, at which a weight falls to
-    1/e; threads: 2 share the work, to the same result. Returns (H, W) float32.
+    within 3x3 pixels beyond which there is an edge, and up to which two pixels are on one side; brightness: difference,
+    gray levels, at which a weight falls to 1/e; threads: 2 share the work, to the same result. Returns (H, W) float32.
     """
     sharp, middle = np.empty_like(disparity), disparity.shape[0] // 2
     border = radius, radius, radius, radius, cv2.BORDER_CONSTANT
@@ -76,30 +78,32 @@ def _sharpen(disparity, guide, taps, radius, jump, table, sharp, first, end):  #
             sharp[y, x] = middle
             high = max(highest[x], highest[x + 1], highest[x + 2])
             if high - min(lowest[x], lowest[x + 1], lowest[x + 2]) > jump and middle == middle:
-                lowest_here, highest_here = _compare(flat, levels, taps, table, at, values, weights)
-                median = _median(values, weights, lowest_here, highest_here) / F32(FINE)
-                if abs(median - middle) > F32(1 / FINE):
-                    sharp[y, x] = median
+                near, low, high = _compare(flat, levels, taps, table, at, jump, values, weights)
+                total = _weight_up_to(values, weights, high)
+                if near < COMPANY * total:
+                    sharp[y, x] = _median(values, weights, total, low, high) / F32(FINE)
 
 
 @part
-def _compare(flat, levels, taps, table, at, values, weights):  # type: ignore[no-untyped-def]
-    """Disparities at the taps, in steps, and their weights, 0 where none is known; returns the extremes."""
-    low, high = F32(np.inf), F32(-np.inf)
+def _compare(flat, levels, taps, table, at, jump, values, weights):  # type: ignore[no-untyped-def]
+    """Disparities at the taps, in parts of a pixel, and their weights, 0 where none is known; returns the weight of
+    those within `jump` of the one in the middle, and the extremes."""
+    near, low, high = F32(0), F32(np.inf), F32(-np.inf)
     for i in range(taps.size):
         place = np.uint64(np.int64(at) + taps[i])
         value, step = flat[place], np.int32(levels[place]) - np.int32(levels[at])
         known = value == value
-        steps = np.floor(value * F32(FINE) + F32(0.5))
-        values[i], weights[i] = (steps, table[abs(step)]) if known else (F32(0), F32(0))
-        low, high = steps if steps < low else low, steps if steps > high else high
-    return low, high
+        fine = np.floor(value * F32(FINE) + F32(0.5))
+        values[i], weights[i] = (fine, table[abs(step)]) if known else (F32(0), F32(0))
+        near += weights[i] if abs(value - flat[at]) <= jump else F32(0)
+        low, high = fine if fine < low else low, fine if fine > high else high
+    return near, low, high
 
 
 @fast_part
-def _median(values, weights, low, high):  # type: ignore[no-untyped-def]
+def _median(values, weights, total, low, high):  # type: ignore[no-untyped-def]
     """The smallest whole number within low and high that, with all below it, has half of the weight."""
-    below, total = low - F32(1), _weight_up_to(values, weights, high)
+    below = low - F32(1)
     while high - below > F32(1):
         half = np.floor(F32(0.5) * (below + high))
         enough = F32(2) * _weight_up_to(values, weights, half) >= total
@@ -129,8 +133,9 @@ def sharpen_edges_reference(disparity: Array, guide: Array, radius: int, jump: f
         known = np.isfinite(disparity[rows, cols])
         values = np.floor(disparity[rows, cols][known] * FINE + 0.5)
         weights = table[np.abs(guide[rows, cols].astype(int) - int(guide[y, x]))][known]
+        near = np.abs(disparity[rows, cols][known] - disparity[y, x]) <= np.float32(jump)
+        if weights[near].sum() >= COMPANY * weights.sum():
+            continue
         order = np.argsort(values, kind="stable")
-        median = values[order][np.argmax(2 * np.cumsum(weights[order]) >= weights.sum())] / FINE
-        if abs(median - disparity[y, x]) > 1 / FINE:
-            sharp[y, x] = median
+        sharp[y, x] = values[order][np.argmax(2 * np.cumsum(weights[order]) >= weights.sum())] / FINE
     return sharp
