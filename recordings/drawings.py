@@ -99,7 +99,7 @@ class Canvas:
             self.log(path, draw())
 
     def curve(self, path: str, name: str, value: float, place: Place) -> None:
-        """A value over time; the curves of one panel differ in colour."""
+        """A value over time; the first five curves of a panel differ in colour."""
         at, drawn = f"{path}/{rr.escape_entity_path_part(name)}", self._curves.setdefault(place.panel, [])
         if at not in drawn:
             self.recording.log(at, rr.SeriesLines(colors=[CURVES[len(drawn) % len(CURVES)]]), static=True)

@@ -71,7 +71,7 @@ class McapSink:
 
     def __post_init__(self) -> None:
         if self.compression not in COMPRESSIONS:
-            raise ValueError(f"McapSink.compression must be {', '.join(COMPRESSIONS)}, not {self.compression}")
+            raise ValueError(f"McapSink.compression must be one of {', '.join(COMPRESSIONS)}, not {self.compression}")
 
     def wants(self, stream: str, kind: type) -> bool:
         """Whether a stream of data of type `kind` is to be written. Raises LogError where it is but cannot be."""

@@ -18,7 +18,7 @@ from stages.intensity import eight_bit, gray
 from stages.kernels.bilateral import joint_bilateral
 from stages.kernels.depth_edges import sharpen_edges
 from stages.kernels.extent import Extent, extent, within_reach
-from stages.kernels.holes import OCCLUSION, fill_holes
+from stages.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.kernels.planar import near_median, pull_to_planes, trusted_matches
 from stages.kernels.planes import Planes, fit_planes
 from stages.kernels.slic import superpixels
@@ -32,14 +32,12 @@ EVEN = 6  # gray levels within a census window that a camera's noise and compres
 COMPACTNESS = 10.0  # SLIC's weight of position against colour, CIELAB units
 SMOOTHING, EDGE = 8000.0, 1.0  # the paper's: lambda of the WLS; gray levels over which its coupling falls to 1/e
 BILATERAL_GRAY, BILATERAL_DISPARITY = 10.0, 1.0  # scales of the bilateral filter, gray levels and px
-JUMP, JUMP_GRAY = (
-    1.0,
-    10.0,
-)  # of a depth edge, px; difference of brightness over which a neighbour's weight falls to 1/e
+JUMP = 2.0  # px, between neighbours, beyond which there is an edge of depth
+JUMP_GRAY = 10.0  # gray levels over which a neighbour's weight falls to 1/e there
 LEAST_WEIGHT = 0.05  # of a match that was let in, however low its confidence
 # Measured with the pipeline `rover` by tests/study.py: the mean of eight Middlebury scenes and of simulated frames.
 TRUST = Trust(
-    agreed=(0.88, 0.98, 0.998), alone=(0.62, 0.86, 0.97), replaced=0.79, plane=0.8, mismatch=0.615, occlusion=0.66
+    agreed=(0.88, 0.98, 0.998), alone=(0.62, 0.86, 0.97), replaced=0.81, plane=0.79, mismatch=0.615, occlusion=0.66
 )
 
 
@@ -108,7 +106,7 @@ class Refine(Stage):
         within = extent(pixels)
         pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
         filled, kinds = self._filled(pixels, weights, within, image, guide)
-        refined = self._sharpened(self._bilateral(filled, guide), guide)
+        refined = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
         source, confidence = name_sources(
             matches, disparity.confidence, agreed, kinds, refined, self.inlier_distance, TRUST, self.threads
         )
@@ -174,10 +172,10 @@ class Refine(Stage):
             self.threads,
         )  # fmt: skip
 
-    def _sharpened(self, pixels: Array, guide: Array) -> Array:
+    def _sharpened(self, pixels: Array, guessed: Array, guide: Array) -> Array:
         if self.edge_radius == 0:
             return pixels
-        return sharpen_edges(pixels, guide, self.edge_radius, JUMP, JUMP_GRAY, self.threads)
+        return sharpen_edges(pixels, guessed, guide, self.edge_radius, JUMP, JUMP_GRAY, self.threads)
 
 
 def _burnt_out(image: Array, guide: Array, level: int) -> Array:

@@ -2,10 +2,10 @@
 
 A match at the edge of a rock is one pixel off as often as not, or between rock and ground, where there is nothing. The
 median of a window, each pixel weighing by how much it looks like the one in the middle, is a disparity of the side it
-belongs to, and never one between. A pixel that has company on the side where it is stays: else what is narrow would go.
-Only pixels next to a jump are looked at, and of their windows every other pixel, as on a chessboard. The median is
-found by halving a range of values: nothing is sorted, each step is one sum over the window, and the sums are of whole
-numbers, exact in any order.
+belongs to, and never one between. Where two fifths of the weight are on a pixel's own side of the jump, it stays. Only
+pixels next to a jump are looked at, and of their windows every other pixel, as on a chessboard. The median is found by
+halving a range of values: nothing is sorted, each step is one sum over the window, and the sums are of whole numbers,
+exact in any order.
 """
 
 from __future__ import annotations
@@ -25,18 +25,20 @@ LANES = 32
 
 
 def sharpen_edges(
-    disparity: Array, guide: Array, radius: int, jump: float, brightness: float, threads: int = 1
+    disparity: Array, guessed: Array, guide: Array, radius: int, jump: float, brightness: float, threads: int = 1
 ) -> Array:
-    """Each known disparity next to a jump, if alone, becomes the weighted median of its window; all others stay.
+    """Each known disparity that jumps against a neighbour becomes the weighted median of its window, unless `COMPANY`
+    of the weight is within a jump of it; all others stay.
 
-    disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: of the window, px; jump: difference, px,
-    within 3x3 pixels beyond which there is an edge, and up to which two pixels are on one side; brightness: difference,
-    gray levels, at which a weight falls to 1/e; threads: 2 share the work, to the same result. Returns (H, W) float32.
+    disparity: (H, W) float32, px, NaN = unknown; guessed: (H, W) bool, disparities that are no evidence and count for
+    none that is; guide: (H, W) uint8; radius: of the window, px; jump: difference, px; brightness: difference, gray
+    levels, at which a weight falls to 1/e; threads: 2 share the work, to the same result. Returns (H, W) float32.
     """
     sharp, middle = np.empty_like(disparity), disparity.shape[0] // 2
     border = radius, radius, radius, radius, cv2.BORDER_CONSTANT
     padded = cv2.copyMakeBorder(disparity, *border, value=np.nan)
-    given = padded, cv2.copyMakeBorder(guide, *border, value=0), _taps(radius) @ [padded.shape[1], 1], radius
+    doubt = cv2.copyMakeBorder(guessed.view(np.uint8), *border, value=0)
+    given = padded, doubt, cv2.copyMakeBorder(guide, *border, value=0), _taps(radius) @ [padded.shape[1], 1], radius
     rule = F32(jump), _weights(brightness)
     with pairs(threads) as both:
         both(
@@ -58,10 +60,10 @@ def _weights(brightness: float) -> Array:
 
 
 @kernel
-def _sharpen(disparity, guide, taps, radius, jump, table, sharp, first, end):  # type: ignore[no-untyped-def]
-    """Rows first to end; disparity and guide are framed by `radius` pixels, taps are steps in memory."""
+def _sharpen(disparity, guessed, guide, taps, radius, jump, table, sharp, first, end):  # type: ignore[no-untyped-def]
+    """Rows first to end; disparity, guessed and guide are framed by `radius` pixels, taps are steps in memory."""
     width, stride = sharp.shape[1], disparity.shape[1]
-    flat, levels = disparity.reshape(-1), guide.reshape(-1)
+    flat, doubt, levels = disparity.reshape(-1), guessed.reshape(-1), guide.reshape(-1)
     size = (taps.size + LANES - 1) // LANES * LANES  # whole vectors; what is over has no weight
     values, weights = np.zeros(size, np.float32), np.zeros(size, np.float32)
     highest, lowest = np.empty(width + 2, np.float32), np.empty(width + 2, np.float32)
@@ -76,27 +78,29 @@ def _sharpen(disparity, guide, taps, radius, jump, table, sharp, first, end):  #
             at = np.uint64((y + radius) * stride + x + radius)
             middle = flat[at]
             sharp[y, x] = middle
-            high = max(highest[x], highest[x + 1], highest[x + 2])
-            if high - min(lowest[x], lowest[x + 1], lowest[x + 2]) > jump and middle == middle:
-                near, low, high = _compare(flat, levels, taps, table, at, jump, values, weights)
+            above = max(highest[x], highest[x + 1], highest[x + 2]) - middle
+            below = middle - min(lowest[x], lowest[x + 1], lowest[x + 2])
+            if above > jump or below > jump:
+                near, low, high = _compare(flat, doubt, levels, taps, table, at, jump, values, weights)
                 total = _weight_up_to(values, weights, high)
                 if near < COMPANY * total:
                     sharp[y, x] = _median(values, weights, total, low, high) / F32(FINE)
 
 
 @part
-def _compare(flat, levels, taps, table, at, jump, values, weights):  # type: ignore[no-untyped-def]
-    """Disparities at the taps, in parts of a pixel, and their weights, 0 where none is known; returns the weight of
+def _compare(flat, doubt, levels, taps, table, at, jump, values, weights):  # type: ignore[no-untyped-def]
+    """Disparities at the taps, in parts of a pixel, and their weights, 0 where none counts; returns the weight of
     those within `jump` of the one in the middle, and the extremes."""
     near, low, high = F32(0), F32(np.inf), F32(-np.inf)
     for i in range(taps.size):
         place = np.uint64(np.int64(at) + taps[i])
         value, step = flat[place], np.int32(levels[place]) - np.int32(levels[at])
-        known = value == value
+        known = value == value and doubt[place] <= doubt[at]
         fine = np.floor(value * F32(FINE) + F32(0.5))
         values[i], weights[i] = (fine, table[abs(step)]) if known else (F32(0), F32(0))
         near += weights[i] if abs(value - flat[at]) <= jump else F32(0)
-        low, high = fine if fine < low else low, fine if fine > high else high
+        if known:
+            low, high = min(low, fine), max(high, fine)
     return near, low, high
 
 
@@ -119,18 +123,20 @@ def _weight_up_to(values, weights, limit):  # type: ignore[no-untyped-def]
     return total
 
 
-def sharpen_edges_reference(disparity: Array, guide: Array, radius: int, jump: float, brightness: float) -> Array:
+def sharpen_edges_reference(
+    disparity: Array, guessed: Array, guide: Array, radius: int, jump: float, brightness: float
+) -> Array:
     """`sharpen_edges` in plain numpy, pixel by pixel."""
     height, width = disparity.shape
     table, taps, sharp = _weights(brightness), _taps(radius), disparity.copy()
     for y, x in np.argwhere(np.isfinite(disparity)):
         near = disparity[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
-        if not np.nanmax(near) - np.nanmin(near) > np.float32(jump):
+        if not np.nanmax(np.abs(near - disparity[y, x])) > np.float32(jump):
             continue
         rows, cols = (taps + np.array([y, x])).T
         inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
         rows, cols = rows[inside], cols[inside]
-        known = np.isfinite(disparity[rows, cols])
+        known = np.isfinite(disparity[rows, cols]) & (guessed[rows, cols] <= guessed[y, x])
         values = np.floor(disparity[rows, cols][known] * FINE + 0.5)
         weights = table[np.abs(guide[rows, cols].astype(int) - int(guide[y, x]))][known]
         near = np.abs(disparity[rows, cols][known] - disparity[y, x]) <= np.float32(jump)

@@ -42,7 +42,7 @@ def superpixels(
     grid = max(1, round(height / step)), max(1, round(width / step))
     smallest = int(0.25 * height * width / count)
     with pairs(threads) as both, _workspaces.one() as space:
-        space.reserve(16 * height * width + 4096)
+        space.reserve(12 * height * width + 64)
         colour = _colours(image, both)
         scale = 2 if min(height // grid[0], width // grid[1]) >= LEAST_CELL and min(height, width) > 1 else 1
         small = colour if scale == 1 else _colours(halved(image[: height // 2 * 2, : width // 2 * 2]), both)
@@ -60,8 +60,8 @@ def superpixels(
 def _colours(image: Array, both: AtOnce = in_turn) -> Array:
     """The image in CIELAB with 8 bits each, (H, W, 3) uint8; a gray one as it is, (H, W, 1)."""
     if image.ndim == 2:
-        return image[..., None]
-    colour, middle = np.empty_like(image), image.shape[0] // 2
+        return image[..., None].copy()
+    colour, middle = np.empty(image.shape, np.uint8), image.shape[0] // 2
     both(
         lambda: cv2.cvtColor(image[:middle], cv2.COLOR_RGB2LAB, dst=colour[:middle]) if middle else None,
         lambda: cv2.cvtColor(image[middle:], cv2.COLOR_RGB2LAB, dst=colour[middle:]),
@@ -90,7 +90,7 @@ def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, b
 def _label(
     colour: Array, centres: Array, grid: tuple[int, int], weight: float, labels: Array, both: AtOnce = in_turn
 ) -> Array:
-    """`_assign` for all rows of the grid; returns the sums."""
+    """Fill in `labels`, (H, W) int32, by `_assign`; or, where they are empty, return its sums, (n, 6) float64."""
     rows, cols = grid
     upper, lower = np.zeros((2, rows * cols, 6))
     square, middle = F32(weight**2), rows // 2

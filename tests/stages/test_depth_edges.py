@@ -6,6 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.kernels.depth_edges import sharpen_edges, sharpen_edges_reference
+from stages.refine import JUMP, JUMP_GRAY
+
+
+def sharpened(disparity, image):
+    return sharpen_edges(disparity, np.zeros(disparity.shape, bool), image, 3, JUMP, JUMP_GRAY)
 
 
 @settings(max_examples=30, deadline=None)
@@ -15,9 +20,10 @@ def test_the_median_is_that_of_the_reference(height, width, radius, seed):
     disparity = np.float32(random.choice([-900.0, 3.0, 40.0], (height, width)) + random.normal(0, 0.2, (height, width)))
     disparity[random.random(disparity.shape) < 0.2] = np.nan
     image = random.integers(0, 60, (height, width), np.uint8)
-    sharp = sharpen_edges(disparity, image, radius, 2.0, 10.0)
-    np.testing.assert_array_equal(sharp, sharpen_edges_reference(disparity, image, radius, 2.0, 10.0))
-    np.testing.assert_array_equal(sharp, sharpen_edges(disparity, image, radius, 2.0, 10.0, threads=2))
+    everything = disparity, random.random(disparity.shape) < 0.3, image, radius, JUMP, JUMP_GRAY
+    sharp = sharpen_edges(*everything)
+    np.testing.assert_array_equal(sharp, sharpen_edges_reference(*everything))
+    np.testing.assert_array_equal(sharp, sharpen_edges(*everything, threads=2))
 
 
 def test_an_edge_that_is_off_moves_to_that_of_the_image():
@@ -26,24 +32,31 @@ def test_an_edge_that_is_off_moves_to_that_of_the_image():
     truth = np.where(image > 100, np.float32(30), np.float32(10))
     off = truth.copy()
     off[:20, 29], off[20:, 30], off[::7, 30] = 30, 10, 21
-    assert np.array_equal(sharpen_edges(off, image, 3, 2.0, 10.0), truth)
+    assert np.array_equal(sharpened(off, image), truth)
 
 
 def test_ground_without_a_jump_and_unknown_pixels_stay():
-    ground = np.repeat(np.arange(5, 17, 0.4, np.float32)[:, None], 40, axis=1)
+    ground = np.repeat(5 + 0.9 * np.arange(30, dtype=np.float32)[:, None], 40, axis=1)
     ground[3:6, 7:9] = np.nan
     image = np.random.default_rng(0).integers(0, 256, (30, 40), np.uint8)
-    assert np.array_equal(sharpen_edges(ground, image, 3, 2.0, 10.0), ground, equal_nan=True)
+    assert np.array_equal(sharpened(ground, image), ground, equal_nan=True)
     ground[:, 20:] += 9
-    sharp = sharpen_edges(ground, image, 3, 2.0, 10.0)
+    sharp = sharpened(ground, image)
     assert np.array_equal(np.isnan(sharp), np.isnan(ground))
     assert np.array_equal(sharp[:, :18], ground[:, :18], equal_nan=True)
+
+
+def test_guesses_do_not_outvote_a_match_but_follow_it():
+    disparity, image = np.full((20, 20), 10, np.float32), np.full((20, 20), 90, np.uint8)
+    disparity[9:11, 9:11] = 30
+    guessed = disparity == 10
+    assert np.array_equal(sharpen_edges(disparity, guessed, image, 3, JUMP, JUMP_GRAY), disparity)
+    assert (sharpen_edges(disparity, ~guessed, image, 3, JUMP, JUMP_GRAY) == 10).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1)])
 def test_images_of_a_row_or_a_column_work(shape):
     disparity = np.arange(np.prod(shape), dtype=np.float32).reshape(shape) * 4
     image = np.zeros(shape, np.uint8)
-    assert np.array_equal(
-        sharpen_edges(disparity, image, 3, 2.0, 10.0), sharpen_edges_reference(disparity, image, 3, 2.0, 10.0)
-    )
+    everything = disparity, np.zeros(shape, bool), image, 3, JUMP, JUMP_GRAY
+    assert np.array_equal(sharpen_edges(*everything), sharpen_edges_reference(*everything))

@@ -57,7 +57,7 @@ def test_every_pixel_says_where_it_comes_from(box):
     confidence = {code: refined.confidence[refined.source == code] for code in Source}
     # as calibrated: of matches by their own confidence, 0.8, and by whether a plane agrees
     assert np.unique(confidence[Source.MEASURED]) == pytest.approx([0.882, 0.984], abs=0.002)
-    assert np.unique(confidence[Source.PLANE]) == pytest.approx([0.79, 0.8])
+    assert np.unique(confidence[Source.PLANE]) == pytest.approx([0.79, 0.81])
     assert set(np.unique(confidence[Source.FILLED])) <= {np.float32(0.615), np.float32(0.66)}
     assert (confidence[Source.UNKNOWN] == 0).all()
     assert all(part.size for part in confidence.values())

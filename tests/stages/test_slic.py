@@ -80,8 +80,9 @@ def test_an_edge_of_the_image_is_an_edge_of_segments():
     assert not set(labels[:, :83].ravel()) & set(labels[:, 83:].ravel())
 
 
-def test_assignment_is_the_nearest_of_nine_centres(photo):
-    image = photo[:90, :131]
+@pytest.mark.parametrize("channels", [3, 1])
+def test_assignment_is_the_nearest_of_nine_centres(photo, channels):
+    image = photo[:90, :131] if channels == 3 else photo[:90, :131, 1]
     colour, rows, cols = slic._colours(image), 6, 9
     centres = slic._grid_centres(colour, rows, cols)
     labels = np.empty(image.shape[:2], np.int32)
@@ -90,6 +91,12 @@ def test_assignment_is_the_nearest_of_nine_centres(photo):
     expected = slic.assign_reference(colour, centres, rows, cols, 0.4)
     assert (labels == expected).mean() > 0.999  # float32 may break a tie differently
     assert np.array_equal(sums[:, 5], np.bincount(labels.ravel(), minlength=rows * cols))
+
+
+def test_an_image_may_lie_in_memory_in_any_order(photo):
+    for image in (photo, photo[..., 1]):
+        turned = np.rot90(image)
+        assert np.array_equal(slic.superpixels(turned, 200)[0], slic.superpixels(turned.copy(), 200)[0])
 
 
 def test_a_step_moves_each_centre_to_the_mean_of_what_is_nearest_to_it(photo):
