@@ -32,18 +32,8 @@ def surfaces(
     step = math.sqrt(height * width / min(groups, count))
     rows, cols = max(1, round(height / step)), max(1, round(width / step))
     points, size = _superpixel_points(image, labels, count, compactness / step, threads)
-    place = np.floor(points[:, 3:] / (compactness / step) * [rows / height, cols / width]).astype(int)
-    near = np.minimum(place, [rows - 1, cols - 1])[:, None] + AROUND
-    inside = ((near >= 0) & (near < [rows, cols])).all(axis=2)
-    near = np.where(inside, near[..., 0] * cols + near[..., 1], 0)
-    nearest = near[:, len(AROUND) // 2]
-    for _ in range(ITERATIONS):
-        mass = np.bincount(nearest, size, rows * cols)
-        sums = [np.bincount(nearest, size * values, rows * cols) for values in points.T]
-        centres = np.stack(sums, axis=1) / np.maximum(mass, 1)[:, None]
-        distance = ((points[:, None] - centres[near]) ** 2).sum(axis=2)
-        choice = np.where(inside & (mass[near] > 0), distance, np.inf).argmin(axis=1)
-        nearest = np.take_along_axis(near, choice[:, None], axis=1)[:, 0]
+    home = np.floor(points[:, 3:] / (compactness / step) * [rows / height, cols / width]).astype(int)
+    nearest = _settle(points, size, np.minimum(home, [rows - 1, cols - 1]), rows, cols)
     used, surface = np.unique(nearest, return_inverse=True)
     return surface.astype(np.int32), len(used)
 
@@ -62,6 +52,35 @@ def _superpixel_points(image: Array, labels: Array, count: int, scale: float, th
     rgb = np.clip(np.rint(means[None, :, :3]), 0, 255).astype(np.uint8)
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)[0] * [100 / 255, 1, 1]
     return np.concatenate([lab, (means[:, 3:] + 0.5) * scale], axis=1), sums[:, 5]
+
+
+@kernel
+def _settle(points, size, home, rows, cols):  # type: ignore[no-untyped-def]
+    """The grid cell (n,) whose centre each of the points (n, 5) settles for, of the nine about its home (n, 2)."""
+    count = len(points)
+    nearest = home[:, 0] * cols + home[:, 1]
+    centres, mass = np.empty((rows * cols, 5)), np.empty(rows * cols)
+    for _ in range(ITERATIONS):
+        centres[:] = 0
+        mass[:] = 0
+        for s in range(count):
+            mass[nearest[s]] += size[s]
+            for i in range(5):
+                centres[nearest[s], i] += size[s] * points[s, i]
+        for k in range(rows * cols):
+            for i in range(5):
+                centres[k, i] /= max(mass[k], 1.0)
+        for s in range(count):
+            best = np.inf
+            for row in range(max(home[s, 0] - 1, 0), min(home[s, 0] + 2, rows)):
+                for col in range(max(home[s, 1] - 1, 0), min(home[s, 1] + 2, cols)):
+                    k = row * cols + col
+                    distance = 0.0
+                    for i in range(5):
+                        distance += (points[s, i] - centres[k, i]) ** 2
+                    if mass[k] > 0 and distance < best:
+                        best, nearest[s] = distance, k
+    return nearest
 
 
 @kernel
