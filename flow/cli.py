@@ -13,6 +13,7 @@ import os
 import shlex
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -318,10 +319,13 @@ def _export(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.folder} is a file; give the name of a folder")
     if options.folder.exists() and any(options.folder.iterdir()):
         raise UsageError(f"{options.folder} is not empty, and maps of two runs must not mix; choose another folder")
-    files = export(options.result, options.folder, options.frames)
+    lost = Counter[str]()
+    files = export(options.result, options.folder, options.frames, lost)
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")
-    return COMPLETE
+    for why in lost:
+        say(f"WARNING: {options.result}: {why}; what is left was exported")
+    return INCOMPLETE if lost else COMPLETE
 
 
 def _demo_arguments(sub: argparse.ArgumentParser) -> None:

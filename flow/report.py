@@ -28,13 +28,13 @@ def headline(summary: dict[str, Any]) -> str:
     frames = f"{whole} of {counted(of, 'frame')}" if all_but else counted(whole, "frame")
     said = f"interrupted after {frames}" if summary["interrupted"] else f"{frames} whole"
     lost = ", ".join(f"{number} {reason}" for reason, number in drops.items())
-    count = f", {sum(drops.values())} lost: {lost}" if drops else ""
+    count = f", {counted(sum(drops.values()), 'loss', 'losses')}: {lost}" if drops else ""
     return f"{summary['verdict']}: {said}{count}; {summary['frames_per_second']:.2f} frames/s"
 
 
-def counted(number: int, what: str) -> str:
-    """A number of things in words: "1 frame", "2 frames"."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
+def counted(number: int, what: str, many: str = "") -> str:
+    """A number of things in words: "1 frame", "2 frames"; many: what several are called if not so."""
+    return f"{number} {what if number == 1 else many or what + 's'}"
 
 
 def report(summary: dict[str, Any]) -> None:

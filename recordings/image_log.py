@@ -178,7 +178,8 @@ def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) ->
     images = [_pixels(path) for path in pair]
     height, width = images[0].shape[:2]
     if images[0].shape != images[1].shape or images[0].dtype != images[1].dtype:
-        shapes = " and ".join(f"{p.shape[1]}x{p.shape[0]} {p.dtype}" for p in images)
+        kinds = ("gray" if image.ndim == 2 else "colour" for image in images)
+        shapes = " and ".join(f"{p.shape[1]}x{p.shape[0]} {p.dtype} {k}" for p, k in zip(images, kinds, strict=True))
         raise LogError(f"{pair[0]} and {pair[1]} differ in size or kind ({shapes})")
     if not (0 <= values["cx"] < width and 0 <= values["cy"] < height):
         raise LogError(

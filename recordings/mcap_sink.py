@@ -54,7 +54,7 @@ class McapSink:
     results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each; where each pixel of
     a Disparity comes from goes to /nav/<stream>/source, why each cell of a NavigationMap has its state to
     /nav/<stream>/reason. also: further streams, for those who would keep the results as they are. compression: of the
-    log, lz4, zstd or none; zstd takes a fifth less room than lz4, and four times as long.
+    log, lz4, zstd or none; zstd takes a fifth less room than lz4, and twice the time to write.
     """
 
     results: tuple[str, ...] = (
@@ -71,7 +71,7 @@ class McapSink:
 
     def __post_init__(self) -> None:
         if self.compression not in COMPRESSIONS:
-            raise ValueError(f"McapSink.compression must be one of {', '.join(COMPRESSIONS)}, not {self.compression}")
+            raise ValueError(f"McapSink.compression must be one of {', '.join(COMPRESSIONS)}, not '{self.compression}'")
 
     def wants(self, stream: str, kind: type) -> bool:
         """Whether a stream of data of type `kind` is to be written. Raises LogError where it is but cannot be."""

@@ -6,6 +6,7 @@ frames gave, in memory that grows with the ground seen and not with the rectangl
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -22,7 +23,7 @@ from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM, Mosaic
 from recordings.export.ply import COLOURS, write_ply
-from recordings.mcap_reader import without_results
+from recordings.mcap_reader import iter_decoded, without_results
 from recordings.paint import hillshade
 from recordings.whole_file import written
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Source, Tiles, Transform
@@ -37,18 +38,19 @@ _CENTRES = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 _POINTS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 
 
-def export(result: Path, out: Path, frames: bool = False) -> list[Path]:
+def export(result: Path, out: Path, frames: bool = False, lost: Counter[str] | None = None) -> list[Path]:
     """Write the regional map of a result log into the folder `out`, or with `frames` the maps of every frame into a
     folder each; returns the files.
 
-    Raises LogError where the log cannot be read, or holds no such map.
+    With `lost`, what is left of a damaged log is exported, and why messages were lost is counted there. Raises LogError
+    where the log cannot be read, or holds no such map.
     """
-    return _export_frames(result, out) if frames else _export_region(result, out)
+    return _export_frames(result, out, lost) if frames else _export_region(result, out, lost)
 
 
-def _messages(result: Path, *topics: str) -> Iterator[tuple[int, dict[str, Any]]]:
+def _messages(result: Path, lost: Counter[str] | None, *topics: str) -> Iterator[tuple[int, dict[str, Any]]]:
     """(stamp, topic -> message) of every frame; under "level" where the frame `level` lies in another."""
-    wanted = ros2.iter_messages(result, [*topics, "/tf"])
+    wanted = iter_decoded(result, [*topics, "/tf"], lost)
     for stamp, group in groupby(wanted, key=lambda item: item[1]):
         frame: dict[str, Any] = {}
         for topic, _, message in group:
@@ -76,10 +78,10 @@ class _Region:
         return [*files, _write(out / "points.ply", _write_cells, self.terrain, self.colours, about)]
 
 
-def _export_region(result: Path, out: Path) -> list[Path]:
+def _export_region(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
     """The regional map in `out`; where it began anew in further frames of reference, a folder for each in `out`."""
     regions: dict[str, _Region] = {}
-    for stamp, frame in _messages(result, *REGION, POINTS):
+    for stamp, frame in _messages(result, lost, *REGION, POINTS):
         if REGION[0] in frame:
             given = _read(ros2.read_grid_map, frame[REGION[0]], result)
             region = regions.setdefault(given.frame_id, _Region(_terrain_mosaic(given, RIM)))
@@ -93,6 +95,7 @@ def _export_region(result: Path, out: Path) -> list[Path]:
                 region.navigation = region.navigation or _navigation_mosaic(cells, RIM)
                 _lay_navigation(region.navigation, cells)
     if not regions:
+        _check_damage(result, lost)
         raise without_results(
             result, REGION[:1], instead=(*FRAME, POINTS), remedy="add --frames to export the maps of every frame"
         )
@@ -104,10 +107,10 @@ def _export_region(result: Path, out: Path) -> list[Path]:
     return [file for name, region in known.items() for file in region.write(out / name.replace("/", "-"))]
 
 
-def _export_frames(result: Path, out: Path) -> list[Path]:
+def _export_frames(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
     files: list[Path] = []
     number = 0
-    for stamp, frame in _messages(result, *FRAME, POINTS):
+    for stamp, frame in _messages(result, lost, *FRAME, POINTS):
         folder, written_before = out / f"frame-{number:04d}-{stamp}", len(files)
         about = f"roverflow: local frame '{LEVEL_FRAME}', metres, z up; at {stamp} ns"
         given = frame.get(FRAME[0])
@@ -127,8 +130,15 @@ def _export_frames(result: Path, out: Path) -> list[Path]:
             files.append(_write(folder / "points.ply", _write_points, points, about))
         number += len(files) > written_before
     if not files:
+        _check_damage(result, lost)
         raise without_results(result, (*FRAME, POINTS))
     return files
+
+
+def _check_damage(result: Path, lost: Counter[str] | None) -> None:
+    """Raise LogError if it is damage that left nothing to export."""
+    for why in lost or ():
+        raise LogError(f"{result}: {why}; nothing that is left of it can be exported, run the traverse again")
 
 
 def _read(reader: Callable[[Any], Any], message: Any, result: Path) -> Any:

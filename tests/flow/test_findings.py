@@ -30,12 +30,12 @@ def said_of(**changes):
 
 def test_the_verdict_says_what_was_lost_in_the_same_line():
     assert said_of(verdict="COMPLETE") == "COMPLETE: 18 of 18 frames whole"
-    assert said_of(drops={"unmatched": 2}) == "INCOMPLETE: 18 frames whole, 2 lost: 2 unmatched"
+    assert said_of(drops={"unmatched": 2}) == "INCOMPLETE: 18 frames whole, 2 losses: 2 unmatched"
     lost = {"failed": 1, "unreadable": 2}
-    assert said_of(frames_out=17, drops=lost) == "INCOMPLETE: 17 of 18 frames whole, 3 lost: 1 failed, 2 unreadable"
+    assert said_of(frames_out=17, drops=lost) == "INCOMPLETE: 17 of 18 frames whole, 3 losses: 1 failed, 2 unreadable"
     assert said_of(interrupted=True, frames_in=1, frames_out=1) == "INCOMPLETE: interrupted after 1 frame"
     stopped = said_of(interrupted=True, drops={"abandoned": 3})
-    assert stopped == "INCOMPLETE: interrupted after 18 frames, 3 lost: 3 abandoned"
+    assert stopped == "INCOMPLETE: interrupted after 18 frames, 3 losses: 3 abandoned"
 
 
 def test_what_a_stage_found_is_said_at_the_end_to_the_user_and_to_the_sinks(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -224,6 +225,26 @@ def test_a_log_without_a_regional_map_says_what_to_add(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
     (points,) = export(path, tmp_path / "out", frames=True)
     assert points.name == "points.ply"
+
+
+def test_what_is_left_of_a_cut_log_is_exported_and_the_loss_told(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    with Ros2Writer(path) as writer:
+        for frame, corner in enumerate([(-1.0, 1.0), (0.0, 1.0)]):
+            terrain, _ = window(frame, corner, (30, 40))
+            writer.write("/nav/regional_map", ros2.grid_map(terrain), terrain.stamp)
+            writer.metadata("between", {})  # ends the chunk
+    content = path.read_bytes()
+    path.write_bytes(content[: content.index(b"between") + 60])
+    with pytest.raises(LogError, match="cut or damaged"):
+        export(path, tmp_path / "none")
+    lost = Counter[str]()
+    export(path, tmp_path / "out", lost=lost)
+    assert [why.partition(" at byte")[0] for why in lost] == ["the log is cut or damaged"]
+    with rasterio.open(tmp_path / "out" / "elevation.tif") as file:
+        assert (file.width, file.height) == (40, 30)
+    with pytest.raises(LogError, match=r"cut or damaged .*; nothing that is left of it can be exported"):
+        export(path, tmp_path / "nothing", frames=True, lost=Counter())
 
 
 @pytest.mark.parametrize("frames", [False, True])
