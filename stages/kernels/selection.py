@@ -16,7 +16,7 @@ from stages.kernels.vectors import (
     byte,
     count_up,
     either,
-    first_equal,
+    first_smallest,
     lanes_in,
     lesser,
     load,
@@ -35,7 +35,7 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):  # ty
 
     total: (W * n,) uint8, the sums; beyond: (n,) uint8, 255 for lanes that are no disparities; guard: (2 n,) uint8, 255
     at n - 1, n, n + 1, else 0; step: direction in which to go through the row, with the same result. Into winner (W,)
-    int16, votes (4, W) uint8: sum of the winner, of its lower and upper neighbour, and the smallest of the others; and
+    int16, votes (4, W) uint16: sum of the winner, of its lower and upper neighbour, and the smallest of the others; and
     right (W + n,) uint8 or uint16: the right image's winners, backwards, that of the partner of left
     pixel x at disparity d at W - 1 - x + d.
     """
@@ -63,8 +63,7 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):  # ty
 @part
 def _find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[no-untyped-def]
     n = lanes_in(width)
-    low = smallest(sums)
-    d = first_equal(sums, low)
+    low, d = first_smallest(sums)
     winner[x] = d
     votes[0, x] = low
     votes[1, x] = byte(total, x * n + max(d - 1, 0))

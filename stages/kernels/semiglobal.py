@@ -105,14 +105,14 @@ def match(
     height, columns = left.shape
     width = Width(lanes_for(rule.disparities))
     pixels, evidence = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
-    with pairs(threads) as both:
-        _sweep_all(left, right, rule, width, prior, memory, pixels, evidence, both)
+    with pairs(threads) as both, _workspaces.one() as space:
+        _sweep_all(left, right, rule, width, prior, memory, pixels, evidence, space, both)
         blank, partner = both(lambda: blank_windows(left), lambda: blank_windows(right))
         if excluded is not None:
             blank[:, :columns] |= excluded
         parts = slice(height // 2), slice(height // 2, height)
         both(*(functools.partial(drop_blank, blank[at], partner[at], pixels[at], evidence[at]) for at in parts))
-        drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, both)
+        drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, space, both)
         confidence, source = np.empty((height, columns), np.float32), np.empty((height, columns), np.uint8)
         both(*(functools.partial(_grade, evidence[at], rule.calibration, confidence[at], source[at]) for at in parts))
     return Matches(pixels, source, confidence)
@@ -120,16 +120,15 @@ def match(
 
 def _sweep_all(
     left: Array, right: Array, rule: Rule, width: Width, prior: tuple[Array, Array] | None, memory: int,
-    pixels: Array, evidence: Array, both: AtOnce,
+    pixels: Array, evidence: Array, space: Workspace, both: AtOnce,
 ) -> None:  # fmt: skip
     """Fill in disparities and evidence; what that takes but the workspace is given back."""
-    with _workspaces.one() as space:
-        left_planes, right_planes = both(lambda: _described(left, rule), lambda: _described(right, rule, width))
-        steps = brightness_steps(left, both)
-        pair = Pair(left_planes, right_planes, steps, *_view(left.shape[1], rule, width), *(prior or NO_PRIOR))
-        upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
-        both(upper.arrive, lower.arrive)
-        both(lambda: upper.cross(lower), lambda: lower.cross(upper))
+    left_planes, right_planes = both(lambda: _described(left, rule), lambda: _described(right, rule, width))
+    steps = brightness_steps(left, both)
+    pair = Pair(left_planes, right_planes, steps, *_view(left.shape[1], rule, width), *(prior or NO_PRIOR))
+    upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
+    both(upper.arrive, lower.arrive)
+    both(lambda: upper.cross(lower), lambda: lower.cross(upper))
 
 
 @kernel
@@ -224,7 +223,7 @@ class _Half:
         guard = np.abs(np.arange(2 * lanes) - lanes) <= 1
         self.scratch = Scratch(
             costs=space.bytes(size), column_sums=space.bytes(2 * size).reshape(2, size), total=space.bytes(size),
-            winner=np.empty(columns, np.int16), votes=np.empty((4, columns), np.uint8),
+            winner=np.empty(columns, np.int16), votes=np.empty((4, columns), np.uint16),
             right=np.empty(columns + lanes, index), partners=np.empty(columns, np.int16),
             guard=np.where(guard, np.uint8(255), np.uint8(0)),
             beyond=np.where(np.arange(lanes) < disparities, np.uint8(0), np.uint8(255)),

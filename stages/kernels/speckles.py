@@ -7,99 +7,115 @@ a row has a hundred times fewer of them, and a patch is dropped run by run.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import in_turn
+from stages.kernels.halves import AtOnce, in_turn
 from stages.kernels.union import join, root
+from stages.kernels.workspace import Workspace
 
 
 def drop_speckles(
-    disparity: Array, evidence: Array, step: float, largest: int, at_once: Callable[..., object] = in_turn
+    disparity: Array, evidence: Array, step: float, largest: int, space: Workspace, both: AtOnce = in_turn
 ) -> None:
     """Set patches of at most `largest` pixels to NaN, and their evidence to 0, in place.
 
-    disparity: (H, W) float32, px, NaN = unknown; evidence: (H, W) uint8; step: px; at_once: calls two functions, one
-    for the upper and one for the lower half of the image.
+    disparity: (H, W) float32, px, NaN = unknown; evidence: (H, W) uint8; step: px; space: where the runs are kept;
+    both: calls two functions, one for the upper and one for the lower half of the image.
     """
     if largest == 0:
         return
     height, columns = disparity.shape
     middle = height // 2
+    halves = (0, middle), (middle, height)
+    space.reserve(4 * (4 * disparity.size + 64))
     # As many runs as pixels at most. What is not touched never becomes memory.
-    start, end, parent = (np.empty(height * columns, np.int32) for _ in range(3))
+    runs = tuple(space.array((disparity.size,), np.int32) for _ in ("start", "end", "parent", "area"))
     seam = np.full((2, columns), -1, np.int32)
-    runs, limit = (start, end, parent), np.float32(step)
-    counts = np.array([0, middle * columns])
+    limit, counts = np.float32(step), [0, 0]
 
-    def find(first: int, last: int, half: int) -> None:
-        rows = np.full((2, columns), -1, np.int32), np.zeros((2, columns + 1), np.bool_)
-        _find_runs(disparity, first, last, limit, runs, counts, seam, half, *rows)
+    def find(half: int) -> None:
+        first, end = halves[half]
+        last = end - 1 if half == 0 else first  # the row next to the other half
+        goes_on = np.zeros(columns + 1, np.bool_)
+        counts[half] = _find_runs(disparity, first, end, limit, runs, seam[half], last, goes_on)
 
-    at_once(lambda: find(0, middle, 0), lambda: find(middle, height, 1))
-    _drop(disparity, evidence, middle, limit, largest, runs, np.zeros(height * columns, np.int32), counts, seam)
+    def drop(half: int) -> None:
+        first = halves[half][0] * columns
+        _drop(disparity.reshape(-1), evidence.reshape(-1), runs, first, first + counts[half], largest)
+
+    both(lambda: find(0), lambda: find(1))
+    _join_halves(disparity, middle, limit, runs, seam)
+    both(lambda: drop(0), lambda: drop(1))
 
 
 @kernel
-def _find_runs(disparity, first_row, end_row, step, runs, counts, seam, half, ids, links):  # type: ignore[no-untyped-def]
-    """Runs of some rows, joined among themselves; `seam` takes those of the row next to the other half."""
-    start, end, parent = runs
-    columns = disparity.shape[1]
-    count = counts[half]
-    beside, over = links[0], links[1]  # whether a pixel belongs to the patch of its left or of its upper neighbour
+def _find_runs(disparity, first_row, end_row, step, runs, seam, seam_row, goes_on):  # type: ignore[no-untyped-def]
+    """Runs of some rows, joined among themselves; returns how many. `seam` takes those of `seam_row`, pixel by pixel.
+
+    A run that is its own parent has the area of its patch, in pixels. goes_on: (W + 1,) bool, False at both ends.
+    """
+    start, end, parent, area = runs
+    pixels, columns = disparity.reshape(-1), disparity.shape[1]
+    begin = first_row * columns
+    count = above = begin
     for y in range(first_row, end_row):
-        row, last = disparity[y], disparity[max(y - 1, 0)]
-        above, here = ids[(y + 1) & 1], ids[y & 1]
+        row, origin, above_end = disparity[y], y * columns, count
         for x in range(1, columns):
-            beside[x] = abs(row[x] - row[x - 1]) <= step
-        for x in range(columns):
-            over[x] = abs(row[x] - last[x]) <= step
-            here[x] = -1
+            goes_on[x] = abs(row[x] - row[x - 1]) <= step
         x = 0
         while x < columns:
-            if row[x] != row[x]:
-                x += 1
-                continue
             first = x
             x += 1
-            while beside[x]:  # ends at the row's end, where there is always False
+            if row[first] != row[first]:
+                continue
+            while goes_on[x]:  # ends at the row's end, where there is always False
                 x += 1
-            start[count], end[count], parent[count] = y * columns + first, y * columns + x, count
-            joined = -1  # the run above that this one was joined with last
-            for i in range(first, x):
-                here[i] = count
-                if over[i] and above[i] != joined:
-                    joined = above[i]
-                    if joined >= 0:
-                        join(parent, count, joined)
+            start[count], end[count], parent[count], area[count] = origin + first, origin + x, count, x - first
+            while above < above_end and end[above] + columns <= start[count]:
+                above += 1
+            other = above
+            while other < above_end and start[other] + columns < end[count]:
+                for i in range(max(start[other] + columns, start[count]), min(end[other] + columns, end[count])):
+                    if abs(pixels[i] - pixels[i - columns]) <= step:
+                        join(parent, count, other)
+                        break
+                other += 1
+            if y == seam_row:
+                seam[first:x] = count
             count += 1
-        if y == (end_row - 1 if half == 0 else first_row):
-            for x in range(columns):
-                seam[half, x] = here[x]
-    counts[half] = count
+        above = above_end
+    for run in range(begin, count):
+        parent[run] = root(parent, run)
+        if parent[run] != run:
+            area[parent[run]] += area[run]
+    return count - begin
 
 
 @kernel
-def _drop(disparity, evidence, middle, step, largest, runs, area, counts, seam):  # type: ignore[no-untyped-def]
-    start, end, parent = runs
-    columns = disparity.shape[1]
-    for x in range(columns):
+def _join_halves(disparity, middle, step, runs, seam):  # type: ignore[no-untyped-def]
+    _, _, parent, area = runs
+    for x in range(disparity.shape[1]):
         if seam[0, x] >= 0 and seam[1, x] >= 0 and abs(disparity[middle, x] - disparity[middle - 1, x]) <= step:
-            join(parent, seam[0, x], seam[1, x])
-    for first, count in ((0, counts[0]), (middle * columns, counts[1])):
-        for run in range(first, count):
-            area[root(parent, run)] += end[run] - start[run]
-    pixels, strength = disparity.reshape(-1), evidence.reshape(-1)
-    for first, count in ((0, counts[0]), (middle * columns, counts[1])):
-        for run in range(first, count):
-            if area[root(parent, run)] <= largest:
-                for i in range(start[run], end[run]):
-                    pixels[i], strength[i] = np.nan, 0
+            upper, lower = root(parent, seam[0, x]), root(parent, seam[1, x])
+            if upper != lower:
+                join(parent, upper, lower)
+                area[min(upper, lower)] += area[max(upper, lower)]
+
+
+@kernel
+def _drop(pixels, strength, runs, first, last, largest):  # type: ignore[no-untyped-def]
+    start, end, parent, area = runs
+    for run in range(first, last):
+        patch = run
+        while parent[patch] != patch:  # both halves at once: read only
+            patch = parent[patch]
+        if area[patch] <= largest:
+            for i in range(start[run], end[run]):
+                pixels[i], strength[i] = np.nan, 0
 
 
 def drop_speckles_reference(disparity: Array, evidence: Array, step: float, largest: int) -> None:

@@ -36,6 +36,7 @@ from numba.np.arrayobj import make_array
 LARGEST_CHUNK = 64
 _unbox: Any = unbox
 _intrinsic: Any = intrinsic(prefer_literal=True)
+_tuple_of: Any = types.Tuple
 _I32 = ir.IntType(32)
 _I64 = ir.IntType(64)
 
@@ -267,50 +268,51 @@ def _smallest(b: Any, kind: Lanes, value: Any) -> Any:
         size //= 2
         low, high = (b.shuffle_vector(rest, rest, _indices(range(s, s + size))) for s in (0, size))
         rest = _lesser(b, low, high)
-    # Of neighbouring bytes first, then of 8 numbers of 16 bits: for these LLVM finds the one instruction of x86.
+    # Of neighbouring bytes first, then of 8 numbers of 16 bits: for these LLVM finds the one instruction of x86, as
+    # long as nobody asks for less than all 16 bits of the result.
     wide = ir.VectorType(ir.IntType(16), 8)
     high = b.bitcast(b.lshr(b.bitcast(rest, wide), ir.Constant(wide, [8] * 8)), rest.type)
     return _call(b, "llvm.vector.reduce.umin.v8i16", ir.IntType(16), [b.bitcast(_lesser(b, rest, high), wide)])
 
 
+def _spread_smallest(b: Any, kind: Lanes, least: Any) -> Any:
+    """One chunk with the result of `_smallest` in all lanes, which never leaves the vector registers."""
+    first = b.bitcast(b.zext(least, ir.IntType(128)), ir.VectorType(ir.IntType(8), 16))
+    return b.shuffle_vector(first, first, _indices([0] * kind.chunk))
+
+
 @_intrinsic
 def smallest(typing_context: Any, value: Any) -> Any:
-    """The smallest of all bytes, a scalar."""
-
-    def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        return b.trunc(_smallest(b, value, args[0]), ir.IntType(8))
-
-    return types.uint8(value), generate
+    """The smallest of all bytes, a scalar of 16 bits; to be stored as such."""
+    return types.uint16(value), lambda context, b, signature, args: _smallest(b, value, args[0])
 
 
 @_intrinsic
 def above_smallest(typing_context: Any, value: Any) -> Any:
-    """The bytes less the smallest of them, which never leaves the vector registers."""
+    """The bytes less the smallest of them."""
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        wide, bytes16 = ir.VectorType(ir.IntType(16), 8), ir.VectorType(ir.IntType(8), 16)
-        least = b.insert_element(ir.Constant(wide, [0] * 8), _smallest(b, value, args[0]), _I32(0))
-        least = b.bitcast(least, bytes16)
-        least = b.shuffle_vector(least, least, _indices([0] * value.chunk))
+        least = _spread_smallest(b, value, _smallest(b, value, args[0]))
         return _joined(b, value, [b.sub(chunk, least) for chunk in _chunks(b, args[0], value)])
 
     return value(value), generate
 
 
 @_intrinsic
-def first_equal(typing_context: Any, value: Any, scalar: Any) -> Any:
-    """Index of the first lane that equals `scalar`, which some lane must."""
+def first_smallest(typing_context: Any, value: Any) -> Any:
+    """`smallest`, and the index of the first lane that holds it."""
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        wanted, found, mask = _spread(b, value, args[1]), _I64(0), ir.IntType(value.chunk)
+        least, found, mask = _smallest(b, value, args[0]), _I64(0), ir.IntType(value.chunk)
+        wanted = _spread_smallest(b, value, least)
         for i, chunk in reversed(list(enumerate(_chunks(b, args[0], value)))):
             equal = b.bitcast(b.icmp_unsigned("==", chunk, wanted), mask)
             zeros = _call(b, f"llvm.cttz.i{value.chunk}", mask, [equal, ir.Constant(ir.IntType(1), 0)])
             here = b.add(_sized(b, zeros, 64), _I64(i * value.chunk))
             found = b.select(b.icmp_unsigned("!=", equal, ir.Constant(mask, 0)), here, found)
-        return found
+        return context.make_tuple(b, signature.return_type, [least, found])
 
-    return types.int64(value, scalar), generate
+    return _tuple_of((types.uint16, types.int64))(value), generate
 
 
 @_intrinsic

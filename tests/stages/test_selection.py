@@ -11,6 +11,7 @@ from stages.kernels.selection import find_winners, fit_row, select_reference
 from stages.kernels.semiglobal import lanes_for
 from stages.kernels.speckles import drop_speckles, drop_speckles_reference
 from stages.kernels.vectors import Width
+from stages.kernels.workspace import Workspace
 from tests.stages.test_census import rule_of
 
 
@@ -36,7 +37,7 @@ def test_a_row_is_selected_as_by_the_reference_in_either_direction(disparities, 
     expected = select_reference(total, disparities, minimum, 1, 1)
     index = np.uint8 if lanes <= 256 else np.uint16
     for step in (1, -1):
-        rows = np.empty(columns, np.int16), np.empty((4, columns), np.uint8), np.empty(columns + lanes, index)
+        rows = np.empty(columns, np.int16), np.empty((4, columns), np.uint16), np.empty(columns + lanes, index)
         pixels, evidence = np.empty(columns, np.float32), np.empty(columns, np.uint8)
         partners = np.empty(columns, np.int16)
         flat = np.append(total.ravel(), np.zeros(64, np.uint8))
@@ -59,6 +60,6 @@ def test_speckles_are_the_small_components_of_a_graph(height, columns, largest, 
     for threads in (1, 2):
         found, found_evidence = disparity.copy(), evidence.copy()
         with pairs(threads) as both:
-            drop_speckles(found, found_evidence, 1.0, largest, both)
+            drop_speckles(found, found_evidence, 1.0, largest, Workspace(), both)
         assert np.array_equal(found, wanted, equal_nan=True)
         assert np.array_equal(found_evidence, wanted_evidence)
