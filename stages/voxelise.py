@@ -19,8 +19,8 @@ from stages.kernels.spread import laid_along_sight
 from stages.stage import Stage, parameter
 
 Grid = tuple[float, tuple[float, float], int, float]  # resolution, origin, rows and columns, region
-FINEST = 0.25  # of a cell, below which a point's reach is not worth following
-WITNESSES = 3  # places along lines of sight that a cell without a point of its own must have
+FINEST = 0.5  # of a cell, below which a point's reach is not worth following
+WITNESSES = 2  # places along lines of sight that a cell without a point of its own must have
 REACHED = 0.5  # the count of such a cell: less than a point
 SUMS = [FIGURES.index(name) for name in ("count", "sum", "sum_of_squares", "noise")]
 
@@ -31,7 +31,7 @@ class Voxelise(Stage):
 
     Layers:
     - elevation (mean), minimum, maximum, m, and count, of the measured points; without any, count is 0, the others NaN.
-      With `reach`, an empty cell into which at least 3 places fall where measured points might lie as well, 4 of them
+      With `reach`, an empty cell into which at least 2 places fall where measured points might lie as well, 4 of them
       along each line of sight, has the mean of these, and a count of 0.5: it is known, but no point says so;
     - variance, m^2: of the mean against the cell's true mean height, from what is random within a frame;
     - common_variance, m^2: from the tilt's uncertainty, which moves a whole frame at once, so that neither many points
@@ -60,6 +60,10 @@ class Voxelise(Stage):
     reach: float = parameter(
         0.0, "how far along its line of sight, in standard deviations of its depth, a measured point speaks for cells "
         "that no point falls into; 0 = it does not", low=0.0,
+    )  # fmt: skip
+    reach_limit: float = parameter(
+        0.08, "how far at most, in depth: at edges, where depth is least sure, what lies behind is hidden", unit="m",
+        low=0.0,
     )  # fmt: skip
     percentiles: tuple[float, ...] = parameter((), "further layers: percentiles of a cell's heights, 50 the median")
     filled: str = parameter(
@@ -109,7 +113,7 @@ class Voxelise(Stage):
         if cloud.source is not None:
             cloud = cloud.only(cloud.source == Source.MEASURED)
         least = FINEST * self.resolution
-        points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.reach, least)
+        points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.reach, least, self.reach_limit)
         near = cell_statistics(points, sigma, *grid)
         reached = (figures[:, :, 0] == 0) & (near[:, :, 0] >= WITNESSES)
         near[:, :, SUMS] *= REACHED / np.maximum(near[:, :, :1], WITNESSES)

@@ -14,25 +14,27 @@ from stages.kernels.compiled import kernel
 PLACES = np.array([-1.0, -0.5, 0.5, 1.0])  # of the reach
 
 
-def laid_along_sight(points: Array, sigma: Array, sensor: Transform, reach: float, least: float) -> tuple[Array, Array]:
+def laid_along_sight(
+    points: Array, sigma: Array, sensor: Transform, reach: float, least: float, most: float
+) -> tuple[Array, Array]:
     """Copies of the points that reach at least so far, to both sides of each.
 
     points: (N, 3) float32, m; sigma: (N,) float32, depth standard deviation, m; sensor: the camera in the points'
-    frame; reach: standard deviations of depth; least: m, points with a shorter reach are left out. Returns the copies,
-    (4 M, 3) float32, and their sigma, (4 M,) float32.
+    frame; reach: standard deviations of depth; least, most: m of depth, points with a shorter reach are left out, a
+    longer one is cut. Returns the copies, (4 M, 3) float32, and their sigma, (4 M,) float32.
     """
     chosen = np.flatnonzero(sigma * np.float32(reach) >= np.float32(least))
     copies, their_sigma = np.empty((len(PLACES) * len(chosen), 3), np.float32), sigma[chosen].repeat(len(PLACES))
-    _lay(points, sigma, chosen, sensor.translation, sensor.rotation[:, 2].copy(), reach * PLACES, copies)
+    _lay(points, sigma, chosen, sensor.translation, sensor.rotation[:, 2].copy(), reach, most, PLACES, copies)
     return copies, their_sigma
 
 
 @kernel
-def _lay(points, sigma, chosen, eye, axis, places, copies):  # type: ignore[no-untyped-def]
+def _lay(points, sigma, chosen, eye, axis, reach, most, places, copies):  # type: ignore[no-untyped-def]
     for k in range(chosen.size):
         i = chosen[k]
         x, y, z = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
-        per_depth = sigma[i] / (x * axis[0] + y * axis[1] + z * axis[2])
+        per_depth = min(reach * sigma[i], most) / (x * axis[0] + y * axis[1] + z * axis[2])
         for place in range(places.size):
             stretch = places[place] * per_depth
             copy = copies[k * places.size + place]
@@ -41,12 +43,12 @@ def _lay(points, sigma, chosen, eye, axis, places, copies):  # type: ignore[no-u
 
 
 def laid_along_sight_reference(
-    points: Array, sigma: Array, sensor: Transform, reach: float, least: float
+    points: Array, sigma: Array, sensor: Transform, reach: float, least: float, most: float
 ) -> tuple[Array, Array]:
     """`laid_along_sight`, in plain numpy."""
     far = sigma * np.float32(reach) >= np.float32(least)
     points, sigma = points[far], sigma[far]
     sight = points - sensor.translation
-    stretch = (sigma / (sight @ sensor.rotation[:, 2]))[:, None] * (reach * PLACES)
+    stretch = (np.minimum(reach * sigma, most) / (sight @ sensor.rotation[:, 2]))[:, None] * PLACES
     copies = points[:, None] + stretch[:, :, None] * sight[:, None]
     return copies.reshape(-1, 3).astype(np.float32), sigma.repeat(len(PLACES))

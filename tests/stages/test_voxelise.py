@@ -229,15 +229,16 @@ def test_points_are_laid_along_their_lines_of_sight_as_the_reference_lays_them()
     points = (SENSOR.translation + random.uniform(1, 8, (500, 1)) * SENSOR.rotation[:, 2]
               + random.normal(0, 0.3, (500, 3))).astype(np.float32)  # fmt: skip
     sigma = random.uniform(0, 0.1, 500).astype(np.float32)
-    copies, their_sigma = laid_along_sight(points, sigma, SENSOR, 2.0, 0.05)
-    expected, expected_sigma = laid_along_sight_reference(points, sigma, SENSOR, 2.0, 0.05)
+    copies, their_sigma = laid_along_sight(points, sigma, SENSOR, 2.0, 0.05, 0.12)
+    expected, expected_sigma = laid_along_sight_reference(points, sigma, SENSOR, 2.0, 0.05, 0.12)
     np.testing.assert_allclose(copies, expected, atol=2e-6)
     np.testing.assert_array_equal(their_sigma, expected_sigma)
     assert 0 < len(copies) < 4 * len(points)
     eye, axis = SENSOR.translation, SENSOR.rotation[:, 2]
     far = points[sigma * np.float32(2) >= np.float32(0.05)]
     moved = (copies.reshape(-1, 4, 3) - eye) @ axis - ((far - eye) @ axis)[:, None]
-    np.testing.assert_allclose(moved, 2 * their_sigma.reshape(-1, 4) * np.array([-1, -0.5, 0.5, 1]), atol=1e-5)
+    reach = np.minimum(2 * their_sigma.reshape(-1, 4), 0.12)
+    np.testing.assert_allclose(moved, reach * np.array([-1, -0.5, 0.5, 1]), atol=1e-5)
 
 
 def rows_apart(sigma: float) -> PointCloud:
@@ -259,6 +260,9 @@ def test_a_cell_that_points_missed_by_their_own_uncertainty_is_known_by_them() -
     assert (reached["count"][gained] == 0.5).all()
     assert np.abs(reached["elevation"][gained]).max() < 0.05
     assert reached["variance"][gained].min() > 0
+    near = Voxelise(reach=2.0, reach_limit=0.05)(cloud).layers["count"] > 0
+    assert gained[near & ~own].all()
+    assert own.sum() < near.sum() < own.sum() + gained.sum()
 
 
 def test_only_measured_points_reach_beyond_their_cell() -> None:
