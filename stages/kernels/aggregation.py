@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.census import differing_bits, seen_costs
+from stages.kernels.census import census_costs
 from stages.kernels.compiled import kernel, part
 from stages.kernels.halves import AtOnce, in_turn
 from stages.kernels.vectors import (
@@ -75,14 +75,15 @@ def _brightness_steps(image, image_stride, steps, rows, stride, first, end, widt
 
 @part
 def aggregate_row(  # type: ignore[no-untyped-def]
-    pair, rule, costs, fused, paths, y, step, sums, place, total, final, width
+    pair, rule, costs, paths, y, step, sums, place, total, final, width
 ):
     """Follow the paths of one sweep from the row before into row y, and add them up.
 
-    pair, rule: `semiglobal.Pair` and `Rule`; costs: (W * n,) uint8, C of the row; fused: C is not in `costs` but the
-    census cost, to be made here, which saves writing and reading it; paths: (3 * W * n,) uint8, L of the row before,
-    all 0 at first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where the sums of the row go,
-    from `place` on (W * n); final: instead, add what the other sweep left there, and put the whole into `total`.
+    pair, rule: `semiglobal.Pair` and `Rule`; costs: (W * n,) uint8, C of the row without the prior's costs, with
+    `rule.gradient`; else C is the census cost, made here, which saves writing and reading it; paths: (3 * W * n,)
+    uint8, L of the row before, all 0 at first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where
+    the sums of the row go, from `place` on (W * n); final: instead, add what the other sweep left there, and put the
+    whole into `total`.
     """
     n = lanes_in(width)
     columns = costs.size // n
@@ -100,13 +101,15 @@ def aggregate_row(  # type: ignore[no-untyped-def]
     store(paths, (2 * columns + (last + y) % columns) * n, nothing)
     path = nothing
     left, right = pair.left[y], pair.right[y]
+    pulled, begin = pair.prior.size > 0, pair.prior[y]
     x = first
     for _ in range(columns):
-        if fused:
-            bits = differing_bits(left, right, columns, x, width)
-            cost = seen_costs(bits, pair, rule.unseen, columns, x, width)
-        else:
+        if rule.gradient:
             cost = load(costs, x * n, width)
+        else:
+            cost = census_costs(left, right, pair, rule.unseen, columns, x, width)
+        if pulled:
+            cost = plus_capped(cost, load(pair.prior_costs, begin[x], width))
         path = _continued(path, cost, small_step, byte(table, byte(steps, beside)), width)
         total_here = path
         at = (columns + x) * n

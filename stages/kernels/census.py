@@ -78,18 +78,13 @@ def census_reference(image: Array, mirrored: bool = False) -> Array:
 
 
 @part
-def census_costs(pair, unseen, y, costs, width):  # type: ignore[no-untyped-def]
-    """The costs of row y, all pixels and disparities: costs (W * n,) uint8, pixel after pixel.
+def census_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
+    """The costs of pixel x of a row at each disparity.
 
-    pair: `semiglobal.Pair`, whose right planes run backwards, so that pixel x and lane d meet at W - 1 - x + d; unseen:
-    the cost where the partner is outside the right image.
+    left, right: the row's planes in pair, `semiglobal.Pair`, of which the right ones run backwards, so that pixel x and
+    lane d meet at W - 1 - x + d; unseen: the cost where the partner is outside the right image; columns: W.
     """
-    n = lanes_in(width)
-    columns = costs.size // n
-    left, right = pair.left[y], pair.right[y]
-    for x in range(columns):
-        bits = differing_bits(left, right, columns, x, width)
-        store(costs, x * n, seen_costs(bits, pair, unseen, columns, x, width))
+    return seen_costs(differing_bits(left, right, columns, x, width), pair, unseen, columns, x, width)
 
 
 @part

@@ -19,10 +19,11 @@ from stages.kernels.vectors import (
     Width,
     average,
     byte,
-    either,
+    greater,
     lanes_in,
     lesser,
     load,
+    minus,
     minus_capped,
     plus,
     plus_capped,
@@ -131,7 +132,7 @@ def _raw_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no
 
 @part
 def _difference(one, other):  # type: ignore[no-untyped-def]
-    return either(minus_capped(one, other), minus_capped(other, one))
+    return minus(greater(one, other), lesser(one, other))
 
 
 def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen: int) -> Array:

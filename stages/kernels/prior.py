@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.compiled import kernel, part
-from stages.kernels.vectors import lanes_in, load, plus_capped, store
+from stages.kernels.compiled import kernel
 
 PHASES = 4
 MARGIN = 16
@@ -42,14 +41,6 @@ def _begin(prior, minimum, least, most, length, far, begin):  # type: ignore[no-
             known = np.isfinite(quarters)
             whole = np.int64(min(max(quarters, least), most)) if known else 0
             begin[y, x] = (whole % PHASES) * length + far - whole // PHASES if known else PHASES * length
-
-
-@part
-def add_prior(costs, begin, table, width):  # type: ignore[no-untyped-def]
-    """Add the prior's costs to those of a row: costs (W * n,) uint8; begin: (W,) int32; table: of `prior_costs`."""
-    n = lanes_in(width)
-    for x in range(begin.size):
-        store(costs, x * n, plus_capped(load(costs, x * n, width), load(table, begin[x], width)))
 
 
 def prior_costs_reference(prior: Array, minimum: int, lanes: int, weight: float, reach: float) -> Array:

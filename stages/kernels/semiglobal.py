@@ -22,11 +22,10 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.aggregation import aggregate_row, brightness_steps
 from stages.kernels.blank import blank_windows, drop_blank
-from stages.kernels.census import census, census_costs
+from stages.kernels.census import census
 from stages.kernels.compiled import kernel
 from stages.kernels.gradient import gradients, smoothed_costs
 from stages.kernels.halves import AtOnce, pairs
-from stages.kernels.prior import add_prior
 from stages.kernels.selection import find_winners, fit_row
 from stages.kernels.speckles import drop_speckles
 from stages.kernels.vectors import Width, lanes_in
@@ -165,19 +164,14 @@ def _sweep(  # type: ignore[no-untyped-def]
 ):
     """Rows y to end (exclusive) in steps of 1 or -1; the sums of row y are at (y - origin) * W * n of `sums`."""
     size = pixels.shape[1] * lanes_in(width)
-    fused = not rule.gradient and pair.prior.size == 0
     if rule.gradient:
         for ahead in (y - step, y):  # smoothed_costs needs the column sums of two rows before it can begin
             smoothed_costs(pair, rule.unseen, ahead, scratch.column_sums, scratch.costs, width)
     while y != end:
         if rule.gradient:
             smoothed_costs(pair, rule.unseen, y + step, scratch.column_sums, scratch.costs, width)
-        elif not fused:
-            census_costs(pair, rule.unseen, y, scratch.costs, width)
-        if pair.prior.size > 0:
-            add_prior(scratch.costs, pair.prior[y], pair.prior_costs, width)
         aggregate_row(
-            pair, rule, scratch.costs, fused, paths, y, step, sums, (y - origin) * size, scratch.total, final, width
+            pair, rule, scratch.costs, paths, y, step, sums, (y - origin) * size, scratch.total, final, width
         )  # fmt: skip
         if final:
             find_winners(

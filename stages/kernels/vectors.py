@@ -183,6 +183,7 @@ greater = _named("umax")
 plus_capped = _named("uadd.sat")  # stops at 255
 minus_capped = _named("usub.sat")  # stops at 0
 plus = _on_chunks(lambda b, kind, x, y: b.add(x, y))
+minus = _on_chunks(lambda b, kind, x, y: b.sub(x, y))
 exclusive_or = _on_chunks(lambda b, kind, x, y: b.xor(x, y))
 either = _on_chunks(lambda b, kind, x, y: b.or_(x, y))
 both = _on_chunks(lambda b, kind, x, y: b.and_(x, y))

@@ -8,14 +8,17 @@ from stages.kernels.blank import blank_windows, blank_windows_reference
 from stages.kernels.census import census, census_costs, census_costs_reference, census_reference
 from stages.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
 from stages.kernels.semiglobal import NO_PRIOR, Pair, Rule, _described, _view, lanes_for
-from stages.kernels.vectors import Width
+from stages.kernels.vectors import Width, lanes_in, store
 from tests.stages.test_match_opencv import textured
 
 
 @njit
 def rows_of_census(pair, unseen, costs, width):
+    n = lanes_in(width)
+    columns = costs.shape[1] // n
     for y in range(costs.shape[0]):
-        census_costs(pair, unseen, y, costs[y], width)
+        for x in range(columns):
+            store(costs[y], x * n, census_costs(pair.left[y], pair.right[y], pair, unseen, columns, x, width))
 
 
 @njit
