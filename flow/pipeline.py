@@ -124,10 +124,13 @@ def _check_keys(tree: _Value) -> None:
 
 
 def _override(tree: _Value, setting: str) -> None:
-    """Apply one "stream.param=value" ("source.param=value" for the source), or "name=value" of the settings."""
+    """Apply one "stream.param=value" ("source.param=value" for the source), or "name=value" of the settings.
+
+    A parameter that is a mapping itself is changed in one place by "stream.param.key=value".
+    """
     path, separator, text = setting.partition("=")
-    stream, dot, param = path.strip().partition(".")
-    if not (separator and stream and (param or not dot)):
+    stream, *names = path.strip().split(".")
+    if not (separator and stream and all(names)):
         raise UsageError(f"--set {setting}: expected stream.param=value")
     top = tree.value if isinstance(tree.value, dict) else {}
     streams, settings = top["streams"].value if "streams" in top else {}, _settings(tree)
@@ -137,7 +140,7 @@ def _override(tree: _Value, setting: str) -> None:
         value = None if node is None else _located(node, place.file, yaml.SafeLoader("")).value
     except yaml.YAMLError as error:
         raise UsageError(f"--set {setting}: '{text}' is not valid YAML") from error
-    if not dot:
+    if not names:
         if stream not in settings:
             raise UsageError(f"--set {setting}: the pipeline has no setting '{stream}'{_nearest(stream, settings)}")
         settings[stream] = _Value(value, place)
@@ -145,9 +148,14 @@ def _override(tree: _Value, setting: str) -> None:
     targets = {**(streams if isinstance(streams, dict) else {}), "source": top.get("source")}
     if targets.get(stream) is None:
         raise UsageError(f"--set {setting}: there is no stream '{stream}'{_nearest(stream, targets)}")
-    if not isinstance(targets[stream].value, dict):
-        raise targets[stream].place.error(f"'{stream}' must be a mapping of names to values")
-    targets[stream].value[param] = _Value(value, place)
+    item, what = targets[stream], stream
+    for depth, name in enumerate(names, 1):
+        if not isinstance(item.value, dict):
+            raise UsageError(f"--set {setting}: '{what}' is no mapping of names to values")
+        if depth == len(names):
+            item.value[name] = _Value(value, place)
+        else:
+            item, what = item.value.setdefault(name, _Value({}, place)), f"{what}.{name}"
 
 
 def _settings(tree: _Value) -> dict[str, _Value]:

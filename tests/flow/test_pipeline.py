@@ -49,6 +49,21 @@ def test_a_setting_from_the_command_line_replaces_one_in_the_file(tmp_path):
     assert graph.source.gain == 1.0
 
 
+def test_one_key_of_a_mapping_is_replaced_alone(tmp_path):
+    angle = "{field: vector.x, unit: deg, sign: 1}"
+    text = f"""\
+        source: {{use: recordings.McapSource, pitch: {angle}}}
+        streams:
+          stereo: {{use: flow.align.pair, left: left, right: right, slop: 5 ms}}
+          rectified: {{use: stages.Rectify, frame: stereo}}
+        sinks: [{{use: tests.flow.toys.Keep}}]
+    """
+    settings = [f"source.roll.{key}" for key in ("field=vector.y", "unit=rad", "sign=1")]
+    source = loaded(tmp_path, text, ["source.pitch.sign=-1", "source.tilt_model=axis", *settings]).source
+    assert source.pitch == {"field": "vector.x", "unit": "deg", "sign": -1}
+    assert source.roll == {"field": "vector.y", "unit": "rad", "sign": 1}
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line", "words"),
     [
@@ -134,7 +149,7 @@ def test_a_setting_that_cannot_be_is_named(tmp_path, text, overrides, message):
     "setting",
     [
         "nonsense", "twice=3", "twise.factor=3", "twice.faktor=3", "twice.bad=[", "a.b", "twice.factor=-1",
-        "twice.bad=!!python/x y",
+        "twice.bad=!!python/x y", "twice.factor.sign=3", "twice..factor=3",
     ],
 )  # fmt: skip
 def test_a_bad_setting_is_named(tmp_path, setting):
