@@ -155,7 +155,9 @@ def _override(tree: _Value, setting: str) -> None:
         if depth == len(names):
             item.value[name] = _Value(value, place)
         else:
-            item, what = item.value.setdefault(name, _Value({}, place)), f"{what}.{name}"
+            inner = item.value.get(name, _Value({}, place))
+            item.value[name] = _Value(inner.value, place)
+            item, what = item.value[name], f"{what}.{name}"
 
 
 def _settings(tree: _Value) -> dict[str, _Value]:
@@ -241,7 +243,7 @@ class _Builder:
                 )
         optional = item.value["optional"].value if "optional" in item.value else False
         if not isinstance(optional, bool):
-            raise item.place.error(f"'optional' must be true or false, not {optional}")
+            raise item.place.error(f"'optional' must be true or false, not {item.value['optional'].plain()}")
         output = output_of(actor, {port: kinds[stream] for port, stream in inputs.items()}, item.place)
         clock = clock_of(name, actor, {port: clocks[stream] for port, stream in inputs.items()}, item.place)
         return Node(name, self._use(item, name), actor, inputs, output, clock, optional, item.place)

@@ -56,7 +56,12 @@ def stamp_or(header: Any, log_time: int) -> int:
 def frame_of(message: Any) -> str:
     """The frame_id of a message's header, empty where it has none."""
     header = getattr(message, "header", None)
-    return str(header.frame_id).lstrip("/") if header is not None else ""
+    return frame_name(header.frame_id) if header is not None else ""
+
+
+def frame_name(text: str) -> str:
+    """The name of a frame without the slash in front that ROS 1 gave it."""
+    return text.lstrip("/")
 
 
 def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
@@ -154,7 +159,7 @@ def camera_model(info: Any) -> CameraModel:
 def transform_of(message: Any) -> Transform:
     """The transform of a geometry_msgs/TransformStamped."""
     moved, turned = message.transform.translation, message.transform.rotation
-    parent, child = frame_of(message), message.child_frame_id.lstrip("/")
+    parent, child = frame_of(message), frame_name(message.child_frame_id)
     name = f"the transform '{parent}' <- '{child}'"
     if not parent or not child:
         raise LogError(f"{name} lacks the name of a frame")
@@ -179,7 +184,7 @@ def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
     base_frame: whose pose it is where the message does not say.
     """
     if hasattr(message, "transforms"):
-        moved = next((item for item in message.transforms if item.child_frame_id == base_frame), None)
+        moved = next((t for t in message.transforms if frame_name(t.child_frame_id) == base_frame), None)
         if moved is None:
             return None
         at = transform_of(moved)
@@ -193,10 +198,10 @@ def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
     position = np.array([pose.position.x, pose.position.y, pose.position.z])
     if not np.isfinite(position).all():
         raise LogError(f"the pose is at {position.tolist()}")
-    child = getattr(message, "child_frame_id", "") or base_frame
+    child = frame_name(getattr(message, "child_frame_id", "")) or base_frame
     return Pose(
         stamp_or(message.header, log_time), position, rotation_of(pose.orientation, "the pose").as_quat(),
-        message.header.frame_id, child, covariance,
+        frame_of(message), child, covariance,
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from mcap.records import Channel
 
-from recordings.decode import camera_model, frame_of, tilt_of, unread_encoding
+from recordings.decode import camera_model, frame_name, frame_of, tilt_of, unread_encoding
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError, counted
 from recordings.mcap_index import Lost, said
@@ -204,7 +204,7 @@ class Opening:
         base, parents, looked_at = self.source.base_frame, dict[str, set[str]](), 0
         for message in self._made(topic, lambda message: message.transforms):
             for item in [] if isinstance(message, LogError) else message:
-                parents.setdefault(item.child_frame_id, set()).add(frame_of(item))
+                parents.setdefault(frame_name(item.child_frame_id), set()).add(frame_of(item))
             looked_at += base in parents
             if looked_at == _TRANSFORMS_LOOKED_AT:
                 break

@@ -209,7 +209,7 @@ class Fuse(Stage):
 
     def _merged(self, cells: Array, seen: dict[str, Array], now: int) -> Array:
         """The cells (n,) with what a frame saw in them at `now`, ms."""
-        cells = cells.copy()
+        cells, now = cells.copy(), min(now, np.iinfo(CELL["first"]).max)
         height, variance = seen["elevation"], seen["variance"]
         known = cells["frames"] > 0
         have = np.full(len(cells), np.inf)

@@ -108,11 +108,11 @@ class Voxelise(Stage):
     def _reached(self, figures: Array, cloud: PointCloud, grid: Grid) -> Array:
         """The figures of `cell_statistics`, with those of empty cells that lie within the reach of points."""
         sensor = cloud.sensor
-        if sensor is None or self.reach == 0:
+        least = FINEST * self.resolution
+        if sensor is None or self.reach == 0 or self.reach_limit < least:
             return figures
         if cloud.source is not None:
             cloud = cloud.only(cloud.source == Source.MEASURED)
-        least = FINEST * self.resolution
         points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.reach, least, self.reach_limit)
         near = cell_statistics(points, sigma, *grid)
         reached = (figures[:, :, 0] == 0) & (near[:, :, 0] >= WITNESSES)

@@ -7,10 +7,11 @@ left or above, a sweep up the other 4. p2 falls with the step of brightness from
 end.
 
 Three tricks. L has its smallest value subtracted as soon as it is known, so that it never exceeds C + p2 and fits a
-byte; Hirschmüller subtracts the same number one pixel later. The 4 paths of a sweep are added where they stand, in
-one pass, as numbers above their own smallest; sums stop at 255, which no disparity that might win reaches. And a path
-along a diagonal keeps its place in memory: its place is x - y (or x + y), which is the same for p and q, so that one
-row of costs for each direction is enough, read and overwritten in place.
+byte (what a prior makes dearer than that stops at 255); Hirschmüller subtracts the same number one pixel later. The 4
+paths of a sweep are added where they stand, in one pass, as numbers above their own smallest; sums stop at 255, which
+no disparity that might win reaches. And a path along a diagonal keeps its place in memory: its place is x - y (or
+x + y), which is the same for p and q, so that one row of costs for each direction is enough, read and overwritten in
+place.
 """
 
 from __future__ import annotations
@@ -26,11 +27,10 @@ from stages.kernels.vectors import (
     Width,
     above_smallest,
     byte,
-    either,
+    difference,
     lanes_in,
     lesser,
     load,
-    minus_capped,
     plus_capped,
     shifted,
     shifted_in_memory,
@@ -69,8 +69,7 @@ def _brightness_steps(image, image_stride, steps, rows, stride, first, end, widt
             for i in range(0, stride, lanes_in(width)):
                 here = (y + 1) * image_stride + i + 1
                 one, other = load(image, here, width), load(image, here + dy * image_stride + dx, width)
-                step = either(minus_capped(one, other), minus_capped(other, one))
-                store(steps, (side * rows + y) * stride + i, step)
+                store(steps, (side * rows + y) * stride + i, difference(one, other))
 
 
 @part
@@ -101,7 +100,8 @@ def aggregate_row(  # type: ignore[no-untyped-def]
     store(paths, (2 * columns + (last + y) % columns) * n, nothing)
     path = nothing
     left, right = pair.left[y], pair.right[y]
-    pulled, begin = pair.prior.size > 0, pair.prior[y]
+    pulled = pair.prior.size > 0
+    begin = pair.prior[y if pulled else 0]
     x = first
     for _ in range(columns):
         if rule.gradient:

@@ -19,11 +19,10 @@ from stages.kernels.vectors import (
     Width,
     average,
     byte,
-    greater,
+    difference,
     lanes_in,
     lesser,
     load,
-    minus,
     minus_capped,
     plus,
     plus_capped,
@@ -122,17 +121,12 @@ def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ign
 def _raw_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
     i = columns - 1 - x
     bits = differing_bits(left, right, columns, x, width)
-    dx = _difference(spread(byte(left[DX], x), width), load(right[DX], i, width))
-    dy = _difference(spread(byte(left[DY], x), width), load(right[DY], i, width))
+    dx = difference(spread(byte(left[DX], x), width), load(right[DX], i, width))
+    dy = difference(spread(byte(left[DY], x), width), load(right[DY], i, width))
     step = lesser(plus_capped(dx, dy), spread(LARGEST, width))
     twice = plus(step, step)
     cost = plus(plus(plus(bits, bits), step), plus(twice, twice))
     return seen_costs(cost, pair, unseen, columns, x, width)
-
-
-@part
-def _difference(one, other):  # type: ignore[no-untyped-def]
-    return minus(greater(one, other), lesser(one, other))
 
 
 def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen: int) -> Array:

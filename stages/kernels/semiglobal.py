@@ -31,7 +31,7 @@ from stages.kernels.speckles import drop_speckles
 from stages.kernels.vectors import Width, lanes_in
 from stages.kernels.workspace import Workspace, Workspaces
 
-NO_PRIOR = np.zeros((0, 0), np.int32), np.zeros(1, np.uint8)
+NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)
 _workspaces = Workspaces()
 
 
@@ -195,24 +195,25 @@ def _halves(
     space.reserve(2 * (size * (10 + band + 3 * heads) + 64 * (8 + heads)))
     sweep = functools.partial(_sweep, pair, rule, width, pixels, evidence)
     rows = range(middle), range(height - 1, middle - 1, -1)
-    return [_Half(part, band, space, sweep, columns, rule.disparities) for part in rows]
+    return [_Half(part, band, heads > 0, space, sweep, columns, rule.disparities) for part in rows]
 
 
 class _Half:
     """The rows from one end of the image to its middle, and the sweep that begins at that end."""
 
     def __init__(
-        self, rows: range, band: int, space: Workspace, sweep: Callable[..., None], columns: int, disparities: int
-    ) -> None:
-        """rows: from the end inwards; band: how many at a time."""
+        self, rows: range, band: int, banded: bool, space: Workspace, sweep: Callable[..., None], columns: int,
+        disparities: int,
+    ) -> None:  # fmt: skip
+        """rows: from the end inwards; band: how many at a time; banded: one of the halves does not fit into a band, so
+        that either has its sums made again, in the memory of the sweep that crosses it."""
         lanes = lanes_for(disparities)
         size = columns * lanes
         self.sweep, self.step = sweep, rows.step
         self.bands = [rows[i : i + band] for i in range(0, len(rows), band)]
         self.paths, self.again = space.bytes(3 * size), space.bytes(3 * size)
         self.sums = space.bytes(band * size)
-        heads = len(self.bands) if len(self.bands) > 1 else 0
-        self.heads = [space.bytes(3 * size) for _ in range(heads)]
+        self.heads = [space.bytes(3 * size) for _ in self.bands] if banded else []
         index = np.uint8 if lanes <= 256 else np.uint16
         guard = np.abs(np.arange(2 * lanes) - lanes) <= 1
         self.scratch = Scratch(
@@ -224,7 +225,7 @@ class _Half:
         )  # fmt: skip
 
     def arrive(self) -> None:
-        """Sweep to the middle. The sums stay if there is one band, else the path costs at the head of each."""
+        """Sweep to the middle. The sums stay, or else the path costs at the head of each band."""
         self.paths[:] = 0
         for i, band in enumerate(self.bands):
             if self.heads:

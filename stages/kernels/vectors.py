@@ -171,6 +171,11 @@ def _lesser(b: Any, x: Any, y: Any) -> Any:
     return _call(b, f"llvm.umin.v{x.type.count}i{x.type.element.width}", x.type, [x, y])
 
 
+def _difference(b: Any, kind: Lanes, x: Any, y: Any) -> Any:
+    most = _call(b, f"llvm.umax.v{kind.chunk}i{kind.bits}", kind.vector, [x, y])
+    return b.sub(most, _lesser(b, x, y))
+
+
 def _average(b: Any, kind: Lanes, x: Any, y: Any) -> Any:
     wide = ir.VectorType(ir.IntType(2 * kind.bits), kind.chunk)
     one = ir.Constant(wide, [1] * kind.chunk)
@@ -183,7 +188,7 @@ greater = _named("umax")
 plus_capped = _named("uadd.sat")  # stops at 255
 minus_capped = _named("usub.sat")  # stops at 0
 plus = _on_chunks(lambda b, kind, x, y: b.add(x, y))
-minus = _on_chunks(lambda b, kind, x, y: b.sub(x, y))
+difference = _on_chunks(_difference)  # of the larger and the smaller
 exclusive_or = _on_chunks(lambda b, kind, x, y: b.xor(x, y))
 either = _on_chunks(lambda b, kind, x, y: b.or_(x, y))
 both = _on_chunks(lambda b, kind, x, y: b.and_(x, y))

@@ -62,6 +62,8 @@ def test_one_key_of_a_mapping_is_replaced_alone(tmp_path):
     source = loaded(tmp_path, text, ["source.pitch.sign=-1", "source.tilt_model=axis", *settings]).source
     assert source.pitch == {"field": "vector.x", "unit": "deg", "sign": -1}
     assert source.roll == {"field": "vector.y", "unit": "rad", "sign": 1}
+    with pytest.raises(PipelineError, match=r"--set source.pitch.sign=-2: .*must be 1 or -1, not -2"):
+        loaded(tmp_path, text, ["source.tilt_model=axis", *settings, "source.pitch.sign=-2"])
 
 
 @pytest.mark.parametrize(

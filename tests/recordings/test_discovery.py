@@ -132,6 +132,11 @@ def test_of_map_odom_and_rover_the_pose_is_that_in_odom(tmp_path: Path) -> None:
     assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
 
 
+def test_a_slash_in_front_of_a_frames_name_does_not_make_it_another(tmp_path: Path) -> None:
+    path = moving(tmp_path / "log.mcap", ("/odom", "/base_link"))
+    assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
+
+
 def test_the_pose_is_that_of_the_base_frame_that_is_set(tmp_path: Path) -> None:
     path = moving(tmp_path / "log.mcap", MAP, ("odom", "foot"))
     poses = items_of(path, McapSource(odometry="/tf", base_frame="foot"))

@@ -24,18 +24,18 @@ def sweep(costs, pair, rule, paths, step, sums, total, final, width):
 @pytest.mark.parametrize("lanes", [16, 96, 192])
 @pytest.mark.parametrize("paths", [4, 8])
 @pytest.mark.parametrize(("height", "columns"), [(9, 23), (30, 5)])
-@pytest.mark.parametrize("pulled", [False, True])
-def test_sums_are_those_of_the_reference(lanes, paths, height, columns, pulled):
+@pytest.mark.parametrize("pull", [None, (0.5, 4.0), (16.0, 64.0)])  # weight and reach: the last costs more than 255
+def test_sums_are_those_of_the_reference(lanes, paths, height, columns, pull):
     rng = np.random.default_rng(lanes + paths)
     image = textured(height, columns).astype(np.uint8)
     table = np.round(12 + 90 / (1 + np.arange(256) / 10)).astype(np.uint8)
     costs = rng.integers(0, 60, (height, columns, lanes)).astype(np.uint8)
     prior, expected = NO_PRIOR, costs
-    if pulled:
+    if pull:
         near = rng.uniform(0, lanes, image.shape).astype(np.float32)
         near[rng.random(image.shape) < 0.3] = np.nan
-        prior = prior_costs(near, 0, lanes, 0.5, 4.0)
-        expected = costs + prior_costs_reference(near, 0, lanes, 0.5, 4.0)
+        prior = prior_costs(near, 0, lanes, *pull)
+        expected = np.minimum(costs.astype(int) + prior_costs_reference(near, 0, lanes, *pull), 255).astype(np.uint8)
     down, up = aggregate_reference(expected, image, table, 9, paths)
     planes = np.zeros((height, 3, columns), np.uint8)
     pair = Pair(planes, planes, brightness_steps(image), np.zeros(1, np.uint8), 0, columns, *prior)

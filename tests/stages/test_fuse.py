@@ -118,6 +118,16 @@ def test_cells_know_when_and_by_how_many_frames_they_were_seen():
     assert cell(terrain, 1.0, 0.02, "frames") == 0
 
 
+def test_a_clock_that_jumps_by_years_leaves_the_map_as_it_is():
+    fuse = Fuse()
+    for frame in range(2):
+        fuse(*drive(frame, flat, at=(0.0, 0.0, 0.0)), MOUNT)
+    cloud, pose = drive(2, flat, at=(0.0, 0.0, 0.0))
+    later = START + 1_700_000_000 * SECOND
+    terrain = fuse(replace(cloud, stamp=later), replace(pose, stamp=later), MOUNT)
+    assert np.nanmax(terrain.layers["frames"]) == 3
+
+
 def test_a_pose_whose_frame_has_no_name_makes_the_map_that_a_named_one_does():
     maps = {}
     for name in ("odom", ""):

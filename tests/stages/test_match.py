@@ -164,7 +164,7 @@ def test_the_bits_depend_neither_on_threads_nor_on_memory_nor_on_company(slope, 
     alone = match(frame)
     with ThreadPoolExecutor(3) as workers:
         others = list(workers.map(lambda stage: stage(frame), [replace(match, threads=t) for t in (1, 2, 3, 2)]))
-    # 200 rows of 320 * 48 bytes are 3 MB: bands of 34 rows
+    # 200 rows of 320 * 64 bytes are 4 MB: bands of 25 rows
     others += [replace(match, memory=1, threads=threads)(frame) for threads in (1, 2)]
     assert all(same(other, alone) for other in others)
 
@@ -293,6 +293,14 @@ def test_real_scenes_are_matched_better_than_by_opencv():
     assert ours[1] > theirs[1] - 0.05
     assert ours[2] < 0.85 * theirs[2]
     assert ours[3] < 0.9 * theirs[3]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("height", [24, 25, 26, 27])  # a band holds 12 rows of 640 * 64 bytes: one half, both, or none
+def test_bands_give_the_same_bits_when_the_halves_differ(height, threads):
+    frame, _ = slanted_pair(height=height, width=640)
+    whole, bands = (Match(disparities=64, memory=memory, threads=threads)(frame) for memory in (400, 1))
+    assert same(bands, whole)
 
 
 def test_a_frame_larger_than_the_memory_is_matched_in_bands():

@@ -265,6 +265,17 @@ def test_a_cell_that_points_missed_by_their_own_uncertainty_is_known_by_them() -
     assert own.sum() < near.sum() < own.sum() + gained.sum()
 
 
+@pytest.mark.parametrize(
+    ("points", "x", "reach", "known"),
+    [(1, 5.025, 0.04, 1), (2, 5.025, 0.04, 3), (1, 5.025, 0.06, 3), (2, 5.045, 0.024, 1), (2, 5.045, 0.026, 2)],
+)
+def test_a_cell_is_reached_by_two_places_of_points_that_reach_half_a_cell(
+    points: int, x: float, reach: float, known: int
+) -> None:
+    cloud = cloud_of(np.tile([x, 0.02, 0.0], (points, 1)), reach / 2)
+    assert (Voxelise(reach=2.0)(cloud).layers["count"] > 0).sum() == known
+
+
 def test_only_measured_points_reach_beyond_their_cell() -> None:
     cloud = rows_apart(sigma=0.06)
     plane = replace(cloud, source=np.full(len(cloud.points), Source.PLANE, np.uint8))
