@@ -37,6 +37,17 @@ def magnitude(text: str, what: str = "a number of at least 0") -> float:
     return value
 
 
+def share(text: str) -> float:
+    """A percentage that is no less than -50, as a share."""
+    try:
+        value = float(text) / 100
+    except ValueError:
+        value = math.nan
+    if not -0.5 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a percentage of at least -50, not '{text}'")
+    return value
+
+
 def seconds(text: str) -> float:
     """Seconds after a log's first message."""
     return magnitude(text, "seconds after the log's first message")
@@ -50,10 +61,13 @@ def size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path]) -> None:
-    """Refuse outputs that cannot be written, that would replace what is being read, or that are one file twice."""
+def check_outputs(log: Path | None, others: Sequence[Path | None], inputs: Sequence[Path]) -> None:
+    """Refuse outputs that cannot be written, that would replace what is being read, or that are one file twice.
+
+    log: the one output that is a log, if any: no other may take a log's place.
+    """
     taken: list[Path] = []
-    for path in filter(None, outputs):
+    for path in filter(None, (log, *others)):
         if not path.parent.is_dir():
             raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
         if path.exists() and not path.is_file():
@@ -65,6 +79,8 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path]) -> Non
             raise UsageError(f"{path} is there already and no output of roverflow; choose another name or remove it")
         if path.resolve() in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
+        if path is not log and (path.suffix.lower() == ".mcap" or _is_log(path)):
+            raise UsageError(f"{path} has the name of a log or is one; choose another for what is none")
         taken.append(path.resolve())
 
 
@@ -84,3 +100,10 @@ def _is_of_others(path: Path) -> bool:
         start = file.read(len(_OWN))
     suffix = path.suffix.lower()
     return suffix in _OF_OTHERS or ((suffix == ".mcap" or start.startswith(_MCAP)) and start != _OWN)
+
+
+def _is_log(path: Path) -> bool:
+    if not path.exists():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_MCAP)) == _MCAP

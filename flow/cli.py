@@ -19,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, size
+from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, share, size
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.replay import as_json, product_version, replay
 from flow.report import counted, headline, report, say
@@ -139,7 +139,7 @@ def _run_arguments(sub: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     out = options.out or options.log.with_name(f"{options.log.stem}-nav.mcap")
     rrd = None if options.no_rrd else options.rrd or out.with_suffix(".rrd")
-    check_outputs([out, rrd, options.summary], [options.log, Path(options.pipeline)])
+    check_outputs(out, [rrd, options.summary], [options.log, Path(options.pipeline)])
 
     def keep(summary: dict[str, Any]) -> None:
         if options.summary:
@@ -202,20 +202,28 @@ def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--slope", type=magnitude, metavar="DEG", help="RMS slope of the terrain (4)")
     sub.add_argument("--tilt-noise", type=magnitude, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
     scale = "by how much odometry overstates the way (1); 0, with --odometry-turn 0, is exact"
-    sub.add_argument("--odometry-scale", type=float, metavar="PERCENT", help=scale)
+    sub.add_argument("--odometry-scale", type=share, metavar="PERCENT", help=scale)
     turn = "drift of odometry's heading, one sigma after 1 m; it grows with the root of the way (0.2)"
     sub.add_argument("--odometry-turn", type=magnitude, metavar="DEG", help=turn)
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    check_outputs([options.out], [])
-    settings = {"frames": options.frames, "seed": options.seed, "abundance": options.rocks}
+    check_outputs(options.out, [], [])
+    settings = {name: getattr(options, name) for name in ("frames", "seed", "odometry_scale")}
+    settings["abundance"] = options.rocks
     for name in ("slope", "tilt_noise", "odometry_turn"):
         degrees = getattr(options, name)
         settings[name] = None if degrees is None else math.radians(degrees)
-    settings["odometry_scale"] = None if options.odometry_scale is None else options.odometry_scale / 100
-    width, height = options.size
-    simulate(options.out, width=width, height=height, **{k: v for k, v in settings.items() if v is not None})
+    settings["width"], settings["height"] = options.size
+    try:
+        simulate(options.out, **{name: value for name, value in settings.items() if value is not None})
+    except UsageError as error:
+        given = {"abundance": "--rocks", "width": "the width of --size", "height": "the height of --size"}
+        named = {f"Simulation.{name} ": given.get(name, f"--{name.replace('_', '-')}") for name in settings}
+        sentence = str(error)
+        for name, option in named.items():
+            sentence = sentence.replace(name, f"{option} ")
+        raise UsageError(sentence) from None
     return COMPLETE
 
 
@@ -253,7 +261,7 @@ def _import_images(options: argparse.Namespace) -> int:
     from recordings.image_log import import_images, pair_images
 
     left, right = pair_images(options.source)
-    check_outputs([options.out], [options.calibration, *left, *right])
+    check_outputs(options.out, [], [options.calibration, *left, *right])
     frames = import_images(
         left, right, options.calibration, options.out,
         pitch_down=options.pitch_down, roll=options.roll, height=options.height, rate=options.rate,
@@ -274,9 +282,9 @@ def _import_middlebury(options: argparse.Namespace) -> int:
     scenes, broken = logs_of(options.source, options.out), list[LogError]()
     for folder, log in scenes:
         if log != options.out and not options.out.exists():
-            check_outputs([options.out], [])
+            check_outputs(options.out, [], [])
             options.out.mkdir()
-        check_outputs([log], list(folder.iterdir()))
+        check_outputs(log, [], list(folder.iterdir()))
         try:
             say(f"{log}: {import_scene(folder, log)}")
         except LogError as error:  # the other scenes can still be had
@@ -298,7 +306,7 @@ def _score(options: argparse.Namespace) -> int:
     from recordings.scoring import score
 
     truth = options.truth or options.result
-    check_outputs([options.json], [options.result, truth])
+    check_outputs(None, [options.json], [options.result, truth])
     result = score(options.result, truth)
     if options.json:
         options.json.write_text(result.to_json() + "\n")
@@ -319,8 +327,13 @@ def _export(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.folder} is a file; give the name of a folder")
     if options.folder.exists() and any(options.folder.iterdir()):
         raise UsageError(f"{options.folder} is not empty, and maps of two runs must not mix; choose another folder")
-    lost = Counter[str]()
-    files = export(options.result, options.folder, options.frames, lost)
+    lost, made = Counter[str](), not options.folder.exists()
+    try:
+        files = export(options.result, options.folder, options.frames, lost)
+    except BaseException:  # half of the maps would look like all, and stand in the way of another try
+        for part in [options.folder] if made else list(options.folder.iterdir()):
+            shutil.rmtree(part, ignore_errors=True) if part.is_dir() else part.unlink(missing_ok=True)
+        raise
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")
     for why in lost:
@@ -343,7 +356,8 @@ def _demo(options: argparse.Namespace) -> int:
     check_demo(folder)
     folder.mkdir(parents=True, exist_ok=True)
     log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
-    check_outputs([log, out, rrd, folder / "summary.json"], [])
+    check_outputs(log, [], [])
+    check_outputs(out, [rrd, folder / "summary.json"], [])
     say("Simulating a traverse ...")
     simulate(log, frames=options.frames)
     say("Replaying it through the pipeline 'rover' (a first run compiles, too, and its frames/s count that) ...")

@@ -79,9 +79,19 @@ class _Outputs:
                 sink.open(self.paths[use], {stream: kinds[stream] for stream in streams}, about)
             except Exception as error:
                 self.errors.append((use, error))
+                self._discard()
                 return False
             self.opened.append(use)
         return True
+
+    def _discard(self) -> None:
+        """Give up what is open, so that an output of an earlier run stays; a sink that cannot is closed later."""
+        for use in tuple(self.opened):
+            discard = getattr(self.sinks[use][0], "discard", None)
+            if discard is not None:
+                self.opened.remove(use)
+                with suppress(Exception):  # the output that could not be opened is the one to tell of
+                    discard()
 
     def close(self, summary: dict[str, Any]) -> None:
         """Close what is open; raises SinkError if anything went wrong with any sink."""

@@ -62,7 +62,7 @@ def describe(path: Path, source: McapSource) -> dict[str, Any]:
 def format_description(description: dict[str, Any]) -> str:
     """The inventory as lines for a terminal."""
     d = description
-    how = "indexed" if d["indexed"] else "no index"
+    how = "indexed, its chunks are not checked" if d["indexed"] else "no index"
     lines = [f"{d['path']}: {d['duration_s']:.3f} s, {d['size_bytes'] / 1e6:.1f} MB, {how}", ""]
     rows = [("topic", "schema", "messages", "Hz", "gap", "stream")]
     roles = {topic: stream for stream, topic in d["streams"].items()}

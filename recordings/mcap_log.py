@@ -125,6 +125,7 @@ class McapLog:
             self.missing, self.refused, self.undecodable = opening.refusals(), opening.refused, opening.undecodable
             self.lacking, self.topics, self.problems = opening.missing, opening.topics, opening.problems
             self.cameras, self.static, self.mount = opening.cameras, opening.static, opening.mount
+            self._check_images()
         except BaseException:
             self.file.close()
             raise
@@ -157,8 +158,7 @@ class McapLog:
             yield self._between(low, times[last] + LEAD, [name for name in STREAMS if name in streams])
 
     def _between(self, low: int | None, high: int | None, streams: Sequence[str]) -> Iterator[tuple[int, str, Any]]:
-        wide_low = None if low is None else max(low - LEAD, 0)
-        wide_high = None if high is None else high + LEAD
+        wide_low, wide_high = _widened(low, high)
         log_start = self.file.start if wide_low is None else max(wide_low, self.file.start)
         for stream, problem in self.problems:
             if stream in (*streams, "log"):
@@ -213,6 +213,20 @@ class McapLog:
             raise LogError(f"{self.path} is {length:.3f} s long; start {self.start} s is behind its end")
         if low is not None and high is not None and low >= high:
             raise LogError(f"start {self.start} s is not before end {self.end} s; give them in that order")
+
+    def _check_images(self) -> None:
+        """Refuse a range without a left image, of which a run would make nothing."""
+        low, high = self._range()
+        if "left" not in self.topics or (low is None and high is None):
+            return
+        raws = self.file.messages(self.channels("left"), *_widened(low, high))
+        if not any(isinstance(raw, Lost) or self._is_within(raw.data, raw.log_time, low, high) for raw in raws):
+            length = (self.file.end - self.file.start) / 1e9
+            until = "its end" if self.end is None else f"{self.end:g} s"
+            raise LogError(
+                f"{self.path} is {length:.3f} s long and has no image on {self.topics['left']} from "
+                f"{self.start or 0:g} s to {until}; choose a wider range"
+            )
 
     def _range(self) -> tuple[int | None, int | None]:
         """The range in log time, ns."""
@@ -286,3 +300,8 @@ def _ahead(raws: Iterable[Raw | Lost], early: dict[int, Reading]) -> Iterator[tu
         while waiting[0][0].log_time < raw.log_time - AHEAD:
             yield waiting.popleft()
     yield from waiting
+
+
+def _widened(low: int | None, high: int | None) -> tuple[int | None, int | None]:
+    """The range of log times in which messages with stamps from `low` to `high`, ns, may be."""
+    return None if low is None else max(low - LEAD, 0), None if high is None else high + LEAD

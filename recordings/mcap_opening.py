@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from mcap.records import Channel
 
-from recordings.decode import camera_model, frame_name, frame_of, tilt_of, unread_encoding
+from recordings.decode import camera_model, frame_name, frame_of, pose_of, tilt_of, unread_encoding
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError, counted
 from recordings.mcap_index import Lost, said
 from recordings.mcap_reader import CONVERT, McapFile
 from recordings.rig import Camera, Frames, calibrated_pair, mounted
 from recordings.ros2_types import decoder_for, full_name
-from stages.data import CameraModel, Mount
+from stages.data import CameraModel, Mount, Pose
 
 if TYPE_CHECKING:
     from recordings.mcap_source import McapSource
@@ -67,6 +67,7 @@ class Opening:
         found = self._discover()
         self._find_cameras(found)
         self._find_mount()
+        self._check_pose()
         self._check_encodings()
         for stream in self.missing:
             self.topics.pop(stream, None)
@@ -168,6 +169,24 @@ class Opening:
             else:
                 self.mount = mount
 
+    def _check_pose(self) -> None:
+        """A pose of something of which nothing tells how the camera sits on it is missing."""
+        if self.cameras is None or "odometry" not in self.topics:
+            return
+        topic, camera = self.topics["odometry"], self.cameras[0].frame_id
+        moving = self._first(topic, lambda message: _pose_of(message, self.source.base_frame).child_frame_id)
+        if isinstance(moving, LogError) or moving == camera:
+            return
+        base = self.mount.base_from_camera if self.mount is not None else self.static.between(moving, camera)
+        if base is None or base.parent != moving:
+            why = (
+                f"{topic} is the pose of '{moving}', and nothing tells how the camera '{camera}' sits on it; record "
+                "that in /tf_static, or set 'base_frame' of the source where it has another name"
+            )
+            self.missing["odometry"] = why
+            if self.source.odometry:
+                self.refused["odometry"] = why
+
     def _check_encodings(self) -> None:
         """A camera whose first image is in an encoding that cannot be read is missing; the others are in it, too."""
         for side in CAMERAS:
@@ -244,6 +263,13 @@ class Opening:
         raws = self.file.messages(self.channels_of(topic))
         first = next((raw for raw in raws if not isinstance(raw, Lost)), None)
         return self.file.start if first is None else max(peek_stamp(first.data) or first.log_time, 0)
+
+
+def _pose_of(message: Any, base_frame: str) -> Pose:
+    pose = pose_of(message, 0, base_frame)
+    if pose is None:
+        raise LogError(f"it holds no pose of '{base_frame}'")
+    return pose
 
 
 def _attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:

@@ -132,6 +132,11 @@ class McapSink:
         writer.metadata("roverflow.run", counts)
         writer.close()
 
+    def discard(self) -> None:
+        """Give up the log; one that stood under its name stays."""
+        writer, self._writer = self._opened(), None
+        writer.abort()
+
     @property
     def _written(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys((*self.results, *self.also)))

@@ -118,6 +118,13 @@ class RerunSink:
         finally:
             self._partial.unlink(missing_ok=True)
 
+    def discard(self) -> None:
+        """Give up the recording; one that stood under its name stays. Does nothing where none is open."""
+        if not self._closed:
+            self._closed = True
+            self._recording.disconnect()
+            self._partial.unlink(missing_ok=True)
+
     def _conclude(self, summary: Mapping[str, Any]) -> None:
         """Enter what there is to say of the whole run."""
         verdict = str(summary.get("verdict", "INCOMPLETE"))

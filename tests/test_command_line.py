@@ -129,7 +129,7 @@ def test_a_pipeline_without_a_recording_writes_and_lists_none(traverse, tmp_path
     pipeline = tmp_path / "short.yaml"
     text = (ROOT / "flow" / "pipelines" / "rover.yaml").read_text()
     pipeline.write_text(text.replace("  - {use: recordings.RerunSink}\n", ""))
-    assert roverflow("run", traverse, "-p", pipeline, *SMALL, "-o", tmp_path / "out.mcap", "--end", "0.5") == 0
+    assert roverflow("run", traverse, "-p", pipeline, *SMALL, "-o", tmp_path / "out.mcap", "--end", "0.8") == 0
     assert ".rrd" not in capsys.readouterr().out
 
 

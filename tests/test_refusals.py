@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -123,6 +124,63 @@ def test_a_device_is_never_replaced_by_a_file(traverse, tmp_path, capsys):
     assert roverflow("simulate", pipe, "--frames", 1) == 2
     assert "device" in capsys.readouterr().err
     assert not pipe.is_file()
+
+
+@pytest.mark.parametrize("option", ["--rrd", "--summary"])
+def test_nothing_but_a_log_takes_the_place_or_the_name_of_one(traverse, tmp_path, capsys, option):
+    log = tmp_path / "earlier.log"
+    log.write_bytes(traverse.read_bytes())
+    for name in (log, tmp_path / "new.mcap"):
+        assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, name) == 2
+        assert f"{name} has the name of a log or is one" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [log]
+
+
+def test_an_output_that_cannot_be_begun_leaves_the_others_of_an_earlier_run(traverse, tmp_path, capsys, monkeypatch):
+    out, rrd = tmp_path / "out.mcap", tmp_path / "out.rrd"
+    out.write_bytes(traverse.read_bytes())
+    monkeypatch.setattr("recordings.rerun_sink.RESERVE", 1 << 62)
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--rrd", rrd) == 1
+    assert "MB are free" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [out]
+    assert out.read_bytes() == traverse.read_bytes()
+
+
+@pytest.mark.parametrize("bounds", [("--end", "0"), ("--start", "2.6"), ("--start", "0.1", "--end", "0.2")])
+def test_a_range_without_an_image_is_refused_and_replaces_nothing(traverse, tmp_path, capsys, bounds):
+    out = tmp_path / "out.mcap"
+    out.write_bytes(traverse.read_bytes())
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", *bounds) == 2
+    assert "has no image on /stereo/left/image_rect_color from" in capsys.readouterr().err
+    assert out.read_bytes() == traverse.read_bytes()
+
+
+def test_an_export_that_fails_leaves_nothing_in_the_way_of_another(traverse, tmp_path, capsys, monkeypatch):
+    result, folder = tmp_path / "out.mcap", tmp_path / "maps"
+    assert roverflow("run", traverse, *SMALL, "-o", result, "--no-rrd") == 0
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("recordings.export.bundle.write_ply", full)
+        assert roverflow("export", result, folder) == 1
+    assert "No space left on device" in capsys.readouterr().err
+    assert not folder.exists()
+    assert roverflow("export", result, folder) == 0
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--slope", "80", "--slope must be at most 45 degrees, not 80 degrees"),
+        ("--rocks", "2", "--rocks must be at most 0.5, not 2"),
+        ("--size", "1x20", "the width of --size must be at least 16"),
+    ],
+)
+def test_a_simulation_beyond_its_limits_is_refused_in_the_words_of_the_options(tmp_path, capsys, option, value, said):
+    assert roverflow("simulate", tmp_path / "log.mcap", option, value) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_an_output_without_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys):

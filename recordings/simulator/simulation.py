@@ -102,10 +102,12 @@ class Simulation:
         for name, low in least.items():
             if not low <= getattr(self, name) < np.inf:
                 raise ValueError(f"Simulation.{name} must be at least {low} and finite, not {getattr(self, name)}")
-        most = {"width": (8192, " px"), "height": (8192, " px"), "abundance": (0.5, ""), "slope": (np.pi / 4, " rad")}
-        for name, (high, unit) in most.items():
-            if getattr(self, name) > high:
-                raise ValueError(f"Simulation.{name} must be at most {high:g}{unit}, not {getattr(self, name):g}{unit}")
+        most = {"width": (8192, " px", 1), "height": (8192, " px", 1), "abundance": (0.5, "", 1),
+                "slope": (np.pi / 4, " degrees", 180 / np.pi)}  # fmt: skip
+        for name, (high, unit, scale) in most.items():
+            if (value := getattr(self, name)) > high:
+                shown = f"at most {high * scale:g}{unit}, not {value * scale:g}{unit}"
+                raise ValueError(f"Simulation.{name} must be {shown}")
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
         if not 0 < self.sun_elevation <= np.pi / 2:

@@ -132,6 +132,19 @@ def test_of_map_odom_and_rover_the_pose_is_that_in_odom(tmp_path: Path) -> None:
     assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
 
 
+@pytest.mark.parametrize("given", [None, "/odom"])
+def test_a_pose_of_something_the_camera_is_not_known_to_sit_on_is_not_taken(tmp_path: Path, given: str | None) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == "/odom":
+            message.child_frame_id = "foot"
+        return message
+
+    with McapSource(odometry=given).open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        said = "/odom is the pose of 'foot', and nothing tells how the camera 'left_optical' sits on it"
+        assert said in log.missing["odometry"]
+        assert ("odometry" in log.refused) == (given is not None)
+
+
 def test_a_slash_in_front_of_a_frames_name_does_not_make_it_another(tmp_path: Path) -> None:
     path = moving(tmp_path / "log.mcap", ("/odom", "/base_link"))
     assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
