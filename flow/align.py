@@ -11,7 +11,7 @@ moved on by `patience` since it arrived, whichever comes first.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, get_type_hints
 
@@ -93,7 +93,7 @@ class PairState:
                 yield self._unmatched("right", f"the next {self.inputs['left']} is {_ms(-apart)} later")
             else:
                 lefts.popleft(), rights.popleft()
-                yield Token(left.stamp, joined(self.name, left, right, lambda a, b, _: a.pair_with(b)))
+                yield Token(left.stamp, _paired(self.name, left, right))
 
     def tick(self, log_time: int) -> Answers:
         """The log's clock has moved to `log_time`."""
@@ -140,7 +140,7 @@ class _Sampler:
 
     def choose(self, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         """The value at `stamp`, or a sentence (str) why there is none, or None to wait (never when `final`, which tells
-        of the stream that what is not there yet does not come)."""
+        of the stream, `name`, that what is not there yet does not come). May raise what the samples' type does."""
         raise NotImplementedError
 
 
@@ -181,8 +181,8 @@ class Interpolate(_Sampler):
             return f"{name} has a gap of {_ms(after.stamp - before.stamp)}, more than {_ms(self.max_gap)}"
         near = self._near(samples, stamp)
         if len(near) >= SMOOTHED:
-            return joined(name, before, after, lambda a, _, at: a.smoothed(near, at), stamp)
-        return joined(name, before, after, lambda a, b, at: a.interpolated(b, at), stamp)
+            return before.value.smoothed(near, stamp)
+        return before.value.interpolated(after.value, stamp)
 
     def _near(self, samples: deque[Token], stamp: int) -> list[Any]:
         """The samples that `smooth` allows, as far on one side of the stamp as on the other."""
@@ -264,7 +264,10 @@ class SamplerState:
                 final = "has no sample after it"
             elif arrived + self.rule.patience < log_time:
                 final = f"has a gap: no sample after it within {_ms(self.rule.patience)} of log time"
-            value = self.rule.choose(self.stream, token.stamp, self.samples, final)
+            try:
+                value = self.rule.choose(self.stream, token.stamp, self.samples, final)
+            except Exception as error:
+                value = Absent(Entry(self.name, token.stamp, self.name, Reason.FAILED, failure(error)))
             if value is None:
                 return
             self.wanted.popleft()
@@ -296,18 +299,15 @@ def _neighbours(samples: deque[Token], stamp: int) -> tuple[Token | None, Token 
     return before, None
 
 
-def joined(
-    name: str, first: Token, second: Token, join: Callable[[Any, Any, int], Any], stamp: int | None = None
-) -> Any:
-    """`join` of two items, or `Absent` if one is absent or they do not fit."""
-    at = first.stamp if stamp is None else stamp
-    for token in (first, second):
+def _paired(name: str, left: Token, right: Token) -> Any:
+    """The pair of two items, or `Absent` if one is absent or they do not fit."""
+    for token in (left, right):
         if isinstance(token.value, Absent):
             return token.value
     try:
-        return join(first.value, second.value, at)
+        return left.value.pair_with(right.value)
     except Exception as error:
-        return Absent(Entry(name, at, name, Reason.FAILED, failure(error)))
+        return Absent(Entry(name, left.stamp, name, Reason.FAILED, failure(error)))
 
 
 pair, interpolate, nearest, latest = Pair, Interpolate, Nearest, Latest

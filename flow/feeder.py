@@ -55,6 +55,7 @@ class Feeder:
 
         An event is (log time, stream, item); an item that is an exception stands for a message that was lost.
         """
+        log_time = 0
         for log_time, stream, item in events:
             for name, aligner in self._aligners.items():
                 self._answer(name, log_time, aligner.tick(log_time))
@@ -66,7 +67,7 @@ class Feeder:
                     self._take(stream, log_time, Token(item.stamp, item))
             yield from self._ready()
         for name, aligner in self._aligners.items():
-            self._answer(name, 2**63, aligner.end())
+            self._answer(name, log_time, aligner.end())
         yield from self._ready()
 
     @property

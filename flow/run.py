@@ -160,6 +160,7 @@ def run(
         times = {"wall_seconds": time.perf_counter() - wall, "start_seconds": started}
         times["cpu_seconds"] = time.process_time() - cpu
         whole = finished and not sinks.errors and not stop.finishing() and not len(ledger)
+        whole = whole and engine is not None and engine.whole == engine.admitted
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),

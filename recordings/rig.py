@@ -27,6 +27,7 @@ _SAME = 1e-6  # m and matrix elements; two transforms of the same frames that di
 _PARALLEL = 1e-3  # rad; cameras turned against each other by less need no rectification: a pixel at 1000 px
 _BESIDE = 0.01  # of the baseline; and so for cameras that are shifted against each other by less in y and z
 _ALIKE = 1e-3  # of a focal length or of cy; and so for lenses that differ by less: a pixel at 1000 px
+_SHRUNK = 0.1  # of the focal length; what rectification makes smaller than that is no image
 
 
 @dataclass
@@ -210,6 +211,11 @@ def _rectifying(left: CameraModel, right: CameraModel, placed: Transform) -> tup
             left.k, left.d, right.k, right.d, size, inverse.rotation, moved,
             flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
         )  # fmt: skip
+    if not made[2][0, 0] > _SHRUNK * left.k[0, 0]:
+        raise LogError(
+            f"no image of {left.width}x{left.height} px can be rectified with these lenses: the distortion D has no "
+            "inverse at the corners; check the calibration"
+        )
     return replace(left, r=made[0], p=made[2]), replace(right, r=made[1], p=made[3])
 
 

@@ -1,11 +1,16 @@
 """A pipeline file that cannot run is refused before anything runs, with file, line and the nearest valid name."""
 
+import math
 import textwrap
+from decimal import Decimal
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from flow.errors import PipelineError, UsageError
 from flow.pipeline import load
+from flow.units import quantity
 
 GOOD = """\
 source: {use: tests.flow.toys.Source, gain: 2.5}
@@ -35,6 +40,18 @@ def test_a_good_file_becomes_a_graph_with_units_converted(tmp_path):
     assert graph.source.gain == 2.5
     assert graph.clock == "both"
     assert list(graph.frame_streams) == ["both", "height", "twice", "sum"]
+
+
+@given(st.integers(1, 10**7), st.sampled_from([("us", 3), ("ms", 6), ("s", 9), ("min", 9)]))
+def test_times_of_whole_nanoseconds_are_exact(nanoseconds, unit):
+    name, digits = unit
+    number = Decimal(nanoseconds).scaleb(-digits)
+    assert quantity(f"{number} {name}", "ns") == nanoseconds * (60 if name == "min" else 1)
+
+
+@pytest.mark.parametrize("text", ["1e-400 s", "0 s", "1e400 s"])
+def test_numbers_beyond_all_measure_are_no_trap(text):
+    assert quantity(text, "ns") in (0.0, math.inf)
 
 
 def test_streams_may_be_written_in_any_order(tmp_path):

@@ -124,6 +124,30 @@ def test_items_that_break_an_aligner_lose_their_frame_not_the_verdict(tmp_path, 
     assert all(said.startswith("TypeError: no such pair (test_run.py, line ") for said in details)
 
 
+def test_a_sample_that_cannot_be_made_is_in_the_ledger_and_the_verdict(tmp_path, monkeypatch):
+    whole = Number.interpolated
+
+    def broken(earlier, later, stamp):
+        if stamp == 200 * MS:
+            raise ValueError("no way between them")
+        return whole(earlier, later, stamp)
+
+    pipeline = graph(tmp_path)
+    monkeypatch.setattr(Number, "interpolated", broken)
+    sink, summary = replayed(pipeline, traverse(5))
+    assert (summary["verdict"], summary["frames_out"], summary["drops"]) == ("INCOMPLETE", 4, {"failed": 1})
+    assert [(entry["stage"], entry["stamp"]) for entry in summary["ledger"]] == [("height", 200 * MS)]
+    assert [r.index for r in sink.records if r.entries] == [2]
+
+
+def test_samplers_of_samplers_are_whole_to_the_end_of_the_log(tmp_path):
+    text = PIPELINE.replace("height: {use: flow.align.interpolate, stream: level, at: both}",
+                            "held: {use: flow.align.nearest, stream: level, at: right, slop: 60 ms}\n"
+                            "  height: {use: flow.align.nearest, stream: held, at: both, slop: 60 ms}")  # fmt: skip
+    _, summary = replayed(graph(tmp_path, text=text), traverse(9))
+    assert (summary["verdict"], summary["frames_out"]) == ("COMPLETE", 9)
+
+
 def test_a_run_that_is_torn_down_is_never_sealed_as_complete(tmp_path):
     class Torn(Log):
         def __iter__(self):

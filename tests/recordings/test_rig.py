@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.rig import Frames
+from recordings.rig import Frames, calibrated_pair
 from recordings.ros2 import transform_message
-from stages.data import Transform
+from stages.data import CameraModel, Transform
 from tests.recordings.sample_log import LEFT, START, TRANSFORMS, model, write_sample
 
 RAW = ("/left/image_raw", "/right/image_raw")
@@ -132,6 +132,17 @@ def test_a_stereo_calibration_whose_projections_differ_is_refused(
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=names)) as log:
         assert f"are not those of a rectified pair: {said}" in log.missing["left"]
+
+
+def test_lenses_that_leave_no_image_are_refused() -> None:
+    k = np.array([[300.0, 0, 320], [0, 300, 240], [0, 0, 1]])
+    folding = np.array([0.0005, -0.0118, -0.0077, -0.0217])  # has no inverse at the corners
+    lens = CameraModel(640, 480, k, folding, np.eye(3), np.hstack([k, np.zeros((3, 1))]), "equidistant")
+    frames = Frames()
+    for item in transform_message([(Transform("l", "r", np.eye(3), [0.25, 0.003, 0]), START)]).transforms:
+        frames.add(item)
+    with pytest.raises(LogError, match="no image of 640x480 px can be rectified with these lenses"):
+        calibrated_pair((lens, lens), ("l", "r"), RAW, frames)
 
 
 def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:
