@@ -19,10 +19,11 @@ from stages.kernels.relief import lowest_around
 from stages.stage import Stage, parameter
 
 MOST = 0.85  # share of `max_step`: cells blunt a peak
-# A plane's height at the cell must be known at least as well as the mean of four cells.
-_LEVERAGE = 0.25
+# A plane's height at the cell must be known about as well as the mean of four cells. No ratio of small integers equals
+# it, so that rounding does not decide.
+_LEVERAGE = 0.2503
 # Under a wheel there are few cells, and it is the slope that counts.
-_WHEEL_LEVERAGE = 0.35
+_WHEEL_LEVERAGE = 0.3503
 # How far above and below the wide plane ground may lie, round by round, in shares of `obstacle`. Both ways, so that a
 # ditch is as little ground as a row of rocks, whichever covers less than the ground does; farther below than above,
 # for rocks are many and pits are few, and from wide to narrow, for the first plane leans on all of them.
@@ -46,8 +47,9 @@ class Assess(Stage):
     - roughness, m: root mean square of the same off its plane under the footprint;
     - support: share of the cells within a wheel's reach that are known;
     - drop, m: how far below the ground of the surroundings a hidden cell lies at least, by the line of sight that
-      passes over it, NaN in others; where the map says below what hidden cells lie (layer `ceiling`). The far wall of a
-      ditch would bend a narrower plane.
+      passes over it, NaN in others; where the map says below what hidden cells lie (layer `ceiling`). That ground is
+      the higher one of the surroundings' plane, for the far wall of a ditch would bend a narrower one, and of `ground`,
+      for the wide plane leans on what lies below a drop, where that is seen.
     """
 
     footprint: float = parameter(1.0, "width and length of the rover: the window of slope and roughness", unit="m",
@@ -107,7 +109,7 @@ class Assess(Stage):
             "support": np.where(observed, support, np.nan),
         }
         if "ceiling" in elevation.layers:
-            layers["drop"] = np.where(observed, np.nan, wide - elevation.layers["ceiling"])
+            layers["drop"] = np.where(observed, np.nan, np.fmax(wide, ground) - elevation.layers["ceiling"])
         return layers
 
     def _ground(self, height: Array, observed: Array, resolution: float) -> tuple[Array, Array, Array, Array]:

@@ -82,6 +82,15 @@ class Binarise(Stage):
     )
     min_points: int = parameter(1, "points without which a cell is not free, where the map counts them", low=1)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("max_step", "ground_clearance"):
+            if self.method == "rover" and not getattr(self, name) > self.margin:
+                raise ValueError(
+                    f"Binarise.{name} must be above Binarise.margin, {self.margin:g} m, not {getattr(self, name):g} m: "
+                    "level ground would reach it"
+                )
+
     def __call__(self, elevation: ElevationMap) -> NavigationMap:
         """The navigation map on the grid of `elevation`."""
         height = elevation.layers["elevation"]
@@ -138,7 +147,7 @@ class Binarise(Stage):
         reach = int(self.fall_reach / elevation.resolution + 1e-6)
         if reach and falls.any():
             falls = binary_dilation(falls, np.ones((3, 3)), iterations=reach, mask=hidden)
-        return _near(falls, self.wheel / 2 / elevation.resolution)
+        return _near(falls, np.ceil(self.wheel / 2 / elevation.resolution - 1e-6))
 
 
 def _near(cells: Array, distance: float) -> Array:

@@ -187,7 +187,9 @@ class Fuse(Stage):
         off = cells["height"].astype(np.float64) - seen["elevation"][both]
         variance = self._variance(cells) + seen["variance"][both]
         expected = np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])
-        plane = fit_plane(x, y, off, variance, expected, self.resolution)
+        # What joined the frame before tells what to expect: a pose whose height drifts is off by much, but by and by.
+        before = np.array([self._map.plane[0], 0.0, 0.0])
+        plane = before + fit_plane(x, y, off - before[0], variance, expected, self.resolution)
         return np.asarray(plane * (1 - np.array([self.follow_height, self.follow_tilt, self.follow_tilt])))
 
     def _jumped(self, plane: Array) -> bool:

@@ -11,9 +11,10 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.compiled import kernel
 
-# Least determinant / trace of the cells' spread, which is close to its smaller eigenvalue: a band less than three cells
-# wide has no slope across. No ratio of small integers equals it, so that rounding does not decide.
-_NARROWEST = 0.4142
+# Least determinant / trace of the cells' spread, which is close to its smaller eigenvalue: 1/3 of 3x3 cells, at most
+# 1/4 of a band two cells wide, which has no slope across. No ratio of small integers equals it, so that rounding does
+# not decide.
+_NARROWEST = 0.2929
 
 
 def fit_planes(heights: Array, use: Array, radius: int, leverage: float) -> Array:

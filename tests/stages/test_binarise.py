@@ -86,6 +86,21 @@ def test_a_tilted_plane_within_the_slope_limit_is_free_wherever_it_was_seen(
     assert (result.cells[~seen] == Cell.UNKNOWN).all()
 
 
+@pytest.mark.parametrize(("resolution", "wheel"), [(0.05, 0.14), (0.1, 0.3), (0.2, 0.3)])
+def test_level_ground_is_free_under_a_wheel_that_spans_three_cells(resolution: float, wheel: float) -> None:
+    level = replace(map_of(np.zeros_like(grid()[0])), resolution=resolution)
+    result = Binarise(wheel=wheel)(Assess(wheel=wheel)(level))
+    assert (result.cells[10:-10, 10:-10] == Cell.FREE).all()
+
+
+@pytest.mark.parametrize("limit", ["max_step", "ground_clearance"])
+def test_a_limit_that_level_ground_would_reach_is_refused(limit: str) -> None:
+    parameters: dict[str, Any] = {limit: 0.03}
+    with pytest.raises(ValueError, match=rf"Binarise.{limit} must be above Binarise.margin, 0.03 m, not 0.03 m"):
+        Binarise(**parameters)
+    Binarise(method="absolute", **parameters)
+
+
 def test_a_plane_beyond_the_slope_limit_is_a_hazard_for_its_slope() -> None:
     x, _ = grid()
     result = decided(map_of(np.tan(np.deg2rad(21)) * x))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages import Fuse
+from stages import Assess, Binarise, Cell, Fuse
 from stages.fuse import local_cells, placement
 from stages.tiles import Tiles
 from tests.stages.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
@@ -116,6 +116,19 @@ def test_cells_know_when_and_by_how_many_frames_they_were_seen():
     assert [cell(terrain, 8.52, 0.02, layer) for layer in ("first", "last", "frames")] == [2.0, 5.0, 4.0]
     assert np.isnan(cell(terrain, 1.0, 0.02, "first"))
     assert cell(terrain, 1.0, 0.02, "frames") == 0
+
+
+@pytest.mark.parametrize("gap", [0.0, 5.0, 12.0])
+def test_a_height_that_drifts_by_and_by_joins_after_a_gap_and_makes_no_step(gap):
+    fuse = Fuse()
+    for frame in range(90):
+        along = 0.25 * frame + (gap if frame >= 60 else 0.0)
+        cloud, pose = drive(frame, flat, at=(along, 0.0, 0.0), noise=0.005)
+        pose = replace(pose, position=np.add(pose.position, (0, 0, 0.016 * along)))
+        terrain = fuse(part(cloud, np.s_[::8]), pose, MOUNT)
+    assert fuse.finding() is None
+    known = np.isfinite(terrain.layers["elevation"])
+    assert not (Binarise()(Assess()(terrain)).cells[known] == Cell.HAZARD).any()
 
 
 def test_a_clock_that_jumps_by_years_leaves_the_map_as_it_is():

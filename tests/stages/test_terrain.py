@@ -86,6 +86,13 @@ def test_the_edge_of_a_drop_whose_foot_is_hidden_is_not_free_and_the_way_to_it_i
     assert (blind.cells[brink] == Cell.FREE).mean() > 0.5  # so the rest of the rules does not see it
 
 
+@pytest.mark.parametrize(("edge", "depth"), [(2.0, 0.4), (2.0, 0.5), (2.5, 0.4), (2.5, 0.6), (3.0, 0.6), (4.0, 0.5)])
+def test_the_edge_of_a_drop_is_not_free_where_the_ground_below_it_is_seen(edge: float, depth: float) -> None:
+    ahead, cliff = profiled(lambda x: np.where(x < edge, 0.0, -depth))
+    assert not (cliff.cells[(ahead > edge - 0.1) & (ahead < edge)] == Cell.FREE).any()
+    assert (cliff.cells[(ahead > 1.6) & (ahead < edge - 0.3)] == Cell.FREE).mean() > 0.98
+
+
 def test_nothing_is_free_within_half_a_wheel_of_a_drop() -> None:
     for wheel in (0.3, 0.6, 1.0):
         ahead, cliff = profiled(lambda x: np.where(x < 4.5, 0.0, -3.0), wheel=wheel)
