@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import find_objects, label
+from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from stages.data import Array, ElevationMap
 from stages.kernels.footprint import fit_planes
@@ -28,6 +28,8 @@ _WHEEL_LEVERAGE = 0.3503
 # ditch is as little ground as a row of rocks, whichever covers less than the ground does; farther below than above,
 # for rocks are many and pits are few, and from wide to narrow, for the first plane leans on all of them.
 _WITHIN = ((0.4, 0.8), (0.25, 0.6), (0.18, 0.6), (0.18, 0.6), (0.18, 0.6))
+# How far ground is carried on into what is hidden, m, and by how much rolling ground is off then, m.
+_CARRIED, _CARRIED_ERROR = 0.5, 0.03
 # How far off the plane between the wheels ground may lie, both ways. Ground is found anew each round, and with it a
 # crest that bends away from the wide plane comes back, from its sides inwards.
 _ABOUT = (0.3, 0.3, 0.3)
@@ -48,8 +50,8 @@ class Assess(Stage):
     - support: share of the cells within a wheel's reach that are known;
     - drop, m: how far below the ground of the surroundings a hidden cell lies at least, by the line of sight that
       passes over it, NaN in others; where the map says below what hidden cells lie (layer `ceiling`). That ground is
-      the higher one of the surroundings' plane, for the far wall of a ditch would bend a narrower one, and of `ground`,
-      for the wide plane leans on what lies below a drop, where that is seen.
+      the higher one of the surroundings' plane, for the far wall of a ditch would bend a narrower one, and of the
+      nearest ground carried on, for the wide plane leans on what lies below a drop, where that is seen.
     """
 
     footprint: float = parameter(1.0, "width and length of the rover: the window of slope and roughness", unit="m",
@@ -95,7 +97,7 @@ class Assess(Stage):
         height = elevation.layers["elevation"].astype(np.float64)
         observed = np.isfinite(height)
         height = np.where(observed, height, 0.0)
-        ground, wide, trend, slope = self._ground(height, observed, elevation.resolution)
+        ground, wide, trend, slope, local = self._ground(height, observed, elevation.resolution)
         step, support = self._step(elevation, height, observed, ground, trend)
         passable = observed & ~(step >= self.obstacle)
         steepness = fit_planes(height, passable, _cells(self.wheel, elevation.resolution), _WHEEL_LEVERAGE)
@@ -109,12 +111,14 @@ class Assess(Stage):
             "support": np.where(observed, support, np.nan),
         }
         if "ceiling" in elevation.layers:
-            layers["drop"] = np.where(observed, np.nan, np.fmax(wide, ground) - elevation.layers["ceiling"])
+            before = np.fmax(wide, _carried_on(local, elevation.resolution))
+            layers["drop"] = np.where(observed, np.nan, before - elevation.layers["ceiling"])
         return layers
 
-    def _ground(self, height: Array, observed: Array, resolution: float) -> tuple[Array, Array, Array, Array]:
+    def _ground(self, height: Array, observed: Array, resolution: float) -> tuple[Array, Array, Array, Array, Array]:
         """Height of the ground at each cell, by the plane between the wheels and by that of the surroundings, the slope
-        (2, rows, cols) of the surroundings, rise per cell, and the slope under the footprint, rad.
+        (2, rows, cols) of the surroundings, rise per cell, the slope under the footprint, rad, and the planes between
+        the wheels (3, rows, cols), NaN where there is no ground.
 
         Where the plane between the wheels is not known (the middle of a large rock), the height is that of the
         surroundings' plane; where that is not known, a step is measured against the level.
@@ -134,7 +138,8 @@ class Assess(Stage):
         footprint = _cells(self.footprint, resolution)
         under = local if footprint == narrow else fit_planes(height, ground, footprint, _LEVERAGE)
         level = np.where(np.isfinite(local[0]), local[0], around[0])
-        return level, around[0], self._trend(around[1:3], resolution), _slope(under, resolution)
+        trend, between = self._trend(around[1:3], resolution), np.where(ground, local[:3], np.nan)
+        return level, around[0], trend, _slope(under, resolution), between
 
     def _trend(self, slopes: Array, resolution: float) -> Array:
         """The slopes (2, rows, cols), rise per cell, cut to `max_slope`; 0 where they are not known."""
@@ -154,6 +159,19 @@ class Assess(Stage):
         step = np.fmax.reduce([rise, above, below, within, np.zeros_like(height)])
         raised = observed & ((np.abs(height - ground) >= self.skirt) | (step >= self.obstacle))
         return np.where(observed, _as_whole_obstacles(step, raised), np.nan), support
+
+
+def _carried_on(planes: Array, resolution: float) -> Array:
+    """Height, less what it may be off by, of the nearest plane, NaN where none is near: planes (3, rows, cols) of
+    height, m, and rise per cell along columns and rows."""
+    known = np.isfinite(planes[0])
+    if not known.any():
+        return np.full(known.shape, np.nan)
+    distance, (row, col) = distance_transform_edt(~known, return_indices=True)
+    rows, cols = np.indices(known.shape)
+    height, along, across = planes[:, row, col]
+    carried = height + along * (cols - col) + across * (rows - row) - _CARRIED_ERROR
+    return np.where(distance * resolution <= _CARRIED, carried, np.nan)
 
 
 def _as_whole_obstacles(step: Array, raised: Array) -> Array:

@@ -86,7 +86,9 @@ def test_the_edge_of_a_drop_whose_foot_is_hidden_is_not_free_and_the_way_to_it_i
     assert (blind.cells[brink] == Cell.FREE).mean() > 0.5  # so the rest of the rules does not see it
 
 
-@pytest.mark.parametrize(("edge", "depth"), [(2.0, 0.4), (2.0, 0.5), (2.5, 0.4), (2.5, 0.6), (3.0, 0.6), (4.0, 0.5)])
+@pytest.mark.parametrize(
+    ("edge", "depth"), [(2, 0.3), (2.5, 0.4), (2.5, 0.6), (3, 0.3), (3, 0.5), (4, 0.3), (4, 0.4), (5, 0.4)]
+)
 def test_the_edge_of_a_drop_is_not_free_where_the_ground_below_it_is_seen(edge: float, depth: float) -> None:
     ahead, cliff = profiled(lambda x: np.where(x < edge, 0.0, -depth))
     assert not (cliff.cells[(ahead > edge - 0.1) & (ahead < edge)] == Cell.FREE).any()
