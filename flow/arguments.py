@@ -79,7 +79,7 @@ def check_outputs(log: Path | None, others: Sequence[Path | None], inputs: Seque
             raise UsageError(f"{path} is there already and no output of roverflow; choose another name or remove it")
         if path.resolve() in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
-        if path is not log and (path.suffix.lower() == ".mcap" or _is_log(path)):
+        if path is not log and (path.suffix.lower() == ".mcap" or _start_of(path).startswith(_MCAP)):
             raise UsageError(f"{path} has the name of a log or is one; choose another for what is none")
         taken.append(path.resolve())
 
@@ -96,14 +96,13 @@ def check_demo(folder: Path) -> None:
 
 def _is_of_others(path: Path) -> bool:
     """Whether a file is, by its name or its first bytes, nothing that roverflow wrote."""
-    with path.open("rb") as file:
-        start = file.read(len(_OWN))
-    suffix = path.suffix.lower()
+    start, suffix = _start_of(path), path.suffix.lower()
     return suffix in _OF_OTHERS or ((suffix == ".mcap" or start.startswith(_MCAP)) and start != _OWN)
 
 
-def _is_log(path: Path) -> bool:
+def _start_of(path: Path) -> bytes:
+    """As many bytes as tell whose file it is; of one that is not there, none."""
     if not path.exists():
-        return False
+        return b""
     with path.open("rb") as file:
-        return file.read(len(_MCAP)) == _MCAP
+        return file.read(len(_OWN))

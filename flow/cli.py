@@ -332,7 +332,10 @@ def _export(options: argparse.Namespace) -> int:
         files = export(options.result, options.folder, options.frames, lost)
     except BaseException:  # half of the maps would look like all, and stand in the way of another try
         for part in [options.folder] if made else list(options.folder.iterdir()):
-            shutil.rmtree(part, ignore_errors=True) if part.is_dir() else part.unlink(missing_ok=True)
+            if part.is_dir():
+                shutil.rmtree(part, ignore_errors=True)
+            else:
+                part.unlink(missing_ok=True)
         raise
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")

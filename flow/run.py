@@ -159,8 +159,8 @@ def run(
     finally:
         times = {"wall_seconds": time.perf_counter() - wall, "start_seconds": started}
         times["cpu_seconds"] = time.process_time() - cpu
-        whole = finished and not sinks.errors and not stop.finishing() and not len(ledger)
-        whole = whole and engine is not None and engine.whole == engine.admitted
+        kept = engine is not None and engine.whole == engine.admitted and not len(ledger)
+        whole = finished and kept and not sinks.errors and not stop.finishing()
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),

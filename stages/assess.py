@@ -9,6 +9,7 @@ a rock stands out of the ground instead of bending it. None of it changes when t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label
@@ -33,6 +34,16 @@ _CARRIED, _CARRIED_ERROR = 0.5, 0.03
 # How far off the plane between the wheels ground may lie, both ways. Ground is found anew each round, and with it a
 # crest that bends away from the wide plane comes back, from its sides inwards.
 _ABOUT = (0.3, 0.3, 0.3)
+
+
+class _Ground(NamedTuple):
+    """The ground under the cells, (rows, cols) each but for two."""
+
+    height: Array  # m, by the plane between the wheels
+    wide: Array  # m, by that of the surroundings
+    trend: Array  # (2, rows, cols), slope of the surroundings, rise per cell
+    slope: Array  # rad, under the footprint
+    planes: Array  # (3, rows, cols), those between the wheels: height and slopes; NaN in cells that are no ground
 
 
 @dataclass(frozen=True)
@@ -97,28 +108,26 @@ class Assess(Stage):
         height = elevation.layers["elevation"].astype(np.float64)
         observed = np.isfinite(height)
         height = np.where(observed, height, 0.0)
-        ground, wide, trend, slope, local = self._ground(height, observed, elevation.resolution)
-        step, support = self._step(elevation, height, observed, ground, trend)
+        ground = self._ground(height, observed, elevation.resolution)
+        step, support = self._step(elevation, height, observed, ground)
         passable = observed & ~(step >= self.obstacle)
         steepness = fit_planes(height, passable, _cells(self.wheel, elevation.resolution), _WHEEL_LEVERAGE)
         roughness = fit_planes(height, passable, _cells(self.footprint, elevation.resolution), _LEVERAGE)[3]
         layers = {
-            "ground": ground,
+            "ground": ground.height,
             "step": step,
-            "slope": np.where(observed, slope, np.nan),
+            "slope": np.where(observed, ground.slope, np.nan),
             "steepness": np.where(passable, _slope(steepness, elevation.resolution), np.nan),
             "roughness": np.where(observed, roughness, np.nan),
             "support": np.where(observed, support, np.nan),
         }
         if "ceiling" in elevation.layers:
-            before = np.fmax(wide, _carried_on(local, elevation.resolution))
-            layers["drop"] = np.where(observed, np.nan, before - elevation.layers["ceiling"])
+            expected = np.fmax(ground.wide, _carried_on(ground.planes, elevation.resolution))
+            layers["drop"] = np.where(observed, np.nan, expected - elevation.layers["ceiling"])
         return layers
 
-    def _ground(self, height: Array, observed: Array, resolution: float) -> tuple[Array, Array, Array, Array, Array]:
-        """Height of the ground at each cell, by the plane between the wheels and by that of the surroundings, the slope
-        (2, rows, cols) of the surroundings, rise per cell, the slope under the footprint, rad, and the planes between
-        the wheels (3, rows, cols), NaN where there is no ground.
+    def _ground(self, height: Array, observed: Array, resolution: float) -> _Ground:
+        """The ground under the cells.
 
         Where the plane between the wheels is not known (the middle of a large rock), the height is that of the
         surroundings' plane; where that is not known, a step is measured against the level.
@@ -138,26 +147,24 @@ class Assess(Stage):
         footprint = _cells(self.footprint, resolution)
         under = local if footprint == narrow else fit_planes(height, ground, footprint, _LEVERAGE)
         level = np.where(np.isfinite(local[0]), local[0], around[0])
-        trend, between = self._trend(around[1:3], resolution), np.where(ground, local[:3], np.nan)
-        return level, around[0], trend, _slope(under, resolution), between
+        trend, planes = self._trend(around[1:3], resolution), np.where(ground, local[:3], np.nan)
+        return _Ground(level, around[0], trend, _slope(under, resolution), planes)
 
     def _trend(self, slopes: Array, resolution: float) -> Array:
         """The slopes (2, rows, cols), rise per cell, cut to `max_slope`; 0 where they are not known."""
         steep = np.hypot(*slopes) / (np.tan(self.max_slope) * resolution + 1e-12)
         return np.where(np.isfinite(steep), slopes / np.maximum(steep, 1.0), 0.0)
 
-    def _step(
-        self, elevation: ElevationMap, height: Array, observed: Array, ground: Array, trend: Array
-    ) -> tuple[Array, Array]:
+    def _step(self, elevation: ElevationMap, height: Array, observed: Array, ground: _Ground) -> tuple[Array, Array]:
         """The layers `step` and `support`."""
-        lowest, support = lowest_around(height, observed, trend, _reach(self.wheel, elevation.resolution))
+        lowest, support = lowest_around(height, observed, ground.trend, _reach(self.wheel, elevation.resolution))
         top, bottom = (_finite(elevation.layers.get(extreme), height) for extreme in ("maximum", "minimum"))
         rise = np.minimum(top - lowest, 4 * (height - lowest))
-        above = np.minimum(top - ground, 4 * (height - ground))
-        below = np.minimum(ground - bottom, 4 * (ground - height))
+        above = np.minimum(top - ground.height, 4 * (height - ground.height))
+        below = np.minimum(ground.height - bottom, 4 * (ground.height - height))
         within = np.minimum(top - bottom, 4 * np.minimum(height - bottom, top - height))
         step = np.fmax.reduce([rise, above, below, within, np.zeros_like(height)])
-        raised = observed & ((np.abs(height - ground) >= self.skirt) | (step >= self.obstacle))
+        raised = observed & ((np.abs(height - ground.height) >= self.skirt) | (step >= self.obstacle))
         return np.where(observed, _as_whole_obstacles(step, raised), np.nan), support
 
 
