@@ -21,6 +21,7 @@ Event = tuple[int, str, Any]
 
 # ns; a stamp that runs ahead of the log's clock by this much more than the one before it is in doubt, for as long
 JUMP = 10_000_000_000
+SET_BACK = "; if a clock was set back, run what follows by itself (--start, a second later)"
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class _Clock:
         elif last is not None and stamp < last.item.stamp:
             back = last.item.stamp - stamp
             message.fault = f"its stamp is {back / 1e6:.1f} ms before that of the {self._stream} message read before it"
-            message.fault += "; if a clock was set back, run what follows by itself (--start)" if back > JUMP else ""
+            message.fault += SET_BACK if back > JUMP else ""
         else:
             self._last = message
 
