@@ -1,6 +1,6 @@
 """A run's output log against the truth topics of the log it ran on: one table of errors.
 
-Results under /nav and truth under /truth meet by header stamp. Both logs are read side by side in log time and a frame
+Results under /nav and truth under /truth meet by header stamp. Both logs are read side by side in time and a frame
 is scored, and forgotten but for its sums, as soon as neither can add to it. Errors are told for what both cameras saw
 and for what one did; values given where there is no truth are counted on their own, and a true frame that the run left
 out is scored as one of which it knew nothing, so that neither a guess nor silence passes for knowledge.
@@ -14,6 +14,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -81,11 +82,11 @@ def score(result: Path, truth: Path) -> Score:
 def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dict[str, Any]]]:
     """(stamp, {topic: message}) of all frames of both logs, each when it is complete."""
     streams = [
-        iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)]),
-        iter_decoded(truth, [*TRUTHS, "/tf_static"], tally.lost[str(truth)]),
+        _on_their_clock(iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)])),
+        _on_their_clock(iter_decoded(truth, [*TRUTHS, "/tf_static"], tally.lost[str(truth)])),
     ]
     waiting: dict[int, dict[str, Any]] = {}
-    for topic, log_time, message in heapq.merge(*streams, key=lambda item: item[1]):
+    for topic, time, message in heapq.merge(*streams, key=lambda item: item[1]):
         if topic in ("/tf", "/tf_static"):
             for item in message.transforms:
                 if topic == "/tf_static":
@@ -94,10 +95,24 @@ def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dic
                     waiting.setdefault(ros2.stamp_of(item.header), {})["/tf"] = item
             continue
         waiting.setdefault(ros2.stamp_of(message.header), {})[topic] = message
-        for stamp in [stamp for stamp in waiting if stamp < log_time - PATIENCE]:
+        for stamp in [stamp for stamp in waiting if stamp < time - PATIENCE]:
             yield stamp, waiting.pop(stamp)
     for stamp in sorted(waiting):
         yield stamp, waiting.pop(stamp)
+
+
+def _on_their_clock(messages: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
+    """The messages with the times of their logging on the clock of their stamps: what is recorded of a simulator is
+    often logged by another one. The first stamp tells how far apart the two are."""
+    stampless = list[tuple[str, int, Any]]()
+    for message in messages:
+        if not hasattr(message[2], "header"):
+            stampless.append(message)
+            continue
+        ahead = message[1] - ros2.stamp_of(message[2].header)
+        yield from ((topic, time - ahead, found) for topic, time, found in chain(stampless, [message], messages))
+        return
+    yield from stampless
 
 
 class _Tally:

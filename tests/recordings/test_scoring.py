@@ -21,6 +21,7 @@ from recordings.score_table import format_score
 from recordings.simulator import Simulation, log
 from recordings.terrain_measures import ROWS, format_terrain
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
+from tests.recordings.sample_log import rewritten
 
 SMALL = Simulation(
     frames=2, rate=1.0, width=320, height=240, relief_cells=512, abundance=0.2, color=False, seed=11
@@ -275,6 +276,12 @@ def test_results_at_stamps_without_truth_are_reported_and_never_compared(tmp_pat
     assert "/nav/disparity: 1 message at stamps without truth" in format_score(found)
     with pytest.raises(LogError, match=r"no result of .* has the stamp of a true frame"):
         scored(tmp_path, truth, frames, shift={0: 1, 1: 1})
+
+
+@pytest.mark.parametrize("ahead", [-(10**18), 3_600_000_000_000])
+def test_a_truth_that_was_logged_by_another_clock_than_its_stamps_scores_the_same(tmp_path, truth, frames, ahead):
+    other = rewritten(truth, tmp_path / "other.mcap", time=lambda topic, log_time: log_time + ahead)
+    assert scored(tmp_path, other, frames).to_json() == scored(tmp_path, truth, frames).to_json()
 
 
 def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
