@@ -125,8 +125,9 @@ class _Tally:
         self.missing: dict[str, list[int]] = {topic: [] for topic in RESULTS}
         self.unmatched: dict[str, int] = {}
         self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
-        with McapFile(truth) as log:
-            self.truths = {log.channel(number).topic for number in log.index.channels}
+        with McapFile(truth) as log:  # recorders note topics of which no message came; of a damaged log, some may have
+            channels = log.index.channels
+            self.truths = {channels[number].topic for number in channels if log.count({number}) or log.index.lost}
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
         self.terrain: terrain_measures.TerrainTally | None = None

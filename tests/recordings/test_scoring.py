@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from flow.cli import main
@@ -282,6 +283,23 @@ def test_results_at_stamps_without_truth_are_reported_and_never_compared(tmp_pat
 def test_a_truth_that_was_logged_by_another_clock_than_its_stamps_scores_the_same(tmp_path, truth, frames, ahead):
     other = rewritten(truth, tmp_path / "other.mcap", time=lambda topic, log_time: log_time + ahead)
     assert scored(tmp_path, other, frames).to_json() == scored(tmp_path, truth, frames).to_json()
+
+
+def test_a_topic_of_the_truth_that_no_message_came_on_is_not_waited_for(tmp_path, truth, frames):
+    bare = tmp_path / "bare.mcap"
+    with truth.open("rb") as source, bare.open("wb") as target:
+        writer, channels = Writer(target), {}
+        writer.start(profile="ros2")
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.topic not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            if channel.topic not in ("/truth/occlusion", "/truth/rocks"):
+                writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    found = scored(tmp_path, bare, frames)
+    assert found.disparity["whole_image"]["all"]["bad_0.5"] == 0
+    assert found.terrain["heights"]["0-8 m"]["raw"]["rmse"] < 1e-6
 
 
 def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
