@@ -19,7 +19,9 @@ from flow.ledger import Absent, Entry, Ledger, Reason
 
 Event = tuple[int, str, Any]
 
-# ns; a stamp that runs ahead of the log's clock by this much more than the one before it is in doubt, for as long
+# ns; a stamp that runs ahead of the log's clock by this much more than the one before it is in doubt
+DOUBT = 1_000_000_000
+# ns; by so much more it is damaged, unless the next of its stream within as long is as far ahead
 JUMP = 10_000_000_000
 SET_BACK = "; if a clock was set back, run what follows by itself (--start, a second later)"
 
@@ -60,13 +62,13 @@ class _Clock:
     def judge(self, message: _Message) -> None:
         """Find what is wrong with the stamp of a message, and settle what was in doubt.
 
-        Two in a row that jump alike are a clock that was set, or another than the log's.
+        If what follows a jump goes on from there, messages were logged late, or a clock was set or is not the log's.
         """
-        doubted = self._doubted
-        self._settle(believed=doubted is not None and abs(doubted.ahead - message.ahead) <= JUMP)
-        last, stamp = self._last, message.item.stamp
-        jump = message.ahead - (last.ahead if last is not None else 0)
-        if jump > JUMP:
+        stamp, doubted = message.item.stamp, self._doubted
+        if doubted is not None:
+            self._settle(doubted, stamp > doubted.item.stamp and message.ahead - doubted.ahead <= JUMP)
+        last, jump = self._last, self._jump(message)
+        if jump > DOUBT:
             message.fault = f"its stamp jumps {jump / 1e9:.1f} s ahead of the log's clock"
             message.doubted, self._doubted = True, message
         elif last is not None and stamp == last.item.stamp:
@@ -80,15 +82,18 @@ class _Clock:
 
     def tick(self, log_time: float) -> None:
         """Settle what has been in doubt for too long: a first stamp that none contradicts is believed."""
-        if self._doubted is not None and self._doubted.log_time + JUMP < log_time:
-            self._settle(believed=self._last is None)
+        doubted = self._doubted
+        if doubted is not None and doubted.log_time + JUMP < log_time:
+            self._settle(doubted, self._last is None or self._jump(doubted) <= JUMP)
 
-    def _settle(self, believed: bool) -> None:
-        if self._doubted is not None:
-            self._doubted.doubted = False
-            if believed:
-                self._doubted.fault, self._last = "", self._doubted
-            self._doubted = None
+    def _jump(self, message: _Message) -> int:
+        """How much farther a stamp runs ahead of the log's clock than the one before it, ns."""
+        return message.ahead - (self._last.ahead if self._last is not None else 0)
+
+    def _settle(self, doubted: _Message, believed: bool) -> None:
+        self._doubted, doubted.doubted = None, False
+        if believed:
+            doubted.fault, self._last = "", doubted
 
 
 def _judged(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:

@@ -50,6 +50,8 @@ def stamp_or(header: Any, log_time: int) -> int:
     stamp = stamp_of(header)
     if stamp < 0:
         raise LogError(f"its stamp is negative ({stamp} ns)")
+    if header.stamp.nanosec >= 1_000_000_000:
+        raise LogError(f"its stamp is damaged ({header.stamp.nanosec} ns beyond the second)")
     return stamp or log_time
 
 

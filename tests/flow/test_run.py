@@ -6,6 +6,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from flow.errors import SinkError, UsageError
 from flow.feeder import Feeder
@@ -172,7 +174,7 @@ def test_a_progress_display_that_fails_does_not_stop_the_run(tmp_path):
     assert summary["frames_out"] == len(sink.records) == 10
 
 
-@pytest.mark.parametrize("ahead", [12_000 * MS, 3_600_000 * MS])
+@pytest.mark.parametrize("ahead", [4_000 * MS, 12_000 * MS, 3_600_000 * MS])
 @pytest.mark.parametrize("damaged", [{4}, {4, 8}, {4, 7, 13}, {0}, {0, 2, 9}])
 def test_a_damaged_stamp_costs_one_message_even_if_another_like_it_comes_later(tmp_path, ahead, damaged):
     events = [
@@ -211,6 +213,21 @@ def test_a_clock_years_from_that_of_the_log_costs_nothing(tmp_path, frames):
         sink, summary = replayed(graph(tmp_path), shifted(traverse(frames), years * 31_557_600_000 * MS))
         assert len(sink.values("raised")) == frames
         assert summary["verdict"] == "COMPLETE"
+
+
+@settings(max_examples=50, deadline=None)
+@given(stalls=st.lists(st.tuples(st.integers(0, 9_000), st.integers(1, 9_000)), max_size=4))
+def test_a_log_that_was_written_in_bursts_loses_nothing(tmp_path_factory, stalls):
+    """A recorder that stalls for up to nine seconds logs what came meanwhile all at once."""
+
+    def logged(at):
+        ends = [(begin + length) * MS for begin, length in stalls if begin * MS <= at < (begin + length) * MS]
+        return max(ends, default=at)
+
+    events = [(logged(at), stream, item) for at, stream, item in traverse(100)]
+    feeder = Feeder(graph(tmp_path_factory.mktemp("burst")), ledger := Ledger())
+    assert len(list(feeder.frames(sorted(events, key=lambda event: event[0])))) == 100
+    assert not [entry for entry in ledger.entries if entry.reason == "out of order"]
 
 
 def test_a_stamp_in_doubt_does_not_hold_up_the_log(tmp_path):

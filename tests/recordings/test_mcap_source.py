@@ -246,6 +246,8 @@ def test_one_bad_message_is_lost_alone(tmp_path: Path) -> None:
             message.encoding = "yuv422"
         if topic == TILT and number == 3:
             message.orientation.x = 5.0
+        if topic == "/odom" and number == 2:
+            message.header.stamp.nanosec = 2**32 - 1
         return message
 
     events = items_of(write_sample(tmp_path / "log.mcap", edit))
@@ -253,6 +255,7 @@ def test_one_bad_message_is_lost_alone(tmp_path: Path) -> None:
     assert f"the image is cut: {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in told["left"]
     assert "image encoding 'yuv422' is not one of those that can be read" in told["right"]
     assert "the quaternion of the inclinometer is not a rotation" in told["inclinometer"]
+    assert "its stamp is damaged (4294967295 ns beyond the second)" in told["odometry"]
     assert len(events) == 4 * FRAMES + 1
 
 
