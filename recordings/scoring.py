@@ -42,6 +42,7 @@ class Score:
 
     frames: in the truth; compared: those with at least one result; missing: result topic -> stamps of true frames that
     it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without truth;
+    unscored: truth topic -> why -> frames that have it but lack another, which it is scored with;
     lost: log -> why -> messages that could not be read; a true frame that lacks one is scored as far as it goes;
     disparity: `StereoErrors.measures`, cropped by the truth's max_disparity (the data set's range where it has one,
     else the frame's largest), rounded up to 16;
@@ -55,6 +56,7 @@ class Score:
     compared: int
     missing: dict[str, list[int]]
     unmatched: dict[str, int]
+    unscored: dict[str, dict[str, int]] = field(default_factory=dict)
     lost: dict[str, dict[str, int]] = field(default_factory=dict)
     disparity: dict[str, Any] | None = None
     terrain: dict[str, Any] | None = None
@@ -124,6 +126,7 @@ class _Tally:
         self.frames = self.compared = 0
         self.missing: dict[str, list[int]] = {topic: [] for topic in RESULTS}
         self.unmatched: dict[str, int] = {}
+        self.unscored: dict[str, dict[str, int]] = {}
         self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
         with McapFile(truth) as log:  # recorders note topics of which no message came; of a damaged log, some may have
             channels = log.index.channels
@@ -162,7 +165,11 @@ class _Tally:
     def _has(self, needed: set[str], besides: set[str], frame: dict[str, Any]) -> bool:
         """Whether a frame has the truth `needed`, and `besides` what the log has of this: no rocks there were is one
         thing, rocks that were lost another."""
-        return needed | (besides & self.truths) <= frame.keys()
+        lacking = (needed | (besides & self.truths)) - frame.keys()
+        for topic in needed & frame.keys() if lacking else ():
+            counts, why = self.unscored.setdefault(topic, {}), f"the truth has no {', '.join(sorted(lacking))} there"
+            counts[why] = counts.get(why, 0) + 1
+        return not lacking
 
     def _add_disparity(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
         true = ros2.read_disparity(frame["/truth/disparity"])
@@ -259,6 +266,7 @@ class _Tally:
             self.frames, self.compared,
             missing={topic: stamps for topic, stamps in self.missing.items() if stamps},
             unmatched=self.unmatched,
+            unscored=self.unscored,
             lost={log: dict(why) for log, why in self.lost.items() if why},
             disparity=self.disparity.measures() if self.disparity else None,
             terrain=self.terrain.measures() if self.terrain else None,

@@ -285,21 +285,33 @@ def test_a_truth_that_was_logged_by_another_clock_than_its_stamps_scores_the_sam
     assert scored(tmp_path, other, frames).to_json() == scored(tmp_path, truth, frames).to_json()
 
 
-def test_a_topic_of_the_truth_that_no_message_came_on_is_not_waited_for(tmp_path, truth, frames):
-    bare = tmp_path / "bare.mcap"
-    with truth.open("rb") as source, bare.open("wb") as target:
+def without(truth: Path, path: Path, *topics: str) -> Path:
+    """The truth with topics of which it has the channels, but no messages, as recorders leave them."""
+    with truth.open("rb") as source, path.open("wb") as target:
         writer, channels = Writer(target), {}
         writer.start(profile="ros2")
         for schema, channel, message in make_reader(source).iter_messages():
             if channel.topic not in channels:
                 known = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, known)
-            if channel.topic not in ("/truth/occlusion", "/truth/rocks"):
+            if channel.topic not in topics:
                 writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
         writer.finish()
-    found = scored(tmp_path, bare, frames)
+    return path
+
+
+def test_a_topic_of_the_truth_that_no_message_came_on_is_not_waited_for(tmp_path, truth, frames):
+    found = scored(tmp_path, without(truth, tmp_path / "bare.mcap", "/truth/occlusion", "/truth/rocks"), frames)
     assert found.disparity["whole_image"]["all"]["bad_0.5"] == 0
     assert found.terrain["heights"]["0-8 m"]["raw"]["rmse"] < 1e-6
+    assert found.unscored == {}
+
+
+def test_a_truth_that_cannot_be_scored_with_says_what_it_lacks(tmp_path, truth, frames):
+    found = scored(tmp_path, without(truth, tmp_path / "bare.mcap", "/truth/navigation_map"), frames)
+    assert found.terrain is None
+    said = "not scored   /truth/elevation_map: 2 frames: the truth has no /truth/navigation_map there"
+    assert said in format_score(found).splitlines()
 
 
 def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
@@ -339,6 +351,9 @@ def test_a_damaged_truth_costs_what_it_held_and_nothing_is_scored_against_it(tmp
         assert rows[0].keys() < found.per_frame[-1].keys()
         whole = scoring.score(run, truth).per_frame[0]
         assert rows[0] == {name: whole[name] for name in rows[0]}
+        unscored = [count for counts in found.unscored.values() for count in counts.values()]
+        assert set(unscored) <= {1}
+        assert bool(unscored) == (topic == "/truth/rocks")
         assert f" of {damaged}: the chunk at byte" in " ".join(format_score(found).split())
         assert main(["score", str(run), "--truth", str(damaged)]) == 3
     assert main(["score", str(run), "--truth", str(truth)]) == 0
