@@ -102,7 +102,8 @@ class Locate(Stage):
     def _begun(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> _State:
         """The first frame of a segment: at its origin, upright by the tilt."""
         world = level_transform(tilt, mount, camera.child, camera_height=0.0)
-        covariance = np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0])
+        # About the origin, which is base_link where that is known, the tilt's error moves the camera as well.
+        covariance = _levered(np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0]), world.translation)
         return _State(motion.segment, camera, motion.covariance, world, covariance, 0.0)
 
     def _drawn(self, state: _State, tilt: Tilt, mount: Mount) -> _State:
@@ -119,9 +120,11 @@ class Locate(Stage):
         base = mount.base_from_camera
         placed = state.world if base is None else state.world.after(base.inverse())
         alike = self._alike(placed.translation, state.way)
+        covariance = _levered(state.covariance, placed.translation - state.world.translation) + alike.T @ alike
+        np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # the origin's is zero but for rounding
         return Pose(
             stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),
-            _frame_of(state.segment), placed.child, state.covariance + alike.T @ alike,
+            _frame_of(state.segment), placed.child, covariance,
         )  # fmt: skip
 
     def _alike(self, place: Array, way: float) -> Array:

@@ -1,8 +1,8 @@
 """Visual odometry: the camera's own motion from one stereo frame to the next (see `tracking`).
 
 Each frame is tracked from a keyframe, which stays as long as it shares enough with what is seen: a rover that stands
-still does not drift. Where tracking is lost a new segment begins, and says so; poses of different segments have nothing
-to do with each other, and nothing is made up to join them.
+still does not drift. Where tracking is lost, as when the images change their size, a new segment begins, and says so;
+poses of different segments have nothing to do with each other, and nothing is made up to join them.
 """
 
 from __future__ import annotations
@@ -60,8 +60,7 @@ class VisualOdometry(Stage):
         # What all is counted from needs no more than to show something: it may be the only frame.
         if seen.known < (1 if before is None else self.least):
             return self._blind(frame.stamp, seen)
-        lost = f"less than {self.least} features agree with the frame before; segment {self._memory.segment + 1} begins"
-        return self._begun(frame, seen, lost if before is not None else "")
+        return self._begun(frame, seen, self._parted(before.view, seen) if before is not None else "")
 
     def finding(self) -> Finding | None:
         """How many frames show too little; None where all show enough. That tracking was lost is for Locate to tell,
@@ -72,6 +71,14 @@ class VisualOdometry(Stage):
 
     def _likely(self, step: Step) -> bool:
         return step.error <= self.worst and float(np.linalg.norm(step.translation)) <= self.fastest
+
+    def _parted(self, before: View, seen: View) -> str:
+        """Why the segment ends."""
+        sizes = [f"{width}x{height}" for height, width in (before.gray.shape, seen.gray.shape)]
+        why = f"less than {self.least} features agree with the frame before"
+        if sizes[0] != sizes[1]:
+            why = f"the images, {sizes[0]} before, are {sizes[1]} now"
+        return f"{why}; segment {self._memory.segment + 1} begins"
 
     def _followed(self, stamp: int, before: _Keyframe, step: Step, seen: View) -> CameraMotion:
         memory = self._memory

@@ -153,6 +153,11 @@ def _rectifying_maps(
             f"Rectify: a {model} camera has {' or '.join(map(str, DISTORTION_SIZES[model]))} distortion coefficients, "
             f"the calibration has {d.size}"
         )
+    if not (min(k[0, 0], k[1, 1]) > 0 and np.allclose(r @ r.T, np.eye(3), atol=1e-3)):
+        raise ValueError(
+            "Rectify: the calibration of a raw image has no focal length in K, or its R is not a rotation; mend it, or "
+            "say that the images are rectified"
+        )
     undistort = cv2.fisheye.initUndistortRectifyMap if model == "equidistant" else cv2.initUndistortRectifyMap
     down = offset_field(terms, width, height)
     above = int(np.ceil(np.abs(down).max())) if terms else 0  # rows beyond the image that the offset may look up

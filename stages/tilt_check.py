@@ -166,7 +166,7 @@ def _ground_normal(cloud: PointCloud) -> Array:
     some = cloud.points[:: -(-len(cloud.points) // GROUND_POINTS) or 1].astype(np.float64)
     if cloud.sensor is not None:
         some = cloud.sensor.inverse()(some)
-    some = some[(some[:, 2] > GROUND_FROM) & (some[:, 2] < GROUND_TO)]
+    some = some[np.isfinite(some).all(axis=1) & (some[:, 2] > GROUND_FROM) & (some[:, 2] < GROUND_TO)]
     if len(some) < GROUND_POINTS // 20:
         return np.full(3, np.nan)
     weights = np.ones(len(some))

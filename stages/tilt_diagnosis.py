@@ -363,10 +363,11 @@ def _offset(evidence: Evidence, sound: _Cause, least: float) -> _Cause | None:
 
 
 def _splines(evidence: Evidence) -> tuple[Array, dict[int, RotationSpline]]:
-    """Per stretch without long gaps the camera's turn as a function of time, s; and for each frame its stretch, -1 for
-    one that does not lie `LONGEST` within its own."""
+    """Per stretch of rising stamps without long gaps the camera's turn as a function of time, s; and for each frame its
+    stretch, -1 for one that does not lie `LONGEST` within its own."""
     seconds = (evidence.stamps - evidence.stamps[0]) / 1e9
-    breaks = (np.diff(seconds) > SLOWEST) | (np.diff(evidence.segments) != 0)
+    steps = np.diff(seconds)
+    breaks = (steps <= 0) | (steps > SLOWEST) | (np.diff(evidence.segments) != 0)
     stretches = np.concatenate([[0], np.cumsum(breaks)])
     within, splines = np.full(len(seconds), -1), dict[int, RotationSpline]()
     for stretch in np.unique(stretches):

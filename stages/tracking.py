@@ -72,9 +72,12 @@ def view(frame: StereoFrame, disparity: Disparity) -> View:
     image = gray(eight_bit(frame.left)[0])
     shrink = max(1, round(image.shape[1] / DETECTION_WIDTH))
     small = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA) if shrink > 1 else image
+    nothing = View(image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty((0, 3)), frame.camera)
+    if min(small.shape) < PATCH:  # OpenCV fails on the smallest
+        return nothing
     found, codes = cv2.ORB.create(FEATURES, scaleFactor=1.3, nlevels=5, fastThreshold=5).detectAndCompute(small, None)
     if not found:
-        return View(image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty((0, 3)), frame.camera)
+        return nothing
     places = (np.array([point.pt for point in found], np.float32) + 0.5) * shrink - 0.5
     return View(image, places, codes, _in_space(places, disparity, frame.camera), frame.camera)
 
@@ -94,7 +97,10 @@ def _in_space(places: Array, disparity: Disparity, camera: StereoCamera) -> Arra
 
 
 def step_between(earlier: View, later: View, least: int) -> Step | None:
-    """How the camera moved from one view to another; None where fewer than `least` features agree on it."""
+    """How the camera moved from one view to another; None where fewer than `least` features agree on it, or where the
+    images are not of one size: a patch looks different then."""
+    if earlier.gray.shape != later.gray.shape:
+        return None
     matrix = np.array([[later.camera.fx, 0, later.camera.cx], [0, later.camera.fy, later.camera.cy], [0, 0, 1.0]])
     here, there = _pairs(earlier, later)
     if len(here) < least:

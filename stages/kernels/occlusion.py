@@ -42,9 +42,15 @@ def lowest_sight(
 @kernel
 def _mark(lowest, x, y, z, dx, dy, dz, length, cells_per_metre, x0, y0, region):  # type: ignore[no-untyped-def]
     """Lower the cells under the line from (x, y, z), in direction (dx, dy, dz), (dx, dy) a unit vector, to it; sampled
-    four times a cell."""
+    four times a cell, where it is within the region, be it ever so long."""
     size = lowest.shape[0]
-    for k in range(1, int(length * cells_per_metre * 4.0) + 1):
+    middle, aside, reach = -(x * dx + y * dy), x * dy - y * dx, region + 1.0 / cells_per_metre
+    if not abs(aside) <= reach:
+        return
+    half = np.sqrt(reach * reach - aside * aside)
+    first = int(max(middle - half, 0.0) * cells_per_metre * 4.0)
+    last = int(min(middle + half, length) * cells_per_metre * 4.0)
+    for k in range(max(first, 1), last + 1):
         way = k / (4.0 * cells_per_metre)
         px, py = x + dx * way, y + dy * way
         col, row = int(np.floor((px - x0) * cells_per_metre)), int(np.floor((py - y0) * cells_per_metre))

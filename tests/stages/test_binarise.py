@@ -86,6 +86,21 @@ def test_a_tilted_plane_within_the_slope_limit_is_free_wherever_it_was_seen(
     assert (result.cells[~seen] == Cell.UNKNOWN).all()
 
 
+@pytest.mark.parametrize("resolution", [0.05, 0.2, 0.4, 0.5, 0.7])
+@pytest.mark.parametrize("heading", [0.0, 0.4, 0.8])
+def test_the_slope_within_a_cell_is_no_step(resolution: float, heading: float) -> None:
+    """At 18 degrees a cell of 0.5 m reaches up by 0.2 m from one corner to the other."""
+    x, y = (axis[:20, :20] / 0.05 * resolution for axis in grid())
+    east, north = np.tan(np.deg2rad(18)) * np.array([np.cos(heading), np.sin(heading)])
+    z, half = east * x + north * y, (abs(east) + abs(north)) * resolution / 2
+    plane = replace(map_of(z, minimum=z - half, maximum=z + half), resolution=resolution)
+    assert (decided(plane).cells[3:-3, 3:-3] == Cell.FREE).all()
+    blocked = z.copy()
+    blocked[10, 10] += 0.25
+    rock = replace(map_of(blocked, minimum=z - half, maximum=blocked + half), resolution=resolution)
+    assert decided(rock).reason[10, 10] == Reason.STEP
+
+
 @pytest.mark.parametrize(("resolution", "wheel"), [(0.05, 0.14), (0.1, 0.3), (0.2, 0.3)])
 def test_level_ground_is_free_under_a_wheel_that_spans_three_cells(resolution: float, wheel: float) -> None:
     level = replace(map_of(np.zeros_like(grid()[0])), resolution=resolution)

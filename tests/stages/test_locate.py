@@ -81,6 +81,22 @@ def test_the_stated_covariance_covers_the_errors_and_grows():
         assert spread[-1, 5] > spread[5, 5]
 
 
+def test_a_rover_that_stands_stays_where_it_is_however_its_tilts_err():
+    """The camera is 1 m from base_link: with each tilt it is placed anew, and base_link stays."""
+    noise, rng, places, stated = np.radians(0.5), np.random.default_rng(0), [], []
+    camera = DRIVE.truth.base_at(DRIVE.stamps(1)[0]).after(DRIVE.truth.mounts[0])
+    for _ in range(20):
+        stage = Locate(tilt_noise=float(noise), tilt_bias=0.0)
+        for motion in motions([camera] * 10, list(range(10))):
+            wrong = Rotation.from_rotvec([*rng.normal(0, noise, 2), 0.0]).as_matrix()
+            up = DRIVE.mount.T @ camera.rotation.T @ wrong[:, 2]
+            pose = stage(motion, Tilt(motion.stamp, up), mount_of(DRIVE))
+        places.append(pose.position)
+        stated.append(np.sqrt(np.diag(pose.covariance)[:3]))
+    assert np.abs(places).max() < 5e-4
+    assert np.max(stated) < 5e-4
+
+
 def test_the_logs_own_pose_goes_through_untouched():
     pose = Pose(7, [1, 2, 3], [0, 0, 0, 1], "odom", "base_link")
     motion = motions(DRIVE.cameras(1), DRIVE.stamps(1))[0]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.simulator import Simulation
 from recordings.simulator.log import true_disparity
-from stages import CameraMotion, Disparity, StereoFrame, Transform, VisualOdometry
+from stages import CameraMotion, Disparity, StereoCamera, StereoFrame, Transform, VisualOdometry
 from stages.tracking import view
 
 FRAMES = 5
@@ -93,6 +93,33 @@ def test_tracking_that_is_lost_begins_a_segment_and_says_so(drive):
     assert "segment 2 begins" in motion.lost
     np.testing.assert_array_equal(camera_of(motion).translation, 0)
     assert odometry.finding() is None  # Locate tells it, once
+
+
+def test_images_of_another_size_begin_a_segment_and_say_so(drive):
+    """As where a camera is switched to another mode: what was tracked at one size is not found at another."""
+    inputs, _ = drive
+    frame, disparity = inputs[1]
+    camera, layers = frame.camera, (disparity.pixels / 2, disparity.source, disparity.confidence)
+    half = replace(camera, fx=camera.fx / 2, fy=camera.fy / 2, cx=camera.cx / 2 - 0.25, cy=camera.cy / 2 - 0.25,
+                   cx_right=camera.cx_right / 2 - 0.25, width=camera.width // 2, height=camera.height // 2)  # fmt: skip
+    smaller = StereoFrame(frame.stamp, frame.left[::2, ::2], frame.right[::2, ::2], half)
+    odometry = VisualOdometry()
+    odometry(*inputs[0])
+    motion = odometry(smaller, Disparity(frame.stamp, *(layer[::2, ::2].copy() for layer in layers), camera=half))
+    size = f"{camera.width}x{camera.height}"
+    assert motion.segment == 2
+    assert motion.lost == f"the images, {size} before, are {half.width}x{half.height} now; segment 2 begins"
+    np.testing.assert_array_equal(camera_of(motion).rotation, np.eye(3))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 700), (20, 20)])
+def test_an_image_smaller_than_a_patch_shows_too_little(shape):
+    height, width = shape
+    image = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
+    camera = StereoCamera(50.0, 50.0, width / 2, height / 2, 0.2, width, height)
+    known = [np.ones(shape, kind) for kind in (np.float32, np.uint8, np.float32)]
+    motion = VisualOdometry()(StereoFrame(0, image, image, camera), Disparity(0, *known))
+    assert motion.lost == "only 0 features with a disparity are in view, less than 40"
 
 
 def test_features_that_agree_only_roughly_are_no_track(drive):

@@ -267,6 +267,15 @@ def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
     assert "of 1 frame)" in found.sentence
 
 
+@pytest.mark.parametrize("entry", [{"k": np.zeros((3, 3))}, {"r": np.zeros((3, 3))}, {"r": np.diag([1.0, 1, 0.5])}])
+def test_an_empty_calibration_makes_no_black_image(entry):
+    models = [CameraModel(WIDTH, HEIGHT, K, np.zeros(5), np.eye(3), projection) for projection in (P_LEFT, P_RIGHT)]
+    camera = StereoCamera.from_models(models[0], replace(models[1], **entry), "cam", rectified=False)
+    image = np.zeros((HEIGHT, WIDTH), np.uint8)
+    with pytest.raises(ValueError, match="no focal length in K, or its R is not a rotation"):
+        Rectify()(StereoFrame(1, image, image, camera))
+
+
 def test_a_list_of_terms_is_taken_as_the_survey_prints_it():
     assert Rectify(row_offset=[0.5, 0.1]) == Rectify(row_offset=(0.5, 0.1))
 

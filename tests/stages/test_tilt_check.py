@@ -68,6 +68,14 @@ def test_frames_that_stand_still_crowd_nothing_out():
     assert halting.finding() == moving.finding()
 
 
+def test_stamps_that_repeat_or_go_back_hide_no_fault():
+    flip, stage = flipped(0), CheckTilt()
+    for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), DRIVE.ups(), strict=True):
+        stamp = motion.stamp // 10**9 * 10**9  # of a clock that counts whole seconds
+        stage(replace(motion, stamp=stamp), Tilt(stamp, flip(up)), Mount(0, DRIVE.mount))
+    assert "the sign of pitch is flipped" in stage.finding().sentence
+
+
 def test_what_the_log_mends_halfway_is_still_told_at_the_end():
     ups = DRIVE.ups()
     ups[:25] = [flipped(0)(up) for up in ups[:25]]
@@ -89,6 +97,9 @@ def test_the_ground_in_view_is_measured_whatever_lies_on_it_and_whatever_frame_t
             0, sensor(cloud.points).astype(np.float32), cloud.colors, cloud.sigma, cloud.pixel, "level", sensor=sensor
         )  # fmt: skip
         assert abs(CheckTilt()(motion, tilt, mount, moved).ground - health.ground) < 1e-3
+        points = cloud.points.copy()
+        points[::50, 0] = np.nan
+        assert abs(CheckTilt()(motion, tilt, mount, replace(cloud, points=points)).ground - health.ground) < 1e-3
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 12])

@@ -215,6 +215,17 @@ def test_occlusion_kernel_equals_the_plain_reference() -> None:
     assert (~alike).mean() < 1e-3  # samples on the border of two cells round either way
 
 
+def test_a_line_of_sight_hides_the_same_cells_however_far_it_goes() -> None:
+    """It is followed within the region only: the farthest of these would take years."""
+    hidden = []
+    for far in (30.0, 1e6, 1e15):
+        points = np.array([[far, 0.3 * far, far / 10], [1.0, 0.3, 0.0]], np.float32)  # image rows run from the sky down
+        hidden.append(lowest_sight(points, np.array([5, 15]), 10, (0.0, 0.0, 1.0), 0.1, (-8.0, -8.0), 160, 8.0))
+    assert 50 < np.isfinite(hidden[0]).sum() < 150
+    np.testing.assert_allclose(hidden[1], hidden[0], atol=0.2)
+    np.testing.assert_allclose(hidden[2], hidden[0], atol=0.2)
+
+
 def test_a_cloud_that_is_not_level_is_refused() -> None:
     cloud = PointCloud(
         0, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32),
