@@ -11,7 +11,9 @@ def program() -> int:
     try:
         from flow.cli import main
 
-        return main()
+        code = main()
+        _leave_workers_behind(code)
+        return code
     except KeyboardInterrupt:
         print("roverflow: interrupted", file=sys.stderr)
         return 130
@@ -19,6 +21,18 @@ def program() -> int:
         import signal
 
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _leave_workers_behind(code: int) -> None:
+    """End at once where a stage of an abandoned frame still works: native code that the interpreter is torn down
+    under may abort the process."""
+    import os
+    import threading
+
+    if any(thread.daemon and thread.is_alive() for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
 
 
 if __name__ == "__main__":
