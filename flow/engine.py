@@ -120,8 +120,10 @@ class Engine:
             self._frames.append(frame)
             self._expect(frame)
             self._pass_absence(frame)
+            retired = list(self._retire())  # a frame that has nothing to work on is through at once
             self._condition.notify_all()
-            return True
+        self._tell(retired)
+        return True
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Wait until every frame is through (or the engine failed, or `stop()`), then end the workers.
