@@ -104,6 +104,8 @@ class _Outputs:
                 self.errors.append((use, error))
         if self.errors:
             use, cause = self.errors[0]
+            if use not in self.paths:  # no output's fault
+                raise cause
             sentence = f"{use.rpartition('.')[2]} could not write {self.paths[use]}: {cause}"
             raise SinkError(sentence, summary | {"verdict": str(Verdict.INCOMPLETE), "failure": sentence}) from cause
 
