@@ -208,7 +208,8 @@ def test_a_link_that_leads_to_itself_is_replaced_by_the_output(tmp_path):
     (tmp_path / "a").symlink_to(tmp_path / "b")
     (tmp_path / "b").symlink_to(tmp_path / "a")
     assert roverflow("simulate", tmp_path / "a", "--frames", 1, "--size", "64x64") == 0
-    assert McapSource().open(tmp_path / "a").frames == 1
+    with McapSource().open(tmp_path / "a") as opened:
+        assert opened.frames == 1
 
 
 @pytest.mark.parametrize(("option", "value", "said"), [
