@@ -305,3 +305,19 @@ def test_an_output_that_fails_at_its_end_makes_the_run_incomplete(tmp_path, monk
     with pytest.raises(SinkError, match="No space left") as caught:
         replayed(graph(tmp_path), traverse(3))
     assert caught.value.summary["verdict"] == "INCOMPLETE"
+
+
+def test_an_exception_that_cannot_be_told_is_not_taken_for_an_outputs_fault(tmp_path, monkeypatch):
+    class UnprintableError(Exception):
+        def __str__(self):
+            raise RuntimeError("no words for it")
+
+    def fail(self, couple):
+        raise UnprintableError
+
+    pipeline = graph(tmp_path)
+    ((_, sink),) = pipeline.sinks
+    monkeypatch.setattr("tests.flow.toys.Scale.__call__", fail)
+    with pytest.raises(RuntimeError, match="no words for it"):
+        replayed(pipeline, traverse(3))
+    assert sink.summary["verdict"] == "INCOMPLETE"
