@@ -11,7 +11,7 @@ moved on by `patience` since it arrived, whichever comes first.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, get_type_hints
 
@@ -106,11 +106,6 @@ class PairState:
         for port, queue in self.waiting.items():
             while queue:
                 yield self._unmatched(port, "the log ended before its partner came")
-
-    def held(self) -> Iterator[tuple[str, int]]:
-        """(stream, stamp) of every message that still waits."""
-        for port, queue in self.waiting.items():
-            yield from ((self.inputs[port], token.stamp) for _, token in queue)
 
     def _unmatched(self, port: str, why: str) -> Entry:
         _, token = self.waiting[port].popleft()
@@ -275,10 +270,6 @@ class SamplerState:
             if isinstance(value, str):
                 value = Absent(Entry(self.name, token.stamp, self.name, Reason.UNALIGNED, value))
             yield Token(token.stamp, value)
-
-    def held(self) -> Iterator[tuple[str, int]]:
-        """Nothing: the frames that wait here are told by the stream they come from, and samples are no frames."""
-        return iter(())
 
     def _forget(self, log_time: int) -> None:
         """Drop the samples before the last one at or before every stamp to come, and those beyond `HISTORY`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,10 @@ _MCAP = b"\x89MCAP0\r\n"
 _OWN = _MCAP + struct.pack("<BQI4sI9s", 1, 21, 4, b"ros2", 9, b"roverflow")  # header: its length, profile and library
 
 
+_MOST_WORKERS = 1024
+_LATEST = 9e9  # s, beyond what stamps in nanoseconds can hold
+
+
 def count(text: str) -> int:
     """A whole number of at least 1."""
     try:
@@ -23,6 +28,14 @@ def count(text: str) -> int:
         value = 0
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not '{text}'")
+    return value
+
+
+def workers(text: str) -> int:
+    """A number of threads: more than there are cores only wait for each other."""
+    value = count(text)
+    if value > _MOST_WORKERS:
+        raise argparse.ArgumentTypeError(f"must be at most {_MOST_WORKERS}, not '{text}'; the cores are enough")
     return value
 
 
@@ -50,13 +63,16 @@ def share(text: str) -> float:
 
 def seconds(text: str) -> float:
     """Seconds after a log's first message."""
-    return magnitude(text, "seconds after the log's first message")
+    value = magnitude(text, what := "seconds after the log's first message")
+    if value > _LATEST:
+        raise argparse.ArgumentTypeError(f"must be {what}, at most {_LATEST:g}, not '{text}'")
+    return value
 
 
 def size(text: str) -> tuple[int, int]:
     """Width and height, px, such as 640x480."""
     width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit()):
+    if not (width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, such as 640x480, not '{text}'")
     return int(width), int(height)
 
@@ -66,7 +82,7 @@ def check_outputs(log: Path | None, others: Sequence[Path | None], inputs: Seque
 
     log: the one output that is a log, if any: no other may take a log's place.
     """
-    taken: list[Path] = []
+    taken: list[str] = []
     for path in filter(None, (log, *others)):
         if not path.parent.is_dir():
             raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
@@ -77,16 +93,18 @@ def check_outputs(log: Path | None, others: Sequence[Path | None], inputs: Seque
                 raise UsageError(f"{path} is what is being read; choose another name for the output")
         if path.exists() and path.stat().st_size and _is_of_others(path):
             raise UsageError(f"{path} is there already and no output of roverflow; choose another name or remove it")
-        if path.resolve() in taken:
+        if (resolved := os.path.realpath(path)) in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
         if path is not log and (path.suffix.lower() == ".mcap" or _start_of(path).startswith(_MCAP)):
             raise UsageError(f"{path} has the name of a log or is one; choose another for what is none")
-        taken.append(path.resolve())
+        taken.append(resolved)
 
 
 def check_demo(folder: Path) -> None:
     """Refuse a folder for the demo that holds what no earlier demo wrote: its log and its maps are replaced."""
-    if not folder.is_dir() or not any(folder.iterdir()):
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder} is a file; give the name of a folder with --out")
+    if not folder.exists() or not any(folder.iterdir()):
         return
     log = folder / "traverse.mcap"
     finished = (folder / "summary.json").is_file() or not (folder / "maps").exists()

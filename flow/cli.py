@@ -19,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, share, size
+from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, share, size, workers
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.replay import as_json, product_version, replay
 from flow.report import counted, headline, report, say
@@ -132,13 +132,13 @@ def _run_arguments(sub: argparse.ArgumentParser) -> None:
     recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
     sub.add_argument("--start", type=seconds, metavar="T", help="begin T seconds after the log's first message")
     sub.add_argument("--end", type=seconds, metavar="T", help="stop T seconds after the log's first message")
-    sub.add_argument("--workers", type=count, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
+    sub.add_argument("--workers", type=workers, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
     sub.add_argument("--summary", type=Path, metavar="OUT.json", help="counts, drops, times and verdict as JSON")
 
 
 def _run(options: argparse.Namespace) -> int:
-    out = options.out or options.log.with_name(f"{options.log.stem}-nav.mcap")
-    rrd = None if options.no_rrd else options.rrd or out.with_suffix(".rrd")
+    out = options.out or options.log.parent / f"{options.log.stem}-nav.mcap"
+    rrd = None if options.no_rrd else options.rrd or out.parent / f"{out.stem}.rrd"
     check_outputs(out, [rrd, options.summary], [options.log, Path(options.pipeline)])
 
     def keep(summary: dict[str, Any]) -> None:

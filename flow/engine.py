@@ -87,11 +87,12 @@ class Engine:
         self._work += [self._sink_work(name, sink, streams) for name, (sink, streams) in sinks.items()]
         for work in self._work:
             work.consumers = [other for other in self._work if work.output in other.inputs]
-        self._closed = False
+        self._closed = self._over = False
         self._writing = 0  # workers inside a sink
         self._telling = threading.Lock()
         self.failure: tuple[str, BaseException] | None = None
-        self.admitted = self.whole = 0
+        self.admitted = self.through = self.whole = 0
+        self.late_entries: list[Entry] = []  # losses of the frames that did not get through
         self.seconds = dict.fromkeys((work.name for work in self._work), 0.0)
         self._threads = [
             threading.Thread(target=self._work_loop, name=f"worker-{index}", daemon=True) for index in range(workers)
@@ -119,8 +120,10 @@ class Engine:
             self._frames.append(frame)
             self._expect(frame)
             self._pass_absence(frame)
+            retired = list(self._retire())  # a frame that has nothing to work on is through at once
             self._condition.notify_all()
-            return True
+        self._tell(retired)
+        return True
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Wait until every frame is through (or the engine failed, or `stop()`), then end the workers.
@@ -138,9 +141,11 @@ class Engine:
             while thread.is_alive() and not stop():
                 thread.join(0.1)
         with self._condition:
+            self._over = True
             for frame in self._frames:
                 detail = "the run ended before it was through"
-                self._ledger.add(Entry("frame", frame.stamp, "engine", Reason.ABANDONED, detail))
+                entry = self._ledger.add(Entry("frame", frame.stamp, "engine", Reason.ABANDONED, detail))
+                self.late_entries += [*frame.entries, entry]
 
     # -- scheduling: everything below, up to the work itself, runs under the lock --------------------------------
 
@@ -161,6 +166,8 @@ class Engine:
                 value = error
             seconds = time.perf_counter() - seconds
             with self._condition:
+                if self._over:  # the frame has been abandoned
+                    return
                 retired: list[bool] = []
                 try:
                     self._writing -= work.output is None
@@ -255,6 +262,7 @@ class Engine:
         while self._frames and len(self._frames[0].done) == len(self._work):
             frame = self._frames.popleft()
             whole = not self.failure and not any(isinstance(value, Absent) for value in frame.values.values())
+            self.through += 1
             self.whole += whole
             yield whole
 

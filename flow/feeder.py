@@ -125,7 +125,6 @@ class Feeder:
             for port, stream in node.inputs.items():
                 self._ports.setdefault(stream, []).append((node.name, port))
         self._wanted = graph.source_streams
-        self._clock = graph.clock
         made = {node.name for node in graph.stages}
         self._entry_streams = [stream for stream in graph.frame_streams if stream not in made]
         self._waiting: dict[str, deque[Token]] = {stream: deque() for stream in self._entry_streams}
@@ -157,21 +156,15 @@ class Feeder:
 
     @property
     def late_entries(self) -> list[Entry]:
-        """Losses noticed after the last frame."""
-        return self._entries
+        """Losses noticed after the last frame that entered the engine."""
+        tokens = [token for queue in self._waiting.values() for token in queue]
+        return [*self._entries, *(token.value.cause for token in tokens if isinstance(token.value, Absent))]
 
     def give_back(self, frame: ReadyFrame) -> None:
-        """Take back a frame that was not admitted, to be abandoned with the others."""
+        """Take back a frame that was not admitted: of what is not in the run, only its losses are told."""
         for stream, value in frame.values.items():
             self._waiting[stream].appendleft(Token(frame.stamp, value))
         self._entries = [*frame.entries, *self._entries]
-
-    def abandon(self, why: str) -> None:
-        """Enter into the ledger every message that still waits here, because the run ends before the log."""
-        held = [(self._clock, token.stamp) for token in self._waiting[self._clock]]
-        held += [place for aligner in self._aligners.values() for place in aligner.held()]
-        for stream, stamp in held:
-            self._lose(Entry(stream, stamp, "engine", Reason.ABANDONED, why))
 
     def _take(self, stream: str, log_time: int, token: Token) -> None:
         """Give a token to the aligners that read its stream, and to the frame it belongs to."""

@@ -147,17 +147,27 @@ def is_aligner(kind: type) -> bool:
 def ports_of(kind: type) -> tuple[dict[str, Any], set[str]]:
     """Input ports of a stage or aligner class (name -> type), and which of them may stay unconnected.
 
-    Raises TypeError for a stage that does not say the type of an input.
+    Raises TypeError for a stage that does not say the name and type of an input.
     """
     if is_aligner(kind):
         return dict.fromkeys(kind.ports, object), set()  # type: ignore[attr-defined]
-    hints = get_type_hints(kind.__call__)
+    hints = hints_of(kind.__call__)
     parameters = list(signature(kind.__call__).parameters.values())[1:]
     for parameter in parameters:
+        if parameter.kind not in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY):
+            raise TypeError(f"{kind.__name__}.__call__ must take each input by its name, unlike '{parameter}'")
         if parameter.name not in hints:
             raise TypeError(f"{kind.__name__}.__call__ does not say the type of its input '{parameter.name}'")
     unneeded = {parameter.name for parameter in parameters if parameter.default is not Parameter.empty}
     return {parameter.name: hints[parameter.name] for parameter in parameters}, unneeded
+
+
+def hints_of(annotated: Any) -> dict[str, Any]:
+    """The types that a class or function is annotated with; raises TypeError where they name what is not there."""
+    try:
+        return get_type_hints(annotated)
+    except Exception as error:  # whatever an annotation of the user's own may come to
+        raise TypeError(f"the annotations of {annotated.__qualname__} cannot be read: {error}") from error
 
 
 def accepts(wanted: Any, given: type) -> bool:
@@ -177,7 +187,7 @@ def output_of(actor: Any, kinds: dict[str, type], place: Place) -> type:
             raise place.error(f"{error}") from error
     returned = get_type_hints(type(actor).__call__).get("return")
     if not isinstance(returned, type):
-        raise place.error(f"{type(actor).__name__}.__call__ does not say what it returns")
+        raise place.error(f"{type(actor).__name__}.__call__ does not say which one type it returns")
     return returned
 
 

@@ -27,7 +27,7 @@ class Reason(StrEnum):
     UNMATCHED = "unmatched"  # no partner for a pair
     UNALIGNED = "unaligned"  # another clock's stream had nothing for the frame
     FAILED = "failed"  # a stage raised
-    ABANDONED = "abandoned"  # the run was stopped before the frame was through
+    ABANDONED = "abandoned"  # the run was stopped, or broke off, before the frame was through
 
 
 class Verdict(StrEnum):

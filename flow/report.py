@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.findings import NOTE, WARNING, lines
-from flow.ledger import Verdict
+from flow.ledger import Reason, Verdict
 
 
 def say(text: str) -> None:
@@ -22,14 +22,20 @@ def say(text: str) -> None:
 
 
 def headline(summary: dict[str, Any]) -> str:
-    """The verdict of a run in a line: how many frames are whole, and what was lost, be it frames or what made none."""
+    """The verdict of a run in a line: how many frames are whole, and what was lost, be it frames or what made none.
+
+    Frames that were in work as the run was stopped, or broke off, are told, but are no losses of the log.
+    """
     whole, of, drops = summary["frames_out"], summary["frames_in"], summary["drops"]
     all_but = summary["verdict"] == Verdict.COMPLETE or whole != of  # else "18 of 18" would hide what made no frame
     frames = f"{whole} of {counted(of, 'frame')}" if all_but else counted(whole, "frame")
-    said = f"interrupted after {frames}" if summary["interrupted"] else f"{frames} whole"
-    lost = ", ".join(f"{number} {reason}" for reason, number in drops.items())
-    count = f", {counted(sum(drops.values()), 'loss', 'losses')}: {lost}" if drops else ""
-    return f"{summary['verdict']}: {said}{count}; {summary['frames_per_second']:.2f} frames/s"
+    cut_off = summary["interrupted"] and summary["verdict"] != Verdict.COMPLETE
+    said = f"interrupted after {frames}" if cut_off else f"{frames} whole"
+    losses = {reason: number for reason, number in drops.items() if reason != Reason.ABANDONED}
+    abandoned = f", {drops[Reason.ABANDONED]} abandoned" if Reason.ABANDONED in drops else ""
+    lost = ", ".join(f"{number} {reason}" for reason, number in losses.items())
+    count = f", {counted(sum(losses.values()), 'loss', 'losses')}: {lost}" if losses else ""
+    return f"{summary['verdict']}: {said}{abandoned}{count}; {summary['frames_per_second']:.2f} frames/s"
 
 
 def counted(number: int, what: str, many: str = "") -> str:
@@ -46,6 +52,8 @@ def report(summary: dict[str, Any]) -> None:
     for reason, number in summary["drops"].items():
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
         say(f"  {number} {reason}, first: {first['stream']} at {first['stamp']}: {first['detail']}")
+    if summary["interrupted"] and not summary["outputs"]:
+        say("  no output was written: no frame was through")
     for path in map(Path, summary["outputs"]):
         say(f"  {path} ({path.stat().st_size / 1e6:.1f} MB)")
     for line in [line for part in found for line in lines(part, WARNING)]:

@@ -49,7 +49,9 @@ def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
 
     def request(number: int, frame: FrameType | None) -> None:
         stop.request()
-        tell("abandoning the frames in flight" if stop.abandoning() else "interrupted: finishing the frames in flight")
+        said = "abandoning the frames in flight" if stop.abandoning() else "interrupted: finishing the frames in flight"
+        with suppress(Exception):  # a terminal that is gone, or is being written to, must not tear the run
+            tell(said)
         if stop.abandoning() and stop.reading:
             raise KeyboardInterrupt  # out of a source that does not answer
 
@@ -79,12 +81,12 @@ class _Outputs:
                 sink.open(self.paths[use], {stream: kinds[stream] for stream in streams}, about)
             except Exception as error:
                 self.errors.append((use, error))
-                self._discard()
+                self.discard()
                 return False
             self.opened.append(use)
         return True
 
-    def _discard(self) -> None:
+    def discard(self) -> None:
         """Give up what is open, so that an output of an earlier run stays; a sink that cannot is closed later."""
         for use in tuple(self.opened):
             discard = getattr(self.sinks[use][0], "discard", None)
@@ -102,6 +104,8 @@ class _Outputs:
                 self.errors.append((use, error))
         if self.errors:
             use, cause = self.errors[0]
+            if use not in self.paths:  # no output's fault
+                raise cause
             sentence = f"{use.rpartition('.')[2]} could not write {self.paths[use]}: {cause}"
             raise SinkError(sentence, summary | {"verdict": str(Verdict.INCOMPLETE), "failure": sentence}) from cause
 
@@ -124,7 +128,8 @@ def run(
     stages found is asked at the end (see flow.findings).
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
-    closed and readable by then. In the summary, start_seconds are those of wall_seconds that the survey and the opening
+    closed and readable by then. A run that is stopped before its first frame is through leaves no output, and those of
+    an earlier run as they are. In the summary, start_seconds are those of wall_seconds that the survey and the opening
     of the outputs took, before the first frame.
     """
     for why in log.refused.values():
@@ -146,27 +151,27 @@ def run(
     started = 0.0
     try:
         said = "\n".join(f"{name}: {found['sentence']}" for name, found in surveys.items())
-        if sinks.open(streams, {**(about or {}), "surveys": said}):
+        if not stop.finishing() and sinks.open(streams, {**(about or {}), "surveys": said}):
             engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
             try:
                 started = time.perf_counter() - wall
                 finished = _feed(feeder, log, engine, stop)
             finally:
-                if not finished:
-                    feeder.abandon("the run ended before the log")
                 engine.finish(stop.abandoning)
             sinks.errors += [engine.failure] if engine.failure else []
     finally:
         times = {"wall_seconds": time.perf_counter() - wall, "start_seconds": started}
         times["cpu_seconds"] = time.process_time() - cpu
         kept = engine is not None and engine.whole == engine.admitted and not len(ledger)
-        whole = finished and kept and not sinks.errors and not stop.finishing()
+        whole = finished and kept and not sinks.errors
+        if stop.finishing() and not (engine and engine.through):
+            sinks.discard()
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
             "surveys": surveys,
             "findings": _notes(log, graph) | findings(graph),
-            "outputs": [str(outputs[use]) for use in used],
+            "outputs": [str(outputs[use]) for use in sinks.opened],
         }
         sinks.close(summary)
     return summary
@@ -237,5 +242,5 @@ def _summary(
         "frames_per_second": round(frames_out / times["wall_seconds"], 4),
         "peak_memory_mb": _peak_memory_mb(),
         "ledger": [entry.as_dict() for entry in ledger.entries],
-        "entries": feeder.late_entries,
+        "entries": [*(engine.late_entries if engine else ()), *feeder.late_entries],
     }

@@ -19,7 +19,7 @@ UNITS: dict[str, tuple[str, float]] = {
     "km": ("length", 1e6),
     "rad": ("angle", 1.0),
     "deg": ("angle", math.pi / 180),
-    "px": ("pixels", 1.0),
+    "px": ("number of pixels", 1.0),
     "Hz": ("frequency", 1.0),
     "%": ("share", 1e-2),
     "": ("number", 1.0),
@@ -44,10 +44,11 @@ def quantity(text: str, unit: str) -> float:
     if given == "":
         check_bare(number, unit)
         return number
-    if given not in UNITS:
-        raise ValueError(f"'{text}' has the unknown unit '{given}'; expected {unit or 'a plain number'}")
-    kind, size = UNITS[given]
     wanted, base = UNITS.get(unit, (unit, 1.0))
+    if given not in UNITS:
+        known = [name for name, (kind, _) in UNITS.items() if kind == wanted and name] or [unit or "a plain number"]
+        raise ValueError(f"'{text}' has the unknown unit '{given}'; expected {', '.join(known)}")
+    kind, size = UNITS[given]
     if kind != wanted:
         raise ValueError(f"'{text}' is a {kind}; expected {f'a {wanted} in {unit}' if unit else 'a plain number'}")
     if given == unit or number == 0 or not math.isfinite(number):

@@ -331,6 +331,31 @@ def test_an_interrupt_while_the_program_begins_or_ends_is_no_traceback(moment):
     assert done.stderr == ("" if moment == AT_EXIT else "roverflow: interrupted\n")
 
 
+def test_a_stage_that_still_works_when_its_frame_is_abandoned_does_not_hold_or_break_the_exit():
+    code = """
+import atexit, sys, threading, time
+from flow import cli, program
+def abandoned():
+    threading.Thread(target=time.sleep, args=(60,), daemon=True, name="worker-0").start()
+    print("INCOMPLETE")
+    return 130
+cli.main = abandoned
+atexit.register(print, "the interpreter is torn down")  # under native code that is at work
+sys.exit(program.program())
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout) == (130, "INCOMPLETE\n")
+
+
+@pytest.mark.parametrize("closed", ["stdout", "stderr"])
+def test_a_program_that_is_started_without_a_stream_works_all_the_same(traverse, tmp_path, closed):
+    arguments = ["run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--end", "0.8"]
+    command = ["bash", "-c", f'"$@" {"" if closed == "stdout" else "2"}>&-', "bash"]
+    command += [sys.executable, "-m", "flow.cli", *map(str, arguments)]
+    assert subprocess.run(command, cwd=ROOT, capture_output=True).returncode == 0
+    assert raw_messages(tmp_path / "out.mcap")
+
+
 def test_help_imports_nothing_heavy():
     code = "import sys, flow.cli; flow.cli.parser().format_help(); print(sorted({'numpy', 'cv2'} & set(sys.modules)))"
     assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "[]"

@@ -99,6 +99,8 @@ def test_the_demo_takes_no_folder_that_holds_anything_else(traverse, tmp_path, c
         assert roverflow("demo", "--out", folder, "--frames", 1) == 2
         assert "not of an earlier demo; choose another folder" in capsys.readouterr().err
         assert (folder / name).read_bytes() == content
+    with pytest.raises(UsageError, match="is a file; give the name of a folder"):
+        check_demo(tmp_path / "notes.txt" / "notes.txt")
     folder = tmp_path / "earlier"
     folder.mkdir()
     check_demo(folder)
@@ -194,6 +196,32 @@ def test_an_output_that_is_a_folder_is_refused_before_anything_runs(traverse, tm
     assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, tmp_path / "taken") == 2
     assert "taken is a folder or a device" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+@pytest.mark.parametrize("log", [".", "/", ""])
+def test_a_log_without_a_name_is_refused_in_one_sentence(log, capsys):
+    assert roverflow("run", log, "-o", "out.mcap", "--no-rrd") == roverflow("run", log) == 2
+    assert capsys.readouterr().err.count("is a folder; give the .mcap file in it\n") == 2
+
+
+def test_a_link_that_leads_to_itself_is_replaced_by_the_output(tmp_path):
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    assert roverflow("simulate", tmp_path / "a", "--frames", 1, "--size", "64x64") == 0
+    with McapSource().open(tmp_path / "a") as opened:
+        assert opened.frames == 1
+
+
+@pytest.mark.parametrize(("option", "value", "said"), [
+    ("--workers", "0", "must be a whole number of at least 1, not '0'"),
+    ("--workers", "9" * 20, "must be at most 1024"),
+    ("--start", "1e300", "at most 9e+09"),
+])  # fmt: skip
+def test_a_number_beyond_all_measure_is_refused(traverse, tmp_path, option, value, said, capsys):
+    with pytest.raises(SystemExit) as caught:
+        roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, value)
+    assert caught.value.code == 2
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "soon"])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from flow.engine import Engine
 from flow.graph import Node, Place
-from flow.ledger import Ledger
+from flow.ledger import Absent, Entry, Ledger, Reason
 from tests.flow.toys import MS, PIPELINE, Couple, Keep, Number, graph, replayed, traverse
 
 
@@ -89,6 +89,15 @@ def test_inboxes_stay_bounded_when_the_end_of_the_line_is_slow(tmp_path):
     assert [record.index for record in sink.records] == list(range(60))
 
 
+def test_a_frame_that_has_nothing_to_work_on_is_through_at_once(tmp_path):
+    told, ledger = [], Ledger()
+    engine = Engine(graph(tmp_path).stages, {}, ledger, on_frame=told.append)
+    lost = Absent(ledger.add(Entry("both", 0, "both", Reason.FAILED, "lost")))
+    assert engine.admit(0, {"both": lost, "height": Number(0, 0.0)}, [])
+    engine.finish()
+    assert told == [False]
+
+
 class Sum:
     """A stage of any number of inputs: the sum of their values plus one; fails on the frames in `bad`."""
 
@@ -115,8 +124,13 @@ def dataflows(draw):
 
 
 @settings(max_examples=150, deadline=None)
-@given(flow=dataflows(), workers=st.integers(1, 5), capacity=st.integers(1, 3), sinks=st.integers(0, 2))
-def test_whatever_the_graph_and_whatever_fails_every_frame_arrives_as_computed_by_hand(flow, workers, capacity, sinks):
+@given(
+    flow=dataflows(), lost=st.sets(st.integers(0, 11), max_size=4),
+    workers=st.integers(1, 5), capacity=st.integers(1, 3), sinks=st.integers(0, 2),
+)  # fmt: skip
+def test_whatever_the_graph_and_whatever_fails_every_frame_arrives_as_computed_by_hand(
+    flow, lost, workers, capacity, sinks
+):
     names = {-1: "entry", **{i: f"s{i}" for i in range(len(flow))}}
     place = Place("random", 1)
     nodes = [
@@ -127,9 +141,10 @@ def test_whatever_the_graph_and_whatever_fails_every_frame_arrives_as_computed_b
     ledger = Ledger()
     engine = Engine(nodes, keeps, ledger, workers=workers, capacity=capacity)
     for frame in range(12):
-        assert engine.admit(frame, {"entry": Couple(frame, 0.0)}, [])
+        entry = Absent(ledger.add(Entry("entry", frame, "source", Reason.UNALIGNED, "lost"))) if frame in lost else None
+        assert engine.admit(frame, {"entry": entry or Couple(frame, 0.0)}, [])
     engine.finish()
-    expected = [by_hand(flow, frame) for frame in range(12)]
+    expected = [({}, 1) if frame in lost else by_hand(flow, frame) for frame in range(12)]
     assert engine.whole == sum(len(values) == len(flow) for values, _ in expected)
     assert len(ledger) == sum(failures for _, failures in expected)
     for keep, _ in keeps.values():

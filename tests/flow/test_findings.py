@@ -34,8 +34,14 @@ def test_the_verdict_says_what_was_lost_in_the_same_line():
     lost = {"failed": 1, "unreadable": 2}
     assert said_of(frames_out=17, drops=lost) == "INCOMPLETE: 17 of 18 frames whole, 3 losses: 1 failed, 2 unreadable"
     assert said_of(interrupted=True, frames_in=1, frames_out=1) == "INCOMPLETE: interrupted after 1 frame"
-    stopped = said_of(interrupted=True, drops={"abandoned": 3})
-    assert stopped == "INCOMPLETE: interrupted after 18 frames, 3 losses: 3 abandoned"
+
+
+def test_frames_that_the_user_gave_up_are_no_losses_of_the_log():
+    stopped = said_of(interrupted=True, frames_out=15, drops={"abandoned": 3})
+    assert stopped == "INCOMPLETE: interrupted after 15 of 18 frames, 3 abandoned"
+    stopped = said_of(interrupted=True, frames_out=14, drops={"abandoned": 3, "failed": 1})
+    assert stopped == "INCOMPLETE: interrupted after 14 of 18 frames, 3 abandoned, 1 loss: 1 failed"
+    assert said_of(interrupted=True, verdict="COMPLETE") == "COMPLETE: 18 of 18 frames whole"
 
 
 def test_what_a_stage_found_is_said_at_the_end_to_the_user_and_to_the_sinks(tmp_path):

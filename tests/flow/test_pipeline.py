@@ -1,6 +1,7 @@
 """A pipeline file that cannot run is refused before anything runs, with file, line and the nearest valid name."""
 
 import math
+import re
 import textwrap
 from decimal import Decimal
 
@@ -83,13 +84,35 @@ def test_one_key_of_a_mapping_is_replaced_alone(tmp_path):
         loaded(tmp_path, text, ["source.tilt_model=axis", *settings, "source.pitch.sign=-2"])
 
 
+SHARED_ANGLE = """\
+settings: {angle: {field: vector.x, unit: deg, sign: 1}}
+source: {use: recordings.McapSource, pitch: $angle, roll: $angle, tilt_model: axis}
+streams:
+  stereo: {use: flow.align.pair, left: left, right: right, slop: 5 ms}
+  rectified: {use: stages.Rectify, frame: stereo}
+sinks: [{use: tests.flow.toys.Keep}]
+"""
+
+
+@pytest.mark.parametrize(("overrides", "pitch", "roll"), [
+    (["angle.sign=-1"], -1, -1),
+    (["source.pitch.sign=-1"], -1, 1),
+    (["source.pitch.sign=1", "angle.sign=-1"], 1, -1),
+])  # fmt: skip
+def test_a_key_of_a_setting_is_replaced_wherever_it_is_named_or_in_one_place_alone(tmp_path, overrides, pitch, roll):
+    source = loaded(tmp_path, SHARED_ANGLE, overrides).source
+    assert source.pitch == {"field": "vector.x", "unit": "deg", "sign": pitch}
+    assert source.roll == {"field": "vector.x", "unit": "deg", "sign": roll}
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line", "words"),
     [
         ("factor", "faktor", 5, ["no input or parameter 'faktor'", "did you mean 'factor'"]),
         ("25 cm", "quick", 5, ["factor", "'quick' is not a number"]),
         ("25 cm", "25 ms", 5, ["'25 ms' is a time", "expected a length in m"]),
-        ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'"]),
+        ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'; expected mm, cm, m, km"]),
+        ("25 cm", "25 px", 5, ["'25 px' is a number of pixels; expected a length in m"]),
         ("25 cm", "-1 m", 5, ["at least 0 m"]),
         ("25 cm", "true", 5, ["expected a number in m"]),
         ("5 ms", "-5 ms", 3, ["must be at least 0 ns"]),
@@ -116,6 +139,22 @@ def test_one_key_of_a_mapping_is_replaced_alone(tmp_path):
         ("  both:", "  left:", 3, ["'left' is already a stream of the source"]),
         ("  sum: ", "  both:", 6, ["'both' stands here twice"]),
         ("  - {use", "  - {use: [", 8, ["not valid YAML"]),
+        ("2.5}", "2\x01}", 1, ["not valid YAML: the character #x0001"]),
+        ("[1, 2.5]", "[" * 3000, 1, ["nested too deep"]),
+        ("2.5}", f"{10**400}}}", 1, ["gain: int too large"]),
+        ("2.5}", f"1{'0' * 5000}}}", 1, ["looks like a YAML int but is none; quote it"]),
+        ("25 cm", "2001-99-99", 5, ["'2001-99-99' looks like a YAML timestamp but is none; quote it"]),
+        ("  twice:", "  yes:", 5, ["'yes' is no name", "in quotes"]),
+        ("{use: tests.flow.toys.Scale", "{<<: {a: 1}, use: tests.flow.toys.Scale", 5, ["'<<' is no name"]),
+        ("  twice:", "  ? [1]\n  :", 5, ["a list or a mapping is no name"]),
+        ("a: twice", "a: [twice]", 6, ["'a' must be the name of a stream, not ['twice']"]),
+        ("tests.flow.toys.Add", "[tests.flow.toys.Add]", 6, ["'use: ['tests.flow.toys.Add']' must be a module and"]),
+        ("tests.flow.toys.Add", "tests..toys.Add", 6, ["'use: tests..toys.Add' must be a module and a class"]),
+        ("gain: 2.5", "optional: true", 1, ["no parameter 'optional'"]),
+        ("toys.Keep", "toys.Keep, optional: true", 8, ["no parameter 'optional'"]),
+        ("a: twice, ", "a: twice, optional: maybe, ", 6, ["'optional' must be true or false, not maybe"]),
+        ("tests.flow.toys.Source, gain: 2.5", "tests.flow.toys.Scale", 1, ["is no source: it has no 'streams'"]),
+        ("toys.Keep", "toys.Scale", 8, ["tests.flow.toys.Scale is no sink: it has no 'suffix'"]),
     ],
 )
 def test_what_is_wrong_is_named_with_its_line(tmp_path, old, new, line, words):
@@ -156,6 +195,9 @@ def test_a_setting_stands_wherever_it_is_named(tmp_path):
     (SETTINGS, ["twice.factor=20"], r"--set twice.factor=20: .*20 needs a unit; write 20 cm or 20 m"),
     (SETTINGS, ["stretch=-1 m"], r"--set stretch=-1 m: .*at least 0 m"),
     (SETTINGS, ["strech=1 m"], r"--set strech=1 m: the pipeline has no setting 'strech'; did you mean 'stretch'"),
+    (SETTINGS, ["strech.a=1 m"], r"--set strech.a=1 m: there is no stream 'strech'; did you mean 'stretch'"),
+    (SETTINGS, ["twice=1 m"], r"--set twice=1 m: say which parameter of 'twice' to set, as in twice.param=value"),
+    (SETTINGS, ["twice.optional=maybe"], r"--set twice.optional=maybe: 'optional' must be true or false, not maybe"),
     (SETTINGS.replace("settings", "setings"), [], r"toy.yaml:1: a pipeline has no 'setings'; did you mean 'settings'"),
     ("settings: 3\n" + GOOD, [], r"toy.yaml:1: 'settings' must be a mapping"),
 ])  # fmt: skip
@@ -168,7 +210,8 @@ def test_a_setting_that_cannot_be_is_named(tmp_path, text, overrides, message):
     "setting",
     [
         "nonsense", "twice=3", "twise.factor=3", "twice.faktor=3", "twice.bad=[", "a.b", "twice.factor=-1",
-        "twice.bad=!!python/x y", "twice.factor.sign=3", "twice..factor=3",
+        "twice.bad=!!python/x y", "twice.factor.sign=3", "twice..factor=3", "twice.bad=!!int x",
+        "twice.bad=" + "[" * 3000, "twice.bad=&a [*a]",
     ],
 )  # fmt: skip
 def test_a_bad_setting_is_named(tmp_path, setting):
@@ -196,6 +239,35 @@ def test_a_module_that_does_not_import_is_named_with_its_line(tmp_path):
     (tmp_path / "broken.py").write_text("1 / 0\n")
     with pytest.raises(PipelineError, match=r"toy.yaml:5: cannot import 'broken': ZeroDivisionError"):
         loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", "broken.Stage"))
+
+
+def test_a_module_that_ends_the_program_as_it_is_imported_does_not_end_this_one(tmp_path):
+    (tmp_path / "script.py").write_text("import sys\nsys.exit(3)\n")
+    with pytest.raises(PipelineError, match=r"toy.yaml:5: cannot import 'script': SystemExit: 3"):
+        loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", "script.Stage"))
+
+
+@pytest.mark.parametrize(("field", "takes", "returns", "said"), [
+    ("list[Nix]", "couple: Couple", "Couple", "the annotations of Own cannot be read: name 'Nix' is not defined"),
+    ("int", "couple: Nix", "Couple", "the annotations of Own.__call__ cannot be read: name 'Nix' is not defined"),
+    ("int", "*couple: Couple", "Couple", "Own.__call__ must take each input by its name"),
+    ("int", "couple: Couple", "Couple | None", "Own.__call__ does not say which one type it returns"),
+])  # fmt: skip
+def test_annotations_that_do_not_tell_are_named_with_their_line(tmp_path, field, takes, returns, said):
+    source = "from __future__ import annotations\nfrom tests.flow.toys import *\n@dataclass(frozen=True)\nclass Own:\n"
+    source += f"    a: {field} = 0\n    def __call__(self, {takes}) -> {returns}: ...\n"
+    module = tmp_path.name
+    (tmp_path / f"{module}.py").write_text(source)
+    with pytest.raises(PipelineError, match=rf"toy.yaml:5: {re.escape(said)}"):
+        loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale, couple: both, factor: 25 cm, bad: [1, 2.5]",
+                                      f"{module}.Own, couple: both"))  # fmt: skip
+
+
+def test_a_stage_without_an_input_is_refused(tmp_path):
+    source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Idle:\n"
+    (tmp_path / "idle.py").write_text(source + "    def __call__(self, a: Couple | None = None) -> Couple: ...\n")
+    with pytest.raises(PipelineError, match=r"toy.yaml:6: 'sum' has no input"):
+        loaded(tmp_path, GOOD.replace("tests.flow.toys.Add, a: twice, b: height", "idle.Idle"))
 
 
 def test_what_is_no_dataclass_is_not_told_to_be_itself(tmp_path):

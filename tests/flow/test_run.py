@@ -1,6 +1,7 @@
 """A run ends with a verdict and a ledger that hold, whatever the log lacks, whatever fails, whoever interrupts it."""
 
 import re
+import signal
 import threading
 from collections import Counter
 from pathlib import Path
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from flow.errors import SinkError, UsageError
 from flow.feeder import Feeder
 from flow.ledger import Ledger
-from flow.run import Stop, run
+from flow.run import Stop, interrupts, run
 from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, Text, graph, replayed, traverse
 
 
@@ -88,8 +89,70 @@ def test_an_interrupt_finishes_the_frames_in_flight_and_closes_the_sinks(tmp_pat
     assert summary["interrupted"]
     assert summary["verdict"] == "INCOMPLETE"
     assert 10 <= summary["frames_out"] == len(sink.records) < 100
-    assert summary["messages"]["left"] == summary["frames_in"] + len(lost_frames(summary))
+    assert (summary["drops"], summary["ledger"]) == ({}, [])  # what was not read on is not lost
     assert sink.summary["frames_out"] == summary["frames_out"]
+
+
+def test_what_was_lost_before_an_interrupt_is_told_to_the_sinks(tmp_path):
+    stop, pipeline = Stop(), graph(tmp_path, nap=0.001)
+
+    class Damaged(Log):
+        def __iter__(self):
+            yield from self.events
+            stop.request()
+            yield 1000 * MS, "left", OSError("chunk 7 is damaged")
+            yield 1100 * MS, "left", OSError("chunk 8 is damaged")
+
+    damaged = Damaged([*traverse(3), (400 * MS, "left", OSError("chunk 6 is damaged"))])
+    ((use, sink),) = pipeline.sinks
+    summary = run(pipeline, damaged, {use: Path("unused")}, stop=stop)
+    assert [entry.detail for entry in sink.summary["entries"]] == ["chunk 6 is damaged"]
+    assert summary["drops"] == {"unreadable": 1}
+
+
+def test_an_interrupt_that_comes_after_the_end_of_the_log_costs_nothing(tmp_path):
+    stop, pipeline = Stop(), graph(tmp_path)
+    ((_, sink),) = pipeline.sinks
+
+    def interrupt(whole):
+        if len(sink.records) == 5:
+            stop.request()
+
+    _, summary = replayed(pipeline, traverse(5), workers=1, stop=stop, on_frame=interrupt)
+    assert (summary["verdict"], summary["interrupted"], summary["frames_out"]) == ("COMPLETE", True, 5)
+
+
+@pytest.mark.parametrize("discards", [True, False])
+def test_a_run_that_is_stopped_before_a_frame_is_through_leaves_no_output(tmp_path, monkeypatch, discards):
+    pipeline, stop, gate, given_up = graph(tmp_path), Stop(), threading.Event(), []
+
+    def hang(self, couple):
+        stop.request()
+        stop.request()
+        gate.wait(60)
+        return couple
+
+    if discards:
+        monkeypatch.setattr(Keep, "discard", lambda self: given_up.append(self), raising=False)
+    monkeypatch.setattr("tests.flow.toys.Scale.__call__", hang)
+    sink, summary = replayed(pipeline, traverse(3), workers=1, stop=stop)
+    gate.set()
+    assert summary["frames_out"] == 0
+    assert (given_up, summary["outputs"]) == (([sink], []) if discards else ([], ["unused"]))
+    assert (sink.summary is None) == discards
+
+
+def test_what_tells_of_an_interrupt_may_fail_and_the_run_still_ends_properly():
+    stop = Stop()
+
+    def gone(sentence):
+        raise OSError("Input/output error")  # as of a terminal that was closed
+
+    with interrupts(stop, gone):
+        signal.raise_signal(signal.SIGHUP)
+        assert (stop.finishing(), stop.abandoning()) == (True, False)
+        signal.raise_signal(signal.SIGINT)
+        assert stop.abandoning()
 
 
 def lost_frames(summary):
@@ -113,7 +176,8 @@ def test_a_second_interrupt_does_not_wait_for_a_stage_that_hangs(tmp_path, monke
     gate.set()
     assert summary["interrupted"]
     assert sink.summary["verdict"] == "INCOMPLETE"
-    assert summary["drops"]["abandoned"] >= 1
+    assert summary["drops"]["abandoned"] == summary["frames_in"] - summary["frames_out"] >= 1
+    assert [entry.as_dict() for entry in sink.summary["entries"]] == summary["ledger"]
 
 
 def test_items_that_break_an_aligner_lose_their_frame_not_the_verdict(tmp_path, monkeypatch):
@@ -295,3 +359,19 @@ def test_an_output_that_fails_at_its_end_makes_the_run_incomplete(tmp_path, monk
     with pytest.raises(SinkError, match="No space left") as caught:
         replayed(graph(tmp_path), traverse(3))
     assert caught.value.summary["verdict"] == "INCOMPLETE"
+
+
+def test_an_exception_that_cannot_be_told_is_not_taken_for_an_outputs_fault(tmp_path, monkeypatch):
+    class UnprintableError(Exception):
+        def __str__(self):
+            raise RuntimeError("no words for it")
+
+    def fail(self, couple):
+        raise UnprintableError
+
+    pipeline = graph(tmp_path)
+    ((_, sink),) = pipeline.sinks
+    monkeypatch.setattr("tests.flow.toys.Scale.__call__", fail)
+    with pytest.raises(RuntimeError, match="no words for it"):
+        replayed(pipeline, traverse(3))
+    assert sink.summary["verdict"] == "INCOMPLETE"

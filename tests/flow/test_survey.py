@@ -124,8 +124,9 @@ def test_a_stage_that_remembers_cannot_stand_before_a_survey(tmp_path):
         run(load(str(file)), Excerpted(EVENTS, [(0, 6)]), {})
 
 
-def test_an_interrupt_during_the_survey_ends_the_run_properly(tmp_path):
+def test_an_interrupt_during_the_survey_ends_the_run_before_any_output_is_begun(tmp_path):
     stop = Stop()
     stop.request()
     summary, sink = result_of(tmp_path, Excerpted(EVENTS, [(0, 6)]), stop=stop)
-    assert (summary["interrupted"], summary["frames_in"], sink.summary["verdict"]) == (True, 0, "INCOMPLETE")
+    assert (summary["interrupted"], summary["frames_in"], summary["verdict"]) == (True, 0, "INCOMPLETE")
+    assert (summary["outputs"], sink.summary) == ([], None)
