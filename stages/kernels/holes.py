@@ -41,22 +41,27 @@ def fill_holes(
 
     disparity: (H, W) float32, px, NaN = unknown; image: (H, W) or (H, W, 3) uint8; within: how far the evidence
     reaches; reach: px within which a find counts, unless it is hidden here, and so may lie as far as what hides it;
-    margin: px beyond the evidence, at the border and above, that are filled; there rays end. Returns the filled image,
-    (H, W) float32, and the kind of each pixel, (H, W) uint8: `KEPT`, `MISMATCH`, `OCCLUSION` or `OPEN`.
+    margin: px beyond the evidence, at the border and above, that are filled. Returns the filled image, (H, W) float32,
+    and the kind of each pixel, (H, W) uint8: `KEPT`, `MISMATCH`, `OCCLUSION` or `OPEN`.
     """
     height, width = disparity.shape
-    filled, kinds = disparity.copy(), np.empty((height, width), np.uint8)
+    filled, kinds = disparity.copy(), np.zeros((height, width), np.uint8)
     colour = _packed(cv2.blur(image, (3, 3)))
     first = np.zeros(height + 1, np.int64)
     middle = height // 2
     with pairs(threads) as both:
-        known = disparity, within, int(margin)
-        both(lambda: _sort(*known, 0, middle, kinds, first), lambda: _sort(*known, middle, height, kinds, first))
+        both(lambda: _count(disparity, 0, middle, first), lambda: _count(disparity, middle, height, first))
         np.cumsum(first, out=first)
         holes, steps = np.empty(first[-1], np.int32), np.empty((8, first[-1]), np.int16)
-        both(lambda: _list(kinds, 0, middle, first, holes), lambda: _list(kinds, middle, height, first, holes))
-        both(lambda: _trace(kinds, first, holes, 1, steps[:4]), lambda: _trace(kinds, first, holes, -1, steps[4:]))
-        given = disparity, colour, F32(reach), first, holes, steps
+        both(
+            lambda: _list(disparity, 0, middle, first, holes),
+            lambda: _list(disparity, middle, height, first, holes),
+        )
+        both(
+            lambda: _trace(disparity, first, holes, 1, steps[:4]),
+            lambda: _trace(disparity, first, holes, -1, steps[4:]),
+        )
+        given = disparity, colour, within, F32(reach), int(margin), first, holes, steps
         both(
             lambda: _fill(*given, 0, middle, filled, kinds),
             lambda: _fill(*given, middle, height, filled, kinds),
@@ -72,39 +77,35 @@ def _packed(image: Array) -> Array:
 
 
 @kernel
-def _sort(disparity, within, margin, begin, end, kinds, first):  # type: ignore[no-untyped-def]
-    """kinds: KEPT, MISMATCH for every hole that evidence reaches, else OPEN; first[y + 1]: how many are MISMATCH."""
+def _count(disparity, begin, end, first):  # type: ignore[no-untyped-def]
+    """first[y + 1]: how many holes row y has."""
     for y in range(begin, end):
         count = np.int64(0)
         for x in range(disparity.shape[1]):
-            reached = (y >= within.top[x] - margin) & (x >= within.first[y] - margin) & (x <= within.last[y] + margin)
-            hole = disparity[y, x] != disparity[y, x]
-            kinds[y, x] = (MISMATCH if reached else OPEN) if hole else KEPT
-            count += np.int64(hole & reached)
+            count += np.int64(disparity[y, x] != disparity[y, x])
         first[y + 1] = count
 
 
 @kernel
-def _list(kinds, begin, end, first, holes):  # type: ignore[no-untyped-def]
+def _list(disparity, begin, end, first, holes):  # type: ignore[no-untyped-def]
     """holes: the columns of the holes, row by row; those of row y from first[y]."""
     for y in range(begin, end):
         n = first[y]
         if first[y + 1] == n:
             continue
-        for x in range(kinds.shape[1]):
-            if kinds[y, x] == MISMATCH:
+        for x in range(disparity.shape[1]):
+            if disparity[y, x] != disparity[y, x]:
                 holes[n] = x
                 n += 1
 
 
 @kernel
-def _trace(kinds, first, holes, sign, steps):  # type: ignore[no-untyped-def]
+def _trace(disparity, first, holes, sign, steps):  # type: ignore[no-untyped-def]
     """How many steps along four of the `RAYS` each hole is from the first known pixel, 0 = there is none.
 
-    sign: 1 for the rays left and up, -1 for those right and down. The next pixel is known, or has been asked before, or
-    the ray has left what evidence reaches, and ends.
+    sign: 1 for the rays left and up, -1 for those right and down. The next pixel is known, or has been asked before.
     """
-    height, width = kinds.shape
+    height, width = disparity.shape
     numbers = np.empty((2, width), np.int32)  # of the holes of this row and of the one before
     for row in range(height):
         y = row if sign > 0 else height - 1 - row
@@ -117,8 +118,8 @@ def _trace(kinds, first, holes, sign, steps):  # type: ignore[no-untyped-def]
                 near_y = y - sign if ray > 0 else y
                 near_x = x + sign * (ray - 2 if ray > 0 else -1)
                 taken = np.int16(0)
-                if 0 <= near_y < height and 0 <= near_x < width and kinds[near_y, near_x] != OPEN:
-                    if kinds[near_y, near_x] == KEPT:
+                if 0 <= near_y < height and 0 <= near_x < width:
+                    if disparity[near_y, near_x] == disparity[near_y, near_x]:
                         taken = np.int16(1)
                     else:
                         further = steps[ray, before[near_x] if ray > 0 else here[near_x]]
@@ -190,13 +191,19 @@ def _quantile(values, weights, total, share, least):  # type: ignore[no-untyped-
 
 
 @kernel
-def _fill(disparity, colour, reach, first, holes, steps, begin, end, filled, kinds):  # type: ignore[no-untyped-def]
+def _fill(disparity, colour, within, reach, margin, first, holes, steps, begin, end, filled, kinds):  # type: ignore[no-untyped-def]
     width = disparity.shape[1]
     bound = np.empty(width, np.float32)
     values, weights = np.empty((8, width), np.float32), np.empty((8, width), np.float32)
     colours, room = np.empty((2, width), np.uint32), np.empty((4, width), np.float32)
     for y in range(begin, end):
         start, stop = first[y], first[y + 1]
+        while start < stop and holes[start] < within.first[y] - margin:  # evidence does not reach so far
+            kinds[y, holes[start]] = OPEN
+            start += 1
+        while start < stop and holes[stop - 1] > within.last[y] + margin:
+            kinds[y, holes[stop - 1]] = OPEN
+            stop -= 1
         n = stop - start
         if n == 0:
             continue
@@ -213,7 +220,7 @@ def _fill(disparity, colour, reach, first, holes, steps, begin, end, filled, kin
         _quantile(values, weights, room[2, :n], room[3, :n], least)
         for i in range(n):
             x = columns[i]
-            if least[i] == NOTHING:
+            if y < within.top[x] - margin or least[i] == NOTHING:
                 kinds[y, x] = OPEN
                 continue
             before, after = steps[LEFT, start + i], steps[RIGHT, start + i]
@@ -238,16 +245,13 @@ def fill_holes_reference(
     """`fill_holes` in plain numpy."""
     height, width = disparity.shape
     colour = cv2.blur(image, (3, 3)).reshape(height, width, -1).astype(int)
-    row, column = np.mgrid[:height, :width]
-    reached = (row >= within.top - margin) & (column >= within.first[:, np.newaxis] - margin)
-    reached &= column <= within.last[:, np.newaxis] + margin
     hidden = np.full(disparity.shape, -NOTHING)
     for x in range(width - 2, -1, -1):
         hidden[:, x] = np.fmax(hidden[:, x + 1], disparity[:, x + 1]) - F32(1)
     hidden -= F32(HIDDEN)
     values, weights, taken = [], [], []
     for (down, across), length, worth in zip(RAYS, LENGTHS, WORTH, strict=True):
-        value, steps, beyond = _look_reference(disparity, reached, colour, down, across)
+        value, steps, beyond = _look_reference(disparity, colour, down, across)
         unlike, distance = abs(beyond - colour).max(axis=2).astype(F32), length * steps.astype(F32)
         ratio = unlike * F32(1 / ALIKE)
         counts = (value < NOTHING) & (unlike <= UNLIKE) & ((distance <= F32(reach)) | (value < hidden))
@@ -262,26 +266,23 @@ def fill_holes_reference(
         line = left + (right - left) * taken[LEFT] / (taken[LEFT] + taken[RIGHT])
         left = np.where(abs(right - left) < APART, line, left)
         guess = np.where(abs(left - least) < APART, left, np.where(abs(right - least) < APART, right, least))
-    fill = np.isnan(disparity) & reached & (least < NOTHING)
+    row, column = np.mgrid[:height, :width]
+    reached = (row >= within.top - margin) & (column >= within.first[:, np.newaxis] - margin)
+    fill = np.isnan(disparity) & reached & (column <= within.last[:, np.newaxis] + margin) & (least < NOTHING)
     kinds = np.where(fill, np.where(guess < hidden, OCCLUSION, MISMATCH), np.where(np.isnan(disparity), OPEN, KEPT))
     return np.where(fill, guess, disparity).astype(F32), kinds.astype(np.uint8)
 
 
-def _look_reference(
-    disparity: Array, reached: Array, colour: Array, down: int, across: int
-) -> tuple[Array, Array, Array]:
+def _look_reference(disparity: Array, colour: Array, down: int, across: int) -> tuple[Array, Array, Array]:
     """The first disparity on a ray from each pixel, inf = none; the steps to it; the colours beyond it."""
     height, width = disparity.shape
     y, x = np.mgrid[:height, :width]
     value, steps = np.full(disparity.shape, NOTHING), np.zeros(disparity.shape, int)
-    ended = np.zeros(disparity.shape, bool)
     for n in range(1, max(height, width)):
         there_y, there_x = y + n * down, x + n * across
         inside = (there_y >= 0) & (there_y < height) & (there_x >= 0) & (there_x < width)
         there = disparity[np.where(inside, there_y, 0), np.where(inside, there_x, 0)]
-        within = reached[np.where(inside, there_y, 0), np.where(inside, there_x, 0)]
-        ended |= np.isnan(there) & ~within
-        new = inside & (steps == 0) & ~ended & ~np.isnan(there)
+        new = inside & (steps == 0) & ~np.isnan(there)
         value[new], steps[new] = there[new], n
     beyond = np.clip(y + (steps + BEYOND) * down, 0, height - 1), np.clip(x + (steps + BEYOND) * across, 0, width - 1)
     return value, steps, colour[beyond]
