@@ -1,11 +1,13 @@
 """The feeder: turns a log's messages, in log-time order, into frames ready for the engine.
 
 It runs the aligners, keeps the ledger of what finds no place, and hands a frame on once every stream that no stage
-makes has its value for that stamp, so that frames start whole and in stamp order.
+makes has its value for that stamp, so that frames start whole and in stamp order. A stamp that jumps ahead is judged by
+the one that follows it, so the log is read a message ahead where there is one.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -17,8 +19,11 @@ from flow.ledger import Absent, Entry, Ledger, Reason
 
 Event = tuple[int, str, Any]
 
-# ns; a stamp that runs ahead of the log's clock by this much more than the one before it is taken for damaged
+# ns; a stamp that runs ahead of the log's clock by this much more than the one before it is in doubt
+DOUBT = 1_000_000_000
+# ns; by so much more it is damaged, unless the next of its stream within as long is as far ahead
 JUMP = 10_000_000_000
+SET_BACK = "; if a clock was set back, run what follows by itself (--start, a second later)"
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,85 @@ class ReadyFrame:
     stamp: int
     values: dict[str, Any]
     entries: list[Entry]
+
+
+@dataclass(eq=False)
+class _Message:
+    """An event of a log. fault: what is wrong with its stamp; doubted: whether the stream's next one may clear it."""
+
+    log_time: int
+    stream: str
+    item: Any
+    fault: str = ""
+    doubted: bool = False
+
+    @property
+    def ahead(self) -> int:
+        """How far the stamp runs ahead of the log's clock, ns."""
+        return int(self.item.stamp) - self.log_time
+
+
+class _Clock:
+    """Judges the stamps of one stream, which must increase: one damaged stamp must not shut out all that follow."""
+
+    def __init__(self, stream: str) -> None:
+        self._stream = stream
+        self._last: _Message | None = None  # the last one that was believed
+        self._doubted: _Message | None = None
+
+    def judge(self, message: _Message) -> None:
+        """Find what is wrong with the stamp of a message, and settle what was in doubt.
+
+        If what follows a jump goes on from there, messages were logged late, or a clock was set or is not the log's.
+        """
+        stamp, doubted = message.item.stamp, self._doubted
+        if doubted is not None:
+            self._settle(doubted, stamp > doubted.item.stamp and message.ahead - doubted.ahead <= JUMP)
+        last, jump = self._last, self._jump(message)
+        if jump > DOUBT:
+            message.fault = f"its stamp jumps {jump / 1e9:.1f} s ahead of the log's clock"
+            message.doubted, self._doubted = True, message
+        elif last is not None and stamp == last.item.stamp:
+            message.fault = f"it repeats the stamp of the {self._stream} message before it"
+        elif last is not None and stamp < last.item.stamp:
+            back = last.item.stamp - stamp
+            message.fault = f"its stamp is {back / 1e6:.1f} ms before that of the {self._stream} message read before it"
+            message.fault += SET_BACK if back > JUMP else ""
+        else:
+            self._last = message
+
+    def tick(self, log_time: float) -> None:
+        """Settle what has been in doubt for too long: a first stamp that none contradicts is believed."""
+        doubted = self._doubted
+        if doubted is not None and doubted.log_time + JUMP < log_time:
+            self._settle(doubted, self._last is None or self._jump(doubted) <= JUMP)
+
+    def _jump(self, message: _Message) -> int:
+        """How much farther a stamp runs ahead of the log's clock than the one before it, ns."""
+        return message.ahead - (self._last.ahead if self._last is not None else 0)
+
+    def _settle(self, doubted: _Message, believed: bool) -> None:
+        self._doubted, doubted.doubted = None, False
+        if believed:
+            doubted.fault, self._last = "", doubted
+
+
+def _judged(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:
+    """The events in their order; what is wrong with the stamps of `streams` stands in them."""
+    clocks = {stream: _Clock(stream) for stream in sorted(streams)}
+    waiting = deque[_Message]()
+    for event in events:
+        message = _Message(*event)
+        for clock in clocks.values() if waiting else ():
+            clock.tick(message.log_time)
+        if message.stream in clocks and not isinstance(message.item, Exception):
+            clocks[message.stream].judge(message)
+        waiting.append(message)
+        while waiting and not waiting[0].doubted:
+            yield waiting.popleft()
+    for clock in clocks.values():
+        clock.tick(math.inf)
+    yield from waiting
 
 
 class Feeder:
@@ -45,8 +129,6 @@ class Feeder:
         made = {node.name for node in graph.stages}
         self._entry_streams = [stream for stream in graph.frame_streams if stream not in made]
         self._waiting: dict[str, deque[Token]] = {stream: deque() for stream in self._entry_streams}
-        self._last: dict[str, tuple[int, int]] = {}  # stamp, and how far it ran ahead of the log's clock
-        self._suspect: dict[str, int] = {}  # how far ahead the last one was that was taken for damaged
         self._entries: list[Entry] = []
         self.messages: Counter[str] = Counter()
 
@@ -56,14 +138,17 @@ class Feeder:
         An event is (log time, stream, item); an item that is an exception stands for a message that was lost.
         """
         log_time = 0
-        for log_time, stream, item in events:
+        for message in _judged(events, self._wanted):
+            log_time, stream, item = message.log_time, message.stream, message.item
             for name, aligner in self._aligners.items():
                 self._answer(name, log_time, aligner.tick(log_time))
             if isinstance(item, Exception):
                 self._lose(Entry(stream, log_time, "source", Reason.UNREADABLE, str(item)))
             elif stream in self._wanted:
                 self.messages[stream] += 1
-                if self._in_order(stream, item.stamp, log_time):
+                if message.fault:
+                    self._lose(Entry(stream, item.stamp, "source", Reason.OUT_OF_ORDER, message.fault))
+                else:
                     self._take(stream, log_time, Token(item.stamp, item))
             yield from self._ready()
         for name, aligner in self._aligners.items():
@@ -87,26 +172,6 @@ class Feeder:
         held += [place for aligner in self._aligners.values() for place in aligner.held()]
         for stream, stamp in held:
             self._lose(Entry(stream, stamp, "engine", Reason.ABANDONED, why))
-
-    def _in_order(self, stream: str, stamp: int, log_time: int) -> bool:
-        """Whether a stamp may follow the one before it; the ledger says why not."""
-        ahead = stamp - log_time
-        last, last_ahead = self._last.get(stream, (stamp - 1, ahead))
-        suspect = self._suspect.get(stream)
-        # One damaged stamp must not shut out all that follow; two in a row that agree are a clock that was set.
-        if ahead - last_ahead > JUMP and (suspect is None or abs(suspect - ahead) > JUMP):
-            self._suspect[stream] = ahead
-            detail = f"its stamp jumps {(ahead - last_ahead) / 1e9:.1f} s ahead of the log's clock"
-        elif stamp == last:
-            detail = f"it repeats the stamp of the {stream} message before it"
-        elif stamp < last:
-            detail = f"its stamp is {(last - stamp) / 1e6:.1f} ms before that of the {stream} message read before it"
-        else:
-            self._last[stream] = (stamp, ahead)
-            self._suspect.pop(stream, None)
-            return True
-        self._lose(Entry(stream, stamp, "source", Reason.OUT_OF_ORDER, detail))
-        return False
 
     def _take(self, stream: str, log_time: int, token: Token) -> None:
         """Give a token to the aligners that read its stream, and to the frame it belongs to."""

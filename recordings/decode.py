@@ -50,6 +50,8 @@ def stamp_or(header: Any, log_time: int) -> int:
     stamp = stamp_of(header)
     if stamp < 0:
         raise LogError(f"its stamp is negative ({stamp} ns)")
+    if header.stamp.nanosec >= 1_000_000_000:
+        raise LogError(f"its stamp is damaged ({header.stamp.nanosec} ns beyond the second)")
     return stamp or log_time
 
 
@@ -110,9 +112,10 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
 def _compressed_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     data = np.ascontiguousarray(message.data, np.uint8)
     content = data.tobytes()
-    # OpenCV fills the missing part of a cut picture with gray and says nothing. Padding may follow the end.
+    # OpenCV fills the missing part of a cut picture with gray and says nothing. Padding may follow the end, and the
+    # rest of a camera's buffer, which is zero.
     end = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(content[:2], b"")
-    if end not in content[-_PADDING:]:
+    if end not in content.rstrip(b"\0")[-_PADDING:]:
         raise LogError(f"the compressed image is cut after {data.size} bytes")
     stated = _stated_size(content)
     if stated is not None:

@@ -31,6 +31,7 @@ CAMERAS = {"left": "left_camera_optical", "right": "right_camera_optical"}
 # Ground truth that data sets put beside their images, as Middlebury's mask0nocc.png.
 _NOT_CAMERAS = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
 _LISTED = 5  # files in a sentence
+_LARGEST = 1e9  # px or m
 _REQUIRED, _OPTIONAL = ("fx", "cx", "cy", "baseline"), ("fy", "cx_right", "width", "height")
 
 
@@ -119,6 +120,9 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
             more = f" and {len(alone) - _LISTED} more have" if len(alone) > _LISTED else " has"
             listed = ", ".join(alone[:_LISTED])
             raise LogError(f"{folder}: {listed}{more} no partner; add it, or take the image away")
+        homes = dict.fromkeys(parent for one, _ in pairs if word.search(parent := Path(one).parent.as_posix()))
+        if len(homes) > 1:
+            raise LogError(f"{folder} holds pairs of several cameras ({', '.join(homes)}); give a folder that has one")
         return [names[one] for one, _ in pairs], [names[two] for _, two in pairs]
     held = counted(len(files), "image")
     raise LogError(f"{folder} holds no image pairs; name them alike but for left/right, l/r or 0/1 ({held})")
@@ -165,8 +169,8 @@ def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
     for name, value in loaded.items():
         if name not in (*_REQUIRED, *_OPTIONAL):
             raise LogError(f"{where} has the unknown '{name}'; it may have {', '.join((*_REQUIRED, *_OPTIONAL))}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise LogError(f"{where}: '{name}' must be a number, not {value!r}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST:
+            raise LogError(f"{where}: '{name}' must be a number up to {_LARGEST:g}, not {value!r}")
         if name in ("fx", "fy", "baseline", "width", "height") and value <= 0:
             raise LogError(f"{where}: '{name}' must be positive, not {value}")
     return {"fy": loaded["fx"], "cx_right": loaded["cx"], **loaded}

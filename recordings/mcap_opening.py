@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from recordings.mcap_source import McapSource
 
 CAMERAS = ("left", "right")
+EVER = 0  # ns, the stamp of what holds throughout: frames may be before the log's first message, or of another clock
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
 _LOOKED_AT = 20  # messages of an Imu; an orientation filter may begin with nonsense
 _TRANSFORMS_LOOKED_AT = 100  # messages from the first one of the rover on; others may come more rarely
@@ -162,8 +163,7 @@ class Opening:
             frame = self._first(self.topics["inclinometer"], frame_of)
             self.tilt_frame = "" if isinstance(frame, LogError) else frame
             given, base = self.source.camera_from_inclinometer, self.source.base_frame
-            stamp = min(self.file.start, self._first_stamp(self.topics["left"]))
-            mount = _attempt(mounted, stamp, self.cameras[0], self.tilt_frame, base, self.static, given)
+            mount = _attempt(mounted, EVER, self.cameras[0], self.tilt_frame, base, self.static, given)
             if isinstance(mount, LogError):
                 self.missing["mount"] = str(mount)
             else:
@@ -257,12 +257,6 @@ class Opening:
             if not isinstance(made, LogError):
                 return made
         return made
-
-    def _first_stamp(self, topic: str) -> int:
-        """The stamp of a topic's first message: it may be before the log's first log time, or of another clock."""
-        raws = self.file.messages(self.channels_of(topic))
-        first = next((raw for raw in raws if not isinstance(raw, Lost)), None)
-        return self.file.start if first is None else max(peek_stamp(first.data) or first.log_time, 0)
 
 
 def _pose_of(message: Any, base_frame: str) -> Pose:

@@ -94,7 +94,8 @@ def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable
     if not text.strip() and name in TYPES.types:
         return lambda data: TYPES.deserialize_cdr(data, name)
     try:
-        store = _store_of(name, schema_encoding, text.decode())
+        # Definitions hold what editors leave: a byte order mark, Windows line ends, comments that are not UTF-8.
+        store = _store_of(name, schema_encoding, text.decode("utf-8-sig", "replace").replace("\r\n", "\n"))
         store.get_msgdef(name)
     except Exception as error:  # a parser of foreign text may fail in any way; all mean the same here
         why = shorten(f"{type(error).__name__}: {error}", _SAID, placeholder=" ...")

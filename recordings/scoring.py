@@ -1,6 +1,6 @@
 """A run's output log against the truth topics of the log it ran on: one table of errors.
 
-Results under /nav and truth under /truth meet by header stamp. Both logs are read side by side in log time and a frame
+Results under /nav and truth under /truth meet by header stamp. Both logs are read side by side in time and a frame
 is scored, and forgotten but for its sums, as soon as neither can add to it. Errors are told for what both cameras saw
 and for what one did; values given where there is no truth are counted on their own, and a true frame that the run left
 out is scored as one of which it knew nothing, so that neither a guess nor silence passes for knowledge.
@@ -14,6 +14,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ class Score:
 
     frames: in the truth; compared: those with at least one result; missing: result topic -> stamps of true frames that
     it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without truth;
+    unscored: truth topic -> why -> frames that have it but lack another, which it is scored with;
     lost: log -> why -> messages that could not be read; a true frame that lacks one is scored as far as it goes;
     disparity: `StereoErrors.measures`, cropped by the truth's max_disparity (the data set's range where it has one,
     else the frame's largest), rounded up to 16;
@@ -54,6 +56,7 @@ class Score:
     compared: int
     missing: dict[str, list[int]]
     unmatched: dict[str, int]
+    unscored: dict[str, dict[str, int]] = field(default_factory=dict)
     lost: dict[str, dict[str, int]] = field(default_factory=dict)
     disparity: dict[str, Any] | None = None
     terrain: dict[str, Any] | None = None
@@ -81,11 +84,11 @@ def score(result: Path, truth: Path) -> Score:
 def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dict[str, Any]]]:
     """(stamp, {topic: message}) of all frames of both logs, each when it is complete."""
     streams = [
-        iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)]),
-        iter_decoded(truth, [*TRUTHS, "/tf_static"], tally.lost[str(truth)]),
+        _on_their_clock(iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)])),
+        _on_their_clock(iter_decoded(truth, [*TRUTHS, "/tf_static"], tally.lost[str(truth)])),
     ]
     waiting: dict[int, dict[str, Any]] = {}
-    for topic, log_time, message in heapq.merge(*streams, key=lambda item: item[1]):
+    for topic, time, message in heapq.merge(*streams, key=lambda item: item[1]):
         if topic in ("/tf", "/tf_static"):
             for item in message.transforms:
                 if topic == "/tf_static":
@@ -94,10 +97,24 @@ def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dic
                     waiting.setdefault(ros2.stamp_of(item.header), {})["/tf"] = item
             continue
         waiting.setdefault(ros2.stamp_of(message.header), {})[topic] = message
-        for stamp in [stamp for stamp in waiting if stamp < log_time - PATIENCE]:
+        for stamp in [stamp for stamp in waiting if stamp < time - PATIENCE]:
             yield stamp, waiting.pop(stamp)
     for stamp in sorted(waiting):
         yield stamp, waiting.pop(stamp)
+
+
+def _on_their_clock(messages: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
+    """The messages with the times of their logging on the clock of their stamps: what is recorded of a simulator is
+    often logged by another one. The first stamp tells how far apart the two are."""
+    stampless = list[tuple[str, int, Any]]()
+    for message in messages:
+        if not hasattr(message[2], "header"):
+            stampless.append(message)
+            continue
+        ahead = message[1] - ros2.stamp_of(message[2].header)
+        yield from ((topic, time - ahead, found) for topic, time, found in chain(stampless, [message], messages))
+        return
+    yield from stampless
 
 
 class _Tally:
@@ -109,9 +126,11 @@ class _Tally:
         self.frames = self.compared = 0
         self.missing: dict[str, list[int]] = {topic: [] for topic in RESULTS}
         self.unmatched: dict[str, int] = {}
+        self.unscored: dict[str, dict[str, int]] = {}
         self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
-        with McapFile(truth) as log:
-            self.truths = {log.channel(number).topic for number in log.index.channels}
+        with McapFile(truth) as log:  # recorders note topics of which no message came; of a damaged log, some may have
+            channels = log.index.channels
+            self.truths = {channels[number].topic for number in channels if log.count({number}) or log.index.lost}
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
         self.terrain: terrain_measures.TerrainTally | None = None
@@ -146,7 +165,11 @@ class _Tally:
     def _has(self, needed: set[str], besides: set[str], frame: dict[str, Any]) -> bool:
         """Whether a frame has the truth `needed`, and `besides` what the log has of this: no rocks there were is one
         thing, rocks that were lost another."""
-        return needed | (besides & self.truths) <= frame.keys()
+        lacking = (needed | (besides & self.truths)) - frame.keys()
+        for topic in needed & frame.keys() if lacking else ():
+            counts, why = self.unscored.setdefault(topic, {}), f"the truth has no {', '.join(sorted(lacking))} there"
+            counts[why] = counts.get(why, 0) + 1
+        return not lacking
 
     def _add_disparity(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
         true = ros2.read_disparity(frame["/truth/disparity"])
@@ -243,6 +266,7 @@ class _Tally:
             self.frames, self.compared,
             missing={topic: stamps for topic, stamps in self.missing.items() if stamps},
             unmatched=self.unmatched,
+            unscored=self.unscored,
             lost={log: dict(why) for log, why in self.lost.items() if why},
             disparity=self.disparity.measures() if self.disparity else None,
             terrain=self.terrain.measures() if self.terrain else None,

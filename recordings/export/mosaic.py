@@ -14,6 +14,7 @@ import numpy as np
 from recordings.errors import LogError
 from stages.data import Array, Tiles
 
+LARGEST = 1 << 31  # cells of a rectangle; pictures of more are beyond what their readers take
 RIM = 1.5  # m; slopes and steps are measured over less than that; what a frame changes lies farther inside
 _ON_GRID = 1e-3  # of a cell; how far from its place a grid's corner may be by rounding
 
@@ -77,11 +78,20 @@ class Mosaic:
             self._high = np.maximum(self._high, places.max(0) + first)
 
     def close(self, like: Mosaic | None = None) -> bool:
-        """Settle shape and origin, those of the map `like` where given; False where no cell is known."""
+        """Settle shape and origin, those of the map `like` where given; False where no cell is known.
+
+        Raises LogError where the rectangle is larger than `LARGEST`.
+        """
         if like is not None:
             self.shape, self._first = like.shape, like._first
         elif (self._low <= self._high).all():
             rows, cols = (int(extent) for extent in self._high - self._low + 1)
+            if rows * cols > LARGEST:
+                size = f"{cols * self.resolution:g} x {rows * self.resolution:g} m"
+                raise LogError(
+                    f"the map in '{self.frame_id}' reaches over {size}, too far for one picture with cells of "
+                    f"{self.resolution:g} m: did its pose jump? add --frames to export the maps of every frame"
+                )
             self.shape, self._first = (rows, cols), (int(self._low[0]), int(self._low[1]))
         return min(self.shape) > 0
 

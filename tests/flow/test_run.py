@@ -2,13 +2,18 @@
 
 import re
 import threading
+from collections import Counter
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from flow.errors import SinkError, UsageError
+from flow.feeder import Feeder
+from flow.ledger import Ledger
 from flow.run import Stop, run
-from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, traverse
+from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, Text, graph, replayed, traverse
 
 
 def test_a_failing_frame_is_recorded_and_skipped_and_the_others_go_on(tmp_path):
@@ -169,8 +174,8 @@ def test_a_progress_display_that_fails_does_not_stop_the_run(tmp_path):
     assert summary["frames_out"] == len(sink.records) == 10
 
 
-@pytest.mark.parametrize("ahead", [12_000 * MS, 3_600_000 * MS])
-@pytest.mark.parametrize("damaged", [{4}, {4, 8}, {4, 7, 13}])
+@pytest.mark.parametrize("ahead", [4_000 * MS, 12_000 * MS, 3_600_000 * MS])
+@pytest.mark.parametrize("damaged", [{4}, {4, 8}, {4, 7, 13}, {0}, {0, 2, 9}])
 def test_a_damaged_stamp_costs_one_message_even_if_another_like_it_comes_later(tmp_path, ahead, damaged):
     events = [
         (at, stream, Number(at + ahead, item.value) if stream == "left" and at // (100 * MS) in damaged else item)
@@ -181,15 +186,64 @@ def test_a_damaged_stamp_costs_one_message_even_if_another_like_it_comes_later(t
     assert summary["drops"] == {"out of order": len(damaged), "unmatched": len(damaged)}
 
 
-def test_a_clock_that_is_set_forward_costs_one_message_of_each_stream(tmp_path):
-    hour = 3_600_000 * MS
-    jump = [
-        (at, stream, Number(item.stamp + hour, item.value)) if at > 450 * MS else (at, stream, item)
-        for at, stream, item in traverse(10)
+def shifted(events, shift, since=-50 * MS):
+    """The events with the stamps of those logged from `since` on shifted, ns."""
+    return [
+        (at, stream, Number(item.stamp + shift, item.value) if at >= since else item) for at, stream, item in events
     ]
-    sink, summary = replayed(graph(tmp_path), jump)
-    assert len(sink.values("sum")) == 9
-    assert summary["drops"]["out of order"] == 3
+
+
+def test_a_clock_that_is_set_forward_costs_nothing_but_the_frame_at_which_the_tilt_leaps(tmp_path):
+    sink, summary = replayed(graph(tmp_path), shifted(traverse(10), 3_600_000 * MS, since=451 * MS))
+    assert len(sink.values("sum")) == 10
+    assert summary["drops"] == {"unaligned": 1}
+
+
+def test_a_clock_that_is_set_back_costs_what_follows_and_every_entry_says_what_to_do(tmp_path):
+    sink, summary = replayed(graph(tmp_path), shifted(traverse(10), -3_600_000 * MS, since=451 * MS))
+    assert len(sink.values("sum")) == 5
+    lost = [entry for entry in summary["ledger"] if entry["reason"] == "out of order"]
+    assert len(lost) == 15
+    assert all("--start" in entry["detail"] for entry in lost)
+
+
+@pytest.mark.parametrize("frames", [1, 10])
+def test_a_clock_years_from_that_of_the_log_costs_nothing(tmp_path, frames):
+    for years in (-50, 50):
+        sink, summary = replayed(graph(tmp_path), shifted(traverse(frames), years * 31_557_600_000 * MS))
+        assert len(sink.values("raised")) == frames
+        assert summary["verdict"] == "COMPLETE"
+
+
+@settings(max_examples=50, deadline=None)
+@given(stalls=st.lists(st.tuples(st.integers(0, 9_000), st.integers(1, 9_000)), max_size=4))
+def test_a_log_that_was_written_in_bursts_loses_nothing(tmp_path_factory, stalls):
+    """A recorder that stalls for up to nine seconds logs what came meanwhile all at once."""
+
+    def logged(at):
+        ends = [(begin + length) * MS for begin, length in stalls if begin * MS <= at < (begin + length) * MS]
+        return max(ends, default=at)
+
+    events = [(logged(at), stream, item) for at, stream, item in traverse(100)]
+    feeder = Feeder(graph(tmp_path_factory.mktemp("burst")), ledger := Ledger())
+    assert len(list(feeder.frames(sorted(events, key=lambda event: event[0])))) == 100
+    assert not [entry for entry in ledger.entries if entry.reason == "out of order"]
+
+
+def test_a_stamp_in_doubt_does_not_hold_up_the_log(tmp_path):
+    """A stream that may have a single message shall not make the log wait in memory for another."""
+    read = Counter()
+
+    def counted(events):
+        for at, stream, item in events:
+            read[stream] += 1
+            yield at, stream, item
+
+    alone = [(0, "words", Text(3_600_000 * MS, "alone"))]
+    text = PIPELINE.replace("sinks:", "  said: {use: flow.align.latest, stream: words, at: both}\nsinks:")
+    feeder = Feeder(graph(tmp_path, text=text), Ledger())
+    next(feeder.frames(counted(alone + traverse(1000)[1:])))
+    assert read["left"] < 110
 
 
 def test_patience_runs_on_the_clock_of_the_whole_log(tmp_path):

@@ -92,7 +92,7 @@ def test_compressed_images_are_decoded_to_rgb_and_cut_ones_refused() -> None:
         pixels_of(compressed(b"nonsense", "jpeg"))
 
 
-@pytest.mark.parametrize("padding", [b"\0" * 16, b"\xff" * 16, b"\n", b"\xff\xd9" + b" " * 500])
+@pytest.mark.parametrize("padding", [b"\0" * 16, b"\0" * 9999, b"\xff" * 16, b"\n", b"\xff\xd9" + b" " * 500])
 def test_what_pads_a_compressed_image_does_no_harm(padding: bytes) -> None:
     pixels = np.full((16, 24, 3), (200, 90, 30), np.uint8)
     jpeg = cv2.imencode(".jpg", pixels)[1].tobytes()

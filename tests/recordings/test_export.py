@@ -272,6 +272,19 @@ def test_maps_that_change_their_grid_on_the_way_are_not_mixed(tmp_path: Path) ->
         export(path, tmp_path / "out")
 
 
+def test_a_map_torn_apart_by_a_pose_that_jumped_is_refused_before_it_fills_the_disk(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    with Ros2Writer(path) as writer:
+        for frame, place in enumerate((0.0, 50_000.0)):
+            terrain = ElevationMap(
+                START + frame, {"elevation": np.ones((3, 3), np.float32)}, STEP, (place,) * 2, "odom"
+            )
+            writer.write("/nav/regional_map", ros2.grid_map(terrain), START + frame)
+    with pytest.raises(LogError, match=r"'odom' reaches over 50000\.3 x 50000\.3 m, .*add --frames"):
+        export(path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_region_that_began_anew_in_another_frame_has_a_folder_of_its_own(tmp_path: Path) -> None:
     names = ("visual_odom", "visual_odom/2")
     export(regional_log(tmp_path / "out.mcap", *((name, STEP) for name in names)), tmp_path / "out")

@@ -100,6 +100,7 @@ def test_pairs_are_found_by_name_in_order(tmp_path: Path, names: list[str], left
         (["a_l.png", "a_r.png", "b_l.png"], r"b_l\.png has no partner"),
         (["0.png", "1.png", "2.png", "3.png"], r"holds no image pairs; .* \(4 images\)"),
         (["im0.png", "im1.png", "view5.png"], r"view5\.png has no partner"),
+        (["left/1.png", "right/1.png", "left_raw/1.png", "right_raw/1.png"], r"several cameras \(left, left_raw\)"),
     ],
 )
 def test_no_image_is_left_out_without_a_word(tmp_path: Path, names: list[str], said: str) -> None:
@@ -124,7 +125,8 @@ def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
     [
         ({"baseline": None}, "lacks 'baseline'"),
         ({"focal": 3.0}, "has the unknown 'focal'"),
-        ({"fx": "wide"}, "'fx' must be a number, not 'wide'"),
+        ({"fx": "wide"}, r"'fx' must be a number up to 1e\+09, not 'wide'"),
+        ({"fx": 10**30}, r"'fx' must be a number up to 1e\+09, not 1000"),
         ({"baseline": -0.2}, "'baseline' must be positive"),
         ({"cx": 24.5}, "is 24x16, the calibration's centre .cx 24.5, cy 7.5. lies outside"),
         ({"width": 640}, "is 24x16, the calibration or the first pair is 640x16"),

@@ -201,6 +201,13 @@ def test_a_stream_may_be_added_to_the_results() -> None:
     assert {"results", "also"} == set(sink.names_streams)
 
 
+@pytest.mark.parametrize("name", ["dense-map", "my map", "2nd", "disparity/source", "diagnostics"])
+def test_a_stream_whose_name_is_no_free_topic_of_ros_2_is_refused(name: str) -> None:
+    assert McapSink(also=("dense_map",)).wants("dense_map", Disparity)
+    with pytest.raises(LogError, match=f"cannot write '{name}': /nav/{name} is taken, or no topic"):
+        McapSink(also=(name,)).wants(name, Disparity)
+
+
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"cannot write .*gone/out\.mcap: No such file"):
         McapSink().open(tmp_path / "gone" / "out.mcap", {}, {})

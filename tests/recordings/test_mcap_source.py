@@ -16,7 +16,7 @@ from recordings import McapSource
 from recordings.errors import LogError
 from recordings.inventory import describe
 from recordings.ros2 import header, make, transform_message
-from stages.data import Mount, Transform
+from stages.data import CameraImage, Mount, Transform
 from tests.recordings.sample_log import (
     BASELINE,
     FRAMES,
@@ -77,6 +77,19 @@ def test_the_mount_comes_first_and_follows_the_static_transforms(whole: list[tup
     np.testing.assert_allclose(mount.camera_from_inclinometer, camera.rotation.T @ sensor.rotation, atol=1e-12)
     assert mount.base_from_camera is not None
     np.testing.assert_allclose(mount.base_from_camera([[0, 0, 2.0]]), [[2.5, 0.1, 0.9]], atol=1e-12)
+
+
+def test_the_mount_holds_for_frames_behind_a_clock_that_was_set_back(tmp_path: Path) -> None:
+    def set_back(topic: str, number: int, message: Any) -> Any:
+        if number >= 3:
+            message.header.stamp.sec -= 3600
+        return message
+
+    items = [item for _, _, item in items_of(write_sample(tmp_path / "log.mcap", set_back), start=0.25)]
+    (mount,) = (item for item in items if isinstance(item, Mount))
+    images = [item for item in items if isinstance(item, CameraImage)]
+    assert len(images) == 4
+    assert all(mount.stamp <= image.stamp for image in images)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -233,6 +246,8 @@ def test_one_bad_message_is_lost_alone(tmp_path: Path) -> None:
             message.encoding = "yuv422"
         if topic == TILT and number == 3:
             message.orientation.x = 5.0
+        if topic == "/odom" and number == 2:
+            message.header.stamp.nanosec = 2**32 - 1
         return message
 
     events = items_of(write_sample(tmp_path / "log.mcap", edit))
@@ -240,6 +255,7 @@ def test_one_bad_message_is_lost_alone(tmp_path: Path) -> None:
     assert f"the image is cut: {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in told["left"]
     assert "image encoding 'yuv422' is not one of those that can be read" in told["right"]
     assert "the quaternion of the inclinometer is not a rotation" in told["inclinometer"]
+    assert "its stamp is damaged (4294967295 ns beyond the second)" in told["odometry"]
     assert len(events) == 4 * FRAMES + 1
 
 

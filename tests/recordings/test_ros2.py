@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import signal
+import struct
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
@@ -328,6 +329,13 @@ RECURSIVE = {
 def test_a_schema_that_is_a_part_of_itself_is_a_log_error(text: bytes) -> None:
     with pytest.raises(LogError, match="vendor_msgs/msg/Odd is a part of itself"):
         decoder_for("vendor_msgs/msg/Odd", "ros2msg", text)
+
+
+def test_a_schema_reads_as_any_editor_saved_it() -> None:
+    plain = "std_msgs/Header header\nfloat32 pitch # 0 to 90 °\n"
+    for text in (plain.encode("latin-1"), plain.replace("\n", "\r\n").encode(), plain.encode("utf-8-sig")):
+        decode = decoder_for("vendor_msgs/msg/Tilt", "ros2msg", text)
+        assert decode(b"\0\1\0\0" + struct.pack("<iII4xf", 5, 6, 1, 0.25)).pitch == 0.25
 
 
 def test_an_empty_schema_is_that_of_a_type_without_fields() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from flow.cli import main
@@ -21,6 +22,7 @@ from recordings.score_table import format_score
 from recordings.simulator import Simulation, log
 from recordings.terrain_measures import ROWS, format_terrain
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
+from tests.recordings.sample_log import rewritten
 
 SMALL = Simulation(
     frames=2, rate=1.0, width=320, height=240, relief_cells=512, abundance=0.2, color=False, seed=11
@@ -277,6 +279,41 @@ def test_results_at_stamps_without_truth_are_reported_and_never_compared(tmp_pat
         scored(tmp_path, truth, frames, shift={0: 1, 1: 1})
 
 
+@pytest.mark.parametrize("ahead", [-(10**18), 3_600_000_000_000])
+def test_a_truth_that_was_logged_by_another_clock_than_its_stamps_scores_the_same(tmp_path, truth, frames, ahead):
+    other = rewritten(truth, tmp_path / "other.mcap", time=lambda topic, log_time: log_time + ahead)
+    assert scored(tmp_path, other, frames).to_json() == scored(tmp_path, truth, frames).to_json()
+
+
+def without(truth: Path, path: Path, *topics: str) -> Path:
+    """The truth with topics of which it has the channels, but no messages, as recorders leave them."""
+    with truth.open("rb") as source, path.open("wb") as target:
+        writer, channels = Writer(target), {}
+        writer.start(profile="ros2")
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.topic not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            if channel.topic not in topics:
+                writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return path
+
+
+def test_a_topic_of_the_truth_that_no_message_came_on_is_not_waited_for(tmp_path, truth, frames):
+    found = scored(tmp_path, without(truth, tmp_path / "bare.mcap", "/truth/occlusion", "/truth/rocks"), frames)
+    assert found.disparity["whole_image"]["all"]["bad_0.5"] == 0
+    assert found.terrain["heights"]["0-8 m"]["raw"]["rmse"] < 1e-6
+    assert found.unscored == {}
+
+
+def test_a_truth_that_cannot_be_scored_with_says_what_it_lacks(tmp_path, truth, frames):
+    found = scored(tmp_path, without(truth, tmp_path / "bare.mcap", "/truth/navigation_map"), frames)
+    assert found.terrain is None
+    said = "not scored   /truth/elevation_map: 2 frames: the truth has no /truth/navigation_map there"
+    assert said in format_score(found).splitlines()
+
+
 def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
     run = Run().write(tmp_path / "run.mcap", frames)
     with pytest.raises(LogError, match="no ground truth"):
@@ -314,6 +351,9 @@ def test_a_damaged_truth_costs_what_it_held_and_nothing_is_scored_against_it(tmp
         assert rows[0].keys() < found.per_frame[-1].keys()
         whole = scoring.score(run, truth).per_frame[0]
         assert rows[0] == {name: whole[name] for name in rows[0]}
+        unscored = [count for counts in found.unscored.values() for count in counts.values()]
+        assert set(unscored) <= {1}
+        assert bool(unscored) == (topic == "/truth/rocks")
         assert f" of {damaged}: the chunk at byte" in " ".join(format_score(found).split())
         assert main(["score", str(run), "--truth", str(damaged)]) == 3
     assert main(["score", str(run), "--truth", str(truth)]) == 0
