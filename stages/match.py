@@ -15,8 +15,10 @@ import numpy as np
 
 from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
+from stages.kernels.around import Windows, windows
+from stages.kernels.pair import Rule
 from stages.kernels.prior import prior_costs
-from stages.kernels.semiglobal import Rule, lanes_for, match
+from stages.kernels.semiglobal import lanes_for, match
 from stages.stage import Stage, parameter
 
 SMALLEST_SIDE = 16
@@ -58,6 +60,9 @@ class Match(Stage):
     With `farthest`, what it measured beyond stays unknown, too. Without a prior some of both is taken for something
     within the range.
 
+    With `around` only what is near to the prior is searched: in a fraction of the time, beyond the range, too, and not
+    at all where the prior is unknown. That takes 48 bytes a pixel, or 96 if `around` is above 4.
+
     The confidence is the probability that the disparity is right within 1 px, as far as the lead of the best sum of
     paths over the others tells, with the penalties that suit the cost and 8 paths.
     """
@@ -78,6 +83,10 @@ class Match(Stage):
     speckle_range: float = parameter(1.0, "disparity step that separates patches", unit="px", low=0)
     prior_weight: float = parameter(0.5, "cost of each pixel of distance from the prior", low=0, high=16)
     prior_reach: float = parameter(4.0, "distance from which the prior's cost grows no more", unit="px", low=0, high=64)
+    around: int = parameter(
+        0, "distance from the prior within which, and only there, is searched; 0: the whole range",
+        unit="px", low=0, high=64,
+    )  # fmt: skip
     nearer: str = parameter(
         "unknown", "what becomes of matches that the prior has nearer than the range", choices=("unknown", "prior")
     )
@@ -98,11 +107,12 @@ class Match(Stage):
         self._check(frame, prior)
         search = self._search(frame.camera)
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
-        guide = None if prior is None else self._guide(prior, search)
+        around = windows(prior.pixels, self.around, search.start) if prior is not None and self.around else None
+        guide = None if prior is None else self._guide(prior, search, around)
         excluded = None if prior is None else self._excluded(prior, search)
-        found = match(left, right, self._rule(search), guide, excluded, self.threads, self.memory << 20)
+        found = match(left, right, self._rule(search), guide, around, excluded, self.threads, self.memory << 20)
         layers = found.pixels, found.source, found.confidence
-        if prior is not None and self.nearer == "prior":
+        if prior is not None and self.nearer == "prior" and not self.around:
             # The search loses what lies within a pixel or two of its end, too.
             taken = np.isnan(found.pixels) & (prior.pixels > search.stop - BEYOND) & (prior.source == Source.MEASURED)
             for layer, known in zip(layers, (prior.pixels, prior.source, prior.confidence), strict=True):
@@ -111,6 +121,9 @@ class Match(Stage):
 
     def _excluded(self, prior: Disparity, search: range) -> Array:
         """Where a measurement of the prior shows that the match is not in the range, (H, W) bool."""
+        if self.around:
+            unguided: Array = np.isnan(prior.pixels)
+            return unguided
         excluded: Array = prior.pixels > search.stop + BEYOND
         if search.start > self.minimum:
             excluded |= prior.pixels < search.start - BEYOND
@@ -125,6 +138,8 @@ class Match(Stage):
             raise ValueError(f"Match: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
         if not -width < self.minimum < width:
             raise ValueError(f"Match.minimum = {self.minimum} px leaves nothing to compare in images {width} px wide")
+        if prior is None and self.around:
+            raise ValueError(f"Match.around = {self.around} px of what? Name a `prior`, or let around be 0")
         if prior is not None and prior.pixels.shape != (height, width):
             raise ValueError(
                 f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; resize it before"
@@ -135,17 +150,17 @@ class Match(Stage):
         return self.p1 or cost.p1, self.p2 or cost.p2
 
     def _search(self, camera: StereoCamera) -> range:
-        """The disparities that are searched."""
+        """The disparities that are searched; with `around` the first of them counts."""
         search = range(self.minimum, self.minimum + self.disparities)
         if not self.farthest:
             return search
         limit = math.floor(camera.fx * camera.baseline / self.farthest - (camera.cx_right - camera.cx))
-        if limit >= search.stop:
+        if limit >= search.stop and not self.around:
             raise ValueError(
                 f"Match.farthest = {self.farthest} m leaves nothing to search: a depth of {self.farthest} m is a "
                 f"disparity of {limit} px, and {search.stop - 1} px is the largest searched"
             )
-        return range(max(search.start, limit), search.stop)
+        return range(max(search.start, limit), max(search.stop, limit + 1))
 
     def _rule(self, search: range) -> Rule:
         cost, (p1, p2) = COSTS[self.cost], self._penalties()
@@ -158,5 +173,9 @@ class Match(Stage):
             confidence,
         )  # fmt: skip
 
-    def _guide(self, prior: Disparity, search: range) -> tuple[Array, Array]:
-        return prior_costs(prior.pixels, search.start, lanes_for(len(search)), self.prior_weight, self.prior_reach)
+    def _guide(self, prior: Disparity, search: range, around: Windows | None) -> tuple[Array, Array]:
+        weight, reach = self.prior_weight, self.prior_reach
+        if around is None:
+            return prior_costs(prior.pixels, search.start, lanes_for(len(search)), weight, reach)
+        apart = np.subtract(prior.pixels, around.first, dtype=np.float32)
+        return prior_costs(apart, 0, around.width.lanes, weight, reach)

@@ -47,6 +47,7 @@ class Refine(Stage):
 
     Only MEASURED pixels are matches; all others count as holes. What moves by at most `inlier_distance` stays MEASURED.
     A match that moves farther has been replaced by what lies about it: it becomes PLANE, as a hole that a plane fills.
+    `segmented`, what an earlier refinement made of the frame, saves making its superpixels again.
     With `fill` background the other holes are filled from what lies about them and looks like them, from the farther
     surface where there are two; with wls by the confidence-weighted smoother. The confidence is the share of pixels of
     that origin that were right within 1 px.
@@ -91,17 +92,19 @@ class Refine(Stage):
     )  # fmt: skip
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
-    def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
-        if disparity.pixels.shape != frame.left.shape[:2]:
-            raise ValueError(f"Refine: disparity is {disparity.pixels.shape}, the image is {frame.left.shape[:2]}")
-        check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
+    def __call__(self, frame: StereoFrame, disparity: Disparity, segmented: Disparity | None = None) -> Disparity:
+        for given in (disparity, segmented):
+            if given is not None and given.pixels.shape != frame.left.shape[:2]:
+                raise ValueError(f"Refine: disparity is {given.pixels.shape}, the image is {frame.left.shape[:2]}")
+            if given is not None:
+                check_same_time(self, frame=frame.stamp, disparity=given.stamp)
         image = eight_bit(frame.left)[0]
         guide = gray(image)
         matches = trusted_matches(disparity.pixels, disparity.source, disparity.confidence, self.trusted, self.threads)
         if frame.left.dtype == np.uint8:  # of more bits nothing tells where the sensor ends
             matches[_burnt_out(image, guide, self.burnt_out)] = np.nan
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
-        labels, count = superpixels(image, self._count(matches.size), COMPACTNESS, threads=self.threads)
+        labels, count = self._segments(image, segmented)
         weights = np.where(np.isnan(matches), F32(0), disparity.confidence)
         within = extent(pixels)
         pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
@@ -114,6 +117,14 @@ class Refine(Stage):
 
     def _count(self, pixels: int) -> int:
         return max(1, min(self.superpixels, pixels // self.smallest))
+
+    def _segments(self, image: Array, segmented: Disparity | None) -> tuple[Array, int]:
+        """Labels of the superpixels, (H, W) int32, and their number."""
+        if segmented is None:
+            return superpixels(image, self._count(image.shape[0] * image.shape[1]), COMPACTNESS, threads=self.threads)
+        if segmented.segments is None:
+            raise ValueError("Refine: `segmented` has no superpixels; give it what stages.Refine made of the frame")
+        return segmented.segments, int(segmented.segments.max()) + 1
 
     def _with_planes(
         self, pixels: Array, weights: Array, within: Extent, image: Array, labels: Array, count: int, seed: int

@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 
 from recordings.simulator import Simulation
-from stages import CrossCheck, Disparity, Enlarge, Match, Rectify, Refine, Source, StereoCamera, StereoFrame
+from stages import Disparity, Match, Rectify, Refine, Source, StereoCamera, StereoFrame
 from stages.data import Array
 from stages.refine import TRUST
-from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stereo_part
+from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stage, stereo_part
 from tests.bench.stereo_scores import errors, rows_filled
 
 PLAIN: dict[str, Any] = {
@@ -72,8 +72,17 @@ def real(folder: Path) -> Iterator[Case]:
 
 
 def refined(stream: str, **parameters: Any) -> Chain:
-    """What Refine with these parameters makes of a stream of `rover`."""
-    return lambda streams, case: Refine(**parameters)(case.frame, streams[stream])
+    """What the last refinement of `rover`, with these parameters, makes of one of its streams."""
+    refine = replace(stage("rover", "disparity"), **parameters)
+    return lambda streams, case: refine(case.frame, streams[stream], streams["outlined"])
+
+
+def remade(**streams: Callable[[dict[str, Any], Case], Disparity]) -> Chain:
+    """`rover` with these streams made otherwise, and with what follows from them."""
+    return lambda found, case: stereo_part(
+        "rover", case.frame, case.disparities, entry="rectified",
+        **{"backward": found["backward"], **{name: make(found, case) for name, make in streams.items()}},
+    )["disparity"]  # fmt: skip
 
 
 def alone(streams: dict[str, Any], case: Case) -> Disparity:
@@ -81,40 +90,39 @@ def alone(streams: dict[str, Any], case: Case) -> Disparity:
     return Refine(**PLAIN)(case.frame, Match(disparities=case.disparities)(case.frame))
 
 
-def unchecked(streams: dict[str, Any], case: Case) -> Disparity:
-    """`rover` without the view from the right."""
-    return Refine()(case.frame, streams["matched"])
+def blind(streams: dict[str, Any], case: Case) -> Disparity:
+    """A view from the right that shows nothing."""
+    shape = case.truth.shape
+    return Disparity(
+        case.frame.stamp, np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
+    )
 
 
 def unguided(streams: dict[str, Any], case: Case) -> Disparity:
-    """`rover` without the coarse match."""
-    matched = Match(disparities=case.disparities)(case.frame)
-    return Refine()(case.frame, CrossCheck()(matched, streams["backward"]))
-
-
-def guided_unrefined(streams: dict[str, Any], case: Case) -> Disparity:
-    """`rover` with the coarse match as it is, not refined, for a guide."""
-    guide = Enlarge()(case.frame, streams["coarse"])
-    matched = Match(disparities=case.disparities, paths=4)(case.frame, guide)
-    return Refine()(case.frame, CrossCheck()(matched, streams["backward"]))
-
-
-def twice(streams: dict[str, Any], case: Case) -> Disparity:
-    """`rover`, and its result as the guide of a second match at full size."""
-    matched = Match(disparities=case.disparities, paths=4)(case.frame, streams["disparity"])
-    return Refine()(case.frame, CrossCheck()(matched, streams["backward"]))
+    """The match at full size without the coarse one."""
+    return Match(disparities=case.disparities)(case.frame)
 
 
 def eight(streams: dict[str, Any], case: Case) -> Disparity:
-    """`rover` with 8 paths at full size."""
-    matched = Match(disparities=case.disparities)(case.frame, streams["prior"])
-    return Refine()(case.frame, CrossCheck()(matched, streams["backward"]))
+    """The match at full size with 8 paths."""
+    return Match(disparities=case.disparities)(case.frame, streams["prior"])
+
+
+def everywhere(streams: dict[str, Any], case: Case) -> Disparity:
+    """The second match at full size with the whole range searched."""
+    return Match(disparities=case.disparities, paths=4)(case.frame, streams["outlined"])
+
+
+def thrice(streams: dict[str, Any], case: Case) -> Disparity:
+    """The second match guided by what comes of itself."""
+    again: Match = stage("rover", "matched_again")
+    return again(case.frame, streams["disparity"])
 
 
 def by_rows(streams: dict[str, Any], case: Case) -> Disparity:
     """`rover` with holes filled along their rows, from the farther end, without asking the image."""
-    refined = Refine(fill="none")(case.frame, streams["checked"])
-    return replace(refined, pixels=rows_filled(refined.pixels))
+    found = refined("checked_again", fill="none")(streams, case)
+    return replace(found, pixels=rows_filled(found.pixels))
 
 
 def whole(pipeline: str) -> Chain:
@@ -126,30 +134,33 @@ STEPS: dict[str, Chain] = {
     "matching alone, filled": alone,
     "coarse to fine, filled": refined("matched", **PLAIN),
     "+ view from the right": refined("checked", **PLAIN),
-    "+ doubtful matches dropped": refined("checked", **{**PLAIN, "trusted": 0.5}),
-    "+ median": refined("checked", **{**PLAIN, "trusted": 0.5, "median": 5}),
-    "+ planes of superpixels": refined("checked", surface=0, plane_fill=False, bilateral_radius=0, edge_radius=0),
-    "+ they fill holes": refined("checked", surface=0, bilateral_radius=0, edge_radius=0),
-    "+ planes of surfaces": refined("checked", bilateral_radius=0, edge_radius=0),
-    "+ bilateral filter": refined("checked", edge_radius=0),
+    "+ matched again about that": refined("checked_again", **PLAIN),
+    "+ doubtful matches dropped": refined("checked_again", **{**PLAIN, "trusted": 0.5}),
+    "+ median": refined("checked_again", **{**PLAIN, "trusted": 0.5, "median": 3}),
+    "+ planes of superpixels": refined("checked_again", surface=0, plane_fill=False, bilateral_radius=0, edge_radius=0),
+    "+ they fill holes": refined("checked_again", surface=0, bilateral_radius=0, edge_radius=0),
+    "+ planes of surfaces": refined("checked_again", bilateral_radius=0, edge_radius=0),
+    "+ bilateral filter": refined("checked_again", edge_radius=0),
     "+ edges as in the image: rover": lambda streams, _: streams["disparity"],
 }
 VARIANTS: dict[str, Chain] = {
-    "rover without the coarse match": unguided,
-    "rover, coarse match not refined": guided_unrefined,
-    "rover without the right view": unchecked,
-    "rover without planes": refined("checked", plane_weight=0, plane_fill=False, surface=0),
-    "rover without surfaces": refined("checked", surface=0),
-    "rover, planes draw more: 0.7": refined("checked", plane_weight=0.7),
-    "rover, planes draw less: 0.3": refined("checked", plane_weight=0.3),
-    "rover, planes replace matches": refined("checked", near=1000, plane_weight=1, inlier_share=0),
+    "rover without the coarse match": remade(matched=unguided),
+    "rover, coarse match not refined": remade(outline=lambda streams, _: streams["coarse"]),
+    "rover without the right view": remade(backward=blind),
+    "rover, not matched again": refined("checked"),
+    "rover, again the whole range": remade(matched_again=everywhere),
+    "rover, matched a third time": remade(matched_again=thrice),
+    "rover without planes": refined("checked_again", plane_weight=0, plane_fill=False, surface=0),
+    "rover without surfaces": refined("checked_again", surface=0),
+    "rover, planes draw more: 0.7": refined("checked_again", plane_weight=0.7),
+    "rover, planes draw less: 0.3": refined("checked_again", plane_weight=0.3),
+    "rover, planes replace matches": refined("checked_again", near=1000, plane_weight=1, inlier_share=0),
     "rover, holes filled along rows": by_rows,
-    "rover, holes filled by WLS": refined("checked", fill="wls"),
-    "rover, bilateral radius 6": refined("checked", bilateral_radius=6),
-    "rover, edges of radius 5": refined("checked", edge_radius=5),
-    "rover, 64 planes tried": refined("checked", hypotheses=64),
-    "rover with 8 paths": eight,
-    "rover, matched once more": twice,
+    "rover, holes filled by WLS": refined("checked_again", fill="wls"),
+    "rover, bilateral radius 6": refined("checked_again", bilateral_radius=6),
+    "rover, edges of radius 5": refined("checked_again", edge_radius=5),
+    "rover, 64 planes tried": refined("checked_again", hypotheses=64),
+    "rover with 8 paths": remade(matched=eight),
     "fast": whole("fast"),
     "paper": whole("paper"),
 }

@@ -107,7 +107,7 @@ def aggregate_row(  # type: ignore[no-untyped-def]
         if rule.gradient:
             cost = load(costs, x * n, width)
         else:
-            cost = census_costs(left, right, pair, rule.unseen, columns, x, width)
+            cost = census_costs(left, right, pair, rule.unseen, x, columns - 1 - x, width)
         if pulled:
             cost = plus_capped(cost, load(pair.prior_costs, begin[x], width))
         path = _continued(path, cost, small_step, byte(table, byte(steps, beside)), width)
@@ -138,7 +138,7 @@ def aggregate_row(  # type: ignore[no-untyped-def]
 def _continued(path, cost, p1, p2, width):  # type: ignore[no-untyped-def]
     """L of the next pixel of a path that is at hand, above its smallest value."""
     near = lesser(shifted(path, FAR, 1), shifted(path, FAR, -1))
-    return _next(path, near, cost, p1, p2, width)
+    return next_path(path, near, cost, p1, p2, width)
 
 
 @part
@@ -146,11 +146,12 @@ def _continued_at(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-de
     """L of the next pixel of a path that is kept in `paths`, above its smallest value."""
     path = load(paths, at, width)
     near = lesser(shifted_in_memory(path, paths, at, FAR, 1), shifted_in_memory(path, paths, at, FAR, -1))
-    return _next(path, near, cost, p1, p2, width)
+    return next_path(path, near, cost, p1, p2, width)
 
 
 @part
-def _next(path, near, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+def next_path(path, near, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    """L of the next pixel above its smallest value. path, near: L before, and the lesser of its neighbours."""
     return above_smallest(plus_capped(cost, lesser(lesser(plus_capped(near, p1), path), spread(p2, width))))
 
 

@@ -78,30 +78,29 @@ def census_reference(image: Array, mirrored: bool = False) -> Array:
 
 
 @part
-def census_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
+def census_costs(left, right, pair, unseen, x, i, width):  # type: ignore[no-untyped-def]
     """The costs of pixel x of a row at each disparity.
 
-    left, right: the row's planes in pair, `semiglobal.Pair`, of which the right ones run backwards, so that pixel x and
-    lane d meet at W - 1 - x + d; unseen: the cost where the partner is outside the right image; columns: W.
+    left, right: the row's planes in pair, `semiglobal.Pair`, of which the right ones run backwards; i: where they hold
+    the partner at the first disparity, followed by the others; unseen: the cost where a partner is outside the image.
     """
-    return seen_costs(differing_bits(left, right, columns, x, width), pair, unseen, columns, x, width)
+    return seen_costs(differing_bits(left, right, x, i, width), pair, unseen, i, width)
 
 
 @part
-def differing_bits(left, right, columns, x, width):  # type: ignore[no-untyped-def]
-    """How many of the 24 comparisons differ between pixel x and its partner at each disparity."""
-    i = columns - 1 - x
+def differing_bits(left, right, x, i, width):  # type: ignore[no-untyped-def]
+    """How many of the 24 comparisons differ between pixel x and its partners, from i on."""
     bits = ones(exclusive_or(spread(byte(left[0], x), width), load(right[0], i, width)))
     bits = plus(bits, ones(exclusive_or(spread(byte(left[1], x), width), load(right[1], i, width))))
     return plus(bits, ones(exclusive_or(spread(byte(left[2], x), width), load(right[2], i, width))))
 
 
 @part
-def seen_costs(costs, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
-    """`costs` of pixel x, but `unseen` where the partner is outside the right image."""
-    if pair.whole_from <= x < pair.whole_to:
+def seen_costs(costs, pair, unseen, i, width):  # type: ignore[no-untyped-def]
+    """`costs` of partners from i on, but `unseen` where they are outside the right image."""
+    if pair.whole_from <= i < pair.whole_to:
         return costs
-    outside = load(pair.outside, columns - 1 - x, width)
+    outside = load(pair.outside, i, width)
     return either(minus_capped(costs, outside), both(outside, spread(unseen, width)))
 
 

@@ -106,7 +106,7 @@ def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ign
     nothing = spread(0, width)
     before = here = nothing
     for x in range(-1, columns):
-        after = _raw_costs(left, right, pair, unseen, columns, min(x + 1, columns - 1), width)
+        after = raw_costs(left, right, pair, unseen, min(x + 1, columns - 1), max(columns - 2 - x, 0), width)
         if x < 0:  # beyond the border, its pixel again
             before = here = after
             continue
@@ -118,15 +118,15 @@ def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ign
 
 
 @part
-def _raw_costs(left, right, pair, unseen, columns, x, width):  # type: ignore[no-untyped-def]
-    i = columns - 1 - x
-    bits = differing_bits(left, right, columns, x, width)
+def raw_costs(left, right, pair, unseen, x, i, width):  # type: ignore[no-untyped-def]
+    """The costs of pixel x, not smoothed; all as of `census_costs`."""
+    bits = differing_bits(left, right, x, i, width)
     dx = difference(spread(byte(left[DX], x), width), load(right[DX], i, width))
     dy = difference(spread(byte(left[DY], x), width), load(right[DY], i, width))
     step = lesser(plus_capped(dx, dy), spread(LARGEST, width))
     twice = plus(step, step)
     cost = plus(plus(plus(bits, bits), step), plus(twice, twice))
-    return seen_costs(cost, pair, unseen, columns, x, width)
+    return seen_costs(cost, pair, unseen, i, width)
 
 
 def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen: int) -> Array:

@@ -198,6 +198,12 @@ def _fill(disparity, colour, within, reach, margin, first, holes, steps, begin, 
     colours, room = np.empty((2, width), np.uint32), np.empty((4, width), np.float32)
     for y in range(begin, end):
         start, stop = first[y], first[y + 1]
+        while start < stop and holes[start] < within.first[y] - margin:  # evidence does not reach so far
+            kinds[y, holes[start]] = OPEN
+            start += 1
+        while start < stop and holes[stop - 1] > within.last[y] + margin:
+            kinds[y, holes[stop - 1]] = OPEN
+            stop -= 1
         n = stop - start
         if n == 0:
             continue
@@ -214,8 +220,7 @@ def _fill(disparity, colour, within, reach, margin, first, holes, steps, begin, 
         _quantile(values, weights, room[2, :n], room[3, :n], least)
         for i in range(n):
             x = columns[i]
-            reached = y >= within.top[x] - margin and x >= within.first[y] - margin and x <= within.last[y] + margin
-            if not reached or least[i] == NOTHING:
+            if y < within.top[x] - margin or least[i] == NOTHING:
                 kinds[y, x] = OPEN
                 continue
             before, after = steps[LEFT, start + i], steps[RIGHT, start + i]

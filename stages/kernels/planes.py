@@ -1,9 +1,9 @@
 """A plane per superpixel (section 3.2 of the paper) by MSAC (Torr & Zisserman, 2000) and two least-squares refits,
 weighted by confidence.
 
-The pixels of each segment are gathered once through a compressed row list, so every hypothesis is scored over
-contiguous float32. Each segment draws from its own counter-based random numbers (splitmix64 of seed and segment): the
-result depends neither on the other segments nor on the order in which they are fitted.
+The known pixels are gathered once, segment by segment, so that every hypothesis is scored over contiguous float32.
+Each segment draws from its own counter-based random numbers (splitmix64 of seed and segment): the result depends
+neither on the other segments nor on the order in which they are fitted.
 """
 
 from __future__ import annotations
@@ -53,46 +53,69 @@ def fit_planes(
     planes = Planes(np.empty((count, 3)), np.empty(count, np.float32), np.empty(count, np.float32))
     weights = np.ones((1, 1), np.float32) if weights is None else weights
     with pairs(threads) as both:
-        start, index = segment_pixels(labels, count, both)
-        most = int(np.diff(start).max(initial=1))
-        middle = int(np.searchsorted(start, labels.size // 2))  # half of the pixels
-        given = disparity, weights, start, index, F32(threshold), hypotheses, U64(seed % 2**64)
-        both(
-            lambda: _fit(*given, 0, middle, np.empty((4, most), np.float32), *planes),
-            lambda: _fit(*given, middle, count, np.empty((4, most), np.float32), *planes),
-        )
+        points, start, sizes = known_points(disparity, labels, weights, count, both)
+        middle = int(np.searchsorted(start, start[-1] // 2))  # half of the points
+        given = points, start, sizes, F32(threshold), hypotheses, U64(seed % 2**64)
+        both(lambda: _fit(*given, 0, middle, *planes), lambda: _fit(*given, middle, count, *planes))
     return planes
 
 
-def segment_pixels(labels: Array, count: int, both: AtOnce = in_turn) -> tuple[Array, Array]:
-    """The pixels of each segment: those of segment s are index[start[s]:start[s + 1]], in scan order.
+def known_points(
+    disparity: Array, labels: Array, weights: Array, count: int, both: AtOnce = in_turn
+) -> tuple[Array, Array, Array]:
+    """The known pixels, segment by segment, in scan order each.
 
-    labels: (H, W) int32 in 0..count-1. Returns start (count + 1,) int64 and index (H * W,) int32.
+    disparity, labels, count: of `fit_planes`; weights: (H, W) float32, or of any other size for none. Returns (4, n)
+    float32, column, row, disparity and weight; (count + 1,) int64, those of segment s are start[s] to start[s + 1];
+    and (count,) int64, how many pixels a segment has, known or not.
     """
-    flat, middle = labels.ravel(), labels.size // 2
-    ahead, behind = np.zeros((2, count), np.int64)
-    both(lambda: _count_labels(flat[:middle], ahead), lambda: _count_labels(flat[middle:], behind))
-    start = np.concatenate([[0], np.cumsum(ahead + behind)])
-    index = np.empty(labels.size, np.int32)
-    next_ahead, next_behind = start[:-1].copy(), start[:-1] + ahead
+    middle = labels.shape[0] // 2
+    parts = slice(middle), slice(middle, labels.shape[0])
+    ahead, behind = np.zeros((2, 2, count), np.int64)
     both(
-        lambda: _place_pixels(flat[:middle], 0, next_ahead, index),
-        lambda: _place_pixels(flat[middle:], middle, next_behind, index),
+        lambda: _count_points(disparity[parts[0]], labels[parts[0]], *ahead),
+        lambda: _count_points(disparity[parts[1]], labels[parts[1]], *behind),
     )
-    return start, index
+    start = np.concatenate([[0], np.cumsum(ahead[0] + behind[0])])
+    points = np.empty((4, start[-1]), np.float32)
+    given = disparity, labels, weights
+    both(
+        lambda: _gather(*given, 0, middle, start[:-1].copy(), points),
+        lambda: _gather(*given, middle, labels.shape[0], start[:-1] + ahead[0], points),
+    )
+    return points, start, ahead[1] + behind[1]
 
 
 @kernel
-def _count_labels(labels, counts):  # type: ignore[no-untyped-def]
-    for i in range(labels.size):
-        counts[labels[i]] += 1
+def _count_points(disparity, labels, known, sizes):  # type: ignore[no-untyped-def]
+    width = labels.shape[1]
+    for y in range(labels.shape[0]):
+        x = 0
+        while x < width:  # run by run of one segment
+            segment, begin, n = labels[y, x], x, 0
+            while x < width and labels[y, x] == segment:
+                n += 1 if disparity[y, x] == disparity[y, x] else 0
+                x += 1
+            known[segment] += n
+            sizes[segment] += x - begin
 
 
 @kernel
-def _place_pixels(labels, first, place, index):  # type: ignore[no-untyped-def]
-    for i in range(labels.size):
-        index[place[labels[i]]] = first + i
-        place[labels[i]] += 1
+def _gather(disparity, labels, weights, first, end, place, points):  # type: ignore[no-untyped-def]
+    width, weighted = labels.shape[1], weights.shape == labels.shape
+    for y in range(first, end):
+        x = 0
+        while x < width:
+            segment = labels[y, x]
+            n = place[segment]
+            while x < width and labels[y, x] == segment:
+                d = disparity[y, x]
+                if d == d:
+                    points[0, n], points[1, n], points[2, n] = x, y, d
+                    points[3, n] = weights[y, x] if weighted else F32(1)
+                    n += 1
+                x += 1
+            place[segment] = n
 
 
 @kernel
@@ -106,44 +129,28 @@ def _draw(seed, segment, counter, n):  # type: ignore[no-untyped-def]
 
 @kernel
 def _fit(  # type: ignore[no-untyped-def]
-    disparity, weights, start, index, threshold, hypotheses, seed, first, end, points, coefficients, inlier_share,
-    valid_share,
-):  # fmt: skip
-    """Planes of the segments first to end; points: (4, most pixels of a segment) float32, workspace."""
-    width = disparity.shape[1]
-    flat, flat_weights = disparity.ravel(), weights.ravel()
-    weighted = weights.size == disparity.size
+    points, start, sizes, threshold, hypotheses, seed, first, end, coefficients, inlier_share, valid_share
+):
+    """Planes of the segments first to end."""
     for s in range(first, end):
-        total = start[s + 1] - start[s]
+        own = slice(start[s], start[s + 1])
+        x, y, d, w = points[0, own], points[1, own], points[2, own], points[3, own]
         coefficients[s, :] = np.nan
         inlier_share[s] = valid_share[s] = F32(0)
-        if total == 0:
+        if x.size > 0:
+            valid_share[s] = F32(x.size / sizes[s])
+        if x.size < LEAST_SUPPORT:
             continue
-        # Coordinates from the segment's first pixel keep float32 sums exact enough.
-        origin_y, origin_x = index[start[s]] // width, index[start[s]] % width
-        n, down, row = 0, 0, origin_y * width + origin_x
-        for j in range(start[s], start[s + 1]):
-            at = index[j]
-            while at >= row + width - origin_x:
-                down += 1
-                row += width
-            d = flat[at]
-            if d == d:
-                points[0, n] = at - row
-                points[1, n] = down
-                points[2, n] = d
-                points[3, n] = flat_weights[at] if weighted else F32(1)
-                n += 1
-        valid_share[s] = F32(n / total)
-        if n < LEAST_SUPPORT:
-            continue
-        x, y, d, w = points[0, :n], points[1, :n], points[2, :n], points[3, :n]
+        # Coordinates from the segment's first point keep float32 sums exact enough.
+        origin_x, origin_y = x[0], y[0]
+        x -= origin_x
+        y -= origin_y
         cost, a, b, c = _best_hypothesis(x, y, d, threshold * threshold, hypotheses, seed, s)
         if cost >= F32(1e30):
             continue
         for _ in range(2):
             a, b, c = _least_squares(x, y, d, w, a, b, c, threshold * threshold)
-        inlier_share[s] = F32(_count_inliers(x, y, d, a, b, c, threshold * threshold) / n)
+        inlier_share[s] = F32(_count_inliers(x, y, d, a, b, c, threshold * threshold) / x.size)
         coefficients[s, 0], coefficients[s, 1] = a, b
         coefficients[s, 2] = np.float64(c) - np.float64(a) * origin_x - np.float64(b) * origin_y
 

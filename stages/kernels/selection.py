@@ -45,7 +45,7 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):  # ty
     if step > 0:
         for x in range(columns):
             sums = either(load(total, x * n, width), outside)
-            _find_winner(sums, total, guard, x, winner, votes, width)
+            find_winner(sums, total, guard, x, winner, votes, width)
             best, index = shifted(best, 255, 1), shifted(index, 0, 1)
             index, best = where_less(sums, best, lanes, index), lesser(sums, best)
             right[columns + n - 2 - x] = outermost(index, 1)
@@ -53,7 +53,7 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):  # ty
     else:
         for x in range(columns - 1, -1, -1):
             sums = either(load(total, x * n, width), outside)
-            _find_winner(sums, total, guard, x, winner, votes, width)
+            find_winner(sums, total, guard, x, winner, votes, width)
             best, index = shifted(best, 255, -1), shifted(index, 0, -1)
             index, best = where_less(best, sums, index, lanes), lesser(sums, best)
             right[columns - 1 - x] = outermost(index, -1)
@@ -61,7 +61,8 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):  # ty
 
 
 @part
-def _find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[no-untyped-def]
+def find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[no-untyped-def]
+    """The best disparity of pixel x, and what else `find_winners` says of it. sums: of the pixel, as in `total`."""
     n = lanes_in(width)
     low, d = first_smallest(sums)
     winner[x] = d
@@ -72,30 +73,37 @@ def _find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[n
 
 
 @part
-def fit_row(winner, votes, right, partners, rule, pixels, evidence):  # type: ignore[no-untyped-def]
+def find_partners(winner, right, partners):  # type: ignore[no-untyped-def]
+    """What the winner's partner in the right image chose, (W,) int16. winner, right: of `find_winners`."""
+    columns = winner.size
+    for x in range(columns):
+        partners[x] = right[np.uint64(columns - 1 - x + winner[x])]
+
+
+@part
+def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):  # type: ignore[no-untyped-def]
     """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
 
-    winner, votes, right: of `find_winners`; rule: `semiglobal.Rule`; into pixels (W,) float32, px, NaN = unknown, and
+    winner, votes, partners: of `find_winners` and `find_partners`; first: (W,) int32, disparity of the first lane;
+    top: the last lane that is a disparity; rule: `semiglobal.Rule`; into pixels (W,) float32, px, NaN = unknown, and
     evidence (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown.
 
     A winner at an end of the search range, or with a neighbour outside the right image, is none: its parabola would
     lean on a sum that says nothing, and the smallest may lie beyond.
     """
     columns = winner.size
-    for x in range(columns):
-        partners[x] = right[np.uint64(columns - 1 - x + winner[x])]
-    minimum, last, top = np.int32(rule.minimum), np.int32(columns - 1), np.int32(rule.disparities - 1)
+    last, top = np.int32(columns - 1), np.int32(top)
     tolerance, margin = np.int32(rule.consistency), np.int32(rule.uniqueness)
     for x in range(columns):
         d = np.int32(winner[x])
         low, next_best = np.int32(votes[0, x]), np.int32(votes[3, x])
         lower, upper = np.int32(votes[1, x]), np.int32(votes[2, x])
-        partner = np.int32(np.int32(x) - minimum - d)
+        partner = np.int32(np.int32(x) - first[x] - d)
         apart = abs(np.int32(np.int32(partners[x]) - d))
         lead = np.int32(next_best - low)
         sound = (d > 0) & (d < top) & (partner > 0) & (partner < last) & (apart <= tolerance) & (lead > margin)
         bend = max(np.int32(lower + upper - low - low), np.int32(1))
-        value = np.float32(minimum + d) + np.float32(lower - upper) / np.float32(bend + bend)
+        value = np.float32(first[x] + d) + np.float32(lower - upper) / np.float32(bend + bend)
         pixels[x] = value if sound else np.float32(np.nan)
         evidence[x] = np.uint8(lead) if sound else np.uint8(0)
 

@@ -197,8 +197,8 @@ average = _on_chunks(_average)  # (x + y + 1) // 2, as if in wider numbers
 
 @_intrinsic
 def load(typing_context: Any, array: Any, index: Any, width: Any) -> Any:
-    """Bytes of `array` from `index` on, as many as `width` says."""
-    kind = Lanes(width.lanes, 8)
+    """Elements of `array` from `index` on, as many as `width` says; the lanes are as wide as they are."""
+    kind = Lanes(width.lanes, array.dtype.bitwidth)
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
         chunks = []

@@ -20,7 +20,7 @@ import numpy as np
 
 from flow.allocator import keep_freed_memory
 from flow.pipeline import load
-from stages import Match, StereoFrame
+from stages import Disparity, Match, StereoFrame
 from stages.data import Array
 from stages.kernels.planes import fit_planes
 from stages.kernels.slic import superpixels
@@ -46,30 +46,38 @@ COLUMNS = "bad-0.5  bad-1  bad-2 | all -0.5     -1     -2 |   RMS"
 
 
 def stereo_part(
-    pipeline: str, frame: StereoFrame, disparities: int, threads: int = 1, entry: str = "stereo"
+    pipeline: str, frame: StereoFrame, disparities: int, threads: int = 1, entry: str = "stereo", **given: Disparity
 ) -> dict[str, Any]:
-    """All streams of a pipeline up to its disparity, by name, for one frame that enters as stream `entry`.
+    """What a pipeline's disparity of one frame, which enters as stream `entry`, is made of, by name of the stream.
 
-    disparities: the range at full size; a coarser one keeps its share of it.
+    disparities: the range at full size; a coarser one keeps its share of it; given: streams that are not made but
+    taken as they are.
     """
-    streams: dict[str, Any] = {entry: frame}
-    for node in _nodes(pipeline):
-        if node.name in streams or not set(node.inputs.values()) <= set(streams):
-            continue
+    streams: dict[str, Any] = {entry: frame, **given}
+    for node in _needed(pipeline, frozenset(streams)):
         actor, names = node.actor, {field.name for field in fields(node.actor)}
         if "disparities" in names:
             actor = replace(actor, disparities=round(actor.disparities * disparities / DISPARITIES))
         if "threads" in names:
             actor = replace(actor, threads=threads)
         streams[node.name] = actor(**{port: streams[name] for port, name in node.inputs.items()})
-        if node.name == "disparity":
-            break
     return streams
 
 
 @functools.cache
-def _nodes(pipeline: str) -> tuple[Any, ...]:
-    return tuple(load(pipeline).nodes)
+def _needed(pipeline: str, given: frozenset[str]) -> tuple[Any, ...]:
+    """The nodes that the disparity depends on where some streams are given, in the order of their work."""
+    wanted, needed = {"disparity"} - given, []
+    for node in reversed(load(pipeline).nodes):
+        if node.name in wanted:
+            needed.append(node)
+            wanted |= set(node.inputs.values()) - given
+    return tuple(reversed(needed))
+
+
+def stage(pipeline: str, name: str) -> Any:
+    """The stage that makes a stream of a pipeline."""
+    return next(node.actor for node in load(pipeline).nodes if node.name == name)
 
 
 def scenes(folder: Path) -> Iterator[tuple[str, StereoFrame, Array, Array, int]]:

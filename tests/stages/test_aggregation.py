@@ -6,8 +6,8 @@ from numba import njit
 
 from stages.kernels.aggregation import aggregate_reference, aggregate_row, brightness_steps
 from stages.kernels.census import census_costs_reference, census_reference
+from stages.kernels.pair import NO_PRIOR, Pair, describe
 from stages.kernels.prior import prior_costs, prior_costs_reference
-from stages.kernels.semiglobal import NO_PRIOR, Pair, _described, _view
 from stages.kernels.vectors import Width
 from tests.stages.test_census import rule_of
 from tests.stages.test_match_opencv import textured
@@ -53,8 +53,7 @@ def test_census_costs_made_on_the_way_are_those_handed_in():
     left, right = (textured(12, 70, seed).astype(np.uint8) for seed in (1, 2))
     rule, width = rule_of(False, 32, 0), Width(32)
     near = np.where(left > 100, 12.0, np.nan).astype(np.float32)
-    pair = Pair(_described(left, rule), _described(right, rule, width), brightness_steps(left), *_view(70, rule, width),
-                *prior_costs(near, 0, 32, 0.5, 4.0))  # fmt: skip
+    pair = describe(left, right, rule, width, prior_costs(near, 0, 32, 0.5, 4.0))
     costs = census_costs_reference(census_reference(left), census_reference(right), 32, 0, rule.unseen)
     flat = costs.reshape(12, -1)
     made, handed = np.empty((2, flat.size), np.uint8)

@@ -7,7 +7,8 @@ from numba import njit
 from stages.kernels.blank import blank_windows, blank_windows_reference
 from stages.kernels.census import census, census_costs, census_costs_reference, census_reference
 from stages.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
-from stages.kernels.semiglobal import NO_PRIOR, Pair, Rule, _described, _view, lanes_for
+from stages.kernels.pair import Rule, describe
+from stages.kernels.semiglobal import lanes_for
 from stages.kernels.vectors import Width, lanes_in, store
 from tests.stages.test_match_opencv import textured
 
@@ -18,7 +19,8 @@ def rows_of_census(pair, unseen, costs, width):
     columns = costs.shape[1] // n
     for y in range(costs.shape[0]):
         for x in range(columns):
-            store(costs[y], x * n, census_costs(pair.left[y], pair.right[y], pair, unseen, columns, x, width))
+            made = census_costs(pair.left[y], pair.right[y], pair, unseen, x, columns - 1 - x, width)
+            store(costs[y], x * n, made)
 
 
 @njit
@@ -72,8 +74,7 @@ def test_costs_are_those_of_the_references_at_every_pixel_and_disparity(images, 
     costs = np.empty((21, 77 * lanes), np.uint8)
     for gradient in (False, True):
         rule = rule_of(gradient, disparities, minimum)
-        described = _described(left, rule), _described(right, rule, width)
-        pair = Pair(*described, np.zeros((4, 1, 1), np.uint8), *_view(77, rule, width), *NO_PRIOR)
+        pair = describe(left, right, rule, width)
         if gradient:
             expected = smoothed_costs_reference(*planes, lanes, minimum, rule.unseen)
             for step in (1, -1):

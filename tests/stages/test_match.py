@@ -157,6 +157,38 @@ def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, dispariti
     assert same(result, replace(match, threads=2)(frame_of(left, right)))
 
 
+@pytest.fixture
+def known(slope):
+    """What a slope's prior may say, no better than within 2 px, where both cameras see it."""
+    _, truth = slope
+    rough = truth + np.random.default_rng(4).uniform(-2, 2, truth.shape).astype(np.float32)
+    rough[:, :50][truth[:, :50] > np.arange(50) - 3] = np.nan
+    return Disparity(0, rough, np.full(truth.shape, Source.FILLED, np.uint8), np.ones(truth.shape, np.float32))
+
+
+@pytest.mark.parametrize("cost", COSTS)
+@pytest.mark.parametrize("paths", [4, 8])
+def test_around_a_prior_disparities_are_found_beyond_the_range_too_and_nowhere_else(slope, known, cost, paths):
+    frame, truth = slope
+    near = Match(disparities=10, around=4, cost=cost, paths=paths, prior_weight=0.0)
+    found = near(frame, known)
+    guided = np.isfinite(known.pixels)
+    assert np.isnan(found.pixels[~guided]).all()
+    assert np.isfinite(found.pixels[guided]).mean() > 0.9
+    error = np.abs(found.pixels - truth)[np.isfinite(found.pixels)]
+    assert np.median(error) < 0.13
+    assert (error > 1).mean() < 0.01
+    assert same(found, replace(near, threads=2)(frame, known))
+    assert same(found, replace(near, disparities=48, nearer="prior")(frame, known))
+
+
+def test_around_a_prior_nothing_is_found_beyond_the_farthest_of_interest(slope, known):
+    frame, truth = slope
+    pixels = Match(around=4, farthest=1.5)(frame, known).pixels  # 20 px
+    assert np.nanmin(pixels) >= 20
+    assert np.isfinite(pixels)[(truth > 24) & np.isfinite(known.pixels)].mean() > 0.95
+
+
 @pytest.mark.parametrize("cost", COSTS)
 def test_the_bits_depend_neither_on_threads_nor_on_memory_nor_on_company(slope, cost):
     frame, _ = slope
@@ -244,6 +276,8 @@ def test_frames_that_cannot_be_matched_are_refused(slope):
     with pytest.raises(ValueError, match=r"farthest = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"):
         Match(disparities=48, farthest=0.5)(frame)
     small = Disparity(0, truth[:50], np.ones((50, 320), np.uint8), np.ones((50, 320), np.float32))
+    with pytest.raises(ValueError, match=r"around = 4 px of what\? Name a `prior`"):
+        Match(around=4)(frame)
     with pytest.raises(ValueError, match=r"prior has shape \(50, 320\)"):
         Match()(frame, small)
 
@@ -258,19 +292,22 @@ sys.path.insert(0, {root!r})
 from stages import Match
 from tests.stages.test_match_opencv import slanted_pair
 frame, _ = slanted_pair(height=64, width=100)
-results = [Match(disparities=40, cost=cost)(frame).pixels.tobytes() for cost in ("census", "census+gradient")]
-print(hashlib.sha256(b"".join(results)).hexdigest())
+results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
+results.append(Match(around=4)(frame, results[0]))
+print(hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).hexdigest())
 """
 
 
 @pytest.mark.parametrize("processor", ["haswell", "nehalem"])
 def test_processors_without_avx512_give_the_same_bits(processor):
     frame, _ = slanted_pair(height=64, width=100)
-    results = [Match(disparities=40, cost=cost)(frame).pixels.tobytes() for cost in ("census", "census+gradient")]
+    results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
+    results.append(Match(around=4)(frame, results[0]))
+    expected = b"".join(result.pixels.tobytes() for result in results)
     command = [sys.executable, "-c", DIGEST.format(root=str(ROOT))]
     environment = {**os.environ, "NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": FEATURES[processor]}
     output = subprocess.check_output(command, env=environment, stderr=subprocess.DEVNULL, text=True)
-    assert output.strip() == hashlib.sha256(b"".join(results)).hexdigest()
+    assert output.strip() == hashlib.sha256(expected).hexdigest()
 
 
 def test_real_scenes_are_matched_better_than_by_opencv():

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.planes import fit_planes, fit_planes_reference, segment_pixels
+from stages.kernels.planes import fit_planes, fit_planes_reference, known_points
 
 SHAPE = (48, 60)
 
@@ -99,8 +99,14 @@ def test_too_few_or_collinear_pixels_give_no_plane():
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 9), st.integers(0, 2**31))
-def test_segment_pixels_lists_each_pixel_once_under_its_label(height, width, count, seed):
-    labels = np.random.default_rng(seed).integers(0, count, (height, width), dtype=np.int32)
-    start, index = segment_pixels(labels, count)
-    assert np.array_equal(np.sort(index), np.arange(labels.size))
-    assert np.array_equal(labels.ravel()[index], np.repeat(np.arange(count), np.diff(start)))
+def test_known_points_are_listed_once_each_under_their_label(height, width, count, seed):
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, count, (height, width), dtype=np.int32)
+    disparity, weights = rng.random((2, height, width)).astype(np.float32)
+    disparity[rng.random(labels.shape) < 0.3] = np.nan
+    points, start, sizes = known_points(disparity, labels, weights, count)
+    assert np.array_equal(sizes, np.bincount(labels.ravel(), minlength=count))
+    for segment in range(count):
+        y, x = np.nonzero((labels == segment) & np.isfinite(disparity))
+        own = points[:, start[segment] : start[segment + 1]]
+        assert np.array_equal(own, np.stack([x, y, disparity[y, x], weights[y, x]]).astype(np.float32))

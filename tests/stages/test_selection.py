@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numba import njit
 
 from stages.kernels.halves import pairs
-from stages.kernels.selection import find_winners, fit_row, select_reference
+from stages.kernels.selection import find_partners, find_winners, fit_row, select_reference
 from stages.kernels.semiglobal import lanes_for
 from stages.kernels.speckles import drop_speckles, drop_speckles_reference
 from stages.kernels.vectors import Width
@@ -16,9 +16,10 @@ from tests.stages.test_census import rule_of
 
 
 @njit
-def select(total, beyond, guard, step, winner, votes, right, partners, rule, pixels, evidence, width):
+def select(total, beyond, guard, step, winner, votes, right, partners, first, rule, pixels, evidence, width):
     find_winners(total, beyond, guard, step, winner, votes, right, width)
-    fit_row(winner, votes, right, partners, rule, pixels, evidence)
+    find_partners(winner, right, partners)
+    fit_row(winner, votes, partners, first, rule.disparities - 1, rule, pixels, evidence)
 
 
 @pytest.mark.parametrize("disparities", [9, 64, 90, 300])
@@ -39,9 +40,9 @@ def test_a_row_is_selected_as_by_the_reference_in_either_direction(disparities, 
     for step in (1, -1):
         rows = np.empty(columns, np.int16), np.empty((4, columns), np.uint16), np.empty(columns + lanes, index)
         pixels, evidence = np.empty(columns, np.float32), np.empty(columns, np.uint8)
-        partners = np.empty(columns, np.int16)
+        partners, first = np.empty(columns, np.int16), np.full(columns, minimum, np.int32)
         flat = np.append(total.ravel(), np.zeros(64, np.uint8))
-        select(flat, beyond, guard, step, *rows, partners, rule, pixels, evidence, width)
+        select(flat, beyond, guard, step, *rows, partners, first, rule, pixels, evidence, width)
         assert np.array_equal(pixels, expected[0], equal_nan=True)
         assert np.array_equal(evidence, expected[1])
     if disparities >= 64 and minimum == 0:

@@ -1,0 +1,353 @@
+"""Semi-global matching around a prior: of each pixel only a few disparities are searched, those about what it is
+expected to have.
+
+Cost, paths and selection are those of the search of a whole range (stages.kernels.semiglobal), at a fraction of its
+time, and nothing is too near to be found. The trick is how windows of neighbouring pixels that begin at different
+disparities are brought together: the lanes of each stand in memory between stretches of 255, "not searched", and are
+loaded from as many bytes later or earlier as the other window begins.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+from stages.data import Array
+from stages.kernels.aggregation import FAR, SIDES, next_path
+from stages.kernels.census import PLANES, census_costs
+from stages.kernels.compiled import kernel, part
+from stages.kernels.gradient import LARGEST, raw_costs
+from stages.kernels.halves import AtOnce
+from stages.kernels.pair import Pair, Rule
+from stages.kernels.selection import find_winner, fit_row
+from stages.kernels.vectors import (
+    Width,
+    average,
+    byte,
+    lanes_in,
+    lesser,
+    load,
+    plus,
+    plus_capped,
+    shifted,
+    spread,
+    store,
+    where_less,
+)  # fmt: skip
+from stages.kernels.workspace import Workspace
+
+STEP = 4  # windows begin at multiples of it, so that those of neighbours mostly begin together
+EDGE = 1  # lanes at either end of a window that cannot win
+GAP = 16  # by how much the stretch between two slots is longer than the lanes
+
+
+class Windows(NamedTuple):
+    """Where the search of every pixel begins, and how far it goes."""
+
+    first: Array  # (H, W) int32, px, disparity of the first lane
+    width: Width
+
+
+def windows(prior: Array, reach: int, least: int) -> Windows:
+    """Windows that reach `reach` px from the prior to either side, where the image and `least` allow.
+
+    prior: (H, W) float32, px, NaN = none: the window is then that of the pixel to the left; least: px, the smallest
+    disparity searched.
+    """
+    lanes = -(-(2 * (reach + EDGE) + STEP + 1) // 16) * 16
+    first = np.empty(prior.shape, np.int32)
+    _begin(prior, lanes, least, first)
+    return Windows(first, Width(lanes))
+
+
+@kernel
+def _begin(prior, lanes, least, first):  # type: ignore[no-untyped-def]
+    height, columns = prior.shape
+    middle = np.float32((lanes - 1) / 2)
+    for y in range(height):
+        begin = least
+        for x in range(columns):
+            if np.isfinite(prior[y, x]):
+                begin = STEP * np.int64(np.rint((prior[y, x] - middle) / STEP))
+            # The first partner is inside the image.
+            first[y, x] = min(max(begin, least, x - columns + 1), x)
+
+
+def search_around(
+    pair: Pair, rule: Rule, windows: Windows, pixels: Array, evidence: Array, space: Workspace, both: AtOnce
+) -> None:
+    """Fill in disparities (H, W) float32, px, NaN = unknown, and the evidence for them, (H, W) uint8.
+
+    pair: of a rule whose minimum is 0, with the prior's costs from the beginning of each window on.
+    """
+    first, width = windows
+    height, columns = pixels.shape
+    size, slots = columns * width.lanes, _slots(columns, width.lanes)
+    space.reserve(3 * (height * size + 64) + 14 * (slots + 64))
+    costs, down, up = (space.array((height, size), np.uint8) for _ in range(3))
+    rows = [space.array((7, slots), np.uint8) for _ in range(2)]
+    halves = slice(0, height // 2), slice(height // 2, height)
+
+    def run(work: functools.partial[None], *arguments: tuple[object, ...]) -> None:
+        both(*(functools.partial(work, *each) for each in zip(*arguments, strict=True)))
+
+    spans = tuple((part.start, part.stop) for part in halves)
+    run(functools.partial(_costs, pair, rule, width, first, costs), spans, tuple(rows))
+    sweep = functools.partial(_sweep, pair.steps, rule, width, first, costs)
+    run(sweep, (1, -1), tuple(rows), (down, up))
+    select = functools.partial(_select, rule, width, first, int(first.min()), int(first.max()), down, up)
+    run(select, spans, (pixels, pixels), (evidence, evidence))
+
+
+def _slots(columns: int, lanes: int) -> int:
+    """Bytes of a row of slots, one for each pixel and one beyond either end."""
+    return (columns + 2) * (2 * lanes + GAP) + lanes + GAP
+
+
+@part
+def _slot(x, width):  # type: ignore[no-untyped-def]
+    """Where the lanes of pixel x begin, from -1 on."""
+    n = lanes_in(width)
+    return (x + 1) * (2 * n + GAP) + n + GAP
+
+
+@part
+def _place(x, later, width):  # type: ignore[no-untyped-def]
+    """Where the lanes in slot x begin for a window that begins `later`."""
+    n = lanes_in(width)
+    return _slot(x, width) + min(max(later, -n - 1), n + 1)
+
+
+@part
+def _or_own(row, x, later, own, width):  # type: ignore[no-untyped-def]
+    """The lanes in slot x as a window has them that begins `later`; those that were not searched are `own`."""
+    found = load(row, _place(x, later, width), width)
+    return where_less(found, spread(FAR, width), found, own)
+
+
+@kernel
+def _costs(pair, rule, width, first, costs, span, rows):  # type: ignore[no-untyped-def]
+    """The costs of rows span[0] to span[1] (exclusive), of W * n bytes each, with the prior's.
+
+    As those of the whole range; but where a neighbour was not searched at a disparity, the pixel's own cost counts.
+    """
+    if rule.gradient:
+        rows[:] = FAR
+        for y in range(span[0] - 1, span[1] + 1):  # a mean needs the rows before and after
+            _sum_columns(pair, rule, first, min(max(y, 0), first.shape[0] - 1), rows[3], rows[y % 3], width)
+            if y > span[0]:
+                _smooth(pair, first, y - 1, rows, costs[y - 1], width)
+    else:
+        n, columns = lanes_in(width), first.shape[1]
+        for y in range(span[0], span[1]):
+            left, right, row = pair.left[y], pair.right[y], costs[y]
+            for x in range(columns):
+                partners = columns - 1 - x + first[y, x]
+                cost = census_costs(left, right, pair, rule.unseen, x, partners, width)
+                store(row, x * n, plus_capped(cost, load(pair.prior_costs, pair.prior[y, x], width)))
+
+
+@part
+def _sum_columns(pair, rule, first, y, raw, sums, width):  # type: ignore[no-untyped-def]
+    """The costs of row y, summed over 3 columns, into the slots of `sums`."""
+    columns = first.shape[1]
+    left, right = pair.left[y], pair.right[y]
+    for x in range(columns):
+        partners = columns - 1 - x + first[y, x]
+        store(raw, _slot(x, width), raw_costs(left, right, pair, rule.unseen, x, partners, width))
+    for x in range(columns):
+        own, here = load(raw, _slot(x, width), width), first[y, x]
+        west, east = max(x - 1, 0), min(x + 1, columns - 1)
+        three = plus(_or_own(raw, west, here - first[y, west], own, width), own)
+        store(sums, _slot(x, width), plus(three, _or_own(raw, east, here - first[y, east], own, width)))
+
+
+@part
+def _smooth(pair, first, y, rows, costs, width):  # type: ignore[no-untyped-def]
+    """The mean of the sums of rows y - 1, y and y + 1, of which y counts twice; and what the prior adds."""
+    n, (height, columns) = lanes_in(width), first.shape
+    north, south, nothing = max(y - 1, 0), min(y + 1, height - 1), spread(0, width)
+    above, below = rows[(y + 2) % 3], rows[(y + 1) % 3]
+    for x in range(columns):
+        own, here = load(rows[y % 3], _slot(x, width), width), first[y, x]
+        up = _or_own(above, x, here - first[north, x], own, width)
+        down = _or_own(below, x, here - first[south, x], own, width)
+        cost = average(average(average(average(up, down), own), nothing), nothing)
+        store(costs, x * n, plus_capped(cost, load(pair.prior_costs, pair.prior[y, x], width)))
+
+
+@kernel
+def _sweep(steps, rule, width, first, costs, step, rows, sums):  # type: ignore[no-untyped-def]
+    """The sums of the paths of a sweep down (step 1) or up (-1), as `aggregation.aggregate_row` follows them."""
+    n, (height, columns) = lanes_in(width), first.shape
+    nothing, p1, table = spread(0, width), spread(rule.p1, width), rule.table
+    rows[:] = FAR
+    for k in range(6):
+        for x in range(-1, columns + 1):
+            store(rows[k], _slot(x, width), nothing)  # a path begins here
+    up = 1 if step < 0 else 0  # steps of brightness are those from above and from the left
+    for i in range(height):
+        y = i if step > 0 else height - 1 - i
+        before, after = 3 * (i & 1), 3 * (1 - (i & 1))
+        path, begin, from_cost, total = nothing, 0, costs[y], sums[y]
+        for j in range(columns):
+            x = j if step > 0 else columns - 1 - j
+            cost, here = load(from_cost, x * n, width), first[y, x]
+            later = here - begin if j > 0 else 0
+            path = _next_beside(path, rows[6], later, cost, p1, byte(table, byte(steps[0, y], x + 1 + up)), width)
+            begin, so_far = here, path
+            for side in range(1, 4):
+                if side == 2 or rule.diagonals:
+                    across = (side - 2) * step
+                    inside = i > 0 and 0 <= x + across < columns
+                    later = here - first[y - step, x + across] if inside else 0
+                    p2 = byte(table, byte(steps[side, y + up], x + 1 - up * (side - 2)))
+                    moved = _next_from(rows[before + side - 1], _place(x + across, later, width), cost, p1, p2, width)
+                    store(rows[after + side - 1], _slot(x, width), moved)
+                    so_far = plus_capped(so_far, moved)
+            store(total, x * n, so_far)
+
+
+@part
+def _next_beside(path, row, later, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    """The path along a row, which is at hand, continued into a window that begins `later`."""
+    if later == 0:
+        near = lesser(shifted(path, FAR, 1), shifted(path, FAR, -1))
+        return next_path(path, near, cost, p1, p2, width)
+    store(row, _slot(0, width), path)
+    return _next_from(row, _place(0, later, width), cost, p1, p2, width)
+
+
+@part
+def _next_from(row, place, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    near = lesser(load(row, place - 1, width), load(row, place + 1, width))
+    return next_path(load(row, place, width), near, cost, p1, p2, width)
+
+
+@kernel
+def _select(rule, width, first, lowest, highest, down, up, span, pixels, evidence):  # type: ignore[no-untyped-def]
+    """Disparities and evidence of rows span[0] to span[1] (exclusive), as `selection` finds and checks them."""
+    n, columns = lanes_in(width), first.shape[1]
+    total, best = np.empty(columns * n, np.uint8), np.empty(columns + n, np.uint8)
+    order = np.arange(highest - lowest + n).astype(np.uint16)
+    chosen = np.zeros(columns + n, np.uint16)  # by the right image's pixels, backwards, less `lowest`
+    guard = np.where(np.abs(np.arange(2 * n) - n) <= 1, 255, 0).astype(np.uint8)
+    winner, votes, partners = (
+        np.empty(columns, np.int16),
+        np.empty((4, columns), np.uint16),
+        np.empty(columns, np.int16),
+    )
+    for y in range(span[0], span[1]):
+        best[:] = 255
+        one, other, begin = down[y], up[y], first[y]
+        for x in range(columns):
+            sums = plus_capped(load(one, x * n, width), load(other, x * n, width))
+            store(total, x * n, sums)
+            find_winner(sums, total, guard, x, winner, votes, width)
+            right = columns - 1 - x + begin[x]
+            known, here = load(best, right, width), load(order, begin[x] - lowest, width)
+            store(chosen, right, where_less(sums, known, here, load(chosen, right, width)))
+            store(best, right, lesser(sums, known))
+        for x in range(columns):
+            partners[x] = chosen[columns - 1 - x + begin[x] + winner[x]] + lowest - begin[x]
+        fit_row(winner, votes, partners, begin, n - 1, rule, pixels[y], evidence[y])
+
+
+def search_around_reference(pair: Pair, rule: Rule, windows: Windows) -> tuple[Array, Array]:
+    """Disparities and evidence as of `search_around`, in plain numpy: in volumes of all disparities of any window, with
+    255 for those that are not in the pixel's own."""
+    first, n = windows.first, windows.width.lanes
+    lanes = first[..., np.newaxis] - first.min() + np.arange(n)
+    searched = np.zeros((*first.shape, int(lanes.max()) + 1), bool)
+    np.put_along_axis(searched, lanes, True, axis=2)
+    costs = np.full(searched.shape, FAR)
+    np.put_along_axis(costs, lanes, _raw_costs_reference(pair, rule, first, n), axis=2)
+    if rule.gradient:
+        costs = _smoothed_reference(costs, searched)
+    pull = pair.prior_costs[pair.prior[..., np.newaxis] + np.arange(n)]
+    np.put_along_axis(costs, lanes, np.minimum(np.take_along_axis(costs, lanes, axis=2) + pull, 255), axis=2)
+    sums = sum(np.minimum(_paths_reference(pair, rule, costs, searched, sign), 255) for sign in (1, -1))
+    total = np.where(searched, np.minimum(sums, 255), 255)
+    pixels, evidence = np.full(first.shape, np.nan, np.float32), np.zeros(first.shape, np.uint8)
+    for y in range(first.shape[0]):
+        _select_reference(total[y], first[y], int(first.min()), n, rule, pixels[y], evidence[y])
+    return pixels, evidence
+
+
+def _raw_costs_reference(pair: Pair, rule: Rule, first: Array, n: int) -> Array:
+    """The costs in the windows, not smoothed, (H, W, n) int64."""
+    height, columns = first.shape
+    partner = columns - 1 - np.arange(columns)[:, np.newaxis] + first[..., np.newaxis] + np.arange(n)
+    left = pair.left[:, :, :columns].transpose(1, 0, 2)[..., np.newaxis]
+    right = pair.right.transpose(1, 0, 2)[:, np.arange(height)[:, np.newaxis, np.newaxis], partner]
+    costs = np.bitwise_count(left[:PLANES] ^ right[:PLANES]).sum(axis=0, dtype=np.int64)
+    if rule.gradient:
+        step = np.abs(left[PLANES:].astype(int) - right[PLANES:]).sum(axis=0)
+        costs = 2 * costs + 5 * np.minimum(step, LARGEST)
+    return np.where(pair.outside[partner] > 0, rule.unseen, costs)
+
+
+def _smoothed_reference(raw: Array, searched: Array) -> Array:
+    """Means over 3x3 pixels, in which a pixel's own stands for what a neighbour lacks."""
+
+    def neighbours(costs: Array, axis: int) -> tuple[Array, Array]:
+        pad = [(int(axis == k),) * 2 for k in range(3)]
+        wide = np.where(np.pad(searched, pad, mode="edge"), np.pad(costs, pad, mode="edge"), -1)
+        length = costs.shape[axis]
+        one, other = wide.take(range(length), axis), wide.take(range(2, length + 2), axis)
+        return np.where(one < 0, costs, one), np.where(other < 0, costs, other)
+
+    west, east = neighbours(raw, 1)
+    three = west + raw + east
+    up, down = neighbours(three, 0)
+    mean = ((up + down + 1) // 2 + three + 1) // 2
+    smoothed: Array = np.where(searched, ((mean + 1) // 2 + 1) // 2, FAR)
+    return smoothed
+
+
+def _paths_reference(pair: Pair, rule: Rule, costs: Array, searched: Array, sign: int) -> Array:
+    """The sums of the paths of a sweep down (1) or up (-1), as of `aggregation.aggregate_reference`."""
+    height, columns, n = costs.shape
+    total = np.zeros(costs.shape, np.int64)
+    for side, (dy, dx) in enumerate(SIDES):
+        if side % 2 and not rule.diagonals:
+            continue
+        dy, dx = sign * dy, sign * dx
+        before = np.zeros((height + 2, columns + 2, n + 2), np.int64)  # of every pixel, a frame of paths that begin
+        before[1:-1, 1:-1] = FAR
+        for y in range(height)[::sign]:
+            for x in range(columns)[::sign]:
+                q = before[y + dy + 1, x + dx + 1]
+                up, left = (y, x) if sign > 0 else (y + dy, x + dx)
+                p2 = rule.table[pair.steps[side, up, left + 1]]
+                near = np.minimum(np.minimum(q[:-2], q[2:]) + rule.p1, np.minimum(q[1:-1], p2))
+                after = np.minimum(costs[y, x] + near, 255)
+                own = searched[y, x]
+                before[y + 1, x + 1, 1:-1][own] = after[own] - after[own].min()
+        total += before[1:-1, 1:-1, 1:-1]
+    return total
+
+
+def _select_reference(
+    total: Array, first: Array, lowest: int, n: int, rule: Rule, pixels: Array, evidence: Array
+) -> None:
+    """Fill in a row, as `selection.select_reference` does."""
+    columns, disparities = total.shape
+    disparity = np.arange(disparities) + lowest
+    right = np.zeros(columns, np.int64)
+    for r in range(columns):
+        seen = [(total[r + d, d - lowest], d) for d in disparity if 0 <= r + d < columns]
+        right[r] = min(seen)[1] if seen else lowest
+    for x in range(columns):
+        d = int(np.argmin(total[x]))
+        lane, partner = d + lowest - first[x], x - lowest - d
+        if not (0 < lane < n - 1 and 0 < partner < columns - 1):
+            continue
+        low, before, after = total[x, d], total[x, d - 1], total[x, d + 1]
+        lead = min([255, *total[x, : d - 1], *total[x, d + 2 :]]) - low
+        if abs(right[partner] - d - lowest) <= rule.consistency and lead > rule.uniqueness:
+            bend = max(before + after - 2 * low, 1)
+            pixels[x] = np.float32(lowest + d) + np.float32(before - after) / np.float32(2 * bend)
+            evidence[x] = lead

@@ -1,0 +1,77 @@
+"""What the matcher's searches are told, and what they read of the images, made once for a frame."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from stages.data import Array
+from stages.kernels.aggregation import brightness_steps
+from stages.kernels.census import census
+from stages.kernels.gradient import gradients
+from stages.kernels.halves import AtOnce, in_turn
+from stages.kernels.vectors import Width
+
+NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)
+
+
+class Rule(NamedTuple):
+    """How to match: see `stages.Match` for the meaning of each."""
+
+    gradient: bool  # census and gradient, or census alone
+    diagonals: bool  # 8 paths, or 4
+    p1: int
+    table: Array  # (256,) uint8, p2 for each step of brightness
+    unseen: int  # cost of a partner outside the right image
+    disparities: int
+    minimum: int
+    uniqueness: int
+    consistency: int
+    speckle_range: float
+    speckle_size: int
+    calibration: Array  # (256,) float32, confidence for each amount of evidence
+
+
+class Pair(NamedTuple):
+    """What the searches read of the images, with n lanes."""
+
+    left: Array  # (H, planes, >= W) uint8: bits of census, gradients
+    right: Array  # (H, planes, >= W + n) uint8: the same of the right image, backwards from the smallest disparity on
+    steps: Array  # of `brightness_steps`
+    outside: Array  # (W + n,) uint8: 255 where an element of `right` is outside the image
+    whole_from: int  # elements of `right` from which n and more are inside
+    whole_to: int
+    prior: Array  # (H, W) int32: where in `prior_costs` the costs of a pixel begin; or none
+    prior_costs: Array  # (m,) uint8
+
+
+def describe(
+    left: Array,
+    right: Array,
+    rule: Rule,
+    width: Width,
+    prior: tuple[Array, Array] | None = None,
+    both: AtOnce = in_turn,
+) -> Pair:
+    """What the searches read of gray images, (H, W) uint8. prior: of `prior.prior_costs`, or None."""
+    left_planes, right_planes = both(lambda: _described(left, rule), lambda: _described(right, rule, width))
+    steps, columns = brightness_steps(left, both), left.shape[1]
+    place = np.arange(columns + width.lanes) + rule.minimum
+    outside = np.where((place < 0) | (place > columns - 1), np.uint8(255), np.uint8(0))
+    whole_from, whole_to = max(0, -rule.minimum), columns + 1 - rule.minimum - width.lanes
+    return Pair(left_planes, right_planes, steps, outside, whole_from, whole_to, *(prior or NO_PRIOR))
+
+
+def _described(image: Array, rule: Rule, width: Width | None = None) -> Array:
+    """The planes of an image; with `width` those of the right image: backwards, moved to the smallest disparity."""
+    backwards, after = width is not None, 0
+    if width is not None:
+        before, after = max(0, -rule.minimum), max(0, rule.minimum)
+        image = cv2.copyMakeBorder(cv2.flip(image, 1), 0, 0, before, after + width.lanes, cv2.BORDER_REPLICATE)
+    planes = np.empty((image.shape[0], 5 if rule.gradient else 3, -(-image.shape[1] // 64) * 64), np.uint8)
+    census(image, planes, backwards)
+    if rule.gradient:
+        gradients(image, planes, backwards)
+    return planes if after == 0 else np.ascontiguousarray(planes[:, :, after:])

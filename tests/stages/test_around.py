@@ -1,0 +1,86 @@
+"""The search around a prior: bit for bit its reference, whatever the windows; and the windows hold the prior."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.kernels.around import EDGE, Windows, search_around, search_around_reference, windows
+from stages.kernels.halves import pairs
+from stages.kernels.pair import describe
+from stages.kernels.prior import prior_costs
+from stages.kernels.vectors import Width
+from stages.kernels.workspace import Workspace
+from tests.stages.test_census import rule_of
+from tests.stages.test_match_opencv import textured
+
+
+def views(height, columns, disparity):
+    """The images, (H, W) uint8, of a surface of these disparities, (H, W) or a number of px."""
+    right = textured(height, columns, 3)
+    x = np.arange(columns) - np.broadcast_to(disparity, (height, columns))
+    left = np.stack([np.interp(line, np.arange(columns), row) for line, row in zip(x, right, strict=True)])
+    return left.astype(np.uint8), right.astype(np.uint8)
+
+
+def searched(images, rule, found, guide, threads):
+    left, right = images
+    pixels, evidence = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
+    with pairs(threads) as both:
+        pair = describe(left, right, rule._replace(minimum=0), found.width, guide, both)
+        search_around(pair, rule, found, pixels, evidence, Workspace(), both)
+    return pair, pixels, evidence
+
+
+@pytest.mark.parametrize("gradient", [True, False])
+@pytest.mark.parametrize("diagonals", [True, False])
+@pytest.mark.parametrize("lanes", [16, 32, 48])
+def test_disparities_and_evidence_are_those_of_the_reference(gradient, diagonals, lanes):
+    rng = np.random.default_rng(lanes + gradient)
+    height, columns = 11, 60
+    disparity = np.where(np.arange(columns) < 30, 9.0, 21.0)  # a step, wider than the narrowest windows
+    images = views(height, columns, disparity)
+    prior = np.broadcast_to(disparity, (height, columns)) + rng.normal(0, 2, (height, columns)).astype(np.float32)
+    prior[rng.random(prior.shape) < 0.1] += 40  # windows that share nothing with their neighbours'
+    begin = np.rint(prior - lanes / 2).astype(np.int32)
+    first = np.minimum(np.maximum(begin, np.arange(columns) - columns + 1), np.arange(columns)).astype(np.int32)
+    found = Windows(first, Width(lanes))
+    guide = prior_costs((prior - first).astype(np.float32), 0, lanes, 0.5, 4.0)
+    table = np.round(12 + 90 / (1 + np.arange(256) / 10)).astype(np.uint8)
+    rule = rule_of(gradient, 64, 0)._replace(diagonals=diagonals, table=table, uniqueness=1)
+    pair, pixels, evidence = searched(images, rule, found, guide, 1)
+    expected = search_around_reference(pair, rule, found)
+    np.testing.assert_array_equal(pixels, expected[0])
+    np.testing.assert_array_equal(evidence, expected[1])
+    assert np.isfinite(pixels).mean() > 0.2
+    for one, other in zip(searched(images, rule, found, guide, 2)[1:], (pixels, evidence), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 9), st.integers(1, 300), st.integers(1, 20), st.integers(-40, 40), st.integers(0, 2**32 - 1))
+def test_a_window_reaches_as_far_as_asked_to_either_side_of_the_prior(height, columns, reach, least, seed):
+    rng = np.random.default_rng(seed)
+    prior = rng.uniform(-60, 320, (height, columns)).astype(np.float32)
+    prior[rng.random(prior.shape) < 0.2] = np.nan
+    first, width = windows(prior, reach, least)
+    x = np.arange(columns)
+    assert (first <= x).all()  # it begins in the image
+    assert (first >= x - columns + 1).all()
+    assert (first >= np.minimum(least, x)).all()
+    free = np.isfinite(prior) & (first < x) & (first > np.maximum(least, x - columns + 1))
+    assert (first + EDGE <= prior - reach)[free].all()
+    assert (prior + reach <= first + width.lanes - 1 - EDGE)[free].all()
+
+
+def test_an_image_of_one_row_and_one_without_any_prior_are_searched():
+    images = views(1, 40, 8.0)
+    rule = rule_of(True, 64, 0)
+    nothing = np.full((1, 40), np.nan, np.float32)
+    for prior in (np.full((1, 40), 8, np.float32), nothing):
+        found = windows(prior, 4, 0)
+        guide = prior_costs(np.subtract(prior, found.first, dtype=np.float32), 0, 16, 0.5, 4.0)
+        pair, pixels, evidence = searched(images, rule, found, guide, 2)
+        expected = search_around_reference(pair, rule, found)
+        np.testing.assert_array_equal(pixels, expected[0])
+        np.testing.assert_array_equal(evidence, expected[1])
