@@ -6,12 +6,11 @@ image shows. A second matching follows the right image's, so what only one camer
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from stages.data import Disparity, Source
-from stages.kernels.contradiction import contradicted
+from stages.data import Disparity
+from stages.kernels.contradiction import drop_contradicted
 from stages.stage import Stage, check_same_time, parameter
 
 
@@ -34,13 +33,8 @@ class CrossCheck(Stage):
                 "match the swapped frame at the same size"
             )
         check_same_time(self, disparity=disparity.stamp, backward=backward.stamp)
-        seen = np.where(backward.source == Source.UNKNOWN, np.float32(np.nan), backward.pixels)
-        wrong = contradicted(disparity.pixels, seen, self.tolerance, self.threads)
-        if self.disparities:
-            wrong &= disparity.pixels <= self.disparities
-        return replace(
-            disparity,
-            pixels=np.where(wrong, np.float32(np.nan), disparity.pixels),
-            source=np.where(wrong, np.uint8(Source.UNKNOWN), disparity.source),
-            confidence=np.where(wrong, np.float32(0), disparity.confidence),
+        found, theirs = ((layer.pixels, layer.source, layer.confidence) for layer in (disparity, backward))
+        pixels, source, confidence = drop_contradicted(
+            found, theirs, self.tolerance, self.disparities or math.inf, self.threads
         )
+        return replace(disparity, pixels=pixels, source=source, confidence=confidence)

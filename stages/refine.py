@@ -100,12 +100,12 @@ class Refine(Stage):
                 check_same_time(self, frame=frame.stamp, disparity=given.stamp)
         image = eight_bit(frame.left)[0]
         guide = gray(image)
-        matches = trusted_matches(disparity.pixels, disparity.source, disparity.confidence, self.trusted, self.threads)
-        if frame.left.dtype == np.uint8:  # of more bits nothing tells where the sensor ends
-            matches[_burnt_out(image, guide, self.burnt_out)] = np.nan
+        matches, weights = trusted_matches(
+            disparity.pixels, disparity.source, disparity.confidence, self.trusted,
+            _burnt_out(frame.left, guide, self.burnt_out), self.threads,
+        )  # fmt: skip
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
         labels, count = self._segments(image, segmented)
-        weights = np.where(np.isnan(matches), F32(0), disparity.confidence)
         within = extent(pixels)
         pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
         filled, kinds = self._filled(pixels, weights, within, image, guide)
@@ -191,11 +191,9 @@ class Refine(Stage):
 
 def _burnt_out(image: Array, guide: Array, level: int) -> Array:
     """Where the image is even and a colour of it burnt out, (H, W) bool: what is matched there is noise."""
-    brightest = image
-    if image.ndim == 3:
-        red, green, blue = cv2.split(image)
-        brightest = cv2.max(cv2.max(red, green), blue)
-    burnt: Array = brightest >= level
+    if image.dtype != np.uint8:  # of more bits nothing tells where the sensor ends
+        return np.zeros(guide.shape, bool)
+    burnt: Array = image >= level if image.ndim == 2 else cv2.inRange(image, (0,) * 3, (level - 1,) * 3) == 0
     if burnt.any():
         burnt &= cv2.morphologyEx(guide, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) <= EVEN
     return burnt

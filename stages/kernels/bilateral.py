@@ -10,7 +10,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
 
 F32 = np.float32
 
@@ -30,11 +30,10 @@ def joint_bilateral(
     given = values, known.astype(np.float32), guide.astype(np.float32), radius, _spatial(radius, space)
     scales = F32(1 / gray), F32(1 / range_scale)
     height = disparity.shape[0]
-    with pairs(threads) as both:
-        both(
-            lambda: _filter(*given, *scales, 0, height // 2, filtered),
-            lambda: _filter(*given, *scales, height // 2, height, filtered),
-        )
+    shared_by(threads)(
+        lambda: _filter(*given, *scales, 0, height // 2, filtered),
+        lambda: _filter(*given, *scales, height // 2, height, filtered),
+    )
     filtered[~known] = np.nan
     return filtered
 

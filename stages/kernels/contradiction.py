@@ -4,47 +4,59 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.data import Array
+from stages.data import Array, Source
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
+
+F32 = np.float32
+UNKNOWN = int(Source.UNKNOWN)
+Layers = tuple[Array, Array, Array]
 
 
-def contradicted(pixels: Array, backward: Array, tolerance: float, threads: int = 1) -> Array:
-    """Whether the partner's disparity differs by more than `tolerance` px, (H, W) bool.
+def drop_contradicted(found: Layers, backward: Layers, tolerance: float, largest: float, threads: int = 1) -> Layers:
+    """The layers of `found` without the pixels whose partner's disparity differs by more than `tolerance` px.
 
-    pixels: (H, W) float32, px, NaN = unknown; backward: the same of the swapped frame, that is, mirrored. An unknown
-    disparity, and one whose partner is outside the image, contradicts and is contradicted by nothing.
+    found: pixels (H, W) float32, px, NaN = unknown, source (H, W) uint8 and confidence (H, W) float32; backward: the
+    same of the swapped frame, that is, mirrored. An unknown disparity, one above `largest` px and one whose partner is
+    unknown or outside the image stays as it is.
     """
-    wrong = np.empty(pixels.shape, np.bool_)
-    middle = len(pixels) // 2
-    limit = np.float32(tolerance)
-    with pairs(threads) as both:
-        both(
-            lambda: _compare(pixels[:middle], backward[:middle], limit, wrong[:middle]),
-            lambda: _compare(pixels[middle:], backward[middle:], limit, wrong[middle:]),
-        )
-    return wrong
+    left = tuple(np.empty(layer.shape, layer.dtype) for layer in found)
+    middle = len(found[0]) // 2
+
+    def drop(rows: slice) -> None:
+        given, made = ([layer[rows] for layer in layers] for layers in (found, left))
+        _drop(*given, backward[0][rows], backward[1][rows], F32(tolerance), F32(largest), *made)
+
+    shared_by(threads)(lambda: drop(slice(0, middle)), lambda: drop(slice(middle, None)))
+    return left[0], left[1], left[2]
 
 
 @kernel
-def _compare(pixels, backward, tolerance, wrong):  # type: ignore[no-untyped-def]
+def _drop(  # type: ignore[no-untyped-def]
+    pixels, source, confidence, backward, known, tolerance, largest, left_pixels, left_source, left_confidence
+):
     last = pixels.shape[1] - 1
     for y in range(pixels.shape[0]):
         for x in range(pixels.shape[1]):
             d = pixels[y, x]
             partner = np.rint(x - d)
             differs = False
-            if partner >= 0 and partner <= last:
-                differs = abs(backward[y, last - np.int64(partner)] - d) > tolerance
-            wrong[y, x] = differs
+            if d <= largest and partner >= 0 and partner <= last:
+                there = last - np.int64(partner)
+                differs = known[y, there] != UNKNOWN and abs(backward[y, there] - d) > tolerance
+            left_pixels[y, x] = F32(np.nan) if differs else d
+            left_source[y, x] = UNKNOWN if differs else source[y, x]
+            left_confidence[y, x] = F32(0) if differs else confidence[y, x]
 
 
-def contradicted_reference(pixels: Array, backward: Array, tolerance: float) -> Array:
-    """`contradicted` in plain numpy."""
-    right = backward[:, ::-1]
+def drop_contradicted_reference(found: Layers, backward: Layers, tolerance: float, largest: float) -> Layers:
+    """`drop_contradicted` in plain numpy."""
+    pixels, source, confidence = found
+    theirs = np.where(backward[1] == UNKNOWN, F32(np.nan), backward[0])[:, ::-1]
     partner = np.rint(np.arange(pixels.shape[1]) - pixels.astype(np.float64))
     inside = (partner >= 0) & (partner < pixels.shape[1])
-    theirs = np.take_along_axis(right, np.where(inside, partner, 0).astype(int), axis=1)
+    asked = np.take_along_axis(theirs, np.where(inside, partner, 0).astype(int), axis=1)
     with np.errstate(invalid="ignore"):
-        wrong: Array = inside & (np.abs(theirs - pixels) > np.float32(tolerance))
-    return wrong
+        wrong = inside & (pixels <= largest) & (np.abs(asked - pixels) > F32(tolerance))
+    kept = np.where(wrong, F32(np.nan), pixels), np.where(wrong, UNKNOWN, source), np.where(wrong, F32(0), confidence)
+    return kept[0], kept[1].astype(np.uint8), kept[2]

@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_part, kernel, part
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
 
 F32 = np.float32
 FINE = 16  # parts of a pixel, to which a median is found
@@ -40,11 +40,10 @@ def sharpen_edges(
     doubt = cv2.copyMakeBorder(guessed.view(np.uint8), *border, value=0)
     given = padded, doubt, cv2.copyMakeBorder(guide, *border, value=0), _taps(radius) @ [padded.shape[1], 1], radius
     rule = F32(jump), _weights(brightness)
-    with pairs(threads) as both:
-        both(
-            lambda: _sharpen(*given, *rule, sharp, 0, middle),
-            lambda: _sharpen(*given, *rule, sharp, middle, disparity.shape[0]),
-        )
+    shared_by(threads)(
+        lambda: _sharpen(*given, *rule, sharp, 0, middle),
+        lambda: _sharpen(*given, *rule, sharp, middle, disparity.shape[0]),
+    )
     return sharp
 
 

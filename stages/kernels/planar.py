@@ -11,23 +11,29 @@ import numpy as np
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
 from stages.kernels.extent import Extent
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
 from stages.kernels.holes import APART
 
 F32 = np.float32
 MEASURED = int(Source.MEASURED)
 
 
-def trusted_matches(pixels: Array, source: Array, confidence: Array, least: float, threads: int = 1) -> Array:
-    """The measured, finite disparities of at least that confidence, (H, W) float32, NaN elsewhere."""
-    trusted = np.empty(pixels.shape, np.float32)
+def trusted_matches(
+    pixels: Array, source: Array, confidence: Array, least: float, excluded: Array, threads: int = 1
+) -> tuple[Array, Array]:
+    """The measured, finite disparities of at least that confidence, (H, W) float32, NaN elsewhere; and that, or 0.
+
+    excluded: (H, W) bool, what is no match all the same.
+    """
+    matches, weights = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.float32)
     middle = pixels.shape[0] // 2
-    with pairs(threads) as both:
-        both(
-            lambda: _trust(pixels[:middle], source[:middle], confidence[:middle], F32(least), trusted[:middle]),
-            lambda: _trust(pixels[middle:], source[middle:], confidence[middle:], F32(least), trusted[middle:]),
-        )
-    return trusted
+    layers = pixels, source, confidence, excluded, matches, weights
+
+    def trust(rows: slice) -> None:
+        _trust(F32(least), *(layer[rows] for layer in layers))
+
+    shared_by(threads)(lambda: trust(slice(0, middle)), lambda: trust(slice(middle, None)))
+    return matches, weights
 
 
 def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Array:
@@ -49,8 +55,7 @@ def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Arr
         median = cv2.medianBlur(low[start:], side)[middle - start :]
         _move_near(matches[middle:], median, F32(near), moved[middle:])
 
-    with pairs(threads) as both:
-        both(upper if middle else lambda: None, lower)
+    shared_by(threads)(upper if middle else lambda: None, lower)
     return moved
 
 
@@ -70,20 +75,22 @@ def pull_to_planes(
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     middle = pixels.shape[0] // 2
     given = pixels, coefficients, labels, within, F32(near), F32(weight), int(margin)
-    with pairs(threads) as both:
-        ranges = both(lambda: _range(pixels[:middle]), lambda: _range(pixels[middle:]))
-        low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
-        both(
-            lambda: _pull(*given, low, high, 0, middle, pulled, spoke),
-            lambda: _pull(*given, low, high, middle, len(pixels), pulled, spoke),
-        )
+    both = shared_by(threads)
+    ranges = both(lambda: _range(pixels[:middle]), lambda: _range(pixels[middle:]))
+    low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
+    both(
+        lambda: _pull(*given, low, high, 0, middle, pulled, spoke),
+        lambda: _pull(*given, low, high, middle, len(pixels), pulled, spoke),
+    )
     return pulled, spoke
 
 
-def trusted_matches_reference(pixels: Array, source: Array, confidence: Array, least: float) -> Array:
+def trusted_matches_reference(
+    pixels: Array, source: Array, confidence: Array, least: float, excluded: Array
+) -> tuple[Array, Array]:
     """`trusted_matches` in plain numpy."""
-    trusted = (source == MEASURED) & (confidence >= F32(least)) & np.isfinite(pixels)
-    return np.where(trusted, pixels, F32(np.nan))
+    trusted = (source == MEASURED) & (confidence >= F32(least)) & np.isfinite(pixels) & ~excluded
+    return np.where(trusted, pixels, F32(np.nan)), np.where(trusted, confidence, F32(0))
 
 
 def near_median_reference(matches: Array, side: int, near: float) -> Array:
@@ -96,11 +103,13 @@ def near_median_reference(matches: Array, side: int, near: float) -> Array:
 
 
 @kernel
-def _trust(pixels, source, confidence, least, trusted):  # type: ignore[no-untyped-def]
+def _trust(least, pixels, source, confidence, excluded, matches, weights):  # type: ignore[no-untyped-def]
     for y in range(pixels.shape[0]):
         for x in range(pixels.shape[1]):
-            good = source[y, x] == MEASURED and confidence[y, x] >= least and np.isfinite(pixels[y, x])
-            trusted[y, x] = pixels[y, x] if good else F32(np.nan)
+            good = (source[y, x] == MEASURED) & (confidence[y, x] >= least) & np.isfinite(pixels[y, x])
+            good &= not excluded[y, x]
+            matches[y, x] = pixels[y, x] if good else F32(np.nan)
+            weights[y, x] = confidence[y, x] if good else F32(0)
 
 
 @kernel

@@ -14,7 +14,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_part, kernel
-from stages.kernels.halves import AtOnce, in_turn, pairs
+from stages.kernels.halves import AtOnce, in_turn, shared_by
 
 F32 = np.float32
 U64 = np.uint64
@@ -52,11 +52,11 @@ def fit_planes(
     """
     planes = Planes(np.empty((count, 3)), np.empty(count, np.float32), np.empty(count, np.float32))
     weights = np.ones((1, 1), np.float32) if weights is None else weights
-    with pairs(threads) as both:
-        points, start, sizes = known_points(disparity, labels, weights, count, both)
-        middle = int(np.searchsorted(start, start[-1] // 2))  # half of the points
-        given = points, start, sizes, F32(threshold), hypotheses, U64(seed % 2**64)
-        both(lambda: _fit(*given, 0, middle, *planes), lambda: _fit(*given, middle, count, *planes))
+    both = shared_by(threads)
+    points, start, sizes = known_points(disparity, labels, weights, count, both)
+    middle = int(np.searchsorted(start, start[-1] // 2))  # half of the points
+    given = points, start, sizes, F32(threshold), hypotheses, U64(seed % 2**64)
+    both(lambda: _fit(*given, 0, middle, *planes), lambda: _fit(*given, middle, count, *planes))
     return planes
 
 

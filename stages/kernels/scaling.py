@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
 
 F32 = np.float32
 LARGEST_STEP = 1.0  # px of the small image, within a surface
@@ -27,8 +27,7 @@ def doubled(small: Array, height: int, width: int, threads: int = 1) -> Array:
     """Values twice as large at every pixel of an image (height, width) float32 that `small`, (H, W) float32, is half of
     (rounded up); NaN = unknown."""
     large, middle = np.empty((height, width), np.float32), height // 2
-    with pairs(threads) as both:
-        both(lambda: _double(small, large, 0, middle), lambda: _double(small, large, middle, height))
+    shared_by(threads)(lambda: _double(small, large, 0, middle), lambda: _double(small, large, middle, height))
     return large
 
 

@@ -24,7 +24,7 @@ from stages.kernels.around import Windows, search_around
 from stages.kernels.blank import blank_windows, drop_blank
 from stages.kernels.compiled import kernel
 from stages.kernels.gradient import smoothed_costs
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
 from stages.kernels.pair import Pair, Rule, describe
 from stages.kernels.selection import find_partners, find_winners, fit_row
 from stages.kernels.speckles import drop_speckles
@@ -73,7 +73,8 @@ def match(
     range, or None; threads: more than 2 have nothing to do; memory: bytes that the sums of paths may take.
     """
     pixels, evidence = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
-    with pairs(threads) as both, _workspaces.one() as space:
+    both = shared_by(threads)
+    with _workspaces.one() as space:
         if windows is None:
             width = Width(lanes_for(rule.disparities))
             pair = describe(left, right, rule, width, prior, both)

@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel, fast_part, kernel
-from stages.kernels.halves import AtOnce, in_turn, pairs
+from stages.kernels.halves import AtOnce, in_turn, shared_by
 from stages.kernels.scaling import halved
 from stages.kernels.union import join, root
 from stages.kernels.workspace import Workspaces
@@ -41,7 +41,8 @@ def superpixels(
     step = math.sqrt(height * width / count)
     grid = max(1, round(height / step)), max(1, round(width / step))
     smallest = int(0.25 * height * width / count)
-    with pairs(threads) as both, _workspaces.one() as space:
+    both = shared_by(threads)
+    with _workspaces.one() as space:
         space.reserve(12 * height * width + 64)
         colour = _colours(image, both)
         scale = 2 if min(height // grid[0], width // grid[1]) >= LEAST_CELL and min(height, width) > 1 else 1

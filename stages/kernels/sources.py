@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
 from stages.kernels.holes import KEPT, MISMATCH
 
 F32 = np.float32
@@ -49,8 +49,7 @@ def name_sources(
             source[rows], worth[rows],
         )  # fmt: skip
 
-    with pairs(threads) as both:
-        both(lambda: name(slice(0, middle)), lambda: name(slice(middle, None)))
+    shared_by(threads)(lambda: name(slice(0, middle)), lambda: name(slice(middle, None)))
     return source, worth
 
 

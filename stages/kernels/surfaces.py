@@ -13,7 +13,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
 
 ITERATIONS = 3
 AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])
@@ -42,11 +42,10 @@ def _superpixel_points(image: Array, labels: Array, count: int, scale: float, th
     """Mean colour (CIELAB, L in 0..100) and place (y, x times `scale`) of each, (count, 5), and its size (count,)."""
     middle = image.shape[0] // 2
     halves = np.zeros((2, count, 6), np.int64)
-    with pairs(threads) as both:
-        both(
-            lambda: _sum_up(image[:middle], labels[:middle], 0, halves[0]),
-            lambda: _sum_up(image[middle:], labels[middle:], middle, halves[1]),
-        )
+    shared_by(threads)(
+        lambda: _sum_up(image[:middle], labels[:middle], 0, halves[0]),
+        lambda: _sum_up(image[middle:], labels[middle:], middle, halves[1]),
+    )
     sums = halves[0] + halves[1]
     means = sums[:, :5] / sums[:, 5:]
     rgb = np.clip(np.rint(means[None, :, :3]), 0, 255).astype(np.uint8)

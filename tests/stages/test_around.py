@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.kernels.around import EDGE, Windows, search_around, search_around_reference, windows
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
 from stages.kernels.pair import describe
 from stages.kernels.prior import prior_costs
 from stages.kernels.vectors import Width
@@ -26,9 +26,9 @@ def views(height, columns, disparity):
 def searched(images, rule, found, guide, threads):
     left, right = images
     pixels, evidence = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
-    with pairs(threads) as both:
-        pair = describe(left, right, rule._replace(minimum=0), found.width, guide, both)
-        search_around(pair, rule, found, pixels, evidence, Workspace(), both)
+    both = shared_by(threads)
+    pair = describe(left, right, rule._replace(minimum=0), found.width, guide, both)
+    search_around(pair, rule, found, pixels, evidence, Workspace(), both)
     return pair, pixels, evidence
 
 

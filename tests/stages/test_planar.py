@@ -53,14 +53,17 @@ def test_trusted_matches_are_those_of_the_reference(height, width, seed, threads
     rng = np.random.default_rng(seed)
     source = rng.integers(0, 4, pixels.shape, dtype=np.uint8)
     confidence = rng.choice(np.array([0.2, 0.5, 0.7], np.float32), pixels.shape)
-    kept = trusted_matches(pixels, source, confidence, 0.5, threads)
-    assert np.array_equal(kept, trusted_matches_reference(pixels, source, confidence, 0.5), equal_nan=True)
+    excluded = rng.random(pixels.shape) < 0.1
+    ours = trusted_matches(pixels, source, confidence, 0.5, excluded, threads)
+    for made, plain in zip(ours, trusted_matches_reference(pixels, source, confidence, 0.5, excluded), strict=True):
+        np.testing.assert_array_equal(made, plain)
 
 
 def test_only_measured_finite_and_trusted_pixels_are_matches():
     pixels = np.array([[1, 2, np.inf, 4, np.nan], [1, 2, 3, 4, 5]], np.float32)
     source = np.array([[1, 2, 1, 1, 1], [0, 1, 3, 1, 1]], np.uint8)
     confidence = np.array([[0.9, 0.9, 0.9, 0.4, 0.9], [0.9, 0.5, 0.9, 0.9, 0.49]], np.float32)
-    kept = trusted_matches(pixels, source, confidence, 0.5)
+    kept, weights = trusted_matches(pixels, source, confidence, 0.5, np.zeros(pixels.shape, bool))
+    np.testing.assert_array_equal(weights, np.where(np.isfinite(kept), confidence, 0))
     nan = np.nan
     assert np.array_equal(kept, np.array([[1, nan, nan, nan, nan], [nan, 2, nan, 4, nan]], np.float32), equal_nan=True)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages import CrossCheck, Disparity, Enlarge, Halve, Match, Source, StereoCamera, StereoFrame, Swap
-from stages.kernels.contradiction import contradicted, contradicted_reference
+from stages.kernels.contradiction import drop_contradicted, drop_contradicted_reference
 from stages.kernels.scaling import doubled, doubled_reference, halved
 
 
@@ -77,7 +77,12 @@ def test_contradictions_equal_the_reference(height, width, tolerance, seed, thre
     rng = np.random.default_rng(seed)
     maps = rng.uniform(-3, 9, (2, height, width)).astype(np.float32)
     maps[rng.random(maps.shape) < 0.2] = np.nan
-    assert np.array_equal(contradicted(*maps, tolerance, threads), contradicted_reference(*maps, tolerance))
+    sources, worth = rng.integers(0, 4, maps.shape, np.uint8), rng.random(maps.shape).astype(np.float32)
+    found, backward = zip(maps, sources, worth, strict=True)
+    for largest in (np.inf, 5.0):
+        left = drop_contradicted(found, backward, tolerance, largest, threads)
+        for ours, plain in zip(left, drop_contradicted_reference(found, backward, tolerance, largest), strict=True):
+            np.testing.assert_array_equal(ours, plain)
 
 
 def test_what_the_right_image_sees_otherwise_is_unknown():

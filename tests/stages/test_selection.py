@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from stages.kernels.halves import pairs
+from stages.kernels.halves import shared_by
 from stages.kernels.selection import find_partners, find_winners, fit_row, select_reference
 from stages.kernels.semiglobal import lanes_for
 from stages.kernels.speckles import drop_speckles, drop_speckles_reference
@@ -60,7 +60,7 @@ def test_speckles_are_the_small_components_of_a_graph(height, columns, largest, 
     drop_speckles_reference(wanted, wanted_evidence, 1.0, largest)
     for threads in (1, 2):
         found, found_evidence = disparity.copy(), evidence.copy()
-        with pairs(threads) as both:
-            drop_speckles(found, found_evidence, 1.0, largest, Workspace(), both)
+        both = shared_by(threads)
+        drop_speckles(found, found_evidence, 1.0, largest, Workspace(), both)
         assert np.array_equal(found, wanted, equal_nan=True)
         assert np.array_equal(found_evidence, wanted_evidence)
