@@ -87,18 +87,14 @@ def search_around(
     size, slots = columns * width.lanes, _slots(columns, width.lanes)
     space.reserve(3 * (height * size + 64) + 14 * (slots + 64))
     costs, down, up = (space.array((height, size), np.uint8) for _ in range(3))
-    rows = [space.array((7, slots), np.uint8) for _ in range(2)]
-    halves = slice(0, height // 2), slice(height // 2, height)
-
-    def run(work: functools.partial[None], *arguments: tuple[object, ...]) -> None:
-        both(*(functools.partial(work, *each) for each in zip(*arguments, strict=True)))
-
-    spans = tuple((part.start, part.stop) for part in halves)
-    run(functools.partial(_costs, pair, rule, width, first, costs), spans, tuple(rows))
+    one, other = (space.array((7, slots), np.uint8) for _ in range(2))
+    upper, lower = (0, height // 2), (height // 2, height)
+    make = functools.partial(_costs, pair, rule, width, first, costs)
     sweep = functools.partial(_sweep, pair.steps, rule, width, first, costs)
-    run(sweep, (1, -1), tuple(rows), (down, up))
     select = functools.partial(_select, rule, width, first, int(first.min()), int(first.max()), down, up)
-    run(select, spans, (pixels, pixels), (evidence, evidence))
+    both(lambda: make(upper, one), lambda: make(lower, other))
+    both(lambda: sweep(1, one, down), lambda: sweep(-1, other, up))
+    both(lambda: select(upper, pixels, evidence), lambda: select(lower, pixels, evidence))
 
 
 def _slots(columns: int, lanes: int) -> int:
