@@ -85,11 +85,15 @@ def speed() -> None:
             contestants[f"{cost} {disparities}, 2 frames on 2 cores"] = lambda match=match, pool=pool: list(
                 pool.map(match, [frame, frame])
             )
+    prior = Match(disparities=192)(frame)
+    for threads in (1, 2):
+        match = Match(around=4, paths=4, threads=threads)
+        contestants[f"census+gradient, 4 px around a prior, 4 paths x{threads}"] = lambda match=match: match(frame, prior)
     seconds = medians(contestants)
-    print(f"{'1280x960, median of ' + str(ROUNDS):42} {'ms':>8}  / HH   / 3WAY")
+    print(f"{'1280x960, median of ' + str(ROUNDS):52} {'ms':>8}  / HH   / 3WAY")
     for name, value in seconds.items():
         ratios = f"{value / seconds['OpenCV HH']:6.3f}  {value / seconds['OpenCV 3WAY']:6.3f}"
-        print(f"{name:42} {1e3 * value:8.1f} {ratios}")
+        print(f"{name:52} {1e3 * value:8.1f} {ratios}")
     for cost in COSTS:
         wide, narrow = seconds[f"{cost} 192 x2"], seconds[f"{cost} 128 x2"]
         print(f"{cost}: 192 disparities over 128 {wide / narrow:.2f}; 2 threads over 1 ", end="")
