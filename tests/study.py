@@ -119,6 +119,11 @@ def thrice(streams: dict[str, Any], case: Case) -> Disparity:
     return again(case.frame, streams["disparity"])
 
 
+def half_range(streams: dict[str, Any], case: Case) -> Disparity:
+    """`rover` with half the search range; what is nearer is found in smaller images first."""
+    return stereo_part("rover", case.frame, case.disparities // 2, entry="rectified")["disparity"]  # type: ignore[no-any-return]
+
+
 def by_rows(streams: dict[str, Any], case: Case) -> Disparity:
     """`rover` with holes filled along their rows, from the farther end, without asking the image."""
     found = refined("checked_again", fill="none")(streams, case)
@@ -150,6 +155,7 @@ VARIANTS: dict[str, Chain] = {
     "rover, not matched again": refined("checked"),
     "rover, again the whole range": remade(matched_again=everywhere),
     "rover, matched a third time": remade(matched_again=thrice),
+    "rover with half the range": half_range,
     "rover without planes": refined("checked_again", plane_weight=0, plane_fill=False, surface=0),
     "rover without surfaces": refined("checked_again", surface=0),
     "rover, planes draw more: 0.7": refined("checked_again", plane_weight=0.7),
