@@ -85,6 +85,10 @@ class _Builder:
         kinds: dict[str, type] = dict(source.streams)
         clocks = {name: name for name in kinds}
         for name, item in streams.items():
+            if not (name.isascii() and name.isidentifier()):
+                raise item.place.error(
+                    f"'{name}' is no name of a stream; letters, digits and underscores make one, no digit first"
+                )
             if name in kinds:
                 raise item.place.error(f"'{name}' is already a stream of the source; choose another name")
         wiring = {name: self._inputs(name, item, [*kinds, *streams]) for name, item in streams.items()}

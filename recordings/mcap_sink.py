@@ -7,7 +7,6 @@ differs between two equal runs goes in (no times of day, no durations): equal ru
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,7 +41,6 @@ _BESIDE: dict[type, tuple[str, Callable[[Any], Any]]] = {
     Disparity: ("source", source_image),
     NavigationMap: ("reason", reason_map),
 }
-_TOPIC = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/DiagnosticStatus
 _COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
 
@@ -85,10 +83,9 @@ class McapSink:
             raise LogError(
                 f"McapSink cannot write '{stream}', a {kind.__name__} (it writes {known}); leave it out of {setting}"
             )
-        if not _TOPIC.fullmatch(stream) or stream == "diagnostics":
+        if stream == "diagnostics":
             raise LogError(
-                f"McapSink cannot write '{stream}': /nav/{stream} is taken, or no topic of ROS 2; give it a name of "
-                "letters, digits and underscores, no digit first"
+                "McapSink cannot write 'diagnostics', for /nav/diagnostics is the ledger's; rename the stream"
             )
         return True
 

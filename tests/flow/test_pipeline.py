@@ -144,6 +144,8 @@ def test_a_key_of_a_setting_is_replaced_wherever_it_is_named_or_in_one_place_alo
         ("2.5}", f"{10**400}}}", 1, ["gain: int too large"]),
         ("2.5}", f"1{'0' * 5000}}}", 1, ["looks like a YAML int but is none; quote it"]),
         ("25 cm", "2001-99-99", 5, ["'2001-99-99' looks like a YAML timestamp but is none; quote it"]),
+        ("  twice:", "  my-twice:", 5, ["'my-twice' is no name of a stream"]),
+        ("  twice:", "  2nd:", 5, ["'2nd' is no name of a stream"]),
         ("  twice:", "  yes:", 5, ["'yes' is no name", "in quotes"]),
         ("{use: tests.flow.toys.Scale", "{<<: {a: 1}, use: tests.flow.toys.Scale", 5, ["'<<' is no name"]),
         ("  twice:", "  ? [1]\n  :", 5, ["a list or a mapping is no name"]),
