@@ -24,7 +24,7 @@ from stages.kernels.around import Windows, search_around
 from stages.kernels.blank import blank_windows, drop_blank
 from stages.kernels.compiled import kernel
 from stages.kernels.gradient import smoothed_costs
-from stages.kernels.halves import shared_by
+from stages.kernels.halves import AtOnce, shared_by
 from stages.kernels.pair import Pair, Rule, describe
 from stages.kernels.selection import find_partners, find_winners, fit_row
 from stages.kernels.speckles import drop_speckles
@@ -76,14 +76,12 @@ def match(
     both = shared_by(threads)
     with _workspaces.one() as space:
         if windows is None:
-            width = Width(lanes_for(rule.disparities))
-            pair = describe(left, right, rule, width, prior, both)
-            upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
-            both(upper.arrive, lower.arrive)
-            both(lambda: upper.cross(lower), lambda: lower.cross(upper))
+            _search_all(left, right, rule, prior, memory, pixels, evidence, space, both)
         else:
-            pair = describe(left, right, rule._replace(minimum=0), windows.width, prior, both)
-            search_around(pair, rule, windows, pixels, evidence, space, both)
+            seen = rule._replace(minimum=0)
+            search_around(
+                describe(left, right, seen, windows.width, prior, both), rule, windows, pixels, evidence, space, both
+            )  # fmt: skip
         blank, partner = both(lambda: blank_windows(left), lambda: blank_windows(right))
         if excluded is not None:
             blank[:, : left.shape[1]] |= excluded
@@ -93,6 +91,18 @@ def match(
         confidence, source = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
         both(*(functools.partial(_grade, evidence[at], rule.calibration, confidence[at], source[at]) for at in parts))
     return Matches(pixels, source, confidence)
+
+
+def _search_all(
+    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, memory: int, pixels: Array,
+    evidence: Array, space: Workspace, both: AtOnce,
+) -> None:  # fmt: skip
+    """Fill in disparities and evidence; what that takes but the workspace is given back."""
+    width = Width(lanes_for(rule.disparities))
+    pair = describe(left, right, rule, width, prior, both)
+    upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
+    both(upper.arrive, lower.arrive)
+    both(lambda: upper.cross(lower), lambda: lower.cross(upper))
 
 
 @kernel
