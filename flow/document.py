@@ -98,6 +98,8 @@ def settled(tree: Value, overrides: Iterable[str]) -> Value:
             raise value.place.error(f"the pipeline has no setting '{name}'{nearest(name, settings)}")
     tree = _filled_in(tree, settings)
     for name, given in _settings(tree).items():
+        if any(isinstance(text, str) and text.startswith("$") for text in _texts(settings[name])):
+            raise settings[name].place.error(f"the setting '{name}' names another; give it a value of its own")
         if f"${name}" not in named:
             raise given.place.error(f"the setting '{name}' is used nowhere; write ${name} where it belongs")
     for name, inner, value in of_entries:

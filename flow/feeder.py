@@ -2,7 +2,7 @@
 
 It runs the aligners, keeps the ledger of what finds no place, and hands a frame on once every stream that no stage
 makes has its value for that stamp, so that frames start whole and in stamp order. A stamp that jumps ahead is judged by
-the one that follows it, so the log is read a message ahead where there is one.
+the next one of its stream, so there the log is read ahead.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ Event = tuple[int, str, Any]
 DOUBT = 1_000_000_000
 # ns; by so much more it is damaged, unless the next of its stream within as long is as far ahead
 JUMP = 10_000_000_000
+# messages that are read ahead, and kept, at most
+AHEAD = 128
 SET_BACK = "; if a clock was set back, run what follows by itself (--start, a second later)"
 
 
@@ -107,6 +109,9 @@ def _judged(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:
         if message.stream in clocks and not isinstance(message.item, Exception):
             clocks[message.stream].judge(message)
         waiting.append(message)
+        if len(waiting) == AHEAD:
+            for clock in clocks.values():
+                clock.tick(math.inf)
         while waiting and not waiting[0].doubted:
             yield waiting.popleft()
     for clock in clocks.values():

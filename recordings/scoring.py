@@ -34,6 +34,7 @@ TRUTHS = (
     "/truth/tilt", "/truth/pose",
 )  # fmt: skip
 PATIENCE = 5_000_000_000  # ns of log time after which no log adds to a frame any more
+FIRST = 9  # stamps that tell how far the clock of the logging is from theirs
 
 
 @dataclass(frozen=True)
@@ -105,16 +106,16 @@ def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dic
 
 def _on_their_clock(messages: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
     """The messages with the times of their logging on the clock of their stamps: what is recorded of a simulator is
-    often logged by another one. The first stamp tells how far apart the two are."""
-    stampless = list[tuple[str, int, Any]]()
+    often logged by another one. The middle one of the first stamps tells how far apart the two are."""
+    read, ahead = list[tuple[str, int, Any]](), list[int]()
     for message in messages:
-        if not hasattr(message[2], "header"):
-            stampless.append(message)
-            continue
-        ahead = message[1] - ros2.stamp_of(message[2].header)
-        yield from ((topic, time - ahead, found) for topic, time, found in chain(stampless, [message], messages))
-        return
-    yield from stampless
+        read.append(message)
+        if hasattr(message[2], "header"):
+            ahead.append(message[1] - ros2.stamp_of(message[2].header))
+        if len(ahead) == FIRST:
+            break
+    apart = sorted(ahead)[len(ahead) // 2] if ahead else 0
+    yield from ((topic, time - apart, found) for topic, time, found in chain(read, messages))
 
 
 class _Tally:

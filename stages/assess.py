@@ -53,8 +53,8 @@ class Assess(Stage):
     - ground, m: height of the ground under a cell, its own obstacle not counted, and under small holes too;
     - step, m: how far the cell reaches from the ground, the largest of: its top above the lowest cell within a wheel's
       reach, what the slope of the surroundings explains taken off; its top above `ground`; its bottom below `ground`;
-      its top above its bottom. Of a cell's top and bottom that slope's own rise within the cell is taken off, too. One
-      stray point makes no step: an extreme counts up to four times as far as the mean.
+      its top above its bottom, that slope's rise within the cell taken off. One stray point makes no step: an extreme
+      counts up to four times as far as the mean.
       An obstacle is as high as its highest cell: cells off the ground by `skirt` that join share the largest step;
     - slope, rad: of the ground under the footprint;
     - steepness, rad: of all that is no obstacle, under a wheel;
@@ -160,12 +160,11 @@ class Assess(Stage):
         """The layers `step` and `support`."""
         lowest, support = lowest_around(height, observed, ground.trend, _reach(self.wheel, elevation.resolution))
         top, bottom = (_finite(elevation.layers.get(extreme), height) for extreme in ("maximum", "minimum"))
-        inclined = np.abs(ground.trend).sum(axis=0) / 2  # how far the slope reaches above and below a cell's middle
-        top, bottom = np.maximum(top - inclined, height), np.minimum(bottom + inclined, height)
         rise = np.minimum(top - lowest, 4 * (height - lowest))
         above = np.minimum(top - ground.height, 4 * (height - ground.height))
         below = np.minimum(ground.height - bottom, 4 * (ground.height - height))
-        within = np.minimum(top - bottom, 4 * np.minimum(height - bottom, top - height))
+        explained = np.abs(ground.trend).sum(axis=0)  # from one corner of a cell to the opposite one
+        within = np.minimum(top - bottom - explained, 4 * np.minimum(height - bottom, top - height))
         step = np.fmax.reduce([rise, above, below, within, np.zeros_like(height)])
         raised = observed & ((np.abs(height - ground.height) >= self.skirt) | (step >= self.obstacle))
         return np.where(observed, _as_whole_obstacles(step, raised), np.nan), support

@@ -61,7 +61,8 @@ class Match(Stage):
     within the range.
 
     With `around` only what is near to the prior is searched: in a fraction of the time, beyond the range, too, and not
-    at all where the prior is unknown. That takes 48 bytes a pixel, or 96 if `around` is above 4.
+    at all where the prior is unknown or beyond `farthest`. That takes 3 bytes for each of `2 around + 7` disparities,
+    rounded up to 16, of every pixel, whatever `memory` is.
 
     The confidence is the probability that the disparity is right within 1 px, as far as the lead of the best sum of
     paths over the others tells, with the penalties that suit the cost and 8 paths.
@@ -114,16 +115,17 @@ class Match(Stage):
         layers = found.pixels, found.source, found.confidence
         if prior is not None and self.nearer == "prior" and not self.around:
             # The search loses what lies within a pixel or two of its end, too.
-            taken = np.isnan(found.pixels) & (prior.pixels > search.stop - BEYOND) & (prior.source == Source.MEASURED)
+            taken = np.isnan(found.pixels) & (prior.source == Source.MEASURED) & np.isfinite(prior.pixels)
+            taken &= prior.pixels > search.stop - BEYOND
             for layer, known in zip(layers, (prior.pixels, prior.source, prior.confidence), strict=True):
                 np.copyto(layer, known, where=taken)
         return Disparity(frame.stamp, *layers, camera=frame.camera)
 
     def _excluded(self, prior: Disparity, search: range) -> Array:
-        """Where a measurement of the prior shows that the match is not in the range, (H, W) bool."""
+        """Where the prior shows that the match is not in the range, or with `around` none to look for, (H, W) bool."""
         if self.around:
-            unguided: Array = np.isnan(prior.pixels)
-            return unguided
+            guided: Array = (prior.pixels >= search.start - BEYOND) & (prior.pixels < prior.pixels.shape[1])
+            return ~guided
         excluded: Array = prior.pixels > search.stop + BEYOND
         if search.start > self.minimum:
             excluded |= prior.pixels < search.start - BEYOND
@@ -154,12 +156,14 @@ class Match(Stage):
         search = range(self.minimum, self.minimum + self.disparities)
         if not self.farthest:
             return search
-        limit = math.floor(camera.fx * camera.baseline / self.farthest - (camera.cx_right - camera.cx))
-        if limit >= search.stop and not self.around:
+        largest = camera.width if self.around else search.stop - 1
+        reach = camera.fx * camera.baseline / self.farthest - (camera.cx_right - camera.cx)
+        if reach >= largest + 1:
             raise ValueError(
                 f"Match.farthest = {self.farthest} m leaves nothing to search: a depth of {self.farthest} m is a "
-                f"disparity of {limit} px, and {search.stop - 1} px is the largest searched"
+                f"disparity of {reach:.0f} px, and {largest} px is the largest searched"
             )
+        limit = math.floor(reach)
         return range(max(search.start, limit), max(search.stop, limit + 1))
 
     def _rule(self, search: range) -> Rule:

@@ -47,7 +47,7 @@ class Refine(Stage):
 
     Only MEASURED pixels are matches; all others count as holes. What moves by at most `inlier_distance` stays MEASURED.
     A match that moves farther has been replaced by what lies about it: it becomes PLANE, as a hole that a plane fills.
-    `segmented`, what an earlier refinement made of the frame, saves making its superpixels again.
+    With `superpixels` 0 those of `segmented` serve again, which an earlier refinement made of the frame.
     With `fill` background the other holes are filled from what lies about them and looks like them, from the farther
     surface where there are two; with wls by the confidence-weighted smoother. The confidence is the share of pixels of
     that origin that were right within 1 px.
@@ -62,7 +62,7 @@ class Refine(Stage):
     near: float = parameter(
         1.0, "distance up to which a match moves to its median or plane; a farther one stays", unit="px", low=0
     )
-    superpixels: int = parameter(4000, "number of superpixels aimed at", low=1)
+    superpixels: int = parameter(4000, "number of superpixels aimed at; 0: those of `segmented`", low=0)
     smallest: int = parameter(
         300, "pixels that a superpixel shall have on average; a small image gets fewer", unit="px", low=1
     )
@@ -93,11 +93,11 @@ class Refine(Stage):
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
     def __call__(self, frame: StereoFrame, disparity: Disparity, segmented: Disparity | None = None) -> Disparity:
-        for given in (disparity, segmented):
-            if given is not None and given.pixels.shape != frame.left.shape[:2]:
-                raise ValueError(f"Refine: disparity is {given.pixels.shape}, the image is {frame.left.shape[:2]}")
-            if given is not None:
-                check_same_time(self, frame=frame.stamp, disparity=given.stamp)
+        given = {"disparity": disparity} | ({} if segmented is None else {"segmented": segmented})
+        for name, found in given.items():
+            if found.pixels.shape != frame.left.shape[:2]:
+                raise ValueError(f"Refine: {name} is {found.pixels.shape}, the image is {frame.left.shape[:2]}")
+            check_same_time(self, frame=frame.stamp, **{name: found.stamp})
         image = eight_bit(frame.left)[0]
         guide = gray(image)
         matches, weights = trusted_matches(
@@ -120,10 +120,13 @@ class Refine(Stage):
 
     def _segments(self, image: Array, segmented: Disparity | None) -> tuple[Array, int]:
         """Labels of the superpixels, (H, W) int32, and their number."""
-        if segmented is None:
+        if self.superpixels:
             return superpixels(image, self._count(image.shape[0] * image.shape[1]), COMPACTNESS, threads=self.threads)
-        if segmented.segments is None:
-            raise ValueError("Refine: `segmented` has no superpixels; give it what stages.Refine made of the frame")
+        if segmented is None or segmented.segments is None:
+            raise ValueError(
+                "Refine.superpixels = 0 needs those of `segmented`: name what stages.Refine made of the frame, or say "
+                "how many to make"
+            )
         return segmented.segments, int(segmented.segments.max()) + 1
 
     def _with_planes(

@@ -78,7 +78,7 @@ def aggregate_row(  # type: ignore[no-untyped-def]
 ):
     """Follow the paths of one sweep from the row before into row y, and add them up.
 
-    pair, rule: `semiglobal.Pair` and `Rule`; costs: (W * n,) uint8, C of the row without the prior's costs, with
+    pair, rule: `pair.Pair` and `Rule`; costs: (W * n,) uint8, C of the row without the prior's costs, with
     `rule.gradient`; else C is the census cost, made here, which saves writing and reading it; paths: (3 * W * n,)
     uint8, L of the row before, all 0 at first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where
     the sums of the row go, from `place` on (W * n); final: instead, add what the other sweep left there, and put the

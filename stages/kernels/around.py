@@ -70,7 +70,8 @@ def _begin(prior, lanes, least, first):  # type: ignore[no-untyped-def]
         begin = least
         for x in range(columns):
             if np.isfinite(prior[y, x]):
-                begin = STEP * np.int64(np.rint((prior[y, x] - middle) / STEP))
+                near = min(max(prior[y, x], np.float32(-columns)), np.float32(2 * columns))
+                begin = STEP * np.int64(np.rint((near - middle) / STEP))
             # The first partner is inside the image.
             first[y, x] = min(max(begin, least, x - columns + 1), x)
 

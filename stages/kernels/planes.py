@@ -50,6 +50,7 @@ def fit_planes(
     pixel is an outlier; weights: (H, W) float32 > 0, what each pixel counts in the least squares, None = the same;
     threads: 2 share the work, to the same result. The same seed gives the same planes.
     """
+    assert weights is None or weights.shape == labels.shape, "a weight for each pixel"
     planes = Planes(np.empty((count, 3)), np.empty(count, np.float32), np.empty(count, np.float32))
     weights = np.ones((1, 1), np.float32) if weights is None else weights
     both = shared_by(threads)

@@ -85,7 +85,7 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):  # typ
     """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
 
     winner, votes, partners: of `find_winners` and `find_partners`; first: (W,) int32, disparity of the first lane;
-    top: the last lane that is a disparity; rule: `semiglobal.Rule`; into pixels (W,) float32, px, NaN = unknown, and
+    top: the last lane that is a disparity; rule: `pair.Rule`; into pixels (W,) float32, px, NaN = unknown, and
     evidence (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown.
 
     A winner at an end of the search range, or with a neighbour outside the right image, is none: its parabola would

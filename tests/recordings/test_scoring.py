@@ -285,6 +285,15 @@ def test_a_truth_that_was_logged_by_another_clock_than_its_stamps_scores_the_sam
     assert scored(tmp_path, other, frames).to_json() == scored(tmp_path, truth, frames).to_json()
 
 
+def test_one_stamp_that_is_far_ahead_does_not_part_the_logs(tmp_path, truth, frames):
+    def ahead(topic, log_time):
+        first = topic == "/truth/pose" and log_time == SMALL.stamp(0)
+        return log_time - 3_600_000_000_000 if first else log_time  # as if its stamp were an hour ahead of its logging
+
+    other = rewritten(truth, tmp_path / "other.mcap", time=ahead)
+    assert scored(tmp_path, other, frames).disparity == scored(tmp_path, truth, frames).disparity
+
+
 def without(truth: Path, path: Path, *topics: str) -> Path:
     """The truth with topics of which it has the channels, but no messages, as recorders leave them."""
     with truth.open("rb") as source, path.open("wb") as target:

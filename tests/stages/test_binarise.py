@@ -97,7 +97,7 @@ def test_the_slope_within_a_cell_is_no_step(resolution: float, heading: float) -
     assert (decided(plane).cells[3:-3, 3:-3] == Cell.FREE).all()
     blocked = z.copy()
     blocked[10, 10] += 0.25
-    rock = replace(map_of(blocked, minimum=z - half, maximum=blocked + half), resolution=resolution)
+    rock = replace(map_of(blocked, minimum=z - half, maximum=np.maximum(z + half, blocked)), resolution=resolution)
     assert decided(rock).reason[10, 10] == Reason.STEP
 
 

@@ -186,6 +186,7 @@ def test_around_a_prior_nothing_is_found_beyond_the_farthest_of_interest(slope, 
     frame, truth = slope
     pixels = Match(around=4, farthest=1.5)(frame, known).pixels  # 20 px
     assert np.nanmin(pixels) >= 20
+    assert np.isnan(pixels[truth < 15]).all()
     assert np.isfinite(pixels)[(truth > 24) & np.isfinite(known.pixels)].mean() > 0.95
 
 
