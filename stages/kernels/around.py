@@ -40,6 +40,7 @@ from stages.kernels.workspace import Workspace
 
 STEP = 4  # windows begin at multiples of it, so that those of neighbours mostly begin together
 EDGE = 1  # lanes at either end of a window that cannot win
+FARTHEST = np.float32(1e6)  # px; beyond any image, and still a whole number
 GAP = 16  # by how much the stretch between two slots is longer than the lanes
 
 
@@ -70,7 +71,7 @@ def _begin(prior, lanes, least, first):  # type: ignore[no-untyped-def]
         begin = least
         for x in range(columns):
             if np.isfinite(prior[y, x]):
-                near = min(max(prior[y, x], np.float32(-columns)), np.float32(2 * columns))
+                near = min(max(prior[y, x], -FARTHEST), FARTHEST)
                 begin = STEP * np.int64(np.rint((near - middle) / STEP))
             # The first partner is inside the image.
             first[y, x] = min(max(begin, least, x - columns + 1), x)
