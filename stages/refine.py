@@ -47,7 +47,7 @@ class Refine(Stage):
 
     Only MEASURED pixels are matches; all others count as holes. What moves by at most `inlier_distance` stays MEASURED.
     A match that moves farther has been replaced by what lies about it: it becomes PLANE, as a hole that a plane fills.
-    With `superpixels` 0 those of `segmented` serve again, which an earlier refinement made of the frame.
+    Without planes, `plane_weight` 0 and no `plane_fill`, no superpixels are made.
     With `fill` background the other holes are filled from what lies about them and looks like them, from the farther
     surface where there are two; with wls by the confidence-weighted smoother. The confidence is the share of pixels of
     that origin that were right within 1 px.
@@ -62,7 +62,7 @@ class Refine(Stage):
     near: float = parameter(
         1.0, "distance up to which a match moves to its median or plane; a farther one stays", unit="px", low=0
     )
-    superpixels: int = parameter(4000, "number of superpixels aimed at; 0: those of `segmented`", low=0)
+    superpixels: int = parameter(4000, "number of superpixels aimed at", low=1)
     smallest: int = parameter(
         300, "pixels that a superpixel shall have on average; a small image gets fewer", unit="px", low=1
     )
@@ -92,12 +92,10 @@ class Refine(Stage):
     )  # fmt: skip
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
-    def __call__(self, frame: StereoFrame, disparity: Disparity, segmented: Disparity | None = None) -> Disparity:
-        given = {"disparity": disparity} | ({} if segmented is None else {"segmented": segmented})
-        for name, found in given.items():
-            if found.pixels.shape != frame.left.shape[:2]:
-                raise ValueError(f"Refine: {name} is {found.pixels.shape}, the image is {frame.left.shape[:2]}")
-            check_same_time(self, frame=frame.stamp, **{name: found.stamp})
+    def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
+        if disparity.pixels.shape != frame.left.shape[:2]:
+            raise ValueError(f"Refine: disparity is {disparity.pixels.shape}, the image is {frame.left.shape[:2]}")
+        check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         image = eight_bit(frame.left)[0]
         guide = gray(image)
         matches, weights = trusted_matches(
@@ -105,9 +103,10 @@ class Refine(Stage):
             _burnt_out(frame.left, guide, self.burnt_out), self.threads,
         )  # fmt: skip
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
-        labels, count = self._segments(image, segmented)
-        within = extent(pixels)
-        pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
+        within, labels, agreed = extent(pixels), None, np.zeros(pixels.shape, bool)
+        if self.plane_weight or self.plane_fill:
+            labels, count = superpixels(image, self._count(pixels.size), COMPACTNESS, threads=self.threads)
+            pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
         filled, kinds = self._filled(pixels, weights, within, image, guide)
         refined = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
         source, confidence = name_sources(
@@ -117,17 +116,6 @@ class Refine(Stage):
 
     def _count(self, pixels: int) -> int:
         return max(1, min(self.superpixels, pixels // self.smallest))
-
-    def _segments(self, image: Array, segmented: Disparity | None) -> tuple[Array, int]:
-        """Labels of the superpixels, (H, W) int32, and their number."""
-        if self.superpixels:
-            return superpixels(image, self._count(image.shape[0] * image.shape[1]), COMPACTNESS, threads=self.threads)
-        if segmented is None or segmented.segments is None:
-            raise ValueError(
-                "Refine.superpixels = 0 needs those of `segmented`: name what stages.Refine made of the frame, or say "
-                "how many to make"
-            )
-        return segmented.segments, int(segmented.segments.max()) + 1
 
     def _with_planes(
         self, pixels: Array, weights: Array, within: Extent, image: Array, labels: Array, count: int, seed: int

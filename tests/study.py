@@ -73,8 +73,8 @@ def real(folder: Path) -> Iterator[Case]:
 
 def refined(stream: str, **parameters: Any) -> Chain:
     """What the last refinement of `rover`, with these parameters, makes of one of its streams."""
-    refine = replace(stage("rover", "disparity"), **parameters)
-    return lambda streams, case: refine(case.frame, streams[stream], streams["outlined"])
+    refine: Refine = replace(stage("rover", "disparity"), **parameters)
+    return lambda streams, case: refine(case.frame, streams[stream])
 
 
 def remade(**streams: Callable[[dict[str, Any], Case], Disparity]) -> Chain:

@@ -6,10 +6,12 @@ inner loop, which runs over whole rows with the tap's offset fixed.
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.compiled import fast_kernel
+from stages.kernels.compiled import fast_kernel, kernel
 from stages.kernels.halves import shared_by
 
 F32 = np.float32
@@ -24,23 +26,37 @@ def joint_bilateral(
     spatial Gaussian, px; gray: scale of the difference in the guide, levels; range_scale: scale of the difference in
     disparity, px; threads: 2 share the work. Returns (H, W) float32.
     """
-    known = np.isfinite(disparity)
-    filtered = np.empty(disparity.shape, np.float32)
-    values = np.where(known, disparity, F32(0))
-    given = values, known.astype(np.float32), guide.astype(np.float32), radius, _spatial(radius, space)
-    scales = F32(1 / gray), F32(1 / range_scale)
-    height = disparity.shape[0]
-    shared_by(threads)(
-        lambda: _filter(*given, *scales, 0, height // 2, filtered),
-        lambda: _filter(*given, *scales, height // 2, height, filtered),
-    )
-    filtered[~known] = np.nan
+    height, filtered = disparity.shape[0], np.empty(disparity.shape, np.float32)
+    values, known, levels = np.empty((3, *disparity.shape), np.float32)
+    given = values, known, levels, radius, _spatial(radius, space), F32(1 / gray), F32(1 / range_scale)
+    parts, both = ((0, height // 2), (height // 2, height)), shared_by(threads)
+    both(*(functools.partial(_prepare, disparity, guide, values, known, levels, *part) for part in parts))
+    both(*(functools.partial(_filter, *given, *part, filtered) for part in parts))
+    both(*(functools.partial(_forget, disparity, *part, filtered) for part in parts))
     return filtered
 
 
 def _spatial(radius: int, space: float) -> Array:
     offsets = np.arange(-radius, radius + 1) / space
     return np.exp(-(offsets[:, None] ** 2 + offsets**2) / 2).astype(np.float32)
+
+
+@kernel
+def _prepare(disparity, guide, values, known, levels, first, end):  # type: ignore[no-untyped-def]
+    """values: the disparities, 0 where unknown; known: 1 or 0; levels: the guide."""
+    for y in range(first, end):
+        for x in range(disparity.shape[1]):
+            finite = np.isfinite(disparity[y, x])
+            values[y, x] = disparity[y, x] if finite else F32(0)
+            known[y, x] = F32(1) if finite else F32(0)
+            levels[y, x] = guide[y, x]
+
+
+@kernel
+def _forget(disparity, first, end, filtered):  # type: ignore[no-untyped-def]
+    for y in range(first, end):
+        for x in range(disparity.shape[1]):
+            filtered[y, x] = filtered[y, x] if np.isfinite(disparity[y, x]) else F32(np.nan)
 
 
 @fast_kernel

@@ -356,20 +356,11 @@ def test_two_threads_give_the_same_bits(box, parameters):
     assert bits(one) == bits(two)
 
 
-def test_superpixels_of_an_earlier_refinement_serve_again(box):
+def test_without_planes_no_superpixels_are_made(box):
     frame, matches, _ = box
-    outlined = Refine(superpixels=200, smallest=1, surface=0, bilateral_radius=0)(frame, matches)
-    own, again = Refine(superpixels=200, smallest=1)(frame, matches), Refine(superpixels=0)(frame, matches, outlined)
-    for name in ("pixels", "source", "confidence", "segments"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(own, name))
-    few = Refine(superpixels=20, smallest=1)(frame, matches, outlined)  # a number counts, whatever is given
-    assert few.segments.max() < 60 < outlined.segments.max()
-    for given in (None, matches):
-        with pytest.raises(ValueError, match=r"superpixels = 0 needs those of `segmented`"):
-            Refine(superpixels=0)(frame, matches, given)
-    half = Disparity(5, outlined.pixels[:60], outlined.source[:60], outlined.confidence[:60], outlined.segments[:60])
-    with pytest.raises(ValueError, match=r"segmented is \(60, 160\), the image is \(120, 160\)"):
-        Refine(superpixels=0)(frame, matches, half)
+    assert Refine(plane_weight=0, plane_fill=False)(frame, matches).segments is None
+    for parameters in ({"plane_weight": 0.0}, {"plane_fill": False}):
+        assert Refine(superpixels=200, smallest=1, **parameters)(frame, matches).segments.max() > 100
 
 
 def test_what_an_object_hides_is_never_given_the_object(box):
