@@ -11,11 +11,9 @@ from pathlib import Path
 
 from flow.errors import UsageError
 
-_OF_OTHERS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pfm", ".txt", ".py", ".yaml", ".yml", ".bag", ".db3"}
 _MCAP = b"\x89MCAP0\r\n"
 _OWN = _MCAP + struct.pack("<BQI4sI9s", 1, 21, 4, b"ros2", 9, b"roverflow")  # header: its length, profile and library
-
-
+_OTHERS = b"RRF", b"{"  # how recordings of rerun begin, and JSON
 _MOST_WORKERS = 1024
 _LATEST = 9e9  # s, beyond what stamps in nanoseconds can hold
 
@@ -91,12 +89,12 @@ def check_outputs(log: Path | None, others: Sequence[Path | None], inputs: Seque
         for given in inputs:
             if path.exists() and given.exists() and path.samefile(given):
                 raise UsageError(f"{path} is what is being read; choose another name for the output")
-        if path.exists() and path.stat().st_size and _is_of_others(path):
-            raise UsageError(f"{path} is there already and no output of roverflow; choose another name or remove it")
         if (resolved := os.path.realpath(path)) in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
         if path is not log and (path.suffix.lower() == ".mcap" or _start_of(path).startswith(_MCAP)):
             raise UsageError(f"{path} has the name of a log or is one; choose another for what is none")
+        if _is_of_others(path, path is log):
+            raise UsageError(f"{path} is there already and no output of roverflow; choose another name or remove it")
         taken.append(resolved)
 
 
@@ -108,14 +106,14 @@ def check_demo(folder: Path) -> None:
         return
     log = folder / "traverse.mcap"
     finished = (folder / "summary.json").is_file() or not (folder / "maps").exists()
-    if not log.is_file() or _is_of_others(log) or not finished:
+    if not log.is_file() or _is_of_others(log, True) or not finished:
         raise UsageError(f"{folder} is not empty, and not of an earlier demo; choose another folder with --out")
 
 
-def _is_of_others(path: Path) -> bool:
-    """Whether a file is, by its name or its first bytes, nothing that roverflow wrote."""
-    start, suffix = _start_of(path), path.suffix.lower()
-    return suffix in _OF_OTHERS or ((suffix == ".mcap" or start.startswith(_MCAP)) and start != _OWN)
+def _is_of_others(path: Path, log: bool) -> bool:
+    """Whether there is a file that, by its first bytes, is nothing that roverflow wrote there: a log, or else."""
+    start = _start_of(path)
+    return bool(start) and (start != _OWN if log else not start.startswith(_OTHERS))
 
 
 def _start_of(path: Path) -> bytes:

@@ -112,8 +112,8 @@ class _Builder:
         for port, stream in inputs.items():
             if not accepts(wanted[port], kinds[stream]):
                 raise item.value[port].place.error(
-                    f"{self._use(item, name)} takes a {_shown(wanted[port])} as '{port}', "
-                    f"but '{stream}' is a {kinds[stream].__name__}"
+                    f"{self._use(item, name)} takes {_shown(wanted[port])} as '{port}', "
+                    f"but '{stream}' is {kinds[stream].__name__}"
                 )
         optional = item.value.get("optional", Value(False, item.place))
         if not isinstance(optional.value, bool):

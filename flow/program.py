@@ -14,14 +14,14 @@ def program() -> int:
 
         code = main()
         _leave_workers_behind(code)
-        return code
     except KeyboardInterrupt:
         print("roverflow: interrupted", file=sys.stderr)
-        return 130
-    finally:
-        import signal
+        code = 130
+    import os
+    import signal
 
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, lambda *_: os._exit(code))
+    return code
 
 
 def _open_what_is_closed() -> None:

@@ -61,8 +61,8 @@ class Match(Stage):
     within the range.
 
     With `around` only what is near to the prior is searched: in a fraction of the time, beyond the range, too, and not
-    at all where the prior is unknown or beyond `farthest`. That takes 3 bytes for each of `2 around + 7` disparities,
-    rounded up to 16, of every pixel, whatever `memory` is.
+    at all where the prior is unknown or beyond `farthest`. Of each pixel `2 around + 7` disparities, rounded up to 16,
+    are searched, which take 3 bytes each, whatever `memory` is.
 
     The confidence is the probability that the disparity is right within 1 px, as far as the lead of the best sum of
     paths over the others tells, with the penalties that suit the cost and 8 paths.
@@ -85,7 +85,7 @@ class Match(Stage):
     prior_weight: float = parameter(0.5, "cost of each pixel of distance from the prior", low=0, high=16)
     prior_reach: float = parameter(4.0, "distance from which the prior's cost grows no more", unit="px", low=0, high=64)
     around: int = parameter(
-        0, "distance from the prior within which, and only there, is searched; 0: the whole range",
+        0, "how far about the prior, at least, and nowhere else is searched; 0: the whole range",
         unit="px", low=0, high=64,
     )  # fmt: skip
     nearer: str = parameter(
@@ -141,7 +141,9 @@ class Match(Stage):
         if not -width < self.minimum < width:
             raise ValueError(f"Match.minimum = {self.minimum} px leaves nothing to compare in images {width} px wide")
         if prior is None and self.around:
-            raise ValueError(f"Match.around = {self.around} px of what? Name a `prior`, or let around be 0")
+            raise ValueError(
+                f"Match.around = {self.around} px needs a `prior` to search about; name one, or let it be 0"
+            )
         if prior is not None and prior.pixels.shape != (height, width):
             raise ValueError(
                 f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; resize it before"

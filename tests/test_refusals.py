@@ -84,11 +84,26 @@ def test_a_log_that_others_recorded_is_never_replaced(traverse, tmp_path, capsys
             ("simulate", log, "--frames", 1), ("import", "middlebury", scene, log),
         ):  # fmt: skip
             assert roverflow(*command) == 2
-            said = capsys.readouterr().err
-            assert said == f"roverflow: {log} {TAKEN}\n"
+            what = (
+                "has the name of a log or is one; choose another for what is none" if "--summary" in command else TAKEN
+            )
+            assert capsys.readouterr().err == f"roverflow: {log} {what}\n"
     assert {path: path.read_bytes() for path in before} == before
     raw.write_bytes(traverse.read_bytes())  # one of our own
     assert roverflow("import", "middlebury", scene, raw) == 0
+
+
+@pytest.mark.parametrize("name", ["notes.md", "table.json", "bare"])
+def test_no_output_takes_the_place_of_what_is_of_another_kind(traverse, tmp_path, capsys, name):
+    mine = tmp_path / name
+    mine.write_text("{}" if name.endswith("json") else "mine")
+    commands = [["simulate", mine, "--frames", "1", "--size", "64x48"], ["run", traverse, "-o", mine, *SMALL]]
+    if name != "table.json":  # a summary may take an earlier one's place
+        commands += [["run", traverse, "-o", tmp_path / "o.mcap", option, mine] for option in ("--rrd", "--summary")]
+    for command in commands:
+        assert roverflow(*command) == 2
+        assert capsys.readouterr().err == f"roverflow: {mine} {TAKEN}\n"
+    assert len(mine.read_text()) in (2, 4)
 
 
 def test_the_demo_takes_no_folder_that_holds_anything_else(traverse, tmp_path, capsys):

@@ -277,7 +277,7 @@ def test_frames_that_cannot_be_matched_are_refused(slope):
     with pytest.raises(ValueError, match=r"farthest = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"):
         Match(disparities=48, farthest=0.5)(frame)
     small = Disparity(0, truth[:50], np.ones((50, 320), np.uint8), np.ones((50, 320), np.float32))
-    with pytest.raises(ValueError, match=r"around = 4 px of what\? Name a `prior`"):
+    with pytest.raises(ValueError, match=r"around = 4 px needs a `prior`"):
         Match(around=4)(frame)
     with pytest.raises(ValueError, match=r"prior has shape \(50, 320\)"):
         Match()(frame, small)
