@@ -118,6 +118,10 @@ class _Builder:
         optional = item.value.get("optional", Value(False, item.place))
         if not isinstance(optional.value, bool):
             raise optional.place.error(f"'optional' must be true or false, not {optional.plain()}")
+        try:
+            getattr(actor, "check_inputs", lambda inputs: None)(set(inputs))
+        except ValueError as error:
+            raise item.place.error(str(error)) from error
         output = output_of(actor, {port: kinds[stream] for port, stream in inputs.items()}, item.place)
         clock = clock_of(name, actor, {port: clocks[stream] for port, stream in inputs.items()}, item.place)
         return Node(name, self._use(item, name), actor, inputs, output, clock, optional.value, item.place)

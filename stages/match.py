@@ -8,6 +8,7 @@ paths decide the disparity, its fraction of a pixel, and whether left and right 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -104,6 +105,13 @@ class Match(Stage):
         if largest + p2 > LARGEST_BYTE:
             raise ValueError(f"Match.p2 must be at most {LARGEST_BYTE - largest} with cost {self.cost}, not {p2}")
 
+    def check_inputs(self, inputs: Collection[str]) -> None:
+        """Refuse to search about a prior where none is among the `inputs`, names of ports."""
+        if self.around and "prior" not in inputs:
+            raise ValueError(
+                f"Match.around = {self.around} px needs a `prior` to search about; name one, or let it be 0"
+            )
+
     def __call__(self, frame: StereoFrame, prior: Disparity | None = None) -> Disparity:
         self._check(frame, prior)
         search = self._search(frame.camera)
@@ -140,10 +148,9 @@ class Match(Stage):
             raise ValueError(f"Match: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
         if not -width < self.minimum < width:
             raise ValueError(f"Match.minimum = {self.minimum} px leaves nothing to compare in images {width} px wide")
-        if prior is None and self.around:
-            raise ValueError(
-                f"Match.around = {self.around} px needs a `prior` to search about; name one, or let it be 0"
-            )
+        self.check_inputs({"frame"} if prior is None else {"frame", "prior"})
+        if prior is not None and not isinstance(prior, Disparity):
+            raise ValueError(f"Match: the prior must be a stages.Disparity, not a {type(prior).__name__}")
         if prior is not None and prior.pixels.shape != (height, width):
             raise ValueError(
                 f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; resize it before"

@@ -279,6 +279,8 @@ def test_frames_that_cannot_be_matched_are_refused(slope):
     small = Disparity(0, truth[:50], np.ones((50, 320), np.uint8), np.ones((50, 320), np.float32))
     with pytest.raises(ValueError, match=r"around = 4 px needs a `prior`"):
         Match(around=4)(frame)
+    with pytest.raises(ValueError, match=r"prior must be a stages\.Disparity, not a ndarray"):
+        Match()(frame, truth)
     with pytest.raises(ValueError, match=r"prior has shape \(50, 320\)"):
         Match()(frame, small)
 
