@@ -123,4 +123,4 @@ def test_a_disparity_of_another_size_and_an_unrectified_frame_are_refused() -> N
     with pytest.raises(ValueError, match="put Rectify before"):
         Reproject()(blank_frame(raw), as_disparity(np.ones((12, 16)), SMALL))
     with pytest.raises(ValueError, match="sigma_worst must be at least"):
-        Reproject(sigma_best=39.0)
+        Reproject(sigma_best=43.0)
