@@ -6,13 +6,11 @@ inner loop, which runs over whole rows with the tap's offset fixed.
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel, kernel
-from stages.kernels.halves import shared_by
+from stages.kernels.halves import by_halves, shared_by
 
 F32 = np.float32
 
@@ -29,10 +27,10 @@ def joint_bilateral(
     height, filtered = disparity.shape[0], np.empty(disparity.shape, np.float32)
     values, known, levels = np.empty((3, *disparity.shape), np.float32)
     given = values, known, levels, radius, _spatial(radius, space), F32(1 / gray), F32(1 / range_scale)
-    parts, both = ((0, height // 2), (height // 2, height)), shared_by(threads)
-    both(*(functools.partial(_prepare, disparity, guide, values, known, levels, *part) for part in parts))
-    both(*(functools.partial(_filter, *given, *part, filtered) for part in parts))
-    both(*(functools.partial(_forget, disparity, *part, filtered) for part in parts))
+    both = shared_by(threads)
+    by_halves(both, height, lambda first, end: _prepare(disparity, guide, values, known, levels, first, end))
+    by_halves(both, height, lambda first, end: _filter(*given, first, end, filtered))
+    by_halves(both, height, lambda first, end: _forget(disparity, first, end, filtered))
     return filtered
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import shared_by
+from stages.kernels.halves import by_halves, shared_by
 
 F32 = np.float32
 UNKNOWN = int(Source.UNKNOWN)
@@ -21,13 +21,13 @@ def drop_contradicted(found: Layers, backward: Layers, tolerance: float, largest
     unknown or outside the image stays as it is.
     """
     left = tuple(np.empty(layer.shape, layer.dtype) for layer in found)
-    middle = len(found[0]) // 2
 
-    def drop(rows: slice) -> None:
+    def drop(first: int, end: int) -> None:
+        rows = slice(first, end)
         given, made = ([layer[rows] for layer in layers] for layers in (found, left))
         _drop(*given, backward[0][rows], backward[1][rows], F32(tolerance), F32(largest), *made)
 
-    shared_by(threads)(lambda: drop(slice(0, middle)), lambda: drop(slice(middle, None)))
+    by_halves(shared_by(threads), len(found[0]), drop)
     return left[0], left[1], left[2]
 
 

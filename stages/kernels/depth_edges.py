@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_part, kernel, part
-from stages.kernels.halves import shared_by
+from stages.kernels.halves import by_halves, shared_by
 
 F32 = np.float32
 FINE = 16  # parts of a pixel, to which a median is found
@@ -34,16 +34,13 @@ def sharpen_edges(
     none that is; guide: (H, W) uint8; radius: of the window, px; jump: difference, px; brightness: difference, gray
     levels, at which a weight falls to 1/e; threads: 2 share the work, to the same result. Returns (H, W) float32.
     """
-    sharp, middle = np.empty_like(disparity), disparity.shape[0] // 2
+    sharp = np.empty_like(disparity)
     border = radius, radius, radius, radius, cv2.BORDER_CONSTANT
     padded = cv2.copyMakeBorder(disparity, *border, value=np.nan)
     doubt = cv2.copyMakeBorder(guessed.view(np.uint8), *border, value=0)
     given = padded, doubt, cv2.copyMakeBorder(guide, *border, value=0), _taps(radius) @ [padded.shape[1], 1], radius
     rule = F32(jump), _weights(brightness)
-    shared_by(threads)(
-        lambda: _sharpen(*given, *rule, sharp, 0, middle),
-        lambda: _sharpen(*given, *rule, sharp, middle, disparity.shape[0]),
-    )
+    by_halves(shared_by(threads), len(disparity), lambda first, end: _sharpen(*given, *rule, sharp, first, end))
     return sharp
 
 

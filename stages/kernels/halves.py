@@ -48,3 +48,9 @@ def at_once(one: Callable[[], Any], other: Callable[[], Any]) -> tuple[Any, Any]
 def shared_by(threads: int) -> AtOnce:
     """What calls two functions and gives both results: at once if there are 2 threads or more, else in turn."""
     return in_turn if threads < 2 else at_once
+
+
+def by_halves(both: AtOnce, rows: int, work: Callable[[int, int], Any]) -> tuple[Any, Any]:
+    """Both results of `work(first, end)`, of the upper and of the lower half of so many rows."""
+    middle = rows // 2
+    return both(lambda: work(0, middle), lambda: work(middle, rows))

@@ -14,7 +14,7 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.compiled import kernel
 from stages.kernels.extent import Extent
-from stages.kernels.halves import shared_by
+from stages.kernels.halves import by_halves, shared_by
 
 F32 = np.float32
 APART = 2.0  # px of disparity that make two surfaces
@@ -48,24 +48,17 @@ def fill_holes(
     filled, kinds = disparity.copy(), np.zeros((height, width), np.uint8)
     colour = _packed(cv2.blur(image, (3, 3)))
     first = np.zeros(height + 1, np.int64)
-    middle = height // 2
     both = shared_by(threads)
-    both(lambda: _count(disparity, 0, middle, first), lambda: _count(disparity, middle, height, first))
+    by_halves(both, height, lambda top, end: _count(disparity, top, end, first))
     np.cumsum(first, out=first)
     holes, steps = np.empty(first[-1], np.int32), np.empty((8, first[-1]), np.int16)
-    both(
-        lambda: _list(disparity, 0, middle, first, holes),
-        lambda: _list(disparity, middle, height, first, holes),
-    )
+    by_halves(both, height, lambda top, end: _list(disparity, top, end, first, holes))
     both(
         lambda: _trace(disparity, first, holes, 1, steps[:4]),
         lambda: _trace(disparity, first, holes, -1, steps[4:]),
     )
     given = disparity, colour, within, F32(reach), int(margin), first, holes, steps
-    both(
-        lambda: _fill(*given, 0, middle, filled, kinds),
-        lambda: _fill(*given, middle, height, filled, kinds),
-    )
+    by_halves(both, height, lambda top, end: _fill(*given, top, end, filled, kinds))
     return filled, kinds
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
 from stages.kernels.extent import Extent
-from stages.kernels.halves import shared_by
+from stages.kernels.halves import by_halves, shared_by
 from stages.kernels.holes import APART
 
 F32 = np.float32
@@ -26,13 +26,12 @@ def trusted_matches(
     excluded: (H, W) bool, what is no match all the same.
     """
     matches, weights = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.float32)
-    middle = pixels.shape[0] // 2
     layers = pixels, source, confidence, excluded, matches, weights
 
-    def trust(rows: slice) -> None:
-        _trust(F32(least), *(layer[rows] for layer in layers))
+    def trust(first: int, end: int) -> None:
+        _trust(F32(least), *(layer[first:end] for layer in layers))
 
-    shared_by(threads)(lambda: trust(slice(0, middle)), lambda: trust(slice(middle, None)))
+    by_halves(shared_by(threads), len(pixels), trust)
     return matches, weights
 
 
@@ -41,21 +40,16 @@ def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Arr
 
     A match with fewer neighbours than holes about it has no median and stays. matches: (H, W) float32, NaN = unknown.
     """
-    height = matches.shape[0]
     low = np.fmax(matches, F32(-np.inf))  # -inf for NaN
     moved = np.empty(matches.shape, np.float32)
-    middle, margin = height // 2, side // 2
 
-    def upper() -> None:
-        median = cv2.medianBlur(low[: middle + margin], side)[:middle]
-        _move_near(matches[:middle], median, F32(near), moved[:middle])
+    def move(first: int, end: int) -> None:
+        if first < end:
+            start = max(first - side // 2, 0)
+            median = cv2.medianBlur(low[start : end + side // 2], side)[first - start : end - start]
+            _move_near(matches[first:end], median, F32(near), moved[first:end])
 
-    def lower() -> None:
-        start = max(middle - margin, 0)
-        median = cv2.medianBlur(low[start:], side)[middle - start :]
-        _move_near(matches[middle:], median, F32(near), moved[middle:])
-
-    shared_by(threads)(upper if middle else lambda: None, lower)
+    by_halves(shared_by(threads), len(matches), move)
     return moved
 
 
@@ -73,15 +67,11 @@ def pull_to_planes(
     where a plane had its say, (H, W) bool.
     """
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
-    middle = pixels.shape[0] // 2
     given = pixels, coefficients, labels, within, F32(near), F32(weight), int(margin)
     both = shared_by(threads)
-    ranges = both(lambda: _range(pixels[:middle]), lambda: _range(pixels[middle:]))
+    ranges = by_halves(both, len(pixels), lambda first, end: _range(pixels[first:end]))
     low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
-    both(
-        lambda: _pull(*given, low, high, 0, middle, pulled, spoke),
-        lambda: _pull(*given, low, high, middle, len(pixels), pulled, spoke),
-    )
+    by_halves(both, len(pixels), lambda first, end: _pull(*given, low, high, first, end, pulled, spoke))
     return pulled, spoke
 
 

@@ -24,7 +24,7 @@ from stages.kernels.around import Windows, search_around
 from stages.kernels.blank import blank_windows, drop_blank
 from stages.kernels.compiled import kernel
 from stages.kernels.gradient import smoothed_costs
-from stages.kernels.halves import AtOnce, shared_by
+from stages.kernels.halves import AtOnce, by_halves, shared_by
 from stages.kernels.pair import Pair, Rule, describe
 from stages.kernels.selection import find_partners, find_winners, fit_row
 from stages.kernels.speckles import drop_speckles
@@ -85,11 +85,18 @@ def match(
         blank, partner = both(lambda: blank_windows(left), lambda: blank_windows(right))
         if excluded is not None:
             blank[:, : left.shape[1]] |= excluded
-        parts = slice(left.shape[0] // 2), slice(left.shape[0] // 2, left.shape[0])
-        both(*(functools.partial(drop_blank, blank[at], partner[at], pixels[at], evidence[at]) for at in parts))
+
+        def drop(first: int, end: int) -> None:
+            drop_blank(*(layer[first:end] for layer in (blank, partner, pixels, evidence)))
+
+        by_halves(both, len(left), drop)
         drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, space, both)
         confidence, source = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
-        both(*(functools.partial(_grade, evidence[at], rule.calibration, confidence[at], source[at]) for at in parts))
+
+        def grade(first: int, end: int) -> None:
+            _grade(rule.calibration, *(layer[first:end] for layer in (evidence, confidence, source)))
+
+        by_halves(both, len(left), grade)
     return Matches(pixels, source, confidence)
 
 
@@ -106,7 +113,7 @@ def _search_all(
 
 
 @kernel
-def _grade(evidence, calibration, confidence, source):  # type: ignore[no-untyped-def]
+def _grade(calibration, evidence, confidence, source):  # type: ignore[no-untyped-def]
     for y in range(evidence.shape[0]):
         for x in range(evidence.shape[1]):
             confidence[y, x] = calibration[evidence[y, x]]

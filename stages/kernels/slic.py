@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel, fast_part, kernel
-from stages.kernels.halves import AtOnce, in_turn, shared_by
+from stages.kernels.halves import AtOnce, by_halves, in_turn, shared_by
 from stages.kernels.scaling import halved
 from stages.kernels.union import join, root
 from stages.kernels.workspace import Workspaces
@@ -62,11 +62,13 @@ def _colours(image: Array, both: AtOnce = in_turn) -> Array:
     """The image in CIELAB with 8 bits each, (H, W, 3) uint8; a gray one as it is, (H, W, 1)."""
     if image.ndim == 2:
         return image[..., None].copy()
-    colour, middle = np.empty(image.shape, np.uint8), image.shape[0] // 2
-    both(
-        lambda: cv2.cvtColor(image[:middle], cv2.COLOR_RGB2LAB, dst=colour[:middle]) if middle else None,
-        lambda: cv2.cvtColor(image[middle:], cv2.COLOR_RGB2LAB, dst=colour[middle:]),
-    )
+    colour = np.empty(image.shape, np.uint8)
+
+    def convert(first: int, end: int) -> None:
+        if first < end:
+            cv2.cvtColor(image[first:end], cv2.COLOR_RGB2LAB, dst=colour[first:end])
+
+    by_halves(both, len(image), convert)
     return colour
 
 
@@ -177,19 +179,12 @@ def connect(labels: Array, smallest: int, scratch: Array, both: AtOnce = in_turn
     pixel, or above it at the left border.
     """
     height = labels.shape[0]
-    middle = height // 2
     # Of each run of equal labels in a row: where it ends, a run of its component before it, and its component's number.
     ends, parent, number = scratch
     rows = np.empty((height, 2), np.int64)  # the first run of each row, and the first beyond
-    both(
-        lambda: _join_runs(labels, 0, middle, rows, ends, parent),
-        lambda: _join_runs(labels, middle, height, rows, ends, parent),
-    )
-    total = int(_number(labels, middle, smallest, rows, ends, parent, number))
-    both(
-        lambda: _write(labels, 0, middle, rows, ends, parent, number),
-        lambda: _write(labels, middle, height, rows, ends, parent, number),
-    )
+    by_halves(both, height, lambda first, end: _join_runs(labels, first, end, rows, ends, parent))
+    total = int(_number(labels, height // 2, smallest, rows, ends, parent, number))
+    by_halves(both, height, lambda first, end: _write(labels, first, end, rows, ends, parent, number))
     return total
 
 

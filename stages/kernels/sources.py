@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import shared_by
+from stages.kernels.halves import by_halves, shared_by
 from stages.kernels.holes import KEPT, MISMATCH
 
 F32 = np.float32
@@ -38,18 +38,18 @@ def name_sources(
     that a match may have moved and still be MEASURED.
     """
     source, worth = np.empty(matches.shape, np.uint8), np.empty(matches.shape, np.float32)
-    middle = len(matches) // 2
     steps = np.arange(256) / 255
     tables = np.array([np.interp(steps, OWN, values) for values in (trust.agreed, trust.alone)], np.float32)
     others = np.array(trust[2:], np.float32)
 
-    def name(rows: slice) -> None:
+    def name(first: int, end: int) -> None:
+        rows = slice(first, end)
         _name(
             matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], F32(moved), tables, others,
             source[rows], worth[rows],
         )  # fmt: skip
 
-    shared_by(threads)(lambda: name(slice(0, middle)), lambda: name(slice(middle, None)))
+    by_halves(shared_by(threads), len(matches), name)
     return source, worth
 
 
