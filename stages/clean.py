@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from stages.data import Array, PointCloud, Source
+from stages.data import Array, PointCloud
 from stages.kernels.order import out_of_order
 from stages.kernels.outliers import supported, usual_slope
 from stages.kernels.patches import depth_images, patches
@@ -59,8 +59,8 @@ class Clean(Stage):
         """Indices of the points that stay, by their neighbours in the image."""
         if cloud.shape is None:
             raise ValueError("Clean: the cloud does not say its image's shape; set it, or use method: knn")
-        if cloud.source is not None and (cloud.source == Source.FILLED).any():
-            return self._with_filled(cloud)
+        if not cloud.measured.all():
+            return self._with_guesses(cloud)
         if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < cloud.shape[0] * cloud.shape[1]:
             raise ValueError(f"Clean: the cloud has pixel indices outside its image of shape {cloud.shape}")
         kept = np.flatnonzero(
@@ -78,13 +78,12 @@ class Clean(Stage):
         )
         return kept[self._whole(cloud, kept, cloud.shape)]
 
-    def _with_filled(self, cloud: PointCloud) -> Array:
-        """The same where the cloud has filled points: those are no evidence, so they support nobody and are cropped
-        only."""
-        filled = cloud.source == Source.FILLED
+    def _with_guesses(self, cloud: PointCloud) -> Array:
+        """The same where not all points are measured: the others are no evidence, so they support nobody and are
+        cropped only."""
         square = np.einsum("ij,ij->i", cloud.points, cloud.points)
-        kept = filled & (cloud.points[:, 2] > 0) & (square <= (self.region + self.margin) ** 2)
-        measured = np.flatnonzero(~filled)
+        kept = ~cloud.measured & (cloud.points[:, 2] > 0) & (square <= (self.region + self.margin) ** 2)
+        measured = np.flatnonzero(cloud.measured)
         kept[measured[self._organised(cloud.only(measured))]] = True
         return np.flatnonzero(kept)
 

@@ -242,6 +242,11 @@ class PointCloud:
         if self.source is not None:
             publish(self, "source", (n,), np.uint8)
 
+    @property
+    def measured(self) -> Array:
+        """Which points were matched at their own pixel, (N,) bool: the evidence."""
+        return np.ones(len(self.points), bool) if self.source is None else np.equal(self.source, Source.MEASURED)
+
     def only(self, kept: Array) -> PointCloud:
         """The points of the indices (n,) int or the mask (N,) bool `kept`, in that order."""
         kept = np.flatnonzero(kept) if kept.dtype == bool else kept

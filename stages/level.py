@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Source, Tilt, Transform
+from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Tilt, Transform
 from stages.kernels.rigid import transform_points
 from stages.stage import Stage, parameter
 
@@ -44,7 +44,7 @@ class Level(Stage):
         """
         if cloud.sensor is not None:
             raise ValueError(f"Level: the cloud is in frame '{cloud.frame_id}', not its camera's; level it only once")
-        if not len(cloud.points) or (cloud.source is not None and np.all(cloud.source == Source.FILLED)):
+        if not cloud.measured.any():
             raise ValueError("Level: no measured point of the frame is left; nothing was matched within the region")
         if mount is None:
             if tilt.frame_id != cloud.frame_id:

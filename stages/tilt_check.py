@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.data import Array, CameraMotion, Mount, PointCloud, Source, Tilt, TiltHealth, Transform
+from stages.data import Array, CameraMotion, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.stage import Finding, Severity, Stage, parameter
 from stages.tilt_diagnosis import INCONSISTENT, Diagnosis, Evidence, diagnose, off_level
 
@@ -161,8 +161,7 @@ def _ground_normal(cloud: PointCloud) -> Array:
 
     Least squares of the measured points with Tukey's weights, so that rocks do not tilt it.
     """
-    if cloud.source is not None:
-        cloud = cloud.only(cloud.source != Source.FILLED)
+    cloud = cloud.only(cloud.measured)
     some = cloud.points[:: -(-len(cloud.points) // GROUND_POINTS) or 1].astype(np.float64)
     if cloud.sensor is not None:
         some = cloud.sensor.inverse()(some)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Source
+from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
 from stages.kernels.grid import FIGURES, cell_percentile, cell_statistics
 from stages.kernels.neighbours import lie_of_cells
 from stages.kernels.occlusion import lowest_sight
@@ -39,7 +39,8 @@ class Voxelise(Stage):
     - occluded: 1 in empty cells between measured ground and measured ground, or behind it, as the camera looks: hidden,
       or not matched; 0 in measured cells; NaN in cells never looked at; absent where the camera is not known;
     - ceiling, m: in occluded cells, the lowest line of sight over them, below which what is hidden lies;
-    - filled, m: mean of points of source FILLED, in cells without measured ones; only where the cloud has such points;
+    - filled, m: mean of points that are not measured, of sources PLANE and FILLED, in cells without measured ones; only
+      where the cloud has such points;
     - percentile_P for each P in `percentiles`, m.
 
     The random variance of a mean of n points is noise * (systematic + min(1, correlated / n)) + shape: noise is the
@@ -67,7 +68,7 @@ class Voxelise(Stage):
     )  # fmt: skip
     percentiles: tuple[float, ...] = parameter((), "further layers: percentiles of a cell's heights, 50 the median")
     filled: str = parameter(
-        "apart", "filled points: a layer of their own, or counted as measured", choices=("apart", "counted")
+        "apart", "what refinement made up: a layer of its own, or counted as measured", choices=("apart", "counted")
     )
 
     def __post_init__(self) -> None:
@@ -100,10 +101,10 @@ class Voxelise(Stage):
 
     def _parted(self, cloud: PointCloud) -> tuple[PointCloud, PointCloud | None]:
         """The points that count as measured, and those that are guesses, if there are any."""
-        if cloud.source is None or self.filled == "counted":
+        measured = cloud.measured
+        if self.filled == "counted" or measured.all():
             return cloud, None
-        guess = cloud.source == Source.FILLED
-        return (cloud.only(~guess), cloud.only(guess)) if guess.any() else (cloud, None)
+        return cloud.only(measured), cloud.only(~measured)
 
     def _reached(self, figures: Array, cloud: PointCloud, grid: Grid) -> Array:
         """The figures of `cell_statistics`, with those of empty cells that lie within the reach of points."""
@@ -111,8 +112,6 @@ class Voxelise(Stage):
         least = FINEST * self.resolution
         if sensor is None or self.reach == 0 or self.reach_limit < least:
             return figures
-        if cloud.source is not None:
-            cloud = cloud.only(cloud.source == Source.MEASURED)
         points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.reach, least, self.reach_limit)
         near = cell_statistics(points, sigma, *grid)
         reached = (figures[:, :, 0] == 0) & (near[:, :, 0] >= WITNESSES)

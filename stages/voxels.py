@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.data import LEVEL_FRAME, PointCloud, Source, VoxelMap
+from stages.data import LEVEL_FRAME, PointCloud, VoxelMap
 from stages.kernels.voxels import voxel_means
 from stages.stage import Stage, parameter
 
 
 @dataclass(frozen=True)
 class Voxels(Stage):
-    """Sorts the measured points of a levelled cloud into cubes; filled points are left out."""
+    """Sorts the measured points of a levelled cloud into cubes; what refinement made up is left out."""
 
     resolution: float = parameter(0.05, "edge of a cube", unit="m", low=0.005, high=2.0)
     region: float = parameter(8.0, "horizontal range from the level frame's origin", unit="m", low=0.1)
@@ -28,9 +28,7 @@ class Voxels(Stage):
         if cloud.frame_id != LEVEL_FRAME:
             raise ValueError(f"Voxels: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
         x, y = cloud.points[:, 0], cloud.points[:, 1]
-        inside = np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.region**2)
-        if cloud.source is not None:
-            inside &= cloud.source != Source.FILLED
+        inside = cloud.measured & np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.region**2)
         near = cloud.only(inside)
         index, count, colors = voxel_means(near.points, near.colors, self.resolution)
         kept = count >= self.least

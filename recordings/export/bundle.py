@@ -227,7 +227,7 @@ def _write_points(path: Path, points: dict[str, Array], about: str) -> None:
 def _colour(colours: Tiles, points: dict[str, Array], level: Transform, resolution: float) -> None:
     """Keep, for every cell, the colour of the point in it whose depth is known best."""
     if "source" in points:  # a guess colours nothing
-        points = {name: values[points["source"] != Source.FILLED] for name, values in points.items()}
+        points = {name: values[points["source"] == Source.MEASURED] for name, values in points.items()}
     if "colors" not in points or "sigma" not in points or not len(points["x"]):
         return
     x, y, _ = level(np.column_stack([points["x"], points["y"], points["z"]])).T

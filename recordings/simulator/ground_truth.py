@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import njit
 
 from recordings.simulator import raycast
+from recordings.simulator.compiled import allocating
 from stages.data import Array
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def _within_image(simulation: Simulation, points: Array, margin: float = 0.0) ->
     return np.asarray((u >= -reach) & (u < camera.width - 1 + reach) & (v >= -reach) & (v < camera.height - 1 + reach))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@allocating
 def _clear_lines(scn: Any, eye: Any, points: Any, clear: Any) -> None:
     """Which points (N, 3) nothing hides from `eye`, into clear (N,) bool."""
     for k in range(points.shape[0]):

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import floor, inf, sqrt
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from recordings.simulator.compiled import allocating, borrowing
 from stages.data import Array
 
 # One bucket of rocks spans 2**BUCKET_LEVEL ground cells.
@@ -23,16 +23,6 @@ SPAN = 16  # px of a row that one beam covers
 SKY = -2
 GROUND = -1
 ROUNDED = -1
-Loop = TypeVar("Loop", bound=Callable[..., Any])
-
-
-def borrowing(loop: Loop) -> Loop:
-    """`njit` for loops that allocate nothing: they only borrow the caller's arrays.
-
-    Counting references to those, as numba does unless told otherwise, would cost a third of the time.
-    """
-    compiled: Any = njit
-    return cast(Loop, compiled(nogil=True, cache=True, error_model="numpy", _nrt=False)(loop))
 
 
 class Scene(NamedTuple):
@@ -92,7 +82,7 @@ def height_at(ground: Any, resolution: float, x: float, y: float) -> float:
     return float(low * (1 - v) + (ground[i1, j] * (1 - u) + ground[i1, j1] * u) * v)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@allocating
 def heights_at(ground: Any, resolution: float, x: Any, y: Any) -> Any:
     """Bilinear ground elevation (N,) float64 at points x, y (N,)."""
     out = np.empty(x.shape[0])
@@ -289,7 +279,7 @@ def clear_until(
     return far
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@allocating
 def tops_at(scn: Any, x: Any, y: Any, ceiling: float) -> Any:
     """What one meets from above at points x, y (N,): elevation (N,) float64, m, and surface (N,) int32.
 

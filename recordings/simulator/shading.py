@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from recordings.simulator.raycast import GROUND, ROUNDED, SKY, borrowing, first_hit, pyramid_of
+from recordings.simulator.compiled import borrowing
+from recordings.simulator.raycast import GROUND, ROUNDED, SKY, first_hit, pyramid_of
 from stages.data import Array
 
 TILE = 1024

@@ -103,22 +103,23 @@ def test_a_mismatch_of_a_hundred_pixels_that_supports_itself_goes() -> None:
     assert np.isin(patch[20:70], Clean(patch=0.0)(cloud).pixel).any()
 
 
-def test_filled_points_support_nobody_and_are_kept_within_the_crop() -> None:
+@pytest.mark.parametrize("made_up", [Source.PLANE, Source.FILLED])
+def test_what_refinement_made_up_supports_nobody_and_is_kept_within_the_crop(made_up: Source) -> None:
     d = seen_disparity()
     d[300:303, 100:103] *= 2
     disparity = as_disparity(d)
     source = disparity.source.copy()
-    source[290:312, 90:112][source[290:312, 90:112] > 0] = Source.FILLED
+    source[290:312, 90:112][source[290:312, 90:112] > 0] = made_up
     source[300:303, 100:103] = Source.MEASURED
-    pixels = np.where(source == Source.FILLED, np.float32(d[301, 101]), disparity.pixels)
+    pixels = np.where(source == made_up, np.float32(d[301, 101]), disparity.pixels)
     cloud = Reproject(filled=True)(blank_frame(), replace(disparity, pixels=pixels, source=source))
     clean = Clean()(cloud)
     assert clean.source is not None
     assert cloud.source is not None
     assert 301 * 640 + 101 not in clean.pixel  # a speck, though all the filled pixels about it agree
-    assert (clean.source == Source.FILLED).sum() == (cloud.source == Source.FILLED).sum() > 400
-    far = replace(disparity, pixels=np.where(source == Source.FILLED, np.float32(12.0), pixels), source=source)
-    assert (Clean()(Reproject(filled=True)(blank_frame(), far)).source == Source.FILLED).sum() == 0
+    assert (clean.source == made_up).sum() == (cloud.source == made_up).sum() > 400
+    far = replace(disparity, pixels=np.where(source == made_up, np.float32(12.0), pixels), source=source)
+    assert (Clean()(Reproject(filled=True)(blank_frame(), far)).source == made_up).sum() == 0
 
 
 def test_patch_kernel_equals_scipys_connected_components() -> None:

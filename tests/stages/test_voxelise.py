@@ -108,10 +108,10 @@ def test_the_tilts_uncertainty_is_the_common_variance_and_not_part_of_the_random
     np.testing.assert_allclose(ratio, 1.0, atol=0.05)
 
 
-def test_filled_points_are_a_layer_of_their_own_unless_they_are_to_count() -> None:
+@pytest.mark.parametrize("made_up", [Source.PLANE, Source.FILLED])
+def test_what_refinement_made_up_is_a_layer_of_its_own_unless_it_is_to_count(made_up: Source) -> None:
     points = np.array([[2.01, 0.01, 0.1], [2.01, 0.01, 0.9], [3.01, 0.01, 0.5]])
-    source = np.array([Source.MEASURED, Source.FILLED, Source.FILLED], np.uint8)
-    cloud = replace(cloud_of(points), source=source)
+    cloud = replace(cloud_of(points), source=np.array([Source.MEASURED, made_up, made_up], np.uint8))
     apart, counted = Voxelise()(cloud), Voxelise(filled="counted")(cloud)
     known = np.isfinite(apart.layers["elevation"])
     assert apart.layers["elevation"][known] == pytest.approx([0.1])
