@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
 from stages.kernels.grid import FIGURES, cell_percentile, cell_statistics
@@ -22,6 +23,7 @@ Grid = tuple[float, tuple[float, float], int, float]  # resolution, origin, rows
 FINEST = 0.5  # of a cell, below which a point's reach is not worth following
 WITNESSES = 2  # places along lines of sight that a cell without a point of its own must have
 REACHED = 0.5  # the count of such a cell: less than a point
+SHOWING = 0.5  # share of the points' noise that shows in their scatter: neighbours err alike
 SUMS = [FIGURES.index(name) for name in ("count", "sum", "sum_of_squares", "noise")]
 
 
@@ -46,18 +48,21 @@ class Voxelise(Stage):
     The random variance of a mean of n points is noise * (systematic + min(1, correlated / n)) + shape: noise is the
     mean square of what the points' depth errors do to a height, on a slope more or less than on the level, and the mean
     of points that share one error is as sure as one of them; shape is what the mean of some points misses of an uneven
-    cell, by its scatter beyond the slope's and by its height off its neighbours; few points miss more (`sampling`^2 /
-    n). Errors have longer tails than a Gaussian's: where 93 to 95 % are within two such sigmas, 70 to 74 % are within
-    one.
+    cell, by its scatter beyond the slope's and the noise's and by its height off its neighbours; few points miss more
+    (`sampling`^2 / n), and so does a cell beside an empty one, of which they may show one side (`rim`). Errors have
+    longer tails than a Gaussian's: where 92 to 95 % are within two such sigmas, 69 to 74 % are within one.
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
     region: float = parameter(8.0, "horizontal range from the level frame's origin kept in the map", unit="m", low=0.1)
-    correlated: float = parameter(10.0, "neighbouring points that share one matching error", low=1.0)
+    correlated: float = parameter(6.0, "neighbouring points that share one matching error", low=1.0)
     systematic: float = parameter(0.05, "share of the points' variance that no averaging removes", low=0.0, high=1.0)
-    scatter: float = parameter(0.27, "share of the scatter beyond the slope's in the variance", low=0.0)
-    bend: float = parameter(0.5, "share of the square of the height off the neighbours in the variance", low=0.0)
+    scatter: float = parameter(0.6, "share of the scatter beyond slope and noise in the variance", low=0.0)
+    bend: float = parameter(0.8, "share of the square of the height off the neighbours in the variance", low=0.0)
     sampling: float = parameter(0.003, "what a single point may miss of its cell", unit="m", low=0.0)
+    rim: float = parameter(
+        0.15, "share of the square of its rise in the variance of a cell beside an empty one", low=0.0
+    )
     reach: float = parameter(
         0.0, "how far along its line of sight, in standard deviations of its depth, a measured point speaks for cells "
         "that no point falls into; 0 = it does not", low=0.0,
@@ -140,13 +145,16 @@ class Voxelise(Stage):
     ) -> Array:
         """The random variance of the cells' means. n, mean, scatter, noise (of depth): (rows, cols), NaN = empty."""
         east, north, bend = lie_of_cells(mean)
-        uneven = np.maximum(scatter - (east * east + north * north) / 12, 0.0)
+        rise = east * east + north * north
         noise = noise * _lever(cloud, mean, x, y, east / self.resolution, north / self.resolution) ** 2
+        uneven = np.maximum(scatter - rise / 12 - SHOWING * noise, 0.0)
+        beside = ~binary_erosion(np.isfinite(mean), np.ones((3, 3)))
         return np.asarray(
             noise * (self.systematic + np.minimum(1.0, self.correlated / n))
             + self.scatter * uneven
             + self.bend * bend * bend
             + self.sampling**2 / n
+            + np.where(beside, self.rim * rise, 0.0)
         )
 
 

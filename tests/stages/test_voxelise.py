@@ -150,7 +150,7 @@ def test_a_hole_stays_a_hole_and_an_empty_cloud_is_an_empty_map_of_the_usual_sha
         np.testing.assert_array_equal(np.isnan(full.layers[name]), full.layers["count"] == 0)
 
 
-PURE = Voxelise(correlated=1.0, systematic=0.0, scatter=0.0, bend=0.0, sampling=0.0)
+PURE = Voxelise(correlated=1.0, systematic=0.0, scatter=0.0, bend=0.0, sampling=0.0, rim=0.0)
 
 
 @pytest.mark.parametrize("slope", [-0.1, 0.0, 0.3])
