@@ -16,6 +16,7 @@ import numpy as np
 from stages.data import Array, Disparity, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.bilateral import joint_bilateral
+from stages.kernels.correlation import correlation
 from stages.kernels.depth_edges import sharpen_edges
 from stages.kernels.extent import Extent, extent, within_reach
 from stages.kernels.holes import KEPT, OCCLUSION, fill_holes
@@ -45,7 +46,8 @@ TRUST = Trust(
 class Refine(Stage):
     """A denser and smoother disparity image, with the superpixels it was made with.
 
-    Only MEASURED pixels are matches; all others count as holes. What moves by at most `inlier_distance` stays MEASURED.
+    Only MEASURED pixels are matches; all others count as holes. What moves by at most `inlier_distance` stays MEASURED,
+    where the images bear it out; where they do not, as in a noisy sky, it becomes FILLED.
     A match that moves farther has been replaced by what lies about it: it becomes PLANE, as a hole that a plane fills.
     Without planes, `plane_weight` 0 and no `plane_fill`, no superpixels are made.
     With `fill` background the other holes are filled from what lies about them and looks like them, from the farther
@@ -80,8 +82,8 @@ class Refine(Stage):
     fill_reach: float = parameter(
         64.0, "distance from which a hole is still filled; what is hidden here, from any", unit="px", low=0
     )
-    fill_margin: float = parameter(
-        16.0, "how far beyond the last match, at the image's border or towards the sky", unit="px", low=0
+    fill_margin: int = parameter(
+        16, "how far beyond the last match, at the image's border or towards the sky", unit="px", low=0
     )
     bilateral_radius: int = parameter(
         3, "radius of the bilateral filter and its scale in the image, 0 = none", unit="px", low=0, high=32
@@ -90,6 +92,9 @@ class Refine(Stage):
         3, "radius of the weighted median that puts depth edges where the image has them, 0 = none", unit="px", low=0,
         high=16,
     )  # fmt: skip
+    correlation: float = parameter(
+        0.5, "of the images about a match, below which it counts as a guess, 0 = not asked", low=0, high=1
+    )
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
@@ -110,8 +115,9 @@ class Refine(Stage):
         filled, kinds = self._filled(pixels, weights, within, image, guide)
         refined = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
         source, confidence = name_sources(
-            matches, disparity.confidence, agreed, kinds, refined, self.inlier_distance, TRUST, self.threads
-        )
+            matches, disparity.confidence, agreed, kinds, refined, self._borne_out(refined, guide, frame.right),
+            self.inlier_distance, TRUST, self.threads,
+        )  # fmt: skip
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
 
     def _count(self, pixels: int) -> int:
@@ -121,7 +127,7 @@ class Refine(Stage):
         self, pixels: Array, weights: Array, within: Extent, image: Array, labels: Array, count: int, seed: int
     ) -> tuple[Array, Array]:
         """Matches near their planes drawn towards them, holes filled from them, (H, W) float32; where, (H, W) bool."""
-        margin = self.fill_margin if self.plane_fill else -1.0
+        margin = self.fill_margin if self.plane_fill else -1
         planes = fit_planes(pixels, labels, count, self.inlier_distance, self.hypotheses, seed, weights, self.threads)
         accepted = self._accepted(planes, self.valid_share)
         pixels, agreed = pull_to_planes(
@@ -173,6 +179,12 @@ class Refine(Stage):
             pixels, guide, self.bilateral_radius, self.bilateral_radius, BILATERAL_GRAY, BILATERAL_DISPARITY,
             self.threads,
         )  # fmt: skip
+
+    def _borne_out(self, pixels: Array, guide: Array, right: Array) -> Array:
+        """Where the images vary alike, so shifted, (H, W) bool."""
+        if self.correlation == 0:
+            return np.ones(pixels.shape, bool)
+        return correlation(pixels, guide, gray(eight_bit(right)[0]), self.threads) >= F32(self.correlation)
 
     def _sharpened(self, pixels: Array, guessed: Array, guide: Array) -> Array:
         if self.edge_radius == 0:

@@ -35,7 +35,7 @@ def extent(disparity: Array) -> Extent:
         known.view(np.uint8), cv2.CV_16U, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_REPLICATE
     )
     known &= around > int(SHARE * SIDE**2 * known.mean())
-    found = Extent(np.full(width, height, np.int64), np.full(height, 4 * width, np.int64), np.full(height, -4 * width))
+    found = Extent(np.full(width, height, np.int64), np.full(height, 2 * width, np.int64), np.full(height, -width))
     _find_top(known, found.top)
     _find_ends(known, found.first, found.last)
     return found
@@ -88,6 +88,6 @@ def extent_reference(disparity: Array) -> Extent:
     rows, columns = known.any(axis=1), known.any(axis=0)
     last = width - 1 - known[:, ::-1].argmax(axis=1)
     return Extent(
-        np.where(columns, known.argmax(axis=0), height), np.where(rows, known.argmax(axis=1), 4 * width),
-        np.where(rows, last, -4 * width),
+        np.where(columns, known.argmax(axis=0), height), np.where(rows, known.argmax(axis=1), 2 * width),
+        np.where(rows, last, -width),
     )  # fmt: skip

@@ -35,7 +35,7 @@ BYTE, EIGHT, SIXTEEN = np.uint32(255), np.uint32(8), np.uint32(16)
 
 
 def fill_holes(
-    disparity: Array, image: Array, within: Extent, reach: float, margin: float, threads: int = 1
+    disparity: Array, image: Array, within: Extent, reach: float, margin: int, threads: int = 1
 ) -> tuple[Array, Array]:
     """Fill the holes that evidence explains.
 
@@ -57,7 +57,7 @@ def fill_holes(
         lambda: _trace(disparity, first, holes, 1, steps[:4]),
         lambda: _trace(disparity, first, holes, -1, steps[4:]),
     )
-    given = disparity, colour, within, F32(reach), int(margin), first, holes, steps
+    given = disparity, colour, within, F32(reach), margin, first, holes, steps
     by_halves(both, height, lambda top, end: _fill(*given, top, end, filled, kinds))
     return filled, kinds
 
@@ -233,7 +233,7 @@ def _along_row(left, right, before, after, value):  # type: ignore[no-untyped-de
 
 
 def fill_holes_reference(
-    disparity: Array, image: Array, within: Extent, reach: float, margin: float
+    disparity: Array, image: Array, within: Extent, reach: float, margin: int
 ) -> tuple[Array, Array]:
     """`fill_holes` in plain numpy."""
     height, width = disparity.shape

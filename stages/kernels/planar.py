@@ -54,7 +54,7 @@ def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Arr
 
 
 def pull_to_planes(
-    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: float,
+    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: int,
     threads: int = 1,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Disparities near their segment's plane drawn towards it, and holes filled from it.
@@ -67,7 +67,7 @@ def pull_to_planes(
     where a plane had its say, (H, W) bool.
     """
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
-    given = pixels, coefficients, labels, within, F32(near), F32(weight), int(margin)
+    given = pixels, coefficients, labels, within, F32(near), F32(weight), margin
     both = shared_by(threads)
     ranges = by_halves(both, len(pixels), lambda first, end: _range(pixels[first:end]))
     low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
@@ -151,7 +151,7 @@ def _pull(  # type: ignore[no-untyped-def]
 
 
 def pull_to_planes_reference(
-    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: float
+    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: int
 ) -> tuple[Array, Array]:
     """`pull_to_planes` in plain numpy."""
     y, x = np.mgrid[: pixels.shape[0], : pixels.shape[1]]

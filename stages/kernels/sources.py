@@ -28,14 +28,15 @@ class Trust(NamedTuple):
 
 
 def name_sources(
-    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, moved: float, trust: Trust,
-    threads: int = 1,
+    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, borne_out: Array, moved: float,
+    trust: Trust, threads: int = 1,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Source and confidence of each pixel, (H, W) uint8 codes of `Source` and float32.
 
     matches: (H, W) float32, px, NaN = none, before refinement; confidence: (H, W) float32, theirs; agreed: (H, W) bool,
-    where a plane had its say; kinds: (H, W) uint8 of `holes.fill_holes`; refined: (H, W) float32, the result; moved: px
-    that a match may have moved and still be MEASURED.
+    where a plane had its say; kinds: (H, W) uint8 of `holes.fill_holes`; refined: (H, W) float32, the result;
+    borne_out: (H, W) bool, where the images bear it out: elsewhere a match is a guess; moved: px that a match may have
+    moved and still be MEASURED.
     """
     source, worth = np.empty(matches.shape, np.uint8), np.empty(matches.shape, np.float32)
     steps = np.arange(256) / 255
@@ -45,8 +46,8 @@ def name_sources(
     def name(first: int, end: int) -> None:
         rows = slice(first, end)
         _name(
-            matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], F32(moved), tables, others,
-            source[rows], worth[rows],
+            matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], borne_out[rows], F32(moved),
+            tables, others, source[rows], worth[rows],
         )  # fmt: skip
 
     by_halves(shared_by(threads), len(matches), name)
@@ -54,13 +55,15 @@ def name_sources(
 
 
 @kernel
-def _name(matches, confidence, agreed, kinds, refined, moved, tables, others, source, worth):  # type: ignore[no-untyped-def]
+def _name(matches, confidence, agreed, kinds, refined, borne_out, moved, tables, others, source, worth):  # type: ignore[no-untyped-def]
     replaced, plane, mismatch, occlusion = others
     for y in range(matches.shape[0]):
         for x in range(matches.shape[1]):
             d, match = refined[y, x], matches[y, x]
             if d != d:
                 source[y, x], worth[y, x] = UNKNOWN, F32(0)
+            elif abs(d - match) <= moved and not borne_out[y, x]:
+                source[y, x], worth[y, x] = FILLED, mismatch
             elif abs(d - match) <= moved:
                 source[y, x] = MEASURED
                 step = np.int64(np.rint(min(max(confidence[y, x], F32(0)), F32(1)) * F32(255)))
@@ -74,16 +77,18 @@ def _name(matches, confidence, agreed, kinds, refined, moved, tables, others, so
 
 
 def name_sources_reference(
-    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, moved: float, trust: Trust
-) -> tuple[Array, Array]:
+    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, borne_out: Array, moved: float,
+    trust: Trust,
+) -> tuple[Array, Array]:  # fmt: skip
     """`name_sources` in plain numpy."""
     own = np.rint(np.clip(confidence, 0, 1) * F32(255)).astype(np.float64) / 255
     stayed = np.abs(refined - matches) <= F32(moved)
     conditions = [
-        np.isnan(refined), stayed & agreed, stayed, np.isfinite(matches), kinds == KEPT, kinds == MISMATCH,
+        np.isnan(refined), stayed & ~borne_out, stayed & agreed, stayed, np.isfinite(matches), kinds == KEPT,
+        kinds == MISMATCH,
     ]  # fmt: skip
-    codes = [UNKNOWN, MEASURED, MEASURED, PLANE, PLANE, FILLED]
+    codes = [UNKNOWN, FILLED, MEASURED, MEASURED, PLANE, PLANE, FILLED]
     tables = [np.interp(own, OWN, values) for values in (trust.agreed, trust.alone)]
-    worths: list[Any] = [0.0, *tables, trust.replaced, trust.plane, trust.mismatch]
+    worths: list[Any] = [0.0, trust.mismatch, *tables, trust.replaced, trust.plane, trust.mismatch]
     source = np.select(conditions, codes, FILLED).astype(np.uint8)
     return source, np.select(conditions, worths, trust.occlusion).astype(np.float32)

@@ -47,7 +47,7 @@ def test_noise_falls_and_holes_close_on_the_right_side_of_edges(box, parameters)
 
 def test_every_pixel_says_where_it_comes_from(box):
     frame, matches, _ = box
-    refined = Refine(superpixels=200, smallest=1)(frame, matches)
+    refined = Refine(superpixels=200, smallest=1, correlation=0)(frame, matches)
     known, matched = np.isfinite(refined.pixels), np.isfinite(matches.pixels)
     near = np.abs(refined.pixels - matches.pixels) <= 0.5
     assert near[matched].mean() > 0.9
@@ -89,12 +89,12 @@ def test_a_match_that_is_replaced_is_called_plane_and_loses_its_confidence(media
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80] = 30
     matches = Disparity(5, pixels, source, confidence)
-    replaced = Refine(near=1000, plane_weight=1, inlier_share=0, median=median)(frame, matches)
+    replaced = Refine(near=1000, plane_weight=1, inlier_share=0, median=median, correlation=0)(frame, matches)
     assert replaced.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert replaced.source[60, 80] == Source.PLANE
     assert replaced.confidence[60, 80] < 0.85
     assert (replaced.source == Source.MEASURED).sum() == HEIGHT * WIDTH - 1
-    kept = Refine(median=median, bilateral_radius=0, edge_radius=0)(frame, matches)
+    kept = Refine(median=median, bilateral_radius=0, edge_radius=0, correlation=0)(frame, matches)
     assert (kept.pixels[60, 80], kept.source[60, 80]) == (30, Source.MEASURED)
     assert kept.confidence[60, 80] == np.float32(0.97)
 
@@ -277,7 +277,8 @@ def test_a_surface_draws_half_as_far_as_a_superpixel_and_what_it_agrees_with_is_
     pixels[60, 80], pixels[60, 90] = 8.4, 8.7
     pixels[30, 30], source[30, 30] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
-    drawn = Refine(median=0, bilateral_radius=0, edge_radius=0, plane_weight=1, near=1, **SURFACES_ONLY)(frame, matches)
+    steps = {"median": 0, "bilateral_radius": 0, "edge_radius": 0, "correlation": 0}
+    drawn = Refine(plane_weight=1, near=1, **steps, **SURFACES_ONLY)(frame, matches)
     assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert drawn.pixels[60, 90] == np.float32(8.7)
     assert drawn.confidence[60, 70] > drawn.confidence[60, 90] > 0.9
@@ -391,3 +392,18 @@ def test_matches_of_a_burnt_out_sky_do_not_count():
     assert np.isnan(refined.pixels[:42]).all()  # the last rows show the ground in their windows, and 5 px are margin
     assert (refined.pixels[50:] < 9).all()
     assert (Refine(burnt_out=256)(sky, Disparity(5, pixels, source, confidence)).pixels[:40] > 50).all()
+
+
+def test_a_match_that_the_images_do_not_bear_out_is_a_guess():
+    """Noise over texture: the same disparity everywhere, of which the upper half of the images knows nothing."""
+    rng = np.random.default_rng(11)
+    texture = rng.integers(60, 140, (HEIGHT, WIDTH + 8)).astype(np.uint8)
+    left, right = texture[:, :WIDTH].copy(), texture[:, 8:].copy()
+    left[:60], right[:60] = rng.integers(98, 103, (2, 60, WIDTH))
+    frame = StereoFrame(5, left, right, StereoCamera(300, 300, 80, 60, 0.1, WIDTH, HEIGHT))
+    _, pixels, source, confidence = flat_scene()
+    refined = Refine()(frame, Disparity(5, pixels, source, confidence))
+    assert (refined.source[:50] == Source.FILLED).all()
+    assert refined.confidence[:50].max() < 0.7
+    assert (refined.source[70:, 15:] == Source.MEASURED).all()
+    assert refined.pixels == pytest.approx(np.full(SHAPE, 8.0), abs=1e-4)

@@ -21,7 +21,7 @@ def test_names_are_those_of_the_reference(height, width, seed, threads):
     refined[rng.random(shape) < 0.2] = np.nan
     kinds = np.where(np.isnan(matches), rng.integers(0, 4, shape), KEPT).astype(np.uint8)
     confidence = rng.uniform(-0.1, 1.1, shape).astype(np.float32)
-    given = matches, confidence, rng.random(shape) < 0.5, kinds, refined, 0.5, TRUST
+    given = matches, confidence, rng.random(shape) < 0.5, kinds, refined, rng.random(shape) < 0.8, 0.5, TRUST
     source, worth = name_sources(*given, threads)
     expected, expected_worth = name_sources_reference(*given)
     assert np.array_equal(source, expected)
@@ -30,11 +30,13 @@ def test_names_are_those_of_the_reference(height, width, seed, threads):
 
 def test_every_origin_has_its_own_worth():
     nan = np.nan
-    matches = np.array([[8, 8, 8, nan, nan, nan, nan]], np.float32)
-    refined = np.array([[8.5, 8, 8.6, 8, 8, 8, nan]], np.float32)
-    kinds = np.array([[KEPT, KEPT, KEPT, KEPT, MISMATCH, OCCLUSION, OPEN]], np.uint8)
-    agreed = np.array([[True, False, True, True, False, False, False]])
-    source, worth = name_sources(matches, np.full((1, 7), 0.75, np.float32), agreed, kinds, refined, 0.5, TRUST)
+    matches = np.array([[8, 8, 8, 8, nan, nan, nan, nan]], np.float32)
+    refined = np.array([[8.5, 8, 8, 8.6, 8, 8, 8, nan]], np.float32)
+    kinds = np.array([[KEPT, KEPT, KEPT, KEPT, KEPT, MISMATCH, OCCLUSION, OPEN]], np.uint8)
+    agreed = np.array([[True, False, False, True, True, False, False, False]])
+    borne_out = np.array([[True, True, False, True, True, True, True, True]])
+    own = np.full((1, 8), 0.75, np.float32)
+    source, worth = name_sources(matches, own, agreed, kinds, refined, borne_out, 0.5, TRUST)
     names = [Source(code).name for code in source[0]]
-    assert names == ["MEASURED", "MEASURED", "PLANE", "PLANE", "FILLED", "FILLED", "UNKNOWN"]
-    assert np.allclose(worth[0], [0.98, 0.86, 0.83, 0.84, 0.58, 0.56, 0], atol=1e-3)
+    assert names == ["MEASURED", "MEASURED", "FILLED", "PLANE", "PLANE", "FILLED", "FILLED", "UNKNOWN"]
+    assert np.allclose(worth[0], [0.98, 0.86, 0.58, 0.83, 0.84, 0.58, 0.56, 0], atol=1e-3)

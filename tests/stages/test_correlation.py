@@ -1,0 +1,47 @@
+"""Correlation: high where two images show the same, about none where noise matches noise; as the plain reference."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.kernels.correlation import correlation, correlation_reference
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 2**31), st.sampled_from([1, 2]))
+def test_it_is_that_of_the_reference(height, width, seed, threads):
+    rng = np.random.default_rng(seed)
+    disparity = rng.uniform(-3, 12, (height, width)).astype(np.float32)
+    disparity[rng.random(disparity.shape) < 0.3] = np.nan
+    left, right = rng.choice(np.array([0, 90, 100, 110, 255], np.uint8), (2, height, width))
+    found = correlation(disparity, left, right, threads)
+    np.testing.assert_array_equal(found, correlation_reference(disparity, left, right))
+    assert np.abs(found).max() <= 1.000001
+
+
+def test_what_both_see_correlates_and_noise_does_not_whatever_was_matched():
+    rng = np.random.default_rng(3)
+    texture = rng.normal(0, 8, (120, 220))
+    noise = rng.normal(0, 2, (2, 120, 200))
+    left, right = texture[:, :200] + noise[0], texture[:, 10:210] + noise[1]  # a disparity of 10 px
+    left[:60], right[:60] = noise[0, :60], noise[1, :60]  # the sky
+    left, right = (np.clip(np.rint(image + 120), 0, 255).astype(np.uint8) for image in (left, right))
+    found = correlation(np.full(left.shape, 10.0, np.float32), left, right)
+    assert found[70:110, 20:190].min() > 0.8
+    assert np.abs(found[:52]).max() < 0.5
+
+
+def test_an_edge_along_the_row_says_nothing():
+    rng = np.random.default_rng(4)
+    left, right = rng.normal(0, 1, (2, 60, 100))
+    for image in (left, right):
+        image[30:] += 100
+    left, right = (np.clip(np.rint(image + 60), 0, 255).astype(np.uint8) for image in (left, right))
+    assert np.abs(correlation(np.full(left.shape, 4.0, np.float32), left, right)).max() < 0.6
+
+
+def test_where_nothing_varies_or_nothing_is_known_there_is_none():
+    flat = np.full((40, 60), 90, np.uint8)
+    assert not correlation(np.zeros((40, 60), np.float32), flat, flat).any()
+    textured = np.random.default_rng(5).integers(0, 255, (40, 60)).astype(np.uint8)
+    assert not correlation(np.full((40, 60), np.nan, np.float32), textured, textured).any()
