@@ -115,7 +115,7 @@ class Refine(Stage):
         filled, kinds = self._filled(pixels, weights, within, image, guide)
         refined = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
         source, confidence = name_sources(
-            matches, disparity.confidence, agreed, kinds, refined, self._borne_out(refined, guide, frame.right),
+            matches, disparity.confidence, agreed, kinds, refined, self._borne_out(refined, kinds != KEPT, guide, frame.right),
             self.inlier_distance, TRUST, self.threads,
         )  # fmt: skip
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
@@ -180,11 +180,12 @@ class Refine(Stage):
             self.threads,
         )  # fmt: skip
 
-    def _borne_out(self, pixels: Array, guide: Array, right: Array) -> Array:
+    def _borne_out(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> Array:
         """Where the images vary alike, so shifted, (H, W) bool."""
         if self.correlation == 0:
             return np.ones(pixels.shape, bool)
-        return correlation(pixels, guide, gray(eight_bit(right)[0]), self.threads) >= F32(self.correlation)
+        evidence = np.where(guessed, F32(np.nan), pixels)
+        return correlation(evidence, guide, gray(eight_bit(right)[0]), self.threads) >= F32(self.correlation)
 
     def _sharpened(self, pixels: Array, guessed: Array, guide: Array) -> Array:
         if self.edge_radius == 0:
