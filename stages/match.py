@@ -20,7 +20,7 @@ from stages.kernels.around import Windows, windows
 from stages.kernels.pair import Rule
 from stages.kernels.prior import prior_costs
 from stages.kernels.semiglobal import lanes_for, match
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_rectified, parameter
 
 SMALLEST_SIDE = 16
 BEYOND = 2.0  # px; a prior so far outside the range says that the match is not in it
@@ -142,8 +142,7 @@ class Match(Stage):
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
         height, width = frame.left.shape[:2]
-        if frame.camera.raw is not None:
-            raise ValueError("Match: the frame is not rectified; put stages.Rectify before stages.Match")
+        check_rectified(self, frame)
         if min(height, width) < SMALLEST_SIDE:
             raise ValueError(f"Match: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
         if not -width < self.minimum < width:

@@ -13,7 +13,7 @@ import numpy as np
 
 from stages.data import Array, Disparity, Source, StereoFrame
 from stages.intensity import eight_bit, gray
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_rectified, parameter
 
 F32 = np.float32
 MODES = {3: cv2.STEREO_SGBM_MODE_SGBM_3WAY, 5: cv2.STEREO_SGBM_MODE_SGBM, 8: cv2.STEREO_SGBM_MODE_HH}
@@ -67,8 +67,7 @@ class MatchOpenCV(Stage):
             raise ValueError("MatchOpenCV: block costs could exceed 16 bits; use a smaller block, p2 or prefilter")
 
     def __call__(self, frame: StereoFrame) -> Disparity:
-        if frame.camera.raw is not None:
-            raise ValueError("MatchOpenCV: the frame is not rectified; put stages.Rectify before stages.MatchOpenCV")
+        check_rectified(self, frame)
         left, right = eight_bit(frame.left, frame.right)
         pixels = self._matched(left, right) if self.color else self._matched(gray(left), gray(right))
         pixels[_texture(gray(left), self.block) <= self.texture] = np.nan

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
-from stages.stage import Finding, Stage, parameter
+from stages.stage import Finding, Stage, check_joined, parameter
 from stages.tracking import Step, View, step_between, view
 
 
@@ -46,13 +46,7 @@ class VisualOdometry(Stage):
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> CameraMotion:
         """The camera's motion since its segment began; without `camera` where the frame shows too little to track."""
-        if frame.camera.raw is not None:
-            raise ValueError("VisualOdometry: the stereo frame is not rectified; put Rectify before it")
-        if disparity.pixels.shape != frame.left.shape[:2]:
-            raise ValueError(
-                f"VisualOdometry: the disparity is {disparity.pixels.shape}, the left image {frame.left.shape[:2]}; "
-                "join the disparity with the rectified frame it was made from"
-            )
+        check_joined(self, frame, disparity)
         before, seen = self._memory.keyframe, view(frame, disparity)
         step = step_between(before.view, seen, self.least) if before is not None else None
         if before is not None and step is not None and self._likely(step):

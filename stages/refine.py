@@ -26,7 +26,7 @@ from stages.kernels.slic import superpixels
 from stages.kernels.smoother import smooth
 from stages.kernels.sources import Trust, name_sources
 from stages.kernels.surfaces import surfaces
-from stages.stage import Stage, check_same_time, parameter
+from stages.stage import Stage, check_joined, check_same_time, parameter
 
 F32 = np.float32
 EVEN = 6  # gray levels within a census window that a camera's noise and compression make of one
@@ -98,8 +98,7 @@ class Refine(Stage):
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
-        if disparity.pixels.shape != frame.left.shape[:2]:
-            raise ValueError(f"Refine: disparity is {disparity.pixels.shape}, the image is {frame.left.shape[:2]}")
+        check_joined(self, frame, disparity)
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         image = eight_bit(frame.left)[0]
         guide = gray(image)
@@ -115,8 +114,8 @@ class Refine(Stage):
         filled, kinds = self._filled(pixels, weights, within, image, guide)
         refined = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
         source, confidence = name_sources(
-            matches, disparity.confidence, agreed, kinds, refined, self._borne_out(refined, kinds != KEPT, guide, frame.right),
-            self.inlier_distance, TRUST, self.threads,
+            matches, disparity.confidence, agreed, kinds, refined,
+            self._borne_out(refined, kinds != KEPT, guide, frame.right), self.inlier_distance, TRUST, self.threads,
         )  # fmt: skip
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from stages.data import Disparity, PointCloud, StereoFrame
 from stages.intensity import eight_bit
 from stages.kernels.triangulation import triangulate
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_joined, parameter
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,7 @@ class Reproject(Stage):
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> PointCloud:
         """The cloud of `disparity`, coloured from the left image, stretched to 8 bit; it may be empty."""
         camera = disparity.camera or frame.camera
-        if frame.camera.raw is not None:
-            raise ValueError("Reproject: the stereo frame is not rectified; put Rectify before it")
-        if disparity.pixels.shape != frame.left.shape[:2]:
-            raise ValueError(
-                f"Reproject: the disparity is {disparity.pixels.shape}, the left image {frame.left.shape[:2]}; "
-                "join the disparity with the rectified frame it was made from"
-            )
+        check_joined(self, frame, disparity)
         points, colors, sigma, pixel = triangulate(
             disparity.pixels,
             disparity.source,

@@ -13,7 +13,7 @@ import cv2
 from stages.data import Disparity, StereoCamera, StereoFrame
 from stages.kernels.scaling import doubled, halved
 from stages.match import SMALLEST_SIDE
-from stages.stage import Stage, check_same_time, parameter
+from stages.stage import Stage, check_rectified, check_same_time, parameter
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,7 @@ class Halve(Stage):
     """The frame at half size, each pixel the mean of four; an odd last row or column is repeated."""
 
     def __call__(self, frame: StereoFrame) -> StereoFrame:
-        if frame.camera.raw is not None:
-            raise ValueError("Halve: the frame is not rectified; put stages.Rectify before stages.Halve")
+        check_rectified(self, frame)
         full_height, full_width = frame.left.shape[:2]
         left, right = halved(frame.left), halved(frame.right)
         height, width = left.shape[:2]
@@ -72,9 +71,8 @@ class Swap(Stage):
     """
 
     def __call__(self, frame: StereoFrame) -> StereoFrame:
+        check_rectified(self, frame)
         camera: StereoCamera = frame.camera
-        if camera.raw is not None:
-            raise ValueError("Swap: the frame is not rectified; put stages.Rectify before stages.Swap")
         last = camera.width - 1
         mirrored = replace(camera, cx=last - camera.cx_right, cx_right=last - camera.cx)
         return StereoFrame(frame.stamp, cv2.flip(frame.right, 1), cv2.flip(frame.left, 1), mirrored)

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any
 
+from stages.data import Disparity, StereoFrame
+
 
 def parameter(
     default: Any,
@@ -83,6 +85,23 @@ class Finding:
 def counted(number: int, what: str) -> str:
     """A number of things in words: "1 frame", "2 frames"."""
     return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def check_rectified(stage: Stage, frame: StereoFrame) -> None:
+    """Refuse a frame as the cameras took it."""
+    if frame.camera.raw is not None:
+        name = type(stage).__name__
+        raise ValueError(f"{name}: the frame is not rectified; put stages.Rectify before stages.{name}")
+
+
+def check_joined(stage: Stage, frame: StereoFrame, disparity: Disparity) -> None:
+    """Refuse a frame that is not rectified, and a disparity that is not of its size."""
+    check_rectified(stage, frame)
+    if disparity.pixels.shape != frame.left.shape[:2]:
+        raise ValueError(
+            f"{type(stage).__name__}: the disparity is {disparity.pixels.shape}, the left image "
+            f"{frame.left.shape[:2]}; join the disparity with the rectified frame it was made from"
+        )
 
 
 def check_same_time(stage: Stage, **stamps: int) -> None:

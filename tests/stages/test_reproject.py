@@ -120,7 +120,7 @@ def test_a_disparity_of_another_size_and_an_unrectified_frame_are_refused() -> N
         Reproject()(blank_frame(), as_disparity(np.ones((12, 16)), SMALL))
     model = CameraModel(16, 12, np.eye(3), np.zeros(5), np.eye(3), np.eye(3, 4))
     raw = StereoCamera(100.0, 100.0, 8.0, 6.0, 0.2, 16, 12, raw=(model, model))
-    with pytest.raises(ValueError, match="put Rectify before"):
+    with pytest.raises(ValueError, match=r"put stages\.Rectify before"):
         Reproject()(blank_frame(raw), as_disparity(np.ones((12, 16)), SMALL))
     with pytest.raises(ValueError, match="sigma_worst must be at least"):
         Reproject(sigma_best=43.0)
