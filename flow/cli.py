@@ -14,7 +14,7 @@ import shlex
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -116,6 +116,13 @@ def _titled(help: str) -> str:
     return f"{help[0].upper()}{help[1:]}."
 
 
+def _check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = ()) -> None:
+    """`check_outputs`, with what the recordings know of their files."""
+    from recordings.whole_file import is_ours
+
+    check_outputs(outputs, inputs, is_ours)
+
+
 def _pipeline_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("-p", "--pipeline", default="rover", help="rover, fast, paper, or a YAML file (rover)")
     sub.add_argument(
@@ -139,7 +146,8 @@ def _run_arguments(sub: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     out = options.out or options.log.parent / f"{options.log.stem}-nav.mcap"
     rrd = None if options.no_rrd else options.rrd or out.parent / f"{out.stem}.rrd"
-    check_outputs(out, [rrd, options.summary], [options.log, Path(options.pipeline)])
+    outputs = {"result log": out, "recording": rrd, "summary": options.summary}
+    _check_outputs(outputs, [options.log, Path(options.pipeline)])
 
     def keep(summary: dict[str, Any]) -> None:
         if options.summary:
@@ -208,7 +216,7 @@ def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    check_outputs(options.out, [], [])
+    _check_outputs({"input log": options.out})
     settings = {name: getattr(options, name) for name in ("frames", "seed", "odometry_scale")}
     settings["abundance"] = options.rocks
     for name in ("slope", "tilt_noise", "odometry_turn"):
@@ -261,7 +269,7 @@ def _import_images(options: argparse.Namespace) -> int:
     from recordings.image_log import import_images, pair_images
 
     left, right = pair_images(options.source)
-    check_outputs(options.out, [], [options.calibration, *left, *right])
+    _check_outputs({"input log": options.out}, [options.calibration, *left, *right])
     frames = import_images(
         left, right, options.calibration, options.out,
         pitch_down=options.pitch_down, roll=options.roll, height=options.height, rate=options.rate,
@@ -282,9 +290,9 @@ def _import_middlebury(options: argparse.Namespace) -> int:
     scenes, broken = logs_of(options.source, options.out), list[LogError]()
     for folder, log in scenes:
         if log != options.out and not options.out.exists():
-            check_outputs(options.out, [], [])
+            _check_outputs({"folder": options.out})
             options.out.mkdir()
-        check_outputs(log, [], list(folder.iterdir()))
+        _check_outputs({"input log": log}, list(folder.iterdir()))
         try:
             say(f"{log}: {import_scene(folder, log)}")
         except LogError as error:  # the other scenes can still be had
@@ -306,7 +314,7 @@ def _score(options: argparse.Namespace) -> int:
     from recordings.scoring import score
 
     truth = options.truth or options.result
-    check_outputs(None, [options.json], [options.result, truth])
+    _check_outputs({"score": options.json}, [options.result, truth])
     result = score(options.result, truth)
     if options.json:
         options.json.write_text(result.to_json() + "\n")
@@ -354,13 +362,14 @@ def _demo(options: argparse.Namespace) -> int:
     from recordings.pictures import draw
     from recordings.score_table import format_score
     from recordings.scoring import score
+    from recordings.whole_file import is_ours
 
     folder = options.out
-    check_demo(folder)
+    check_demo(folder, is_ours)
     folder.mkdir(parents=True, exist_ok=True)
     log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
-    check_outputs(log, [], [])
-    check_outputs(out, [rrd, folder / "summary.json"], [])
+    outputs = {"input log": log, "result log": out, "recording": rrd, "summary": folder / "summary.json"}
+    _check_outputs(outputs)
     say("Simulating a traverse ...")
     simulate(log, frames=options.frames)
     say("Replaying it through the pipeline 'rover' (a first run compiles, too, and its frames/s count that) ...")
