@@ -376,6 +376,8 @@ def _demo(options: argparse.Namespace) -> int:
     summary = replay(log, "rover", out, rrd, workers=os.cpu_count() or 1)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     report(summary)
+    if summary["interrupted"]:
+        return INTERRUPTED
     say(f"\n{format_score(score(out, log))}")
     shutil.rmtree(folder / "maps", ignore_errors=True)
     pictures, maps = draw(out, folder / "pictures"), export(out, folder / "maps")
