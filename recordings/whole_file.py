@@ -74,12 +74,20 @@ def written(path: Path) -> Iterator[Path]:
     """A temporary name to write to; it becomes `path` at the end, or goes. Raises UnwritableError where it cannot."""
     temporary = temporary_name(path)
     try:
-        yield temporary
-        give_name(temporary, path)
-    except OSError as error:
-        raise unwritable(path, error.strerror or str(error)) from error
+        with writing(path):
+            yield temporary
+            give_name(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """What writes the file or the folder `path`. Raises UnwritableError where it cannot."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(path, error.strerror or str(error)) from error
 
 
 def unwritable(path: Path, reason: str, kept: str = "") -> UnwritableError:

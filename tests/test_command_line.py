@@ -391,7 +391,10 @@ def test_graph_draws_every_stream(form, capsys):
 
 def test_graph_shows_what_is_set(capsys):
     assert roverflow("graph", "--set", "disparities=128") == 0
-    assert "disparities=128" in capsys.readouterr().out
+    drawn = capsys.readouterr().out
+    assert "disparities=128" in drawn
+    assert "smooth=100 ms)" in drawn
+    assert "max_slope=20 deg)" in drawn
 
 
 def test_info_says_what_a_log_holds(traverse, capsys):

@@ -318,11 +318,13 @@ def test_a_place_that_cannot_be_written_is_the_same_fault_of_every_command(trave
         ("import", "middlebury", scene.parent, "/proc/x"),
         ("score", result, "--truth", traverse, "--json", "/proc/x.json"),
         ("export", result, "/proc/x"), ("demo", "--out", "/proc/x"),
+        ("run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--summary", "/proc/x.json"),
     ):  # fmt: skip
         capsys.readouterr()
         assert roverflow(*command) == 1, command
         said = capsys.readouterr().err
-        assert "/proc/x" in said
+        assert "cannot write /proc/x" in said
+        assert "; choose another place for the output" in said
         assert said.count("\n") == 1
 
 
