@@ -167,14 +167,19 @@ def _exit_code_of(summary: dict[str, Any]) -> int:
 
 def _info_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("log", type=Path, metavar="LOG.mcap")
+    _pipeline_arguments(sub)
     sub.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _info(options: argparse.Namespace) -> int:
+    from flow.pipeline import load
     from recordings import McapSource
     from recordings.inventory import describe, format_description
 
-    description = describe(options.log, McapSource())
+    graph = load(options.pipeline, options.set)
+    if not isinstance(graph.source, McapSource):
+        raise UsageError(f"{graph.source_use} is no recordings.McapSource, through which alone info can look at a log")
+    description = describe(options.log, graph.source)
     say(json.dumps(description, indent=2) if options.json else format_description(description))
     return COMPLETE
 
