@@ -50,14 +50,16 @@ def is_ours(path: Path, kind: str) -> bool:
     """
     with path.open("rb") as file:
         start = file.read(_BEGINNING)
+    if not start:
+        return True
     if kind in _KEYS:
-        return not start or _has_keys(path, _KEYS[kind])
+        return start.startswith(b"{") and _has_keys(path, _KEYS[kind])
     if kind == "recording":
-        return not start or (start.startswith(_RECORDING[0]) and all(mark in start for mark in _RECORDING))
+        return start.startswith(_RECORDING[0]) and all(mark in start for mark in _RECORDING)
     code, name = _ABOUT
     follows = start[len(_HEADER) :]
     result = follows[:1] == bytes([code]) and follows[9:].startswith(name)  # 8 bytes between them are its length
-    return not start or (start.startswith(_HEADER) and result == (kind == "result log"))
+    return start.startswith(_HEADER) and result == (kind == "result log")
 
 
 def _has_keys(path: Path, keys: set[str]) -> bool:

@@ -110,7 +110,8 @@ def test_a_log_that_others_recorded_is_never_replaced(traverse, tmp_path, capsys
 
 OF_OTHERS = {
     "notes.md": "mine", "bare": "mine", "table.json": "{}", "list.json": "[1]", "frames.json": '{"frames_in": 3}',
-    "open.json": '{"verdict": "COMPLETE", "frames_in": 3,', "deep.json": "[" * 100_000, "theirs.rrd": "RRF2 theirs",
+    "open.json": '{"verdict": "COMPLETE", "frames_in": 3,', "deep.json": '{"a":' + "[" * 100_000,
+    "theirs.rrd": "RRF2 theirs",
 }  # fmt: skip
 
 
