@@ -5,15 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from flow.errors import UsageError
 
-_MCAP = b"\x89MCAP0\r\n"
-_OWN = _MCAP + struct.pack("<BQI4sI9s", 1, 21, 4, b"ros2", 9, b"roverflow")  # header: its length, profile and library
-_OTHERS = b"RRF", b"{"  # how recordings of rerun begin, and JSON
 _MOST_WORKERS = 1024
 _LATEST = 9e9  # s, beyond what stamps in nanoseconds can hold
 
@@ -75,13 +71,18 @@ def size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def check_outputs(log: Path | None, others: Sequence[Path | None], inputs: Sequence[Path]) -> None:
-    """Refuse outputs that cannot be written, that would replace what is being read, or that are one file twice.
+def check_outputs(
+    outputs: Mapping[str, Path | None], inputs: Sequence[Path], is_ours: Callable[[Path, str], bool]
+) -> None:
+    """Refuse outputs that cannot be written, that would replace what is being read or what is none of ours, or that are
+    one file twice.
 
-    log: the one output that is a log, if any: no other may take a log's place.
+    outputs: kind -> path; is_ours: whether an existing file is an earlier output of that kind, which may be replaced.
     """
     taken: list[str] = []
-    for path in filter(None, (log, *others)):
+    for kind, path in outputs.items():
+        if path is None:
+            continue
         if not path.parent.is_dir():
             raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
         if path.exists() and not path.is_file():
@@ -91,14 +92,14 @@ def check_outputs(log: Path | None, others: Sequence[Path | None], inputs: Seque
                 raise UsageError(f"{path} is what is being read; choose another name for the output")
         if (resolved := os.path.realpath(path)) in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
-        if path is not log and (path.suffix.lower() == ".mcap" or _start_of(path).startswith(_MCAP)):
-            raise UsageError(f"{path} has the name of a log or is one; choose another for what is none")
-        if _is_of_others(path, path is log):
-            raise UsageError(f"{path} is there already and no output of roverflow; choose another name or remove it")
+        if path.suffix.lower() == ".mcap" and not kind.endswith("log"):
+            raise UsageError(f"{path} has the name of a log; choose another for a {kind}")
+        if path.exists() and not is_ours(path, kind):
+            raise UsageError(f"{path} is there already and no {kind} of roverflow; choose another name or remove it")
         taken.append(resolved)
 
 
-def check_demo(folder: Path) -> None:
+def check_demo(folder: Path, is_ours: Callable[[Path, str], bool]) -> None:
     """Refuse a folder for the demo that holds what no earlier demo wrote: its log and its maps are replaced."""
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file; give the name of a folder with --out")
@@ -106,19 +107,5 @@ def check_demo(folder: Path) -> None:
         return
     log = folder / "traverse.mcap"
     finished = (folder / "summary.json").is_file() or not (folder / "maps").exists()
-    if not log.is_file() or _is_of_others(log, True) or not finished:
+    if not log.is_file() or not is_ours(log, "input log") or not finished:
         raise UsageError(f"{folder} is not empty, and not of an earlier demo; choose another folder with --out")
-
-
-def _is_of_others(path: Path, log: bool) -> bool:
-    """Whether there is a file that, by its first bytes, is nothing that roverflow wrote there: a log, or else."""
-    start = _start_of(path)
-    return bool(start) and (start != _OWN if log else not start.startswith(_OTHERS))
-
-
-def _start_of(path: Path) -> bytes:
-    """As many bytes as tell whose file it is; of one that is not there, none."""
-    if not path.exists():
-        return b""
-    with path.open("rb") as file:
-        return file.read(len(_OWN))

@@ -23,6 +23,8 @@ from flow.arguments import check_demo, check_outputs, count, magnitude, seconds,
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.replay import as_json, product_version, replay
 from flow.report import counted, headline, report, say
+from recordings.errors import LogError, UnwritableError
+from recordings.whole_file import is_ours, writing, written
 
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -45,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _sentence(error: Exception) -> str:
-    if isinstance(error, RoverflowError) or _is_log_error(error):
+    if isinstance(error, RoverflowError | LogError):
         return str(error)
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'the output'}: {error.strerror}"
@@ -55,17 +57,9 @@ def _sentence(error: Exception) -> str:
 
 
 def _exit_code(error: Exception) -> int:
-    from recordings.errors import UnwritableError
-
     if isinstance(error, RoverflowError):
         return error.exit_code
-    return UNUSABLE if _is_log_error(error) and not isinstance(error, UnwritableError) else FAILED
-
-
-def _is_log_error(error: Exception) -> bool:
-    from recordings.errors import LogError
-
-    return isinstance(error, LogError)
+    return UNUSABLE if isinstance(error, LogError) and not isinstance(error, UnwritableError) else FAILED
 
 
 def parser() -> argparse.ArgumentParser:
@@ -116,6 +110,14 @@ def _titled(help: str) -> str:
     return f"{help[0].upper()}{help[1:]}."
 
 
+def _write(path: Path | None, text: str) -> None:
+    """Write an output of text, where it is asked for."""
+    if path is None:
+        return
+    with written(path) as temporary:
+        temporary.write_text(f"{text}\n")
+
+
 def _pipeline_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("-p", "--pipeline", default="rover", help="rover, fast, paper, or a YAML file (rover)")
     sub.add_argument(
@@ -139,11 +141,8 @@ def _run_arguments(sub: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     out = options.out or options.log.parent / f"{options.log.stem}-nav.mcap"
     rrd = None if options.no_rrd else options.rrd or out.parent / f"{out.stem}.rrd"
-    check_outputs(out, [rrd, options.summary], [options.log, Path(options.pipeline)])
-
-    def keep(summary: dict[str, Any]) -> None:
-        if options.summary:
-            options.summary.write_text(json.dumps(summary, indent=2) + "\n")
+    outputs = {"result log": out, "recording": rrd, "summary": options.summary}
+    check_outputs(outputs, [options.log, Path(options.pipeline)], is_ours)
 
     try:
         summary = replay(
@@ -152,10 +151,10 @@ def _run(options: argparse.Namespace) -> int:
         )  # fmt: skip
     except SinkError as error:
         say(headline(error.summary))
-        with suppress(OSError):  # the log's own fault is the one to tell
-            keep(as_json(error.summary))
+        with suppress(UnwritableError):  # the log's own fault is the one to tell
+            _write(options.summary, json.dumps(as_json(error.summary), indent=2))
         raise
-    keep(summary)
+    _write(options.summary, json.dumps(summary, indent=2))
     report(summary)
     return _exit_code_of(summary)
 
@@ -168,14 +167,19 @@ def _exit_code_of(summary: dict[str, Any]) -> int:
 
 def _info_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("log", type=Path, metavar="LOG.mcap")
+    _pipeline_arguments(sub)
     sub.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _info(options: argparse.Namespace) -> int:
+    from flow.pipeline import load
     from recordings import McapSource
     from recordings.inventory import describe, format_description
 
-    description = describe(options.log, McapSource())
+    graph = load(options.pipeline, options.set)
+    if not isinstance(graph.source, McapSource):
+        raise UsageError(f"{graph.source_use} is no recordings.McapSource, through which alone info can look at a log")
+    description = describe(options.log, graph.source)
     say(json.dumps(description, indent=2) if options.json else format_description(description))
     return COMPLETE
 
@@ -208,7 +212,7 @@ def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    check_outputs(options.out, [], [])
+    check_outputs({"input log": options.out}, [], is_ours)
     settings = {name: getattr(options, name) for name in ("frames", "seed", "odometry_scale")}
     settings["abundance"] = options.rocks
     for name in ("slope", "tilt_noise", "odometry_turn"):
@@ -261,7 +265,7 @@ def _import_images(options: argparse.Namespace) -> int:
     from recordings.image_log import import_images, pair_images
 
     left, right = pair_images(options.source)
-    check_outputs(options.out, [], [options.calibration, *left, *right])
+    check_outputs({"input log": options.out}, [options.calibration, *left, *right], is_ours)
     frames = import_images(
         left, right, options.calibration, options.out,
         pitch_down=options.pitch_down, roll=options.roll, height=options.height, rate=options.rate,
@@ -276,15 +280,15 @@ def _import_middlebury_arguments(sub: argparse.ArgumentParser) -> None:
 
 
 def _import_middlebury(options: argparse.Namespace) -> int:
-    from recordings.errors import LogError
     from recordings.middlebury import import_scene, logs_of
 
     scenes, broken = logs_of(options.source, options.out), list[LogError]()
     for folder, log in scenes:
         if log != options.out and not options.out.exists():
-            check_outputs(options.out, [], [])
-            options.out.mkdir()
-        check_outputs(log, [], list(folder.iterdir()))
+            check_outputs({"folder": options.out}, [], is_ours)
+            with writing(options.out):
+                options.out.mkdir()
+        check_outputs({"input log": log}, list(folder.iterdir()), is_ours)
         try:
             say(f"{log}: {import_scene(folder, log)}")
         except LogError as error:  # the other scenes can still be had
@@ -306,10 +310,9 @@ def _score(options: argparse.Namespace) -> int:
     from recordings.scoring import score
 
     truth = options.truth or options.result
-    check_outputs(None, [options.json], [options.result, truth])
+    check_outputs({"score": options.json}, [options.result, truth], is_ours)
     result = score(options.result, truth)
-    if options.json:
-        options.json.write_text(result.to_json() + "\n")
+    _write(options.json, result.to_json())
     say(format_score(result))
     return INCOMPLETE if result.lost else COMPLETE
 
@@ -329,7 +332,8 @@ def _export(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.folder} is not empty, and maps of two runs must not mix; choose another folder")
     lost, made = Counter[str](), not options.folder.exists()
     try:
-        files = export(options.result, options.folder, options.frames, lost)
+        with writing(options.folder):
+            files = export(options.result, options.folder, options.frames, lost)
     except BaseException:  # half of the maps would look like all, and stand in the way of another try
         for part in [options.folder] if made else list(options.folder.iterdir()):
             if part.is_dir():
@@ -356,20 +360,24 @@ def _demo(options: argparse.Namespace) -> int:
     from recordings.scoring import score
 
     folder = options.out
-    check_demo(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    check_demo(folder, is_ours)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
-    check_outputs(log, [], [])
-    check_outputs(out, [rrd, folder / "summary.json"], [])
+    outputs = {"input log": log, "result log": out, "recording": rrd, "summary": folder / "summary.json"}
+    check_outputs(outputs, [], is_ours)
     say("Simulating a traverse ...")
     simulate(log, frames=options.frames)
     say("Replaying it through the pipeline 'rover' (a first run compiles, too, and its frames/s count that) ...")
     summary = replay(log, "rover", out, rrd, workers=os.cpu_count() or 1)
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    _write(outputs["summary"], json.dumps(summary, indent=2))
     report(summary)
+    if summary["interrupted"]:
+        return INTERRUPTED
     say(f"\n{format_score(score(out, log))}")
     shutil.rmtree(folder / "maps", ignore_errors=True)
-    pictures, maps = draw(out, folder / "pictures"), export(out, folder / "maps")
+    with writing(folder):
+        pictures, maps = draw(out, folder / "pictures"), export(out, folder / "maps")
     say(f"\n{len(pictures)} pictures in {folder / 'pictures'}, {len(maps)} files of the map in {folder / 'maps'}")
     say(f"the timeline: rerun {shlex.quote(str(rrd))}")
     return _exit_code_of(summary)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import fields
 from html import escape
 from typing import Any
 
 from flow.graph import Graph
+from flow.units import as_written
 
 _BOX_WIDTH, _BOX_HEIGHT, _GAP_X, _GAP_Y, _MARGIN = 168, 44, 76, 22, 16
 
@@ -42,8 +44,13 @@ def _text(graph: Graph) -> str:
 
 def _settings(actor: Any) -> list[str]:
     """The parameters of a stage or aligner that are not as by default."""
-    given = ((item.name, getattr(actor, item.name), item.default) for item in fields(actor) if item.init)
-    return [f"{name}={value}" for name, value, default in given if value != default]
+    given = [(item, getattr(actor, item.name)) for item in fields(actor) if item.init]
+    return [f"{item.name}={_shown(value, item.metadata)}" for item, value in given if value != item.default]
+
+
+def _shown(value: Any, metadata: Mapping[str, Any]) -> str:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return as_written(value, metadata.get("unit", "")) if is_number else str(value)
 
 
 def _mermaid(graph: Graph) -> str:

@@ -23,8 +23,13 @@ def finding(severity: str, sentence: str) -> Finding:
 
 
 def plain(said: Any) -> Finding:
-    """A finding out of what a stage returns: an object with `severity` and `sentence`."""
-    return finding(str(said.severity), str(said.sentence))
+    """A finding out of what a stage returns: an object with `severity` and `sentence`; one whose severity is none is a
+    warning that says so."""
+    severity, sentence = str(said.severity), str(said.sentence)
+    if severity not in (NOTE, WARNING):
+        wrong = f"a {type(said).__name__}'s severity must be {NOTE} or {WARNING}, not '{severity}'"
+        severity, sentence = WARNING, f"{sentence} ({wrong})"
+    return finding(severity, sentence)
 
 
 def findings(graph: Graph) -> dict[str, Finding]:

@@ -7,13 +7,35 @@ graph share one clock; joining others is the aligners' work.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
 from types import UnionType
 from typing import Any, Protocol, Union, get_args, get_origin, get_type_hints
 
 from flow.errors import PipelineError
+
+Event = tuple[int, str, Any]  # of a log: log time in ns, stream, item; an exception stands for an item that was lost
+
+
+class Log(Protocol):
+    """What a source opens: its events in the order of log time, and what it says of itself before any is read.
+
+    missing: stream -> why the log cannot provide it; refused: setting of the source -> why the log cannot be read so,
+    whatever the graph needs.
+    """
+
+    missing: Mapping[str, str]
+    refused: Mapping[str, str]
+
+    def __iter__(self) -> Iterator[Event]:
+        """The events, from the first one on."""
+
+    def notes(self) -> Mapping[str, str]:
+        """What there is to say of a stream, as a note of the run; asked at its end."""
+
+    def excerpts(self, count: int, streams: set[str]) -> Iterable[Iterable[Event]]:
+        """So many stretches of these streams, spread over the whole log; asked for where a stage surveys it."""
 
 
 class Sink(Protocol):

@@ -20,6 +20,7 @@ from flow.ledger import failure
 from flow.values import coerced
 
 SHIPPED = Path(__file__).parent / "pipelines"
+_BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"
 _RESERVED = ("use", "optional")
 # what a class needs to have to be one
 _NEEDED = {"the source": ("streams",), "a sink": ("suffix", "wants", "open", "write", "close")}
@@ -33,25 +34,32 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     path = find(name)
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise UsageError(f"the pipeline {path} is no text; give {', '.join(shipped())} or a YAML file") from error
+    except OSError as error:
         raise UsageError(f"cannot read the pipeline {path}: {error}") from error
     if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))  # stages may stand beside the file that uses them
     tree = read(text, lambda line: Place(path.name, line))
     if tree.value is None:
-        raise tree.place.error("the file is empty; it needs 'source', 'streams' and 'sinks'")
+        raise tree.place.error(f"the file is empty; {_BEGIN}")
     _check_keys(tree)
     return _Builder(path, text, settled(tree, overrides)).graph()
 
 
 def find(name: str) -> Path:
     """The file of a pipeline."""
-    shipped = sorted(file.stem for file in SHIPPED.glob("*.yaml"))
-    if name in shipped:
+    if name in shipped():
         return SHIPPED / f"{name}.yaml"
     if Path(name).is_file():
         return Path(name)
-    raise UsageError(f"no pipeline '{name}': neither a file nor one of {', '.join(shipped)}{nearest(name, shipped)}")
+    known = shipped()
+    raise UsageError(f"no pipeline '{name}': neither a file nor one of {', '.join(known)}{nearest(name, known)}")
+
+
+def shipped() -> list[str]:
+    """The names of the pipelines that ship with the product."""
+    return sorted(file.stem for file in SHIPPED.glob("*.yaml"))
 
 
 def _check_keys(tree: Value) -> None:
@@ -73,7 +81,7 @@ class _Builder:
         top = _mapping(self.tree, "the pipeline")
         for key in ("source", "streams", "sinks"):
             if key not in top:
-                raise self.tree.place.error(f"the pipeline has no '{key}'")
+                raise self.tree.place.error(f"the pipeline has no '{key}'; {_BEGIN}")
         source = self._made(top["source"], "the source")
         streams = _mapping(top["streams"], "'streams'")
         if not isinstance(top["sinks"].value, list) or not top["sinks"].value:

@@ -16,9 +16,9 @@ from typing import Any
 
 from flow.engine import Engine
 from flow.errors import PipelineError, SinkError, UsageError
-from flow.feeder import Event, Feeder
+from flow.feeder import Feeder
 from flow.findings import NOTE, Finding, finding, findings
-from flow.graph import Graph, Sink
+from flow.graph import Event, Graph, Log, Sink
 from flow.ledger import Ledger, Verdict
 from flow.survey import surveyed
 
@@ -27,20 +27,20 @@ class Stop:
     """What interrupts ask for: the first to finish the frames in flight, the second to abandon them too."""
 
     def __init__(self) -> None:
-        self._finish, self._abandon = threading.Event(), threading.Event()
+        self._requests = 0
         self.reading = False  # whether the log is being read, where an exception does no harm
 
     def request(self) -> None:
         """One more interrupt."""
-        (self._abandon if self._finish.is_set() else self._finish).set()
+        self._requests += 1
 
     def finishing(self) -> bool:
         """Whether no new frame shall start."""
-        return self._finish.is_set()
+        return self._requests >= 1
 
     def abandoning(self) -> bool:
         """Whether even the frames in flight shall not be waited for."""
-        return self._abandon.is_set()
+        return self._requests >= 2
 
 
 @contextmanager
@@ -112,7 +112,7 @@ class _Outputs:
 
 def run(
     graph: Graph,
-    log: Any,
+    log: Log,
     outputs: Mapping[str, Path],
     *,
     workers: int = 2,
@@ -122,15 +122,10 @@ def run(
 ) -> dict[str, Any]:
     """Run an opened log through `graph`; returns the summary.
 
-    log: iterates over (log time, stream, item), has `missing` (stream -> why the log cannot provide it) and
-    `refused` (setting of the source -> why the log cannot be read so, whatever the graph needs), `notes()` (stream
-    -> what is to be said of it, as a note of the run), and where stages survey it `excerpts` (see flow.survey). What
-    stages found is asked at the end (see flow.findings).
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
     closed and readable by then. A run that is stopped before its first frame is through leaves no output, and those of
-    an earlier run as they are. In the summary, start_seconds are those of wall_seconds that the survey and the opening
-    of the outputs took, before the first frame.
+    an earlier run as they are. Of the summary's wall_seconds, start_seconds were over before the first frame.
     """
     for why in log.refused.values():
         raise UsageError(why)
@@ -177,7 +172,7 @@ def run(
     return summary
 
 
-def _notes(log: Any, graph: Graph) -> dict[str, Finding]:
+def _notes(log: Log, graph: Graph) -> dict[str, Finding]:
     """What the log says of the streams that the graph reads."""
     return {name: finding(NOTE, why) for name, why in log.notes().items() if name in graph.source_streams}
 
@@ -186,7 +181,7 @@ class _StoppedError(Exception):
     """Leaves the log in the middle; the aligners then draw no conclusion from its end."""
 
 
-def _feed(feeder: Feeder, log: Any, engine: Engine, stop: Stop) -> bool:
+def _feed(feeder: Feeder, log: Log, engine: Engine, stop: Stop) -> bool:
     """Admit the frames of the log; False if it was stopped, or an output failed, before the log's end."""
     with suppress(_StoppedError):
         for frame in feeder.frames(_events(log, stop)):

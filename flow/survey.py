@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from flow.feeder import Event, Feeder
+from flow.feeder import Feeder
 from flow.findings import WARNING, Finding, finding, plain
-from flow.graph import Graph, Node
+from flow.graph import Event, Graph, Node
 from flow.ledger import Absent, Ledger, failure
 
 EXCERPTS = 9

@@ -50,7 +50,7 @@ def quantity(text: str, unit: str) -> float:
         raise ValueError(f"'{text}' has the unknown unit '{given}'; expected {', '.join(known)}")
     kind, size = UNITS[given]
     if kind != wanted:
-        raise ValueError(f"'{text}' is a {kind}; expected {f'a {wanted} in {unit}' if unit else 'a plain number'}")
+        raise ValueError(f"'{text}' is {_a(kind)}; expected {f'{_a(wanted)} in {unit}' if unit else 'a plain number'}")
     if given == unit or number == 0 or not math.isfinite(number):
         return number
     return float(Fraction(match[1]) * Fraction(size) / Fraction(base))  # 4.1 ms are 4100000 ns, not a bit less
@@ -61,3 +61,21 @@ def check_bare(number: float, unit: str) -> None:
     units = _WRITTEN.get(UNITS.get(unit, ("", 1.0))[0])
     if units and number:
         raise ValueError(f"{number:.15g} needs a unit; write {' or '.join(f'{number:.15g} {name}' for name in units)}")
+
+
+def as_written(value: float, unit: str) -> str:
+    """A number of `unit` as one would write it by hand.
+
+    >>> as_written(5_000_000, "ns")
+    '5 ms'
+    """
+    kind, base = UNITS.get(unit, (unit, 1.0))
+    if kind not in _WRITTEN or not value:
+        return str(value)
+    numbers = {name: value * base / UNITS[name][1] for name in _WRITTEN[kind]}
+    texts = [(abs(number) < 1, f"{number:.9g} {name}") for name, number in numbers.items()]
+    return min(texts, key=lambda text: (text[0], len(text[1])))[1]
+
+
+def _a(noun: str) -> str:
+    return f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"

@@ -79,7 +79,7 @@ def test_a_broken_scene_does_not_keep_the_others_from_being_imported(tmp_path, c
         ("im1.png", "out.mcap", "im1.png is not an image"),
         (None, "Box/im0.png", "is what is being read"),
         (None, "Box", "is a folder or a device"),
-        (None, "Bex.png", "no output of roverflow"),
+        (None, "Bex.png", "no input log of roverflow"),
     ],
 )
 def test_a_scene_that_cannot_be_imported_is_refused_in_one_sentence(tmp_path, capsys, spoilt, out, words):

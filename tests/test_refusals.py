@@ -9,21 +9,31 @@ import sys
 from pathlib import Path
 
 import pytest
+import rerun
 
 from flow.arguments import check_demo
 from flow.cli import main
 from flow.errors import UsageError
-from recordings import McapSource
+from recordings import McapSource, RerunSink
+from recordings.whole_file import is_ours
 from tests.conftest import rewrite
 from tests.recordings.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
-TAKEN = "is there already and no output of roverflow; choose another name or remove it"
+TAKEN = "is there already and no {} of roverflow; choose another name or remove it"
 SMALL = ("--set", "disparities=64")
 
 
 def roverflow(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result log of the traverse, with recording and summary beside it."""
+    out = tmp_path_factory.mktemp("result") / "out.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--summary", out.with_suffix(".json")) == 0
+    return out
 
 
 def drop(*parts: str):
@@ -90,26 +100,57 @@ def test_a_log_that_others_recorded_is_never_replaced(traverse, tmp_path, capsys
             ("simulate", log, "--frames", 1), ("import", "middlebury", scene, log),
         ):  # fmt: skip
             assert roverflow(*command) == 2
-            what = (
-                "has the name of a log or is one; choose another for what is none" if "--summary" in command else TAKEN
-            )
+            what = TAKEN.format("result log" if command[0] == "run" else "input log")
+            what = "has the name of a log; choose another for a summary" if "--summary" in command else what
             assert capsys.readouterr().err == f"roverflow: {log} {what}\n"
     assert {path: path.read_bytes() for path in before} == before
     raw.write_bytes(traverse.read_bytes())  # one of our own
     assert roverflow("import", "middlebury", scene, raw) == 0
 
 
-@pytest.mark.parametrize("name", ["notes.md", "table.json", "bare"])
-def test_no_output_takes_the_place_of_what_is_of_another_kind(traverse, tmp_path, capsys, name):
-    mine = tmp_path / name
-    mine.write_text("{}" if name.endswith("json") else "mine")
-    commands = [["simulate", mine, "--frames", "1", "--size", "64x48"], ["run", traverse, "-o", mine, *SMALL]]
-    if name != "table.json":  # a summary may take an earlier one's place
-        commands += [["run", traverse, "-o", tmp_path / "o.mcap", option, mine] for option in ("--rrd", "--summary")]
-    for command in commands:
+OF_OTHERS = {
+    "notes.md": "mine", "bare": "mine", "table.json": "{}", "list.json": "[1]", "frames.json": '{"frames_in": 3}',
+    "open.json": '{"verdict": "COMPLETE", "frames_in": 3,', "deep.json": '{"a":' + "[" * 100_000,
+    "theirs.rrd": "RRF2 theirs",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OF_OTHERS)
+def test_no_output_takes_the_place_of_what_is_of_another_kind(traverse, result, tmp_path, capsys, name):
+    mine, run = tmp_path / name, ["run", traverse, "-o", tmp_path / "o.mcap"]
+    mine.write_text(OF_OTHERS[name])
+    for kind, command in {
+        "input log": ["simulate", mine, "--frames", 1], "result log": ["run", traverse, "-o", mine],
+        "recording": [*run, "--rrd", mine], "summary": [*run, "--summary", mine],
+        "score": ["score", result, "--truth", traverse, "--json", mine],
+    }.items():  # fmt: skip
         assert roverflow(*command) == 2
-        assert capsys.readouterr().err == f"roverflow: {mine} {TAKEN}\n"
-    assert len(mine.read_text()) in (2, 4)
+        assert capsys.readouterr().err == f"roverflow: {mine} {TAKEN.format(kind)}\n"
+    assert mine.read_text() == OF_OTHERS[name]
+
+
+def test_an_output_takes_the_place_of_an_earlier_one_of_its_kind_alone(traverse, result, tmp_path, capsys):
+    score = tmp_path / "score.json"
+    assert roverflow("score", result, "--truth", traverse, "--json", score) == 0
+    files = {
+        "input log": traverse, "result log": result, "recording": result.with_suffix(".rrd"),
+        "summary": result.with_suffix(".json"), "score": score,
+    }  # fmt: skip
+    (tmp_path / "empty").touch()
+    for kind in files:
+        assert [other for other, file in files.items() if is_ours(file, kind)] == [kind]
+        assert is_ours(tmp_path / "empty", kind)
+
+
+def test_a_recording_of_another_application_is_ours_as_well(tmp_path):
+    sink, recording = RerunSink(application_id="desk"), tmp_path / "out.rrd"
+    sink.open(recording, {}, {"log": "traverse.mcap", "pipeline": "# a line of many\n" * 5000})
+    sink.close({"verdict": "COMPLETE"})
+    assert is_ours(recording, "recording")
+    with rerun.RecordingStream("theirs") as theirs:
+        theirs.set_sinks(rerun.FileSink(str(tmp_path / "theirs.rrd")))
+        theirs.log("picture", rerun.TextDocument("mine"))
+    assert not is_ours(tmp_path / "theirs.rrd", "recording")
 
 
 def test_the_demo_takes_no_folder_that_holds_anything_else(traverse, tmp_path, capsys):
@@ -121,17 +162,17 @@ def test_the_demo_takes_no_folder_that_holds_anything_else(traverse, tmp_path, c
         assert "not of an earlier demo; choose another folder" in capsys.readouterr().err
         assert (folder / name).read_bytes() == content
     with pytest.raises(UsageError, match="is a file; give the name of a folder"):
-        check_demo(tmp_path / "notes.txt" / "notes.txt")
+        check_demo(tmp_path / "notes.txt" / "notes.txt", is_ours)
     folder = tmp_path / "earlier"
     folder.mkdir()
-    check_demo(folder)
+    check_demo(folder, is_ours)
     (folder / "traverse.mcap").write_bytes(traverse.read_bytes())
-    check_demo(folder)
+    check_demo(folder, is_ours)
     (folder / "maps").mkdir()
     with pytest.raises(UsageError):
-        check_demo(folder)
+        check_demo(folder, is_ours)
     (folder / "summary.json").touch()
-    check_demo(folder)
+    check_demo(folder, is_ours)
 
 
 @pytest.mark.parametrize("options", [("--rrd", "out.mcap"), ("--summary", "out.mcap")])
@@ -155,32 +196,36 @@ def test_nothing_but_a_log_takes_the_place_or_the_name_of_one(traverse, tmp_path
     log.write_bytes(traverse.read_bytes())
     for name in (log, tmp_path / "new.mcap"):
         assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, name) == 2
-        assert f"{name} has the name of a log or is one" in capsys.readouterr().err
+        said = (
+            "has the name of a log" if name.suffix == ".mcap" else TAKEN.format(option[2:].replace("rrd", "recording"))
+        )
+        assert f"{name} {said}" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [log]
 
 
-def test_an_output_that_cannot_be_begun_leaves_the_others_of_an_earlier_run(traverse, tmp_path, capsys, monkeypatch):
+def test_an_output_that_cannot_be_begun_leaves_the_others_of_an_earlier_run(
+    traverse, result, tmp_path, capsys, monkeypatch
+):
     out, rrd = tmp_path / "out.mcap", tmp_path / "out.rrd"
-    out.write_bytes(traverse.read_bytes())
+    out.write_bytes(result.read_bytes())
     monkeypatch.setattr("recordings.rerun_sink.RESERVE", 1 << 62)
     assert roverflow("run", traverse, *SMALL, "-o", out, "--rrd", rrd) == 1
     assert "MB are free" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [out]
-    assert out.read_bytes() == traverse.read_bytes()
+    assert out.read_bytes() == result.read_bytes()
 
 
 @pytest.mark.parametrize("bounds", [("--end", "0"), ("--start", "2.6"), ("--start", "0.1", "--end", "0.2")])
-def test_a_range_without_an_image_is_refused_and_replaces_nothing(traverse, tmp_path, capsys, bounds):
+def test_a_range_without_an_image_is_refused_and_replaces_nothing(traverse, result, tmp_path, capsys, bounds):
     out = tmp_path / "out.mcap"
-    out.write_bytes(traverse.read_bytes())
+    out.write_bytes(result.read_bytes())
     assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", *bounds) == 2
     assert "has no image on /stereo/left/image_rect_color from" in capsys.readouterr().err
-    assert out.read_bytes() == traverse.read_bytes()
+    assert out.read_bytes() == result.read_bytes()
 
 
-def test_an_export_that_fails_leaves_nothing_in_the_way_of_another(traverse, tmp_path, capsys, monkeypatch):
-    result, folder = tmp_path / "out.mcap", tmp_path / "maps"
-    assert roverflow("run", traverse, *SMALL, "-o", result, "--no-rrd") == 0
+def test_an_export_that_fails_leaves_nothing_in_the_way_of_another(result, tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "maps"
 
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -264,9 +309,8 @@ def test_a_simulation_of_less_than_nothing_is_refused(tmp_path, option, value, c
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder in which nobody can write")
-def test_a_place_that_cannot_be_written_is_the_same_fault_of_every_command(traverse, tmp_path, capsys):
-    scene, result = write_scene(tmp_path / "scenes" / "Box"), tmp_path / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", result, "--no-rrd") == 0
+def test_a_place_that_cannot_be_written_is_the_same_fault_of_every_command(traverse, result, tmp_path, capsys):
+    scene = write_scene(tmp_path / "scenes" / "Box")
     (tmp_path / "cam.yaml").write_text("{fx: 100, cx: 10, cy: 10, baseline: 0.1}")
     images = ("images", scene, "/proc/x.mcap", "--calibration", tmp_path / "cam.yaml", "--pitch-down", 20)
     for command in (
@@ -275,11 +319,13 @@ def test_a_place_that_cannot_be_written_is_the_same_fault_of_every_command(trave
         ("import", "middlebury", scene.parent, "/proc/x"),
         ("score", result, "--truth", traverse, "--json", "/proc/x.json"),
         ("export", result, "/proc/x"), ("demo", "--out", "/proc/x"),
+        ("run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--summary", "/proc/x.json"),
     ):  # fmt: skip
         capsys.readouterr()
         assert roverflow(*command) == 1, command
         said = capsys.readouterr().err
-        assert "/proc/x" in said
+        assert "cannot write /proc/x" in said
+        assert "; choose another place for the output" in said
         assert said.count("\n") == 1
 
 

@@ -214,6 +214,12 @@ def test_smoothing_reaches_as_far_back_as_ahead_even_where_frames_follow_each_ot
     assert found == [(stamp, pytest.approx(stamp / 10)) for stamp in (100, 110, 120, 130)]
 
 
+def test_smoothing_keeps_the_samples_that_the_next_frame_wants_as_well():
+    bent = [(10 * count, float(count**2)) for count in range(30)]
+    found = values(smoothing(bent, [100, 110, 120, 130], 50))  # of five samples to either side the mean is 10 more
+    assert found == [(stamp, pytest.approx((stamp / 10) ** 2 + 10)) for stamp in (100, 110, 120, 130)]
+
+
 def test_smoothing_does_not_lag_at_either_end_of_the_stream_and_gaps_are_gaps():
     ramp = [(10 * count, float(count)) for count in range(8)]
     assert values(smoothing(ramp, [5, 12, 65], 50)) == [(5, 0.5), (12, pytest.approx(1.0)), (65, 6.5)]

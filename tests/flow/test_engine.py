@@ -52,7 +52,7 @@ sinks: [{use: tests.flow.toys.Keep}]
     monkeypatch.setattr("tests.flow.toys.Scale.__call__", noted)
     engine = Engine(pipeline.stages, {}, Ledger(), workers=1, capacity=4)
     for index in range(4):
-        engine.admit(index, {"both": Couple(index, 1.0), "height": Number(index, 0.0)}, [])
+        engine.admit(index, frame(index), [])
     gate.set()
     engine.finish()
     assert calls == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
@@ -82,7 +82,7 @@ def test_inboxes_stay_bounded_when_the_end_of_the_line_is_slow(tmp_path):
     helper.start()
     for index in range(60):
         inside.append(index)
-        engine.admit(index, {"both": Couple(index, 1.0), "height": Number(index, 0.0)}, [])
+        engine.admit(index, frame(index), [])
     engine.finish()
     helper.join()
     assert most[0] <= 2 * (len(pipeline.stages) + 1) + 3
@@ -96,6 +96,52 @@ def test_a_frame_that_has_nothing_to_work_on_is_through_at_once(tmp_path):
     assert engine.admit(0, {"both": lost, "height": Number(0, 0.0)}, [])
     engine.finish()
     assert told == [False]
+
+
+def frame(index):
+    """The streams that a frame of the toys' pipeline starts with."""
+    return {"both": Couple(index, 1.0), "height": Number(index, 0.0)}
+
+
+def test_a_sink_that_is_at_work_is_waited_for_whatever_is_stopped(tmp_path):
+    inside, gate, ledger = threading.Event(), threading.Event(), Ledger()
+
+    class Slow(Keep):
+        def write(self, record):
+            inside.set()
+            gate.wait(5)
+            super().write(record)
+
+    engine = Engine(graph(tmp_path).stages, {"slow": (sink := Slow(), ["sum"])}, ledger, workers=1)
+    engine.admit(0, frame(0), [])
+    inside.wait(5)
+    threading.Timer(0.2, gate.set).start()
+    engine.finish(lambda: True)
+    assert (len(sink.records), engine.through, len(ledger)) == (1, 1, 0)
+
+
+def test_what_a_frame_lost_before_it_was_abandoned_is_told_and_what_becomes_of_it_later_is_not(tmp_path, monkeypatch):
+    inside, gate, told, ledger, stages = threading.Event(), threading.Event(), [], Ledger(), graph(tmp_path).stages
+
+    def hang(self, couple):
+        inside.set()
+        gate.wait(5)
+        raise ValueError("too late")
+
+    monkeypatch.setattr("tests.flow.toys.Scale.__call__", hang)
+    engine = Engine(stages, {}, ledger, workers=1, on_frame=told.append)
+    lost = ledger.add(Entry("level", 0, "source", Reason.UNREADABLE, "chunk 7 is damaged"))
+    engine.admit(0, frame(0), [lost])
+    inside.wait(5)
+    engine.finish(lambda: True)
+    gate.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("worker-"):
+            thread.join(5)
+    abandoned = Entry("frame", 0, "engine", Reason.ABANDONED, "the run ended before it was through")
+    assert engine.late_entries == [lost, abandoned]
+    assert set(ledger.entries) == {lost, abandoned}
+    assert (told, engine.through) == ([], 0)
 
 
 class Sum:

@@ -2,8 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
+from flow.findings import plain
 from flow.report import headline, report
 from flow.run import run
+from stages.stage import Finding
 from tests.flow.toys import Log, graph, replayed, traverse
 
 
@@ -59,3 +63,9 @@ def test_a_finding_that_breaks_down_costs_the_run_nothing(tmp_path):
     found = summary["findings"]["total"]
     assert (summary["verdict"], found["severity"]) == ("COMPLETE", "warning")
     assert found["sentence"].startswith("RuntimeError: unlucky (toys.py, line ")
+
+
+@pytest.mark.parametrize("said", [Finding("warning", "the mount is loose"), Finding("the mount is loose", "warn")])
+def test_a_finding_of_no_severity_that_there_is_is_a_warning_that_says_what_is_wrong(said):
+    wrong = f"a Finding's severity must be note or warning, not '{said.severity}'"
+    assert plain(said) == {"severity": "warning", "sentence": f"{said.sentence} ({wrong})"}

@@ -1,9 +1,11 @@
-"""What the ledger says of an exception: a refusal says what it says, what breaks down is named with its place."""
+"""The ledger says the same of equal runs, and of an exception what it says or where it broke down."""
+
+from itertools import permutations
 
 import numpy as np
 import pytest
 
-from flow.ledger import failure
+from flow.ledger import Entry, Ledger, Reason, failure
 from stages import Match
 
 
@@ -38,3 +40,13 @@ def test_so_does_a_refusal_by_a_stage_of_ours_that_another_is_made_of():
 def test_an_operation_that_breaks_down_is_named_with_file_and_line(call, said):
     line = call.__code__.co_firstlineno
     assert said_of(call) == f"{said} (test_ledger.py, line {line}; --debug shows the way there)"
+
+
+def test_equal_runs_give_equal_ledgers_whatever_fails_first():
+    where = [(0, "match", "right"), (1, "match", "left"), (1, "match", "right"), (1, "refine", "left")]
+    entries = [Entry(stream, stamp, stage, Reason.FAILED, "no") for stamp, stage, stream in where]
+    for order in permutations(entries):
+        ledger = Ledger()
+        for entry in order:
+            ledger.add(entry)
+        assert list(ledger.entries) == entries

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from flow.errors import PipelineError, UsageError
 from flow.pipeline import load
-from flow.units import quantity
+from flow.units import as_written, quantity
 
 GOOD = """\
 source: {use: tests.flow.toys.Source, gain: 2.5}
@@ -112,6 +112,7 @@ def test_a_key_of_a_setting_is_replaced_wherever_it_is_named_or_in_one_place_alo
         ("25 cm", "quick", 5, ["factor", "'quick' is not a number"]),
         ("25 cm", "25 ms", 5, ["'25 ms' is a time", "expected a length in m"]),
         ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'; expected mm, cm, m, km"]),
+        ("25 cm", "25 rad", 5, ["'25 rad' is an angle; expected a length in m"]),
         ("25 cm", "25 px", 5, ["'25 px' is a number of pixels; expected a length in m"]),
         ("25 cm", "-1 m", 5, ["at least 0 m"]),
         ("25 cm", "true", 5, ["expected a number in m"]),
@@ -291,6 +292,28 @@ def test_a_stage_that_breaks_down_as_it_is_made_is_named_with_its_line(tmp_path)
 def test_an_anchor_that_holds_itself_is_refused(tmp_path):
     with pytest.raises(PipelineError, match="anchor"):
         loaded(tmp_path, "a: &a [*a]\n")
+
+
+@pytest.mark.parametrize(("value", "unit", "text"), [
+    (5_000_000, "ns", "5 ms"), (100_000_000, "ns", "100 ms"), (1.5, "s", "1.5 s"), (0.05, "m", "5 cm"),
+    (math.radians(20), "rad", "20 deg"), (math.radians(60), "rad", "60 deg"), (0, "ns", "0"), (128, "px", "128"),
+    (12.0, "m", "12 m"), (0.25, "", "0.25"),
+])  # fmt: skip
+def test_a_number_is_shown_as_one_would_write_it(value, unit, text):
+    assert as_written(value, unit) == text
+    assert quantity(text, unit) == pytest.approx(value)
+
+
+def test_a_file_that_is_no_text_is_refused_with_what_may_be_given(tmp_path):
+    (tmp_path / "t.mcap").write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(UsageError, match=r"t.mcap is no text; give fast, paper, rover or a YAML file"):
+        load(str(tmp_path / "t.mcap"))
+
+
+@pytest.mark.parametrize("text", ["", "source: {use: a.B}"])
+def test_what_lacks_a_part_says_what_to_begin_with(tmp_path, text):
+    with pytest.raises(PipelineError, match=r"toy.yaml:1: .*; begin with a copy of .*/flow/pipelines/rover.yaml"):
+        loaded(tmp_path, text)
 
 
 def test_an_unknown_pipeline_lists_those_that_ship():

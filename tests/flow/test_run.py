@@ -310,6 +310,25 @@ def test_a_stamp_in_doubt_does_not_hold_up_the_log(tmp_path):
     assert read["left"] < 110
 
 
+def test_what_is_read_ahead_of_a_stamp_in_doubt_is_bounded_however_much_the_log_holds(tmp_path):
+    alone = [(0, "words", Text(3_600_000 * MS, "alone"))]
+    often = [(at, "level", Number(at, at / 1e9)) for at in range(MS, 5000 * MS, MS)]
+    text = PIPELINE.replace("sinks:", "  said: {use: flow.align.latest, stream: words, at: both}\nsinks:")
+    read = iter(alone + traverse(1)[:3] + often)
+    next(Feeder(graph(tmp_path, text=text), Ledger()).frames(read))
+    assert len(often) - len(list(read)) < 130
+
+
+def test_two_damaged_stamps_in_a_row_that_do_not_go_on_from_each_other_are_lost_alone(tmp_path):
+    hours = {4: 3_600_000 * MS, 5: 7_200_000 * MS}
+    events = [
+        (at, stream, Number(at + hours.get(at // (100 * MS), 0), item.value) if stream == "left" else item)
+        for at, stream, item in traverse(20)
+    ]
+    _, summary = replayed(graph(tmp_path), events)
+    assert (summary["frames_out"], summary["drops"]) == (18, {"out of order": 2, "unmatched": 2})
+
+
 def test_patience_runs_on_the_clock_of_the_whole_log(tmp_path):
     events = [(0, "left", Number(0, 1.0))]
     events += [(at, "level", Number(at, 0.0)) for at in range(0, 3000 * MS, 50 * MS)]
