@@ -212,6 +212,21 @@ def print_fills(cases: list[Case]) -> None:
     )
 
 
+def print_skies(cases: list[Case]) -> None:
+    """Print how much of the sky, and of the ground that both cameras see, `rover` calls measured; and how much were it
+    not asked whether the images bear a match out."""
+    shares: dict[str, list[tuple[float, float]]] = {}
+    for case in cases:
+        streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
+        for name, chain in (("asked", refined("checked_again")), ("not", refined("checked_again", correlation=0.0))):
+            measured = chain(streams, case).source == Source.MEASURED
+            known = np.isfinite(case.truth) & (case.mask == 255)
+            shares.setdefault(name, []).append((measured[case.mask == 0].mean(), measured[known].mean()))
+    (sky, ground), (sky_else, ground_else) = (100 * np.mean(values, axis=0) for values in shares.values())
+    print(f"measured: {sky:.1f} % of the sky, {ground:.1f} % of the ground; {sky_else:.1f} %, {ground_else:.1f} % if")
+    print("what the images do not bear out counted as well")
+
+
 def print_worth(cases: list[Case]) -> None:
     """Print what share of the pixels of an origin is right within 1 px, beside the confidence that `rover` states."""
     origins: dict[str, Callable[[Disparity], Array]] = {
@@ -298,6 +313,7 @@ def main(folder: Path) -> None:
     cases = simulated()
     print_table("simulated frames", measure(cases), None)
     print_fills(cases)
+    print_skies(cases)
     print_worth(cases)
     for case in cases:
         streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
