@@ -38,7 +38,7 @@ JUMP_GRAY = 10.0  # gray levels over which a neighbour's weight falls to 1/e the
 LEAST_WEIGHT = 0.05  # of a match that was let in, however low its confidence
 # Measured with the pipeline `rover` by tests/study.py: the mean of eight Middlebury scenes and of simulated frames.
 TRUST = Trust(
-    agreed=(0.88, 0.98, 0.998), alone=(0.62, 0.86, 0.97), replaced=0.81, plane=0.79, mismatch=0.615, occlusion=0.66
+    agreed=(0.88, 0.98, 0.998), alone=(0.62, 0.86, 0.97), replaced=0.81, plane=0.79, mismatch=0.72, occlusion=0.66
 )
 
 
