@@ -104,7 +104,7 @@ class Opening:
     def _read_static(self) -> None:
         for topic, schema in sorted(self.schemas.items()):
             if schema == TRANSFORMS and topic.endswith("tf_static"):
-                for transforms in self._made(topic, lambda message: message.transforms):
+                for transforms in self._made(topic, lambda message: message.transforms, any_order=True):
                     for item in [transforms] if isinstance(transforms, LogError) else transforms:
                         added = item if isinstance(item, LogError) else _attempt(self.static.add, item)
                         if isinstance(added, LogError):
@@ -242,9 +242,9 @@ class Opening:
             )
         return None
 
-    def _made(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
+    def _made(self, topic: str, make: Callable[[Any], T], any_order: bool = False) -> Iterator[T | LogError]:
         """What `make` makes of each message of a topic; a LogError for one of which it makes nothing."""
-        for raw in self.file.messages(self.channels_of(topic)):
+        for raw in self.file.messages(self.channels_of(topic), any_order=any_order):
             if not isinstance(raw, Lost):
                 yield _attempt(lambda data, decoder: make(decoder(data)), raw.data, self.decoders[raw.channel])
             elif raw.channel is not None:

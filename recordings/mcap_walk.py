@@ -86,8 +86,8 @@ def _note(index: Index, opcode: int, content: bytes, length: int, position: int,
         _note_chunk(index, content, position)
     elif opcode == Opcode.MESSAGE:
         channel, _, log_time, _ = MESSAGE.unpack_from(content)
-        index.loose.append(Loose(channel, log_time, position + RECORD.size + MESSAGE.size, length - MESSAGE.size))
-        index.seen(channel, log_time)
+        offset, clock = position + RECORD.size + MESSAGE.size, index.seen(channel, log_time)
+        index.loose.append(Loose(channel, log_time, offset, length - MESSAGE.size, clock))
     elif opcode == Opcode.HEADER and before == 0:
         index.profile = profile_of(content)
     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -107,7 +107,7 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
         reason = f"the chunk at byte {position} is broken and its messages are lost ({said(error)})"
         index.lose(reason, start_time(content))
         return
-    offsets, times = {}, []
+    offsets, times, before = {}, [], index.clocks.copy()
     for opcode, record in inside:
         if opcode == Opcode.MESSAGE:
             channel, _, log_time, _ = MESSAGE.unpack_from(record)
@@ -123,6 +123,7 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
             message_start_time=min(times), uncompressed_size=0,
         )  # fmt: skip
         index.chunks.append(chunk)
+        index.before[position] = before
 
 
 def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None, size: int) -> None:
@@ -137,8 +138,8 @@ def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None,
         with suppress(*BROKEN):  # nothing more is to be had then
             for opcode, content in records(unpacked_start(record[RECORD.size :]), whole=False):
                 if opcode == Opcode.MESSAGE:
-                    index.rescued.append(raw(content))
-                    index.seen(index.rescued[-1].channel, index.rescued[-1].log_time)
+                    message = raw(content)
+                    index.rescued.append((message, index.seen(message.channel, message.log_time)))
                 else:
                     index.define(opcode, content)
     if found is None:

@@ -107,7 +107,8 @@ def test_messages_come_in_log_time_order_whatever_their_order_in_the_file(sample
         writer = Writer(target, chunk_size=2000)
         writer.start()
         known: dict[int, int] = {}
-        for schema, channel, message in reversed(list(make_reader(source).iter_messages())):
+        messages = list(make_reader(source).iter_messages())
+        for schema, channel, message in sorted(messages, key=lambda found: found[1].topic, reverse=True):
             if channel.id not in known:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 known[channel.id] = writer.register_channel(channel.topic, "cdr", number)
