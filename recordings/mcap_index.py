@@ -147,6 +147,7 @@ def from_summary(file: BinaryIO, size: int) -> Index | None:
     chunks, channels, schemas = index.counts
     whole = (
         chunks == len(index.chunks) > 0
+        and index.expected  # statistics may leave these counts out
         and channels == len(index.channels)
         and schemas == len(index.schemas)
         and all(chunk.message_index_offsets.keys() <= index.channels.keys() for chunk in index.chunks)

@@ -8,6 +8,7 @@ import math
 import re
 import struct
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import Statistics
 from mcap.writer import CompressionType, IndexType, Writer
 
 from recordings import McapSource
@@ -214,6 +216,15 @@ def test_many_losses_take_their_time_from_the_last_message_before_them() -> None
         index.lose("gone")
     assert [lost.log_time for lost in index.lost] == [5, 9, 9]
     assert index.latest == 9
+
+
+def test_statistics_that_do_not_count_by_channel_are_no_sign_of_an_empty_log(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = Statistics.write
+    monkeypatch.setattr(Statistics, "write", lambda self, to: written(replace(self, channel_message_counts={}), to))
+    path = rewritten(sample, tmp_path / "log.mcap", chunk_size=500)
+    assert [essence(item) for _, _, item in items_of(path)] == [essence(item) for _, _, item in whole]
 
 
 def test_an_index_that_points_behind_the_end_loses_its_chunk_alone(sample: Path, tmp_path: Path) -> None:
