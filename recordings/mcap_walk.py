@@ -59,6 +59,7 @@ def walk(file: BinaryIO, size: int) -> Index:
         if opcode == Opcode.DATA_END and 4 <= length < MESSAGE.size:  # a longer one was once something else
             if checksum is not None and struct.unpack_from("<I", content)[0] not in (0, checksum):
                 index.lose("the CRC of the data section does not match: messages in it were changed, not known which")
+            _note_rest(index, file, position, size)
             return index
         try:
             _note(index, opcode, content, length, position, before)
@@ -124,6 +125,18 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
         )  # fmt: skip
         index.chunks.append(chunk)
         index.before[position] = before
+
+
+def _note_rest(index: Index, file: BinaryIO, position: int, size: int) -> None:
+    """Note what follows the log whose data section ends at `position`, as where files were put one behind another."""
+    for start in range(position, size, _BLOCK):
+        place = read(file, start, _BLOCK + len(MAGIC) - 1).find(MAGIC)
+        end = start + place + len(MAGIC)
+        if place >= 0:
+            if end < size:
+                unread = f"the log ends at byte {end}, and {size - end} bytes behind that are not read"
+                index.lose(f"{unread}; give each log by itself")
+            return
 
 
 def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None, size: int) -> None:

@@ -227,6 +227,22 @@ def test_statistics_that_do_not_count_by_channel_are_no_sign_of_an_empty_log(
     assert [essence(item) for _, _, item in items_of(path)] == [essence(item) for _, _, item in whole]
 
 
+@pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no index", "no crcs"])
+@pytest.mark.parametrize("second", ["log", "zeros"])
+def test_what_is_behind_the_end_of_a_log_is_told(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, second: str
+) -> None:
+    first = rewritten(sample, tmp_path / "first.mcap", **LAYOUTS[layout]).read_bytes()
+    path = tmp_path / "log.mcap"
+    path.write_bytes(first + (first if second == "log" else bytes(5000)))
+    *events, (_, stream, lost) = items_of(path)
+    assert [essence(item) for _, _, item in events] == [essence(item) for _, _, item in whole]
+    size = len(first) if second == "log" else 5000
+    said = f"the log ends at byte {len(first)}, and {size} bytes behind that are not read; give each log by itself"
+    assert (stream, str(lost)) == ("log", f"log.mcap: {said}")
+    assert describe(path, McapSource())["damage"] == [said]
+
+
 def test_an_index_that_points_behind_the_end_loses_its_chunk_alone(sample: Path, tmp_path: Path) -> None:
     full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500)
     with McapFile(full) as log:
