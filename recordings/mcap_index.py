@@ -141,7 +141,7 @@ def _check_read(record: Schema | Channel, content: bytes | memoryview) -> None:
 
 def from_summary(file: BinaryIO, size: int) -> Index | None:
     """The index that the file carries itself, or None where it has none that is sure to describe the whole file."""
-    index = _summary(file, size)
+    index = summary(file, size)
     if index is None or index.counts is None:
         return None
     chunks, channels, schemas = index.counts
@@ -160,18 +160,12 @@ def from_summary(file: BinaryIO, size: int) -> Index | None:
     return index
 
 
-def own_statistics(file: BinaryIO, size: int) -> dict[int, int]:
-    """How many messages a file's own statistics count by channel; empty where it has none."""
-    index = _summary(file, size)
-    return index.expected if index is not None else {}
-
-
 def profile_of(content: bytes) -> str:
     """The profile that a header record names."""
     return str(Header.read(_stream(content)).profile)
 
 
-def _summary(file: BinaryIO, size: int) -> Index | None:
+def summary(file: BinaryIO, size: int) -> Index | None:
     """What the summary section says, None where there is none or its CRC does not match."""
     if size < len(MAGIC) + _TAIL:
         return None

@@ -75,8 +75,10 @@ class Opening:
         self._tell_sealed()
 
     def refusals(self) -> dict[str, str]:
-        """`missing`, each as a sentence that stands alone: what was sought may be among what cannot be decoded."""
-        aside = f" ({self.undecodable})" if self.undecodable else ""
+        """`missing`, each as a sentence that stands alone: what was sought may be among what cannot be decoded or is
+        lost."""
+        lost = f"messages were lost: {self.file.index.lost[0].reason}" if self.file.index.lost else ""
+        aside = "".join(f" ({what})" for what in (self.undecodable, lost) if what)
         return {name: why + aside if name in self._sought else why for name, why in self.missing.items()}
 
     def channels_of(self, topic: str) -> set[int]:

@@ -24,12 +24,12 @@ from recordings.mcap_index import (
     RECORD,
     Index,
     Loose,
-    own_statistics,
     profile_of,
     raw,
     read,
     records,
     said,
+    summary,
 )
 
 _PRIVATE = 0x80  # from here on, opcodes are free for private use
@@ -41,7 +41,8 @@ _BLOCK = 1 << 20
 
 def walk(file: BinaryIO, size: int) -> Index:
     """The index of a file, from its data section."""
-    index = Index(walked=True, expected=own_statistics(file, size))
+    own = summary(file, size) or Index()  # what it defines may be lost in the data section
+    index = Index(own.schemas, own.channels, expected=own.expected, walked=True)
     position, before = len(MAGIC), 0
     checksum: int | None = zlib.crc32(MAGIC)  # None: bytes were passed over
     while True:

@@ -28,7 +28,7 @@ from recordings.inventory import describe, format_description
 from recordings.mcap_chunk import unpacked
 from recordings.mcap_index import MAGIC, Index, Lost
 from recordings.mcap_reader import McapFile
-from tests.recordings.sample_log import LAYOUTS, LEFT, data_folder, essence, items_of, rewritten
+from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, items_of, rewritten
 
 
 def record(opcode: int, content: bytes) -> bytes:
@@ -136,6 +136,26 @@ def test_a_broken_chunk_costs_its_own_messages_each_with_its_time(
     kept = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
     assert kept == [essence(item) for time, stream, item in whole if (time, stream) not in lost]
     assert describe(damaged, McapSource())["damage"]
+
+
+def test_damage_that_took_all_images_is_told_as_that(sample: Path, tmp_path: Path) -> None:
+    full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500, use_statistics=False)
+    with full.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    content, broken = bytearray(full.read_bytes()), []
+    for chunk in summary.chunk_indexes:
+        if {summary.channels[number].topic for number in chunk.message_index_offsets} & {LEFT, RIGHT}:
+            content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+            broken.append(chunk.chunk_start_offset)
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    with McapSource().open(damaged) as log:
+        assert log.missing["left"].startswith(
+            "the log has no camera image (sensor_msgs/Image or CompressedImage): "
+            f"no message of {LEFT}, {RIGHT} can be read; give one that has "
+            f"(messages were lost: the chunk at byte {broken[0]} is broken and its messages are lost"
+        )
+        assert log.lacking["left"].endswith("give one that has")
 
 
 def test_a_record_with_a_broken_length_costs_what_it_held(
