@@ -198,8 +198,12 @@ class McapLog:
                 return
 
     def notes(self) -> dict[str, str]:
-        """Stream -> what there is to say of it: that its messages, going by the first, have no stamps of their own."""
-        return {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
+        """Stream -> what there is to say of it: that its messages, going by the first, have no stamps of their own; of
+        the right camera, where the baseline is from if not from its CameraInfo alone."""
+        notes = {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
+        if "right" in self.topics and (said := self._opening.baseline_note):
+            notes["right"] = "; ".join((*filter(None, [notes.get("right")]), said))
+        return notes
 
     def _is_unstamped(self, stream: str, topic: str) -> bool:
         raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, Lost))

@@ -19,7 +19,7 @@ from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError, counted
 from recordings.mcap_index import Lost, said
 from recordings.mcap_reader import CONVERT, McapFile
-from recordings.rig import Camera, Frames, calibrated_pair, mounted
+from recordings.rig import Camera, Frames, baseline_note, calibrated_pair, mounted
 from recordings.ros2_types import decoder_for, full_name
 from stages.data import Array, CameraModel, Mount, Pose
 
@@ -43,8 +43,8 @@ class Opening:
     decoders: by channel; missing: stream -> why the log does not provide it, and what to do; refused: setting of the
     source that the log does not bear out -> why; undecodable: the topics that are, in words; topics: stream -> topic;
     infos: side -> topic of its calibration, and the first of it; cameras: the calibrated pair, where both are there;
-    static: the log's static transforms; tilt_frame: of the inclinometer's first message; problems: (stream, loss) that
-    came up.
+    baseline_note: what there is to say of that; static: the log's static transforms; tilt_frame: of the inclinometer's
+    first message; problems: (stream, loss) that came up.
     """
 
     def __init__(self, file: McapFile, source: McapSource) -> None:
@@ -56,6 +56,7 @@ class Opening:
         self.cameras: tuple[Camera, Camera] | None = None
         self.static = Frames()
         self.mount: Mount | None = None
+        self.baseline_note = ""
         self.tilt_frame = ""
         self.problems: list[tuple[str, LogError]] = []
         self.schemas: dict[str, str] = {}
@@ -155,6 +156,7 @@ class Opening:
             self.missing.update(left=str(cameras), right=str(cameras))
         else:
             self.cameras = cameras
+            self.baseline_note = baseline_note(cameras, models, (frames[0], frames[1]), self.static)
 
     def _find_mount(self) -> None:
         if self.cameras is None:
