@@ -109,13 +109,17 @@ def test_a_calibration_that_may_be_of_another_image_size_is_doubted(tmp_path: Pa
         (BASELINE, BASELINE * 1.04, ""),
         (
             BASELINE, BASELINE * 1.06,
-            "the baseline is 0.25 m by P of the CameraInfo, which is used, but 0.265 m by the static transform "
-            "'left_optical' <- 'right_optical'; correct the wrong one",
+            (
+                "the baseline is 0.25 m by P of the CameraInfo, which is used, but 0.265 m by the static transform "
+                "'left_optical' <- 'right_optical'; correct the wrong one"
+            ),
         ),
         (
             0.0, 0.3,
-            "the baseline of 0.3 m is that of the static transform 'left_optical' <- 'right_optical': P[0,3] of both "
-            "CameraInfo is 0",
+            (
+                "the baseline of 0.3 m is that of the static transform 'left_optical' <- 'right_optical': "
+                "P[0,3] of both CameraInfo is 0"
+            ),
         ),
     ],
 )  # fmt: skip
