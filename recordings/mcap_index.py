@@ -10,7 +10,7 @@ import struct
 import zlib
 from array import array
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -73,13 +73,12 @@ class Lost(NamedTuple):
 
 
 class Loose(NamedTuple):
-    """Where a message outside the chunks lies: its data's offset and size, bytes; clock: as it shows it."""
+    """Where a message outside the chunks lies: its data's offset and size, bytes."""
 
     channel: int
     log_time: int
     offset: int
     size: int
-    clock: Clock
 
 
 @dataclass
@@ -226,11 +225,12 @@ def raw(content: memoryview) -> Raw:
     return Raw(channel, log_time, content[MESSAGE.size :])
 
 
-def in_order(message: T, clock: Clock) -> T | Lost:
-    """A message, as a `Lost` if the clock, which it shows, was set back."""
-    if not clock.back or message.log_time > LAST_TIME:
+def in_order(message: T, clocks: Iterable[Clock]) -> T | Lost:
+    """A message, as a `Lost` if by one of the clocks the time at which it was logged had been before."""
+    fall = max((clock.back for clock in clocks if clock.back and message.log_time < clock.latest), default=0)
+    if not fall:
         return message
-    back = f"by {clock.back / 1e9:.3g} s or more, and had not come to where it was before"
+    back = f"by {fall / 1e9:.3g} s or more, and had not come to where it was before"
     return Lost(message.channel, message.log_time, f"the log's clock was set back {back}")
 
 

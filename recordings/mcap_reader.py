@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from itertools import accumulate
@@ -35,6 +35,7 @@ from recordings.mcap_index import (
     Loose,
     Lost,
     Raw,
+    T,
     from_summary,
     in_order,
     raw,
@@ -86,16 +87,18 @@ class McapFile:
         """The messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
 
         What is lost of them, or may be, comes in its place; where its log time is damaged, behind all others. Where the
-        clock was set back what follows is lost, until that time has come; not if messages may be in `any_order`.
+        clock was set back what follows is lost, until that time has come; not if messages may be in `any_order`. It was
+        where one of `channels` fell back: a log may be written topic by topic.
         """
         low, high = (0 if start is None else start), (1 << 64 if end is None else end)
-        queue = self._queue(channels, any_order)
+        ordered = set[int]() if any_order else channels
+        queue = self._queue(channels, ordered)
         found = dict.fromkeys(channels, 0)
         while queue and queue[0][0] < high:
             log_time, offset, _, item = heappop(queue)
             if isinstance(item, ChunkIndex):
                 if item.message_end_time >= low:
-                    for place, inside in enumerate(self._chunk_or_lost(item, any_order)):
+                    for place, inside in enumerate(self._chunk_or_lost(item, ordered)):
                         heappush(queue, (inside.log_time, offset, place, inside))
             elif item.channel is None or item.channel in channels:
                 if item.channel is not None:
@@ -148,16 +151,16 @@ class McapFile:
     ) -> None:
         self.close()
 
-    def _queue(self, channels: set[int], any_order: bool) -> list[tuple[int, int, int, Any]]:
+    def _queue(self, channels: set[int], ordered: set[int]) -> list[tuple[int, int, int, Any]]:
         """What may be read, as a heap of (time, offset in the file, place in a chunk, thing)."""
         index = self.index
         queue: list[tuple[int, int, int, Any]] = []
         queue += [(lost.log_time, self.size, place, lost) for place, lost in enumerate(index.lost)]
         for place, (found, clock) in enumerate(index.rescued, -len(index.rescued)):
-            queue.append((found.log_time, self.size, place, found if any_order else in_order(found, clock)))
-        for loose in index.loose:
-            if loose.channel in channels:
-                queue.append((loose.log_time, loose.offset, -1, loose if any_order else in_order(loose, loose.clock)))
+            queue.append((found.log_time, self.size, place, in_order(found, [clock] if ordered else ())))
+        loose = [item for item in index.loose if item.channel in channels]
+        for found_at, item in zip(loose, _in_order(loose, {}, ordered), strict=True):
+            queue.append((item.log_time, found_at.offset, -1, item))
         queue += [(chunk.message_start_time, chunk.chunk_start_offset, -1, chunk) for chunk in self._chunks(channels)]
         heapify(queue)
         return queue
@@ -186,11 +189,11 @@ class McapFile:
                 clocks[item.channel] = clocks[item.channel].then(item.log_time)
         return before
 
-    def _chunk_or_lost(self, chunk: ChunkIndex, any_order: bool = True) -> list[Raw | Lost]:
+    def _chunk_or_lost(self, chunk: ChunkIndex, ordered: Collection[int] = ()) -> list[Raw | Lost]:
         """The messages of a chunk, or one `Lost` for each that its message index knows of."""
         try:
-            messages = self._chunk_messages(chunk)
-            return [*messages] if any_order else self._in_order(messages, chunk.chunk_start_offset)
+            before = self._before.get(chunk.chunk_start_offset, {}) if ordered else {}
+            return _in_order(self._chunk_messages(chunk), before, ordered)
         except BROKEN as error:
             reason = f"the chunk at byte {chunk.chunk_start_offset} is broken and its messages are lost ({said(error)})"
         try:
@@ -200,15 +203,6 @@ class McapFile:
         known = known or [(number, chunk.message_start_time) for number in chunk.message_index_offsets]
         lost = [Lost(channel, log_time, reason) for channel, log_time in known]
         return [*lost] or [Lost(None, chunk.message_start_time, reason)]
-
-    def _in_order(self, messages: Iterable[Raw], offset: int) -> list[Raw | Lost]:
-        """The messages of the chunk at `offset`, those as `Lost` before which the clock was set back."""
-        clocks = defaultdict[int | None, Clock](Clock, self._before.get(offset, {}))
-        found = list[Raw | Lost]()
-        for message in messages:
-            clock = clocks[message.channel] = clocks[message.channel].then(message.log_time)
-            found.append(in_order(message, clock))
-        return found
 
     def _chunk_messages(self, chunk: ChunkIndex) -> list[Raw]:
         length = chunk.chunk_length - RECORD.size
@@ -269,6 +263,18 @@ class McapFile:
         if not ends:
             raise LogError(f"{self.path} holds no messages whose log times are whole; record it again")
         return min(ends), max(ends)
+
+
+def _in_order(messages: Iterable[T], before: Mapping[int | None, Clock], ordered: Collection[int]) -> list[T | Lost]:
+    """The messages, those as `Lost` before which a clock of the channels `ordered` was set back; before: the clocks."""
+    clocks, found = defaultdict[int | None, Clock](Clock, before), list[T | Lost]()
+    back = {channel for channel in ordered if channel in clocks and clocks[channel].back}
+    for message in messages:
+        clock = clocks[message.channel] = clocks[message.channel].then(message.log_time)
+        if message.channel in ordered:
+            (back.add if clock.back else back.discard)(message.channel)
+        found.append(in_order(message, [clocks[channel] for channel in back]) if back else message)
+    return found
 
 
 def iter_decoded(

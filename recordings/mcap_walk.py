@@ -88,8 +88,8 @@ def _note(index: Index, opcode: int, content: bytes, length: int, position: int,
         _note_chunk(index, content, position)
     elif opcode == Opcode.MESSAGE:
         channel, _, log_time, _ = MESSAGE.unpack_from(content)
-        offset, clock = position + RECORD.size + MESSAGE.size, index.seen(channel, log_time)
-        index.loose.append(Loose(channel, log_time, offset, length - MESSAGE.size, clock))
+        index.loose.append(Loose(channel, log_time, position + RECORD.size + MESSAGE.size, length - MESSAGE.size))
+        index.seen(channel, log_time)
     elif opcode == Opcode.HEADER and before == 0:
         index.profile = profile_of(content)
     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):

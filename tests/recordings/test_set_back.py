@@ -88,6 +88,22 @@ def test_a_clock_that_comes_to_where_it_was_loses_nothing_from_there_on(
 
 
 @pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
+def test_no_image_from_behind_the_fall_meets_a_tilt_from_before_it(
+    sample: Path, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    def rare_images(messages: list[Any]) -> list[Any]:
+        """The clock set back, the left images of frames 1 and 2 left out: those alone do not show it."""
+        rare = range(START + PERIOD, START + FIRST * PERIOD)
+        kept = [found for found in messages if found[1].topic != LEFT or found[2].log_time not in rare]
+        return set_back(kept)
+
+    path = reordered(sample, tmp_path / "log.mcap", rare_images, **options)
+    left = [item for _, stream, item in items_of(path) if stream == "left"]
+    assert [item.stamp for item in left if not isinstance(item, Exception)] == [START]
+    assert len([item for item in left if str(item).startswith(f"{LEFT}: the log's clock was set back")]) == 2
+
+
+@pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
 def test_a_log_written_topic_by_topic_or_with_jitter_loses_nothing(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, options: dict[str, Any]
 ) -> None:
