@@ -26,6 +26,7 @@ MAGIC = b"\x89MCAP0\r\n"
 BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError, OSError)
 
 LAST_TIME = (1 << 63) - 1  # ns; a log time after it is damage, which no clock can show
+SETTLED = 1_000_000_000  # ns; stamps are before log times: so much later none is of before the clock was set back
 JITTER = 100_000_000  # ns; messages of a channel may be logged in another order than they were written by so much
 
 RECORD = struct.Struct("<BQ")  # opcode, length
@@ -49,8 +50,8 @@ class Raw(NamedTuple):
 class Clock(NamedTuple):
     """The recorder's clock as a message shows it, and those of its channel that precede it in the file.
 
-    latest: the latest log time of them, ns; back: by how much the clock was set back, ns, until it has come there again
-    (then 0).
+    latest: the latest log time of them, ns; back: by how much the clock was set back, ns, until it is `SETTLED` beyond
+    that time (then 0).
     """
 
     latest: int = 0
@@ -61,7 +62,9 @@ class Clock(NamedTuple):
         if log_time > LAST_TIME:
             return self
         fall = self.latest - log_time
-        return Clock(max(self.latest, log_time), (self.back or fall) if fall > (0 if self.back else JITTER) else 0)
+        if fall > (-SETTLED if self.back else JITTER):
+            return Clock(self.latest, max(self.back, fall))
+        return Clock(max(self.latest, log_time))
 
 
 class Lost(NamedTuple):
@@ -227,10 +230,10 @@ def raw(content: memoryview) -> Raw:
 
 def in_order(message: T, clocks: Iterable[Clock]) -> T | Lost:
     """A message, as a `Lost` if by one of the clocks the time at which it was logged had been before."""
-    fall = max((clock.back for clock in clocks if clock.back and message.log_time < clock.latest), default=0)
+    fall = max((clock.back for clock in clocks if clock.back and message.log_time < clock.latest + SETTLED), default=0)
     if not fall:
         return message
-    back = f"by {fall / 1e9:.3g} s or more, and had not come to where it was before"
+    back = f"by {fall / 1e9:.3g} s or more, and was not yet 1 s beyond where it had been"
     return Lost(message.channel, message.log_time, f"the log's clock was set back {back}")
 
 

@@ -87,8 +87,8 @@ class McapFile:
         """The messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
 
         What is lost of them, or may be, comes in its place; where its log time is damaged, behind all others. Where the
-        clock was set back what follows is lost, until that time has come; not if messages may be in `any_order`. It was
-        where one of `channels` fell back: a log may be written topic by topic.
+        clock was set back, what follows is lost until a second after that time, unless messages may be in `any_order`;
+        it was where one of `channels` fell back, as a log may be written topic by topic.
         """
         low, high = (0 if start is None else start), (1 << 64 if end is None else end)
         ordered = set[int]() if any_order else channels
