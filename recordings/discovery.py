@@ -142,9 +142,11 @@ def _find_images(topics: Sequence[Topic], settings: Settings, found: Topics) -> 
     ]
     if not pairs:
         listed = _listed(candidates)
+        silent = _listed([topic for topic in images if not topic.messages and not _OTHER_IMAGES.search(topic.name)])
+        unread = f": no message of {silent} can be read" if silent else ""
         why = {
-            0: "the log has no camera image (sensor_msgs/Image or CompressedImage); give one that has",
-            1: f"the log has one image topic only ({listed}), stereo needs two",
+            0: f"the log has no camera image (sensor_msgs/Image or CompressedImage){unread}; give one that has",
+            1: f"the log has one image topic only ({listed}), stereo needs two{unread}",
         }.get(len(candidates), f"no two image topics are named like a left and a right one ({listed})")
         remedy = "; set 'left' and 'right' of the source to the topics" if len(candidates) > 1 else ""
         found.missing.update(left=why + remedy, right=why + remedy)

@@ -171,14 +171,11 @@ def _tilted(left: Stamps, tilt: Stamps) -> int:
 def _calibration(log: McapLog) -> dict[str, Any] | None:
     if log.cameras is None:
         return None
-    left, right = (camera.model for camera in log.cameras)
-    return {
-        "width": left.width, "height": left.height, "fx": float(left.p[0, 0]), "fy": float(left.p[1, 1]),
-        "cx": float(left.p[0, 2]), "cy": float(left.p[1, 2]), "cx_right": float(right.p[0, 2]),
-        "baseline": float(left.p[0, 3] / left.p[0, 0] - right.p[0, 3] / right.p[0, 0]),
-        "rectified": log.cameras[0].rectified, "frame_id": log.cameras[0].frame_id,
-        "doubts": list(StereoCamera.from_models(left, right, "", log.cameras[0].rectified).doubts),
-    }  # fmt: skip
+    left, right = log.cameras
+    camera = StereoCamera.from_models(left.model, right.model, left.frame_id, left.rectified)
+    names = ("width", "height", "fx", "fy", "cx", "cy", "cx_right", "baseline", "frame_id")
+    values = {name: getattr(camera, name) for name in names}
+    return values | {"rectified": left.rectified, "doubts": list(camera.doubts)}
 
 
 def _mount(log: McapLog) -> dict[str, Any] | None:

@@ -9,11 +9,12 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -25,6 +26,8 @@ MAGIC = b"\x89MCAP0\r\n"
 BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError, OSError)
 
 LAST_TIME = (1 << 63) - 1  # ns; a log time after it is damage, which no clock can show
+SETTLED = 1_000_000_000  # ns; stamps are before log times: so much later none is of before the clock was set back
+JITTER = 100_000_000  # ns; messages of a channel may be logged in another order than they were written by so much
 
 RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -33,12 +36,35 @@ _SECTION = 1 << 30  # bytes; of a longer summary, or header, not all is read
 _TAIL = RECORD.size + _FOOTER_LENGTH + len(MAGIC)
 
 
+T = TypeVar("T", "Raw", "Loose")
+
+
 class Raw(NamedTuple):
     """One message as it lies in the file. log_time: ns; data: its bytes, a view of the chunk it came in."""
 
     channel: int
     log_time: int
     data: memoryview
+
+
+class Clock(NamedTuple):
+    """The recorder's clock as a message shows it, and those of its channel that precede it in the file.
+
+    latest: the latest log time of them, ns; back: by how much the clock was set back, ns, until it is `SETTLED` beyond
+    that time (then 0).
+    """
+
+    latest: int = 0
+    back: int = 0
+
+    def then(self, log_time: int) -> Clock:
+        """The clock as the next message shows it."""
+        if log_time > LAST_TIME:
+            return self
+        fall = self.latest - log_time
+        if fall > (-SETTLED if self.back else JITTER):
+            return Clock(self.latest, max(self.back, fall))
+        return Clock(max(self.latest, log_time))
 
 
 class Lost(NamedTuple):
@@ -62,29 +88,33 @@ class Loose(NamedTuple):
 class Index:
     """Where things are in a file.
 
-    chunks: with the channels that each holds (none listed: not known); rescued: messages of a chunk that is cut; lost:
-    what is damaged; times: log times by channel, filled only where the file was `walked`; expected: how many messages
-    the file's own statistics count by channel; counts: of chunks, channels and schemas, by the same.
+    chunks: with the channels that each holds (none listed: not known); rescued: messages of a chunk that is cut, each
+    with its clock; lost: what is damaged; expected: how many messages the file's own statistics count by channel;
+    counts: of chunks, channels and schemas, by the same. Filled only where the file was `walked`: times: log times by
+    channel, in file order; clocks: by channel; before: offset of a chunk -> what `clocks` were where it begins.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
     loose: list[Loose] = field(default_factory=list)
-    rescued: list[Raw] = field(default_factory=list)
+    rescued: list[tuple[Raw, Clock]] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
     times: dict[int, array[int]] = field(default_factory=dict)
+    clocks: dict[int | None, Clock] = field(default_factory=lambda: defaultdict(Clock))
+    before: dict[int, dict[int | None, Clock]] = field(default_factory=dict)
     expected: dict[int, int] = field(default_factory=dict)
     counts: tuple[int, int, int] | None = None
     profile: str = ""
     walked: bool = False
     latest: int = 0  # the last log time seen, ns
 
-    def seen(self, channel: int, log_time: int) -> None:
-        """Count one message."""
+    def seen(self, channel: int, log_time: int) -> Clock:
+        """Count one message; returns the clock of its channel."""
         self.times.setdefault(channel, array("Q")).append(log_time)
-        if log_time <= LAST_TIME:
-            self.latest = max(self.latest, log_time)
+        clock = self.clocks[channel] = self.clocks[channel].then(log_time)
+        self.latest = max(self.latest, clock.latest)
+        return clock
 
     def define(self, opcode: int, content: bytes | memoryview) -> None:
         """Take note of a schema or channel; other records do not matter."""
@@ -113,12 +143,13 @@ def _check_read(record: Schema | Channel, content: bytes | memoryview) -> None:
 
 def from_summary(file: BinaryIO, size: int) -> Index | None:
     """The index that the file carries itself, or None where it has none that is sure to describe the whole file."""
-    index = _summary(file, size)
+    index = summary(file, size)
     if index is None or index.counts is None:
         return None
     chunks, channels, schemas = index.counts
     whole = (
         chunks == len(index.chunks) > 0
+        and index.expected  # statistics may leave these counts out
         and channels == len(index.channels)
         and schemas == len(index.schemas)
         and all(chunk.message_index_offsets.keys() <= index.channels.keys() for chunk in index.chunks)
@@ -131,18 +162,12 @@ def from_summary(file: BinaryIO, size: int) -> Index | None:
     return index
 
 
-def own_statistics(file: BinaryIO, size: int) -> dict[int, int]:
-    """How many messages a file's own statistics count by channel; empty where it has none."""
-    index = _summary(file, size)
-    return index.expected if index is not None else {}
-
-
 def profile_of(content: bytes) -> str:
     """The profile that a header record names."""
     return str(Header.read(_stream(content)).profile)
 
 
-def _summary(file: BinaryIO, size: int) -> Index | None:
+def summary(file: BinaryIO, size: int) -> Index | None:
     """What the summary section says, None where there is none or its CRC does not match."""
     if size < len(MAGIC) + _TAIL:
         return None
@@ -201,6 +226,15 @@ def raw(content: memoryview) -> Raw:
     """The message of a message record."""
     channel, _, log_time, _ = MESSAGE.unpack_from(content)
     return Raw(channel, log_time, content[MESSAGE.size :])
+
+
+def in_order(message: T, clocks: Iterable[Clock]) -> T | Lost:
+    """A message, as a `Lost` if by one of the clocks the time at which it was logged had been before."""
+    fall = max((clock.back for clock in clocks if clock.back and message.log_time < clock.latest + SETTLED), default=0)
+    if not fall:
+        return message
+    back = f"by {fall / 1e9:.3g} s or more, and was not yet 1 s beyond where it had been"
+    return Lost(message.channel, message.log_time, f"the log's clock was set back {back}")
 
 
 def said(error: BaseException) -> str:

@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recordings.decode import camera_model, pixels_of, pose_of, stamp_or, tilt_of
 from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
@@ -60,14 +61,14 @@ class Calibrations:
         if place >= 0 and not self.same[place]:
             raise LogError(
                 "the calibration has changed since the log began, so the image cannot be used; cut the log in two "
-                f"where it changes ({self._since(place)} ns)"
+                f"where it changes ({self._since(place)})"
             )
 
-    def _since(self, place: int) -> int:
-        """Since when the calibration at `place` is in force."""
+    def _since(self, place: int) -> str:
+        """Since when a calibration like that at `place` is in force; not known where it is the first that was noted."""
         while place > 0 and not self.same[place - 1]:
             place -= 1
-        return self.stamps[place]
+        return f"{'' if place else 'at or before '}{self.stamps[place]} ns"
 
 
 def _equal(one: CameraModel, other: CameraModel) -> bool:
@@ -116,6 +117,7 @@ class McapLog:
     static: Frames = field(init=False)
     mount: Mount | None = field(init=False)
     problems: list[tuple[str, LogError]] = field(init=False)
+    _info_times: dict[str, NDArray[np.int64]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.file = McapFile(self.path)
@@ -166,7 +168,10 @@ class McapLog:
         if self.mount is not None and "mount" in streams:
             yield log_start, "mount", self.mount
         calibrations = {side: Calibrations(model) for side, (_, model) in self._opening.infos.items()}
-        infos = self._by_channel(self._info_readings(calibrations, streams))
+        readings = self._info_readings(calibrations, streams)
+        for reading in readings if log_start > self.file.start else ():
+            self._note_last_before(log_start, reading)
+        infos = self._by_channel(readings)
         items = self._by_channel(self._item_readings(calibrations, streams))
         raws = self.file.messages(infos.keys() | items.keys(), wide_low, wide_high)
         for raw, noted in _ahead(raws, infos):
@@ -181,9 +186,24 @@ class McapLog:
                 if item is not None:
                     yield raw.log_time, reading.stream, item
 
+    def _note_last_before(self, log_time: int, infos: Reading) -> None:
+        """Take note of the calibration that was in force at `log_time`: the last one before it that can be read."""
+        channels = set(infos.decoders)
+        if infos.topic not in self._info_times:
+            self._info_times[infos.topic] = self.file.times(channels)
+        times = self._info_times[infos.topic]
+        for time in reversed(times[times < log_time].tolist()):
+            raws = self.file.messages(channels, time, time + 1)
+            if any(raw.channel in channels and isinstance(raw, Raw) and infos(raw) is None for raw in raws):
+                return
+
     def notes(self) -> dict[str, str]:
-        """Stream -> what there is to say of it: that its messages, going by the first, have no stamps of their own."""
-        return {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
+        """Stream -> what there is to say of it: that its messages, going by the first, have no stamps of their own; of
+        the right camera, where the baseline is from if not from its CameraInfo alone."""
+        notes = {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
+        if "right" in self.topics and (said := self._opening.baseline_note):
+            notes["right"] = "; ".join((*filter(None, [notes.get("right")]), said))
+        return notes
 
     def _is_unstamped(self, stream: str, topic: str) -> bool:
         raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, Lost))

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from mcap.records import Channel
 
-from recordings.decode import camera_model, frame_name, frame_of, pose_of, tilt_of, unread_encoding
+from recordings.decode import camera_model, frame_name, frame_of, pixels_of, pose_of, tilt_of, unread_encoding
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError, counted
 from recordings.mcap_index import Lost, said
 from recordings.mcap_reader import CONVERT, McapFile
-from recordings.rig import Camera, Frames, calibrated_pair, mounted
+from recordings.rig import Camera, Frames, baseline_note, calibrated_pair, mounted
 from recordings.ros2_types import decoder_for, full_name
-from stages.data import CameraModel, Mount, Pose
+from stages.data import Array, CameraModel, Mount, Pose
 
 if TYPE_CHECKING:
     from recordings.mcap_source import McapSource
@@ -43,8 +43,8 @@ class Opening:
     decoders: by channel; missing: stream -> why the log does not provide it, and what to do; refused: setting of the
     source that the log does not bear out -> why; undecodable: the topics that are, in words; topics: stream -> topic;
     infos: side -> topic of its calibration, and the first of it; cameras: the calibrated pair, where both are there;
-    static: the log's static transforms; tilt_frame: of the inclinometer's first message; problems: (stream, loss) that
-    came up.
+    baseline_note: what there is to say of that; static: the log's static transforms; tilt_frame: of the inclinometer's
+    first message; problems: (stream, loss) that came up.
     """
 
     def __init__(self, file: McapFile, source: McapSource) -> None:
@@ -56,6 +56,7 @@ class Opening:
         self.cameras: tuple[Camera, Camera] | None = None
         self.static = Frames()
         self.mount: Mount | None = None
+        self.baseline_note = ""
         self.tilt_frame = ""
         self.problems: list[tuple[str, LogError]] = []
         self.schemas: dict[str, str] = {}
@@ -70,13 +71,16 @@ class Opening:
         self._find_mount()
         self._check_pose()
         self._check_encodings()
+        self._check_pixels()
         for stream in self.missing:
             self.topics.pop(stream, None)
         self._tell_sealed()
 
     def refusals(self) -> dict[str, str]:
-        """`missing`, each as a sentence that stands alone: what was sought may be among what cannot be decoded."""
-        aside = f" ({self.undecodable})" if self.undecodable else ""
+        """`missing`, each as a sentence that stands alone: what was sought may be among what cannot be decoded or is
+        lost."""
+        lost = f"messages were lost: {self.file.index.lost[0].reason}" if self.file.index.lost else ""
+        aside = "".join(f" ({what})" for what in (self.undecodable, lost) if what)
         return {name: why + aside if name in self._sought else why for name, why in self.missing.items()}
 
     def channels_of(self, topic: str) -> set[int]:
@@ -104,7 +108,7 @@ class Opening:
     def _read_static(self) -> None:
         for topic, schema in sorted(self.schemas.items()):
             if schema == TRANSFORMS and topic.endswith("tf_static"):
-                for transforms in self._made(topic, lambda message: message.transforms):
+                for transforms in self._made(topic, lambda message: message.transforms, any_order=True):
                     for item in [transforms] if isinstance(transforms, LogError) else transforms:
                         added = item if isinstance(item, LogError) else _attempt(self.static.add, item)
                         if isinstance(added, LogError):
@@ -152,6 +156,7 @@ class Opening:
             self.missing.update(left=str(cameras), right=str(cameras))
         else:
             self.cameras = cameras
+            self.baseline_note = baseline_note(cameras, models, (frames[0], frames[1]), self.static)
 
     def _find_mount(self) -> None:
         if self.cameras is None:
@@ -194,6 +199,41 @@ class Opening:
                 unread = self._first(self.topics[side], unread_encoding)
                 if unread and not isinstance(unread, LogError):
                     self.missing[side] = f"{self.topics[side]}: {unread}; record it in one of these"
+
+    def _check_pixels(self) -> None:
+        """Cameras whose first and last images do not fit their calibration, or each other, are missing: so hardly any
+        frame could be made."""
+        if any(side not in self.infos or side in self.missing for side in CAMERAS):
+            return
+        first = {side: self._pixels(side) for side in CAMERAS}
+        if self._misfits(first):
+            last = self._misfits({side: self._pixels(side, last=True) for side in CAMERAS})
+            self.missing.update((side, why) for side, why in self._misfits(first).items() if side in last)
+
+    def _misfits(self, images: dict[str, Array | None]) -> dict[str, str]:
+        """Side -> why its image does not fit its calibration or that of the other side."""
+        said = dict[str, str]()
+        for side, pixels in images.items():
+            topic, (info, model) = self.topics[side], self.infos[side]
+            if pixels is not None and pixels.shape[:2] != (model.height, model.width):
+                size = f"{pixels.shape[1]}x{pixels.shape[0]}"
+                said[side] = (
+                    f"the images on {topic} are {size}, but {info} is the calibration of images of "
+                    f"{model.width}x{model.height}; set '{side}_info' of the source to that of these, or record it"
+                )
+        left, right = (images[side] for side in CAMERAS)
+        if not said and left is not None and right is not None and _kind(left) != _kind(right):
+            one, other = self.topics["left"], self.topics["right"]
+            why = f"the images on {one} are {_kind(left)}, those on {other} {_kind(right)}; record both alike"
+            said.update(left=why, right=why)
+        return said
+
+    def _pixels(self, side: str, last: bool = False) -> Array | None:
+        """The first image of a side that can be decoded, or its last; None where it cannot."""
+        topic = self.topics[side]
+        start = max(self.file.times(self.channels_of(topic)).tolist(), default=None) if last else None
+        made = islice(self._made(topic, pixels_of, start), _LOOKED_AT)
+        return next((pixels for pixels in made if not isinstance(pixels, LogError)), None)
 
     def _tell_sealed(self) -> None:
         """Messages of a chosen topic that came in another encoding, or by another schema, are lost."""
@@ -242,9 +282,12 @@ class Opening:
             )
         return None
 
-    def _made(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
-        """What `make` makes of each message of a topic; a LogError for one of which it makes nothing."""
-        for raw in self.file.messages(self.channels_of(topic)):
+    def _made(
+        self, topic: str, make: Callable[[Any], T], start: int | None = None, any_order: bool = False
+    ) -> Iterator[T | LogError]:
+        """What `make` makes of each message of a topic, from a log time on; a LogError for one of which it makes
+        nothing."""
+        for raw in self.file.messages(self.channels_of(topic), start, any_order=any_order):
             if not isinstance(raw, Lost):
                 yield _attempt(lambda data, decoder: make(decoder(data)), raw.data, self.decoders[raw.channel])
             elif raw.channel is not None:
@@ -264,6 +307,12 @@ def _pose_of(message: Any, base_frame: str) -> Pose:
     if pose is None:
         raise LogError(f"it holds no pose of '{base_frame}'")
     return pose
+
+
+def _kind(pixels: Array) -> str:
+    """What the two images of a frame have in common, in words."""
+    kind = "gray" if pixels.ndim == 2 else "colour"
+    return f"{pixels.shape[1]}x{pixels.shape[0]} {kind} of {8 * pixels.itemsize} bit"
 
 
 def _attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:

@@ -8,9 +8,12 @@ chunk costs its own messages, a cut file what was cut.
 from __future__ import annotations
 
 import struct
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
 from heapq import heapify, heappop, heappush
+from itertools import accumulate
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -24,13 +27,17 @@ from recordings.errors import LogError, counted
 from recordings.mcap_chunk import LARGEST, unpacked
 from recordings.mcap_index import (
     BROKEN,
+    JITTER,
     LAST_TIME,
     MAGIC,
     RECORD,
+    Clock,
     Loose,
     Lost,
     Raw,
+    T,
     from_summary,
+    in_order,
     raw,
     read,
     records,
@@ -74,20 +81,25 @@ class McapFile:
         wanted = set(topics)
         return {number for number, channel in self.index.channels.items() if channel.topic in wanted}
 
-    def messages(self, channels: set[int], start: int | None = None, end: int | None = None) -> Iterator[Raw | Lost]:
+    def messages(
+        self, channels: set[int], start: int | None = None, end: int | None = None, any_order: bool = False
+    ) -> Iterator[Raw | Lost]:
         """The messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
 
-        What is lost of them, or may be, comes in its place; where its log time is damaged, behind all others.
+        What is lost of them, or may be, comes in its place; where its log time is damaged, behind all others. Where the
+        clock was set back, what follows is lost until a second after that time, unless messages may be in `any_order`;
+        it was where one of `channels` fell back, as a log may be written topic by topic.
         """
         low, high = (0 if start is None else start), (1 << 64 if end is None else end)
-        queue = self._queue(channels)
+        ordered = set[int]() if any_order else channels
+        queue = self._queue(channels, ordered)
         found = dict.fromkeys(channels, 0)
         while queue and queue[0][0] < high:
             log_time, offset, _, item = heappop(queue)
             if isinstance(item, ChunkIndex):
                 if item.message_end_time >= low:
-                    for place, inside in enumerate(self._chunk_or_lost(item)):
-                        heappush(queue, (inside[1], offset, place, inside))
+                    for place, inside in enumerate(self._chunk_or_lost(item, ordered)):
+                        heappush(queue, (inside.log_time, offset, place, inside))
             elif item.channel is None or item.channel in channels:
                 if item.channel is not None:
                     found[item.channel] += 1
@@ -100,15 +112,25 @@ class McapFile:
             yield from self._unaccounted(found)
 
     def times(self, channels: set[int]) -> NDArray[np.int64]:
-        """The log times of channels' messages, ns, sorted; where the file is indexed, without reading the messages."""
-        found = list[int]()
+        """The log times of channels' messages, ns, sorted; where the file is indexed, without reading the messages.
+
+        Those that the clock showed once more after it was set back are left out.
+        """
+        found = defaultdict[int | None, list[int]](list)
         if self.index.walked:
-            for channel in channels:
-                found.extend(self.index.times.get(channel, ()))
+            found.update((channel, self.index.times.get(channel, array("Q")).tolist()) for channel in channels)
         else:
             for chunk in self._chunks(channels):
-                found.extend(item.log_time for item in self._contents(chunk) if item.channel in channels)
-        return np.sort(np.array([time for time in found if time <= LAST_TIME], dtype=np.int64))
+                for item in self._contents(chunk):
+                    found[item.channel].append(item.log_time)
+        kept = [np.zeros(0, np.int64)]
+        for channel in channels:
+            times = np.array([time for time in found[channel] if time <= LAST_TIME], np.int64)
+            if np.any(np.maximum.accumulate(times) - times > JITTER):
+                clocks = accumulate(times.tolist(), Clock.then, initial=Clock())
+                times = times[[not clock.back for clock in clocks][1:]]
+            kept.append(times)
+        return np.sort(np.concatenate(kept))
 
     def count(self, channels: set[int]) -> int:
         """How many messages of the channels the file holds, by its statistics or by the walk."""
@@ -129,28 +151,49 @@ class McapFile:
     ) -> None:
         self.close()
 
-    def _queue(self, channels: set[int]) -> list[tuple[int, int, int, Any]]:
+    def _queue(self, channels: set[int], ordered: set[int]) -> list[tuple[int, int, int, Any]]:
         """What may be read, as a heap of (time, offset in the file, place in a chunk, thing)."""
         index = self.index
         queue: list[tuple[int, int, int, Any]] = []
         queue += [(lost.log_time, self.size, place, lost) for place, lost in enumerate(index.lost)]
-        queue += [
-            (found.log_time, self.size, place - len(index.rescued), found) for place, found in enumerate(index.rescued)
-        ]
-        queue += [(loose.log_time, loose.offset, -1, loose) for loose in index.loose if loose.channel in channels]
+        for place, (found, clock) in enumerate(index.rescued, -len(index.rescued)):
+            queue.append((found.log_time, self.size, place, in_order(found, [clock] if ordered else ())))
+        loose = [item for item in index.loose if item.channel in channels]
+        for found_at, item in zip(loose, _in_order(loose, {}, ordered), strict=True):
+            queue.append((item.log_time, found_at.offset, -1, item))
         queue += [(chunk.message_start_time, chunk.chunk_start_offset, -1, chunk) for chunk in self._chunks(channels)]
         heapify(queue)
         return queue
 
     def _chunks(self, channels: set[int]) -> list[ChunkIndex]:
-        """The chunks that hold, or may hold, messages of the channels."""
-        chunks = self.index.chunks
+        """The chunks that hold, or may hold, messages of the channels, in file order."""
+        chunks = sorted(self.index.chunks, key=lambda chunk: chunk.chunk_start_offset)
         return [c for c in chunks if not c.message_index_offsets or channels & c.message_index_offsets.keys()]
 
-    def _chunk_or_lost(self, chunk: ChunkIndex) -> list[Raw] | list[Lost]:
+    @cached_property
+    def _before(self) -> dict[int, dict[int | None, Clock]]:
+        """Offset of a chunk -> the clocks of the channels where it begins.
+
+        Empty where each chunk begins when those before it have ended: then what they hold does not matter.
+        """
+        if self.index.walked:
+            return self.index.before
+        chunks = [chunk for chunk in self._chunks(set(self.index.channels)) if chunk.message_end_time]
+        ends = accumulate((chunk.message_end_time for chunk in chunks), max)
+        if all(end - chunk.message_start_time <= JITTER for end, chunk in zip(ends, chunks[1:], strict=False)):
+            return {}
+        before, clocks = dict[int, dict[int | None, Clock]](), defaultdict[int | None, Clock](Clock)
+        for chunk in chunks:
+            before[chunk.chunk_start_offset] = clocks.copy()
+            for item in self._contents(chunk):
+                clocks[item.channel] = clocks[item.channel].then(item.log_time)
+        return before
+
+    def _chunk_or_lost(self, chunk: ChunkIndex, ordered: Collection[int] = ()) -> list[Raw | Lost]:
         """The messages of a chunk, or one `Lost` for each that its message index knows of."""
         try:
-            return self._chunk_messages(chunk)
+            before = self._before.get(chunk.chunk_start_offset, {}) if ordered else {}
+            return _in_order(self._chunk_messages(chunk), before, ordered)
         except BROKEN as error:
             reason = f"the chunk at byte {chunk.chunk_start_offset} is broken and its messages are lost ({said(error)})"
         try:
@@ -159,7 +202,7 @@ class McapFile:
             known = []
         known = known or [(number, chunk.message_start_time) for number in chunk.message_index_offsets]
         lost = [Lost(channel, log_time, reason) for channel, log_time in known]
-        return lost or [Lost(None, chunk.message_start_time, reason)]
+        return [*lost] or [Lost(None, chunk.message_start_time, reason)]
 
     def _chunk_messages(self, chunk: ChunkIndex) -> list[Raw]:
         length = chunk.chunk_length - RECORD.size
@@ -173,8 +216,8 @@ class McapFile:
     def _loose_message(self, loose: Loose) -> Raw:
         return Raw(loose.channel, loose.log_time, memoryview(read(self._file, loose.offset, loose.size)))
 
-    def _contents(self, chunk: ChunkIndex) -> list[Raw] | list[Lost]:
-        """Channel and log time of a chunk's messages, from its message index where it has one."""
+    def _contents(self, chunk: ChunkIndex) -> list[Raw | Lost]:
+        """Channel and log time of a chunk's messages, from its message index where it has one; a channel's in order."""
         try:
             known = self._message_index(chunk)
         except BROKEN:
@@ -182,14 +225,17 @@ class McapFile:
         return [Raw(number, time, memoryview(b"")) for number, time in known] or self._chunk_or_lost(chunk)
 
     def _message_index(self, chunk: ChunkIndex) -> list[tuple[int, int]]:
-        """(channel, log time) of each message, from the message index behind a chunk; empty where there is none."""
+        """(channel, log time) of each message, from the message index behind a chunk; empty where there is none.
+
+        Those of one channel are in file order.
+        """
         found: list[tuple[int, int]] = []
         first = chunk.chunk_start_offset + chunk.chunk_length
         for opcode, content in records(read(self._file, first, min(chunk.message_index_length, LARGEST))):
             if opcode == Opcode.MESSAGE_INDEX:
                 channel, size = struct.unpack_from("<HI", content)
-                pairs = np.frombuffer(content, "<u8", size // 8, 6)
-                found.extend((channel, time) for time in pairs[::2].tolist())
+                pairs = np.frombuffer(content, "<u8", size // 16 * 2, 6).reshape(-1, 2)
+                found.extend((channel, time) for time in pairs[pairs[:, 1].argsort(kind="stable"), 0].tolist())
         return found
 
     def _unaccounted(self, found: dict[int, int]) -> Iterator[Lost]:
@@ -219,6 +265,18 @@ class McapFile:
         return min(ends), max(ends)
 
 
+def _in_order(messages: Iterable[T], before: Mapping[int | None, Clock], ordered: Collection[int]) -> list[T | Lost]:
+    """The messages, those as `Lost` before which a clock of the channels `ordered` was set back; before: the clocks."""
+    clocks, found = defaultdict[int | None, Clock](Clock, before), list[T | Lost]()
+    back = {channel for channel in ordered if channel in clocks and clocks[channel].back}
+    for message in messages:
+        clock = clocks[message.channel] = clocks[message.channel].then(message.log_time)
+        if message.channel in ordered:
+            (back.add if clock.back else back.discard)(message.channel)
+        found.append(in_order(message, [clocks[channel] for channel in back]) if back else message)
+    return found
+
+
 def iter_decoded(
     path: Path, topics: Iterable[str] | None = None, lost: Counter[str] | None = None
 ) -> Iterator[tuple[str, int, Any]]:
@@ -240,7 +298,7 @@ def iter_decoded(
             schema = log.schema(channel)
             if schema and channel.message_encoding == "cdr" and (wanted is None or channel.topic in wanted):
                 decoders[number] = decoder_for(schema.name, schema.encoding, schema.data)
-        for item in log.messages(set(decoders)):
+        for item in log.messages(set(decoders), any_order=True):
             if isinstance(item, Lost):
                 lose(item.reason)
                 continue

@@ -24,12 +24,12 @@ from recordings.mcap_index import (
     RECORD,
     Index,
     Loose,
-    own_statistics,
     profile_of,
     raw,
     read,
     records,
     said,
+    summary,
 )
 
 _PRIVATE = 0x80  # from here on, opcodes are free for private use
@@ -41,7 +41,8 @@ _BLOCK = 1 << 20
 
 def walk(file: BinaryIO, size: int) -> Index:
     """The index of a file, from its data section."""
-    index = Index(walked=True, expected=own_statistics(file, size))
+    own = summary(file, size) or Index()  # what it defines may be lost in the data section
+    index = Index(own.schemas, own.channels, expected=own.expected, walked=True)
     position, before = len(MAGIC), 0
     checksum: int | None = zlib.crc32(MAGIC)  # None: bytes were passed over
     while True:
@@ -59,6 +60,7 @@ def walk(file: BinaryIO, size: int) -> Index:
         if opcode == Opcode.DATA_END and 4 <= length < MESSAGE.size:  # a longer one was once something else
             if checksum is not None and struct.unpack_from("<I", content)[0] not in (0, checksum):
                 index.lose("the CRC of the data section does not match: messages in it were changed, not known which")
+            _note_rest(index, file, position, size)
             return index
         try:
             _note(index, opcode, content, length, position, before)
@@ -107,7 +109,7 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
         reason = f"the chunk at byte {position} is broken and its messages are lost ({said(error)})"
         index.lose(reason, start_time(content))
         return
-    offsets, times = {}, []
+    offsets, times, before = {}, [], index.clocks.copy()
     for opcode, record in inside:
         if opcode == Opcode.MESSAGE:
             channel, _, log_time, _ = MESSAGE.unpack_from(record)
@@ -123,6 +125,19 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
             message_start_time=min(times), uncompressed_size=0,
         )  # fmt: skip
         index.chunks.append(chunk)
+        index.before[position] = before
+
+
+def _note_rest(index: Index, file: BinaryIO, position: int, size: int) -> None:
+    """Note what follows the log whose data section ends at `position`, as where files were put one behind another."""
+    for start in range(position, size, _BLOCK):
+        place = read(file, start, _BLOCK + len(MAGIC) - 1).find(MAGIC)
+        end = start + place + len(MAGIC)
+        if place >= 0:
+            if end < size:
+                unread = f"the log ends at byte {end}, and {size - end} bytes behind that are not read"
+                index.lose(f"{unread}; give each log by itself")
+            return
 
 
 def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None, size: int) -> None:
@@ -137,8 +152,8 @@ def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None,
         with suppress(*BROKEN):  # nothing more is to be had then
             for opcode, content in records(unpacked_start(record[RECORD.size :]), whole=False):
                 if opcode == Opcode.MESSAGE:
-                    index.rescued.append(raw(content))
-                    index.seen(index.rescued[-1].channel, index.rescued[-1].log_time)
+                    message = raw(content)
+                    index.rescued.append((message, index.seen(message.channel, message.log_time)))
                 else:
                     index.define(opcode, content)
     if found is None:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from recordings.decode import transform_of
 from recordings.discovery import looks_rectified
 from recordings.errors import LogError
-from stages.data import Array, CameraModel, Mount, Transform
+from stages.data import Array, CameraModel, Mount, StereoCamera, Transform
 
 # A camera's axes (x right, y down, z forward) in the rover's (x forward, y left, z up), when it looks straight ahead.
 BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -27,6 +27,7 @@ _SAME = 1e-6  # m and matrix elements; two transforms of the same frames that di
 _PARALLEL = 1e-3  # rad; cameras turned against each other by less need no rectification: a pixel at 1000 px
 _BESIDE = 0.01  # of the baseline; and so for cameras that are shifted against each other by less in y and z
 _ALIKE = 1e-3  # of a focal length or of cy; and so for lenses that differ by less: a pixel at 1000 px
+_AGREEING = 0.05  # of a baseline; what tells it twice tells the same where it differs by less
 _SHRUNK = 0.1  # of the focal length; what rectification makes smaller than that is no image
 
 
@@ -126,6 +127,29 @@ def calibrated_pair(
             "record the stereo calibration"
         )
     return Camera(left, rectified, names[0]), Camera(right, rectified, names[1])
+
+
+def baseline_note(
+    cameras: tuple[Camera, Camera], models: tuple[CameraModel, CameraModel], names: tuple[str, str], frames: Frames
+) -> str:
+    """What there is to say of the baseline of `cameras`, as `calibrated_pair` made them of the rest: that the static
+    transform between them tells it, or tells another; else empty."""
+    placed = frames.between(*names)
+    if placed is None or not np.any(placed.translation):
+        return ""
+    baseline = StereoCamera.from_models(cameras[0].model, cameras[1].model, names[0], rectified=True).baseline
+    transform, distance = (
+        f"the static transform '{names[0]}' <- '{names[1]}'",
+        float(np.linalg.norm(placed.translation)),
+    )
+    if not any(model.p[0, 3] for model in models):
+        return f"the baseline of {baseline:.4g} m is that of {transform}: P[0,3] of both CameraInfo is 0"
+    if np.isclose(baseline, distance, rtol=_AGREEING, atol=0):
+        return ""
+    return (
+        f"the baseline is {baseline:.4g} m by P of the CameraInfo, which is used, but {distance:.4g} m by {transform}; "
+        "correct the wrong one"
+    )
 
 
 def is_ideal(model: CameraModel) -> bool:

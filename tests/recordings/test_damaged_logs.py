@@ -8,6 +8,7 @@ import math
 import re
 import struct
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import Statistics
 from mcap.writer import CompressionType, IndexType, Writer
 
 from recordings import McapSource
@@ -26,7 +28,7 @@ from recordings.inventory import describe, format_description
 from recordings.mcap_chunk import unpacked
 from recordings.mcap_index import MAGIC, Index, Lost
 from recordings.mcap_reader import McapFile
-from tests.recordings.sample_log import LAYOUTS, LEFT, data_folder, essence, items_of, rewritten
+from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, items_of, rewritten
 
 
 def record(opcode: int, content: bytes) -> bytes:
@@ -136,6 +138,26 @@ def test_a_broken_chunk_costs_its_own_messages_each_with_its_time(
     assert describe(damaged, McapSource())["damage"]
 
 
+def test_damage_that_took_all_images_is_told_as_that(sample: Path, tmp_path: Path) -> None:
+    full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500, use_statistics=False)
+    with full.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    content, broken = bytearray(full.read_bytes()), []
+    for chunk in summary.chunk_indexes:
+        if {summary.channels[number].topic for number in chunk.message_index_offsets} & {LEFT, RIGHT}:
+            content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+            broken.append(chunk.chunk_start_offset)
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    with McapSource().open(damaged) as log:
+        assert log.missing["left"].startswith(
+            "the log has no camera image (sensor_msgs/Image or CompressedImage): "
+            f"no message of {LEFT}, {RIGHT} can be read; give one that has "
+            f"(messages were lost: the chunk at byte {broken[0]} is broken and its messages are lost"
+        )
+        assert log.lacking["left"].endswith("give one that has")
+
+
 def test_a_record_with_a_broken_length_costs_what_it_held(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path
 ) -> None:
@@ -214,6 +236,31 @@ def test_many_losses_take_their_time_from_the_last_message_before_them() -> None
         index.lose("gone")
     assert [lost.log_time for lost in index.lost] == [5, 9, 9]
     assert index.latest == 9
+
+
+def test_statistics_that_do_not_count_by_channel_are_no_sign_of_an_empty_log(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = Statistics.write
+    monkeypatch.setattr(Statistics, "write", lambda self, to: written(replace(self, channel_message_counts={}), to))
+    path = rewritten(sample, tmp_path / "log.mcap", chunk_size=500)
+    assert [essence(item) for _, _, item in items_of(path)] == [essence(item) for _, _, item in whole]
+
+
+@pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no index", "no crcs"])
+@pytest.mark.parametrize("second", ["log", "zeros"])
+def test_what_is_behind_the_end_of_a_log_is_told(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, second: str
+) -> None:
+    first = rewritten(sample, tmp_path / "first.mcap", **LAYOUTS[layout]).read_bytes()
+    path = tmp_path / "log.mcap"
+    path.write_bytes(first + (first if second == "log" else bytes(5000)))
+    *events, (_, stream, lost) = items_of(path)
+    assert [essence(item) for _, _, item in events] == [essence(item) for _, _, item in whole]
+    size = len(first) if second == "log" else 5000
+    said = f"the log ends at byte {len(first)}, and {size} bytes behind that are not read; give each log by itself"
+    assert (stream, str(lost)) == ("log", f"log.mcap: {said}")
+    assert describe(path, McapSource())["damage"] == [said]
 
 
 def test_an_index_that_points_behind_the_end_loses_its_chunk_alone(sample: Path, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ def images(path: Path, topics: dict[str, str], infos: dict[str, str]) -> Path:
             stamp = START + number * PERIOD
             for topic, frame in infos.items():
                 side = "right" if "right" in topic else "left"
-                writer.write(topic, camera_info(stamp, frame, model(side, width=20 + len(topic) % 7)), stamp)
+                writer.write(topic, camera_info(stamp, frame, model(side)), stamp)
             for topic, frame in topics.items():
                 writer.write(topic, image(stamp, frame, picture(number)), stamp)
     return path

@@ -11,7 +11,20 @@ import pytest
 
 from recordings import McapSource
 from recordings.inventory import describe, format_description
-from tests.recordings.sample_log import BASELINE, FRAMES, LEFT, PERIOD, RIGHT, TILT, rewritten, write_sample
+from recordings.ros2 import transform_message
+from stages.data import Transform
+from tests.recordings.sample_log import (
+    BASELINE,
+    FRAMES,
+    LEFT,
+    PERIOD,
+    RIGHT,
+    START,
+    TILT,
+    TRANSFORMS,
+    rewritten,
+    write_sample,
+)
 from tests.recordings.test_mcap_log import copied
 
 
@@ -88,6 +101,48 @@ def test_a_calibration_that_may_be_of_another_image_size_is_doubted(tmp_path: Pa
         "doubtful: cx of 11.5 px lies in the outer fifth of 60x32 images: check that the calibration is for this size"
         in (format_description(describe(path, McapSource())))
     )
+
+
+@pytest.mark.parametrize(
+    ("told", "told_by_transform", "note"),
+    [
+        (BASELINE, BASELINE * 1.04, ""),
+        (
+            BASELINE, BASELINE * 1.06,
+            (
+                "the baseline is 0.25 m by P of the CameraInfo, which is used, but 0.265 m by the static transform "
+                "'left_optical' <- 'right_optical'; correct the wrong one"
+            ),
+        ),
+        (
+            0.0, 0.3,
+            (
+                "the baseline of 0.3 m is that of the static transform 'left_optical' <- 'right_optical': "
+                "P[0,3] of both CameraInfo is 0"
+            ),
+        ),
+    ],
+)  # fmt: skip
+def test_a_baseline_that_is_told_twice_or_by_the_transform_alone_is_noted(
+    tmp_path: Path, told: float, told_by_transform: float, note: str
+) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == "/tf_static":
+            beside = Transform("left_optical", "right_optical", np.eye(3), [told_by_transform, 0, 0])
+            return transform_message([(transform, START) for transform in (*TRANSFORMS, beside)])
+        if topic == "/stereo/right/camera_info":
+            message.p = message.p.copy()
+            message.p[3] = -20 * told
+        if topic == RIGHT:
+            message.header.stamp.sec = message.header.stamp.nanosec = 0
+        return message
+
+    path = write_sample(tmp_path / "log.mcap", edit)
+    described = describe(path, McapSource())
+    assert described["calibration"]["baseline"] == pytest.approx(told or told_by_transform)
+    unstamped = "header stamps are 0: log times are used"
+    assert described["notes"] == {"right": f"{unstamped}; {note}" if note else unstamped}
+    assert f"note: right: {described['notes']['right']}" in format_description(described).splitlines()
 
 
 def test_a_missing_right_calibration_is_said_in_whole_sentences(tmp_path: Path) -> None:

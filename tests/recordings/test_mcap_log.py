@@ -18,7 +18,18 @@ from recordings import McapSource
 from recordings.errors import LogError
 from recordings.inventory import describe
 from recordings.ros2 import iter_messages
-from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, items_of, write_sample
+from tests.recordings.sample_log import (
+    FRAMES,
+    LAYOUTS,
+    LEFT,
+    PERIOD,
+    RIGHT,
+    START,
+    TILT,
+    items_of,
+    rewritten,
+    write_sample,
+)
 
 INFO = "/stereo/left/camera_info"
 IMAGE_LAG = 1000  # ns between an image's stamp and its log time in the sample
@@ -71,6 +82,58 @@ def test_no_image_comes_with_a_calibration_that_was_not_in_force(tmp_path: Path,
     left = [item.stamp for _, stream, item in events if stream == "left" and not isinstance(item, Exception)]
     assert left == [START + number * PERIOD for number in (0, 1, 4)]
     assert sum(stream == "right" for _, stream, _ in events) == FRAMES
+
+
+def calibrated_once_more(path: Path, layout: str, again: Any = 2) -> Path:
+    """A log of half a hertz whose CameraInfo come with frame 0, and changed with frame 2 (and `again`)."""
+
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic.endswith("camera_info"):
+            message.k = message.k * (1.5 if number else 1)
+            return message if number in (0, 2, again) else None
+        return message
+
+    slow = lambda topic, time: START + 20 * (time - START)  # noqa: E731
+    plain = write_sample(path.with_name("plain.mcap"), edit)
+    return rewritten(plain, path, slow, **LAYOUTS[layout])
+
+
+def left_of(log: Any) -> tuple[list[int], list[str]]:
+    """Numbers of the left images of an iteration, and what is said of those that are lost."""
+    items = [(time, item) for time, stream, item in log if stream == "left"]
+    lost = [str(item) for _, item in items if isinstance(item, Exception)]
+    return [round((time - START) / (20 * PERIOD)) for time, item in items if not isinstance(item, Exception)], lost
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_calibration_that_changed_before_the_range_or_excerpt_is_known(tmp_path: Path, layout: str) -> None:
+    path = calibrated_once_more(tmp_path / "log.mcap", layout)
+    with McapSource().open(path, start=7) as log:
+        read, lost = left_of(log)
+        assert (read, len(lost)) == ([], 1)
+        assert f"where it changes (at or before {START + 2 * PERIOD} ns)" in lost[0]
+        excerpts = [left_of(events)[0] for events in log.excerpts(FRAMES, {"left", "right"})]
+    assert excerpts == [[0, 1], [1], [], [], []]
+    with McapSource().open(path, start=3) as log:
+        assert f"where it changes ({START + 2 * PERIOD} ns)" in left_of(log)[1][0]
+
+
+def test_a_damaged_calibration_before_the_range_leaves_the_one_before_it_in_force(tmp_path: Path) -> None:
+    path = calibrated_once_more(tmp_path / "log.mcap", "small chunks", again=3)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        infos = {number for number, channel in summary.channels.items() if channel.topic == INFO}
+        broken = max(
+            (chunk for chunk in summary.chunk_indexes if infos & chunk.message_index_offsets.keys()),
+            key=lambda chunk: chunk.message_start_time,
+        )
+    content = bytearray(path.read_bytes())
+    content[broken.chunk_start_offset + broken.chunk_length // 2] ^= 0xFF
+    path.write_bytes(content)
+    assert broken.message_start_time >= START + 60 * PERIOD
+    with McapSource().open(path, start=8.0) as log:
+        read, lost = left_of(log)
+        assert (read, lost[-1].rpartition("(")[2]) == ([], f"at or before {START + 2 * PERIOD} ns)")
 
 
 def test_a_tilt_of_another_sensor_than_the_mounts_is_lost(tmp_path: Path) -> None:

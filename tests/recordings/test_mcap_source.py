@@ -107,7 +107,8 @@ def test_messages_come_in_log_time_order_whatever_their_order_in_the_file(sample
         writer = Writer(target, chunk_size=2000)
         writer.start()
         known: dict[int, int] = {}
-        for schema, channel, message in reversed(list(make_reader(source).iter_messages())):
+        messages = list(make_reader(source).iter_messages())
+        for schema, channel, message in sorted(messages, key=lambda found: found[1].topic, reverse=True):
             if channel.id not in known:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 known[channel.id] = writer.register_channel(channel.topic, "cdr", number)
@@ -272,6 +273,45 @@ def test_a_camera_whose_images_nobody_can_read_is_missing_before_the_run(tmp_pat
         assert "(mono8, 8UC1, " in log.missing["right"]
     described = describe(path, McapSource())
     assert (described["frames"]["pairs"], described["missing"]) == (0, log.missing)
+
+
+def gray(message: Any) -> Any:
+    message.encoding, message.step, message.data = "mono8", WIDTH, message.data[: WIDTH * HEIGHT]
+    return message
+
+
+def cropped(message: Any) -> Any:
+    message.height, message.data = HEIGHT - 2, message.data[: 3 * WIDTH * (HEIGHT - 2)]
+    return message
+
+
+@pytest.mark.parametrize("odd", [range(FRAMES), range(1), range(FRAMES - 1, FRAMES), range(1, FRAMES - 1)])
+@pytest.mark.parametrize(
+    ("topic", "change", "told"),
+    [
+        (
+            RIGHT, gray,
+            dict.fromkeys(
+                ("left", "right"),
+                f"the images on {LEFT} are 24x16 colour of 8 bit, those on {RIGHT} 24x16 gray of 8 bit; "
+                "record both alike",
+            ),
+        ),
+        (
+            LEFT, cropped,
+            {
+                "left": f"the images on {LEFT} are 24x14, but {INFO} is the calibration of images of 24x16; "
+                "set 'left_info' of the source to that of these, or record it"
+            },
+        ),
+    ],
+)  # fmt: skip
+def test_images_that_fit_no_frame_are_told_before_the_run_unless_some_do(
+    tmp_path: Path, topic: str, change: Any, told: dict[str, str], odd: range
+) -> None:
+    edit = lambda name, number, message: change(message) if name == topic and number in odd else message  # noqa: E731
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert log.missing == (told if len(odd) == FRAMES else {})
 
 
 # Bare angles

@@ -1,0 +1,131 @@
+"""A clock that was set back while a log was recorded costs what came until that time had come again, and no more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from recordings import McapSource
+from recordings.inventory import describe
+from recordings.mcap_index import JITTER
+from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, items_of
+
+BACK = 2 * PERIOD + PERIOD // 2
+FIRST = 3  # the first frame after the clock was set back
+
+
+def reordered(source: Path, out: Path, order: Callable[[list[Any]], list[Any]], **options: Any) -> Path:
+    """The messages of a log in another order in the file."""
+    with source.open("rb") as stream, out.open("wb") as file:
+        writer, channels = Writer(file, **options), dict[int, int]()
+        writer.start(profile="ros2", library="test")
+        for schema, channel, message in order(list(make_reader(stream).iter_messages())):
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", known)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return out
+
+
+def set_back(messages: list[Any]) -> list[Any]:
+    """The clock set back before the message at FIRST, its stamps as well as its log times."""
+    for schema, _, message in messages:
+        if message.log_time >= START + FIRST * PERIOD:
+            message.log_time -= BACK
+            if schema.name.startswith("sensor_msgs") or schema.name.startswith("nav_msgs"):
+                nanoseconds = int.from_bytes(message.data[8:12], "little") - BACK
+                message.data = message.data[:8] + nanoseconds.to_bytes(4, "little") + message.data[12:]
+    return messages
+
+
+@pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
+def test_what_follows_a_clock_set_back_is_lost_until_that_time_has_come(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, options: dict[str, Any]
+) -> None:
+    path = reordered(sample, tmp_path / "log.mcap", set_back, **options)
+    events = items_of(path)
+    good = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
+    assert good == [essence(item) for time, _, item in whole if time < START + FIRST * PERIOD]
+    lost = [(time, str(item)) for time, stream, item in events if isinstance(item, Exception) and stream == "left"]
+    images = [(time, said) for time, said in lost if said.startswith(f"{LEFT}: ")]
+    assert [time for time, _ in images] == [START + number * PERIOD - BACK + 1000 for number in range(FIRST, FRAMES)]
+    said = "the log's clock was set back by 0.15 s or more, and was not yet 1 s beyond where it had been"
+    assert {told for _, told in images} == {f"{LEFT}: {said}"}
+    with McapSource().open(path) as log:
+        assert log.file.times(log.channels("left")).tolist() == [START + n * PERIOD + 1000 for n in range(FIRST)]
+        surveyed = [item for events in log.excerpts(9, {"left"}) for _, stream, item in events if stream == "left"]
+    assert {item.stamp for item in surveyed if not isinstance(item, Exception)} == {
+        START + number * PERIOD for number in range(FIRST)
+    }
+    description = describe(path, McapSource())
+    assert description["frames"]["pairs"] == FIRST
+    assert f"{LEFT} at {images[0][0]} ns: {said}" in description["damage"]
+
+
+@pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
+def test_a_clock_that_is_a_second_beyond_where_it_was_loses_nothing_from_there_on(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, options: dict[str, Any]
+) -> None:
+    def back_and_on(messages: list[Any]) -> list[Any]:
+        """Two seconds a frame; the clock set back before FIRST, and put right again behind it."""
+        for _, _, message in messages:
+            is_back = (message.log_time - START) // PERIOD == FIRST
+            message.log_time = START + 20 * (message.log_time - START - (BACK if is_back else 0))
+        return messages
+
+    events = items_of(reordered(sample, tmp_path / "log.mcap", back_and_on, **options))
+    lost = [(stream, item) for _, stream, item in events if isinstance(item, Exception)]
+    assert sorted(stream for stream, _ in lost) == ["inclinometer", "left", "left", "odometry", "right", "right"]
+    good = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
+    assert good == [essence(item) for time, _, item in whole if (time - START) // PERIOD != FIRST]
+
+
+@pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
+def test_no_image_from_behind_the_fall_meets_a_tilt_from_before_it(
+    sample: Path, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    def rare_images(messages: list[Any]) -> list[Any]:
+        """The clock set back, the left images of frames 1 and 2 left out: those alone do not show it."""
+        rare = range(START + PERIOD, START + FIRST * PERIOD)
+        kept = [found for found in messages if found[1].topic != LEFT or found[2].log_time not in rare]
+        return set_back(kept)
+
+    path = reordered(sample, tmp_path / "log.mcap", rare_images, **options)
+    left = [item for _, stream, item in items_of(path) if stream == "left"]
+    assert [item.stamp for item in left if not isinstance(item, Exception)] == [START]
+    assert len([item for item in left if str(item).startswith(f"{LEFT}: the log's clock was set back")]) == 2
+
+
+@pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
+def test_a_log_written_topic_by_topic_or_with_jitter_loses_nothing(
+    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, options: dict[str, Any]
+) -> None:
+    def by_topic(messages: list[Any]) -> list[Any]:
+        """By topic, and in each the messages two by two in the wrong order."""
+        topics = dict.fromkeys(channel.topic for _, channel, _ in messages)
+        rows = [[found for found in messages if found[1].topic == topic] for topic in topics]
+        assert max(b[2].log_time - a[2].log_time for row in rows for a, b in pairwise(row)) == JITTER
+        return [row[place] for row in rows for place in sorted(range(len(row)), key=lambda number: number ^ 1)]
+
+    events = items_of(reordered(sample, tmp_path / "log.mcap", by_topic, **options))
+    assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
+    assert sorted((t, s, essence(i)) for t, s, i in events) == sorted((t, s, essence(i)) for t, s, i in whole)
+
+
+def test_static_transforms_hold_whenever_they_were_logged(sample: Path, tmp_path: Path) -> None:
+    def late_before(messages: list[Any]) -> list[Any]:
+        (schema, channel, message), *others = messages
+        assert channel.topic == "/tf_static"
+        nothing = replace(message, log_time=START + 9 * PERIOD, data=message.data[:4] + bytes(4))
+        return [(schema, channel, nothing), (schema, channel, message), *others]
+
+    with McapSource().open(reordered(sample, tmp_path / "log.mcap", late_before)) as log:
+        assert (log.missing, log.problems) == ({}, [])
