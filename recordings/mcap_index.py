@@ -27,6 +27,7 @@ BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError
 
 LAST_TIME = (1 << 63) - 1  # ns; a log time after it is damage, which no clock can show
 SETTLED = 1_000_000_000  # ns; stamps are before log times: so much later none is of before the clock was set back
+LEAP = 10_000_000_000  # ns; a message that is so far ahead of those before and behind it is damage, no clock's doing
 JITTER = 100_000_000  # ns; messages of a channel may be logged in another order than they were written by so much
 
 RECORD = struct.Struct("<BQ")  # opcode, length
@@ -51,20 +52,23 @@ class Clock(NamedTuple):
     """The recorder's clock as a message shows it, and those of its channel that precede it in the file.
 
     latest: the latest log time of them, ns; back: by how much the clock was set back, ns, until it is `SETTLED` beyond
-    that time (then 0).
+    that time (then 0); before: the latest without the last of them.
     """
 
     latest: int = 0
     back: int = 0
+    before: int = 0
 
     def then(self, log_time: int) -> Clock:
         """The clock as the next message shows it."""
         if log_time > LAST_TIME:
             return self
         fall = self.latest - log_time
-        if fall > (-SETTLED if self.back else JITTER):
-            return Clock(self.latest, max(self.back, fall))
-        return Clock(max(self.latest, log_time))
+        if fall <= (-SETTLED if self.back else JITTER):
+            return Clock(max(self.latest, log_time), 0, self.latest)
+        if not self.back and self.before < log_time and self.latest - self.before > LEAP:  # the last one is wrong
+            return Clock(log_time, 0, self.before)
+        return Clock(self.latest, max(self.back, fall), self.before)
 
 
 class Lost(NamedTuple):

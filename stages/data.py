@@ -135,7 +135,7 @@ class StereoCamera:
                 outer = f"{name} of {getattr(self, name):g} px lies in the outer fifth of {size} images"
                 said.append(f"{outer}: check that the calibration is for this size")
         if self.baseline > 5:
-            said.append(f"the baseline is {self.baseline:g} m: check that it is not given in centimetres")
+            said.append(f"the baseline is {self.baseline:g} m: check that it is given in metres")
         return tuple(said)
 
 

@@ -120,6 +120,20 @@ def test_a_log_written_topic_by_topic_or_with_jitter_loses_nothing(
     assert sorted((t, s, essence(i)) for t, s, i in events) == sorted((t, s, essence(i)) for t, s, i in whole)
 
 
+@pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
+def test_a_log_time_that_leaps_ahead_alone_is_no_clock_set_back(
+    sample: Path, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    def one_ahead(messages: list[Any]) -> list[Any]:
+        found = next(m for _, channel, m in messages if channel.topic == LEFT and m.log_time > START + PERIOD)
+        found.log_time += 10**13
+        return messages
+
+    events = items_of(reordered(sample, tmp_path / "log.mcap", one_ahead, **options))
+    assert not [item for _, _, item in events if isinstance(item, Exception)]
+    assert sum(stream == "left" for _, stream, _ in events) == FRAMES
+
+
 def test_static_transforms_hold_whenever_they_were_logged(sample: Path, tmp_path: Path) -> None:
     def late_before(messages: list[Any]) -> list[Any]:
         (schema, channel, message), *others = messages

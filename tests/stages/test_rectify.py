@@ -246,7 +246,7 @@ def test_images_that_are_infinitely_far_at_another_disparity_are_not_called_swap
 @pytest.mark.parametrize(("changes", "words"), [
     ({"cx": 120.0, "cx_right": 320.0}, "cx of 120 px lies in the outer fifth of 640x480 images: check that"),
     ({"cy": 400.0}, "cy of 400 px lies in the outer fifth of 640x480 images: check that"),
-    ({"baseline": 12.0}, "the baseline is 12 m: check that it is not given in centimetres; "),
+    ({"baseline": 12.0}, "the baseline is 12 m: check that it is given in metres; "),
 ])  # fmt: skip
 def test_a_calibration_that_hardly_any_camera_has_is_a_warning(changes, words):
     camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE)
