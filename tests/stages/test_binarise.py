@@ -145,7 +145,7 @@ def test_tilting_and_raising_the_scene_changes_no_step_and_no_roughness(
         for elevation in (terrain.elevation, with_plane(terrain.elevation, gx, gy, offset))
     )
     # float32 heights round; a cell that lies on a threshold may fall to the other side, and its neighbours with it.
-    assert (plain.cells != moved.cells).mean() <= 0.004
+    assert (plain.cells != moved.cells).mean() <= 0.002
 
 
 @settings(max_examples=15, deadline=None)
