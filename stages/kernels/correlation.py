@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.compiled import kernel
+from stages.kernels.compiled import kernel, part
 from stages.kernels.halves import by_halves, shared_by
 
 RADIUS = 7  # px, of the square over which is correlated
@@ -56,30 +56,37 @@ def _multiply(disparity, left, right, first, end, products):  # type: ignore[no-
                 products[0, y, x], products[1, y, x], products[2, y, x] = one * one, other * other, one * other
 
 
+@part
+def _add(columns, products, y, sign):  # type: ignore[no-untyped-def]
+    for k in range(3):
+        for x in range(columns.shape[1]):
+            columns[k, x] += np.int32(sign) * products[k, y, x]
+
+
 @kernel
 def _correlate(products, first, end, found):  # type: ignore[no-untyped-def]
     height, width = found.shape
     columns = np.zeros((3, width), np.int32)  # sums over the rows of the square
+    # Sums along the row so far. They may run over 2^31; the difference of two, of a square, is right all the same.
+    along = np.zeros((3, width + 2 * RADIUS + 1), np.int32)
     for y in range(max(first - RADIUS, 0), min(first + RADIUS, height)):
-        columns += products[:, y]
+        _add(columns, products, y, 1)
     for y in range(first, end):
         if y + RADIUS < height:
-            columns += products[:, y + RADIUS]
+            _add(columns, products, y + RADIUS, 1)
         if y > first and y - RADIUS > 0:
-            columns -= products[:, y - RADIUS - 1]
-        left = right = mixed = np.int64(0)
-        for ahead in range(-RADIUS, width):
-            if ahead + RADIUS < width:
-                left += columns[0, ahead + RADIUS]
-                right += columns[1, ahead + RADIUS]
-                mixed += columns[2, ahead + RADIUS]
-            if ahead - RADIUS > 0:
-                left -= columns[0, ahead - RADIUS - 1]
-                right -= columns[1, ahead - RADIUS - 1]
-                mixed -= columns[2, ahead - RADIUS - 1]
-            if ahead >= 0:
-                scale = np.sqrt(np.float64(left) * np.float64(right))
-                found[y, ahead] = np.float64(mixed) / scale if scale > 0 else np.float64(0)
+            _add(columns, products, y - RADIUS - 1, -1)
+        for k in range(3):
+            total = np.int32(0)
+            for x in range(width):
+                total = np.int32(total + columns[k, x])
+                along[k, x + RADIUS + 1] = total
+            along[k, width + RADIUS + 1 :] = total
+        for x in range(width):
+            left = np.float64(np.int32(along[0, x + 2 * RADIUS + 1] - along[0, x]))
+            right = np.float64(np.int32(along[1, x + 2 * RADIUS + 1] - along[1, x]))
+            mixed = np.float64(np.int32(along[2, x + 2 * RADIUS + 1] - along[2, x]))
+            found[y, x] = mixed / np.sqrt(max(left * right, 1.0))  # where either is 0, so is mixed
 
 
 def correlation_reference(disparity: Array, left: Array, right: Array) -> Array:
@@ -96,6 +103,5 @@ def correlation_reference(disparity: Array, left: Array, right: Array) -> Array:
     for y, x in np.ndindex(height, width):
         square = np.s_[max(y - RADIUS, 0) : y + RADIUS + 1, max(x - RADIUS, 0) : x + RADIUS + 1]
         a, b = (change[square][inside[square]].astype(np.float64) for change in (one, other))
-        scale = np.sqrt((a @ a) * (b @ b))
-        found[y, x] = a @ b / scale if scale > 0 else 0.0
+        found[y, x] = a @ b / np.sqrt(max((a @ a) * (b @ b), 1.0))
     return found

@@ -19,6 +19,13 @@ def test_it_is_that_of_the_reference(height, width, seed, threads):
     assert np.abs(found).max() <= 1.000001
 
 
+def test_sums_of_a_wide_row_of_full_contrast_hold():
+    rng = np.random.default_rng(2)
+    left = rng.choice(np.array([0, 255], np.uint8), (3, 4000))
+    disparity = np.full(left.shape, 1.5, np.float32)
+    np.testing.assert_array_equal(correlation(disparity, left, left), correlation_reference(disparity, left, left))
+
+
 def test_what_both_see_correlates_and_noise_does_not_whatever_was_matched():
     rng = np.random.default_rng(3)
     texture = rng.normal(0, 8, (120, 220))
