@@ -285,11 +285,9 @@ def _rotation(quaternion: Any) -> Array:
 
 def _rocks(message: Any) -> Array:
     """x, y, diameter, height, m, and, where told, pixels and shown, of /truth/rocks (all within 10 m of base_link)."""
-    offsets = {item.name: item.offset for item in message.fields}
-    rows = np.ascontiguousarray(message.data).reshape(message.width, message.point_step)
-    names = [name for name in ("x", "y", "diameter", "height", "pixels", "shown") if name in offsets]
-    columns = (np.ascontiguousarray(rows[:, offsets[name] : offsets[name] + 4]).view("<f4")[:, 0] for name in names)
-    return np.column_stack(list(columns))
+    fields = ros2.read_point_cloud(message)
+    names = ("x", "y", "diameter", "height", "pixels", "shown")
+    return np.column_stack([fields[name] for name in names if name in fields])
 
 
 def _without_nan(value: Any) -> Any:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from recordings.decode import pixels_of, up_of
+from recordings.decode import pixels_of, pose_of, up_of
 from recordings.errors import LogError
 from recordings.ros2 import header, image, make
 from tests.recordings.sample_log import HEIGHT, WIDTH, picture
@@ -112,3 +112,21 @@ def test_an_image_of_another_size_than_its_calibration_is_refused_before_it_is_u
         pixels_of(compressed(data, suffix), (10, HEIGHT))
     with pytest.raises(LogError, match=f"the image is {WIDTH}x{HEIGHT}, its calibration is for 10x{HEIGHT}"):
         pixels_of(raw_image("mono8", picture(1)[:, :, 0], WIDTH), (10, HEIGHT))
+
+
+@pytest.mark.parametrize(("first", "known"), [(0.25, True), (0.0, False), (-1.0, False)])
+def test_a_covariance_of_zeros_or_that_begins_below_zero_is_none(first: float, known: bool) -> None:
+    origin = {"position": make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)}
+    turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    pose = make(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=header(5, "odom"),
+        pose=make(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=make("geometry_msgs/msg/Pose", **origin, orientation=turn),
+            covariance=np.diag([first] * 6).reshape(-1),
+        ),
+    )
+    found = pose_of(pose, 5, "base_link")
+    assert found is not None
+    assert (found.covariance is not None) == known
