@@ -252,7 +252,8 @@ class Opening:
     def _untilted(self, topic: str) -> str | None:
         """Why the first messages of an Imu tell no tilt; None where one does."""
         why: LogError | None = LogError("it has no messages")
-        for tilt in islice(self._made(topic, lambda message: tilt_of(message, 0)), _LOOKED_AT):
+        made = self._made(topic, lambda message: tilt_of(message, 0), any_order=True)
+        for tilt in islice(made, _LOOKED_AT):
             if not isinstance(tilt, LogError):
                 return None
             why = tilt

@@ -12,7 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from recordings import McapSource
+from recordings import McapSource, mcap_opening
 from recordings.inventory import describe
 from recordings.mcap_index import JITTER
 from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, items_of
@@ -118,6 +118,23 @@ def test_a_log_written_topic_by_topic_or_with_jitter_loses_nothing(
     events = items_of(reordered(sample, tmp_path / "log.mcap", by_topic, **options))
     assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
     assert sorted((t, s, essence(i)) for t, s, i in events) == sorted((t, s, essence(i)) for t, s, i in whole)
+
+
+def test_a_clock_set_back_by_all_that_was_recorded_takes_no_sensor(
+    sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcap_opening, "_LOOKED_AT", 3)  # what is lost comes first, and may be more than is looked at
+
+    def far_back(messages: list[Any]) -> list[Any]:
+        for _, _, message in messages:
+            if message.log_time >= START + FIRST * PERIOD:
+                message.log_time -= 100 * PERIOD
+        return messages
+
+    with McapSource().open(reordered(sample, tmp_path / "log.mcap", far_back)) as log:
+        assert log.missing == {}
+        stamps = [item.stamp for _, stream, item in log if stream == "left" and not isinstance(item, Exception)]
+    assert stamps == [START + number * PERIOD for number in range(FIRST)]
 
 
 @pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
