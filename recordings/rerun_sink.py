@@ -86,6 +86,7 @@ class RerunSink:
         self._recording.set_sinks(rr.FileSink(str(self._partial)))
         self._recording.send_recording_name(self._about.get("log", self._path.stem))
         self._recording.log(SUMMARY, _document("RUNNING", self._about), static=True)
+        self._recording.flush()  # so that the file begins with it
 
     def write(self, record: FrameRecord) -> None:
         """Draw one frame. May be called from any thread, one call at a time."""
