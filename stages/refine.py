@@ -183,8 +183,7 @@ class Refine(Stage):
         """Where the images vary alike, so shifted, (H, W) bool."""
         if self.correlation == 0:
             return np.ones(pixels.shape, bool)
-        evidence = np.where(guessed, F32(np.nan), pixels)
-        return correlation(evidence, guide, gray(eight_bit(right)[0]), self.threads) >= F32(self.correlation)
+        return correlation(pixels, guessed, guide, gray(eight_bit(right)[0]), self.threads) >= F32(self.correlation)
 
     def _sharpened(self, pixels: Array, guessed: Array, guide: Array) -> Array:
         if self.edge_radius == 0:

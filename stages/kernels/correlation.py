@@ -20,17 +20,17 @@ ACROSS, DOWN = np.array([1, 2, 0, -2, -1], np.float32), np.array([1, 2, 1], np.f
 HALF = 0.5  # of that, so that the sum of squares over a square is below 2^31
 
 
-def correlation(disparity: Array, left: Array, right: Array, threads: int = 1) -> Array:
+def correlation(disparity: Array, guessed: Array, left: Array, right: Array, threads: int = 1) -> Array:
     """Correlation of the images' changes along the row about each pixel, (H, W) float32, -1 to 1; 0 where nothing
     varies, or no disparity about it leads into the right image.
 
-    disparity: (H, W) float32, px, NaN = unknown; left, right: (H, W) uint8; threads: 2 share the work, to the same
-    result.
+    disparity: (H, W) float32, px, NaN = unknown; guessed: (H, W) bool, where it has no say; left, right: (H, W) uint8;
+    threads: 2 share the work, to the same result.
     """
     both, height = shared_by(threads), len(disparity)
     changes = both(lambda: _changes(left), lambda: _changes(right))
     products, found = np.empty((3, *disparity.shape), np.int32), np.empty(disparity.shape, np.float32)
-    by_halves(both, height, lambda first, end: _multiply(disparity, *changes, first, end, products))
+    by_halves(both, height, lambda first, end: _multiply(disparity, guessed, *changes, first, end, products))
     by_halves(both, height, lambda first, end: _correlate(products, first, end, found))
     return found
 
@@ -41,14 +41,14 @@ def _changes(image: Array) -> Array:
 
 
 @kernel
-def _multiply(disparity, left, right, first, end, products):  # type: ignore[no-untyped-def]
+def _multiply(disparity, guessed, left, right, first, end, products):  # type: ignore[no-untyped-def]
     """Squares of the left and of the right change, and their product; 0 where there is no partner."""
     width = disparity.shape[1]
     for y in range(first, end):
         for x in range(width):
             at = np.float32(x) - disparity[y, x]
             products[0, y, x] = products[1, y, x] = products[2, y, x] = 0
-            if np.float32(0) <= at <= np.float32(width - 1):
+            if np.float32(0) <= at <= np.float32(width - 1) and not guessed[y, x]:
                 before = int(at)
                 here, beside = np.float32(right[y, before]), np.float32(right[y, min(before + 1, width - 1)])
                 other = np.int32(np.rint(here + (at - np.float32(before)) * (beside - here)))
@@ -89,12 +89,12 @@ def _correlate(products, first, end, found):  # type: ignore[no-untyped-def]
             found[y, x] = mixed / np.sqrt(max(left * right, 1.0))  # where either is 0, so is mixed
 
 
-def correlation_reference(disparity: Array, left: Array, right: Array) -> Array:
+def correlation_reference(disparity: Array, guessed: Array, left: Array, right: Array) -> Array:
     """`correlation` in plain numpy, one square at a time."""
     height, width = disparity.shape
     one, changes = (_changes(image).astype(np.float32) for image in (left, right))
     at = np.arange(width, dtype=np.float32) - disparity
-    inside = (at >= 0) & (at <= width - 1)
+    inside = (at >= 0) & (at <= width - 1) & ~guessed
     at = np.where(inside, at, 0)
     row, before = np.arange(height)[:, None], at.astype(int)
     here, beside = changes[row, before], changes[row, np.minimum(before + 1, width - 1)]

@@ -34,7 +34,7 @@ def extent(disparity: Array) -> Extent:
     around = cv2.boxFilter(
         known.view(np.uint8), cv2.CV_16U, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_REPLICATE
     )
-    known &= around > int(SHARE * SIDE**2 * known.mean())
+    known &= around > int(SHARE * SIDE**2 * (np.count_nonzero(known) / known.size))
     found = Extent(np.full(width, height, np.int64), np.full(height, 2 * width, np.int64), np.full(height, -width))
     _find_top(known, found.top)
     _find_ends(known, found.first, found.last)

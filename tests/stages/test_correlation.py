@@ -14,16 +14,19 @@ def test_it_is_that_of_the_reference(height, width, seed, threads):
     disparity = rng.uniform(-3, 12, (height, width)).astype(np.float32)
     disparity[rng.random(disparity.shape) < 0.3] = np.nan
     left, right = rng.choice(np.array([0, 90, 100, 110, 255], np.uint8), (2, height, width))
-    found = correlation(disparity, left, right, threads)
-    np.testing.assert_array_equal(found, correlation_reference(disparity, left, right))
+    guessed = rng.random(disparity.shape) < 0.1
+    found = correlation(disparity, guessed, left, right, threads)
+    np.testing.assert_array_equal(found, correlation_reference(disparity, guessed, left, right))
     assert np.abs(found).max() <= 1.000001
 
 
 def test_sums_of_a_wide_row_of_full_contrast_hold():
     rng = np.random.default_rng(2)
     left = rng.choice(np.array([0, 255], np.uint8), (3, 4000))
-    disparity = np.full(left.shape, 1.5, np.float32)
-    np.testing.assert_array_equal(correlation(disparity, left, left), correlation_reference(disparity, left, left))
+    disparity, none = np.full(left.shape, 1.5, np.float32), np.zeros(left.shape, bool)
+    np.testing.assert_array_equal(
+        correlation(disparity, none, left, left), correlation_reference(disparity, none, left, left)
+    )
 
 
 def test_what_both_see_correlates_and_noise_does_not_whatever_was_matched():
@@ -33,7 +36,7 @@ def test_what_both_see_correlates_and_noise_does_not_whatever_was_matched():
     left, right = texture[:, :200] + noise[0], texture[:, 10:210] + noise[1]  # a disparity of 10 px
     left[:60], right[:60] = noise[0, :60], noise[1, :60]  # the sky
     left, right = (np.clip(np.rint(image + 120), 0, 255).astype(np.uint8) for image in (left, right))
-    found = correlation(np.full(left.shape, 10.0, np.float32), left, right)
+    found = correlation(np.full(left.shape, 10.0, np.float32), np.zeros(left.shape, bool), left, right)
     assert found[70:110, 20:190].min() > 0.8
     assert np.abs(found[:52]).max() < 0.5
 
@@ -44,11 +47,14 @@ def test_an_edge_along_the_row_says_nothing():
     for image in (left, right):
         image[30:] += 100
     left, right = (np.clip(np.rint(image + 60), 0, 255).astype(np.uint8) for image in (left, right))
-    assert np.abs(correlation(np.full(left.shape, 4.0, np.float32), left, right)).max() < 0.6
+    found = correlation(np.full(left.shape, 4.0, np.float32), np.zeros(left.shape, bool), left, right)
+    assert np.abs(found).max() < 0.6
 
 
 def test_where_nothing_varies_or_nothing_is_known_there_is_none():
     flat = np.full((40, 60), 90, np.uint8)
-    assert not correlation(np.zeros((40, 60), np.float32), flat, flat).any()
+    none = np.zeros(flat.shape, bool)
+    assert not correlation(np.zeros((40, 60), np.float32), none, flat, flat).any()
     textured = np.random.default_rng(5).integers(0, 255, (40, 60)).astype(np.uint8)
-    assert not correlation(np.full((40, 60), np.nan, np.float32), textured, textured).any()
+    assert not correlation(np.full((40, 60), np.nan, np.float32), none, textured, textured).any()
+    assert not correlation(np.zeros((40, 60), np.float32), ~none, textured, textured).any()
