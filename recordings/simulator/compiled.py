@@ -1,6 +1,7 @@
 """How the simulator's loops are compiled: kept between runs, until any file of this folder changes.
 
-numba looks at the file that defines a loop and no further, but its machine code holds that of the loops it calls.
+numba looks at the file that defines a loop and no further, but its machine code holds that of the loops it calls. The
+method's kernels are kept in the same way, by a file of their own: recordings know nothing of the method but its data.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from stages.kernels.halves import by_halves, shared_by
 RADIUS = 7  # px, of the square over which is correlated
 # Change along a row, of the image smoothed a little, which takes more from noise than from texture.
 ACROSS, DOWN = np.array([1, 2, 0, -2, -1], np.float32), np.array([1, 2, 1], np.float32)
-HALF = 0.5  # of that, so that the sum of squares over a square is below 2^31
+HALF = 0.5  # of that: the sum of squares over a square then stays well below 2^31
 
 
 def correlation(disparity: Array, guessed: Array, left: Array, right: Array, threads: int = 1) -> Array:

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,18 +16,6 @@ from recordings.simulator import Simulation, log, raycast, terrain, traverse
 from recordings.simulator.odometry import dead_reckoning
 from stages.data import Cell, Transform
 
-ROOT = Path(__file__).parents[2]
-BELOW = """
-import numpy as np
-from recordings.simulator import ground_truth, raycast
-flat, nothing = np.zeros((4, 4)), np.zeros(0, np.int32)
-scene = raycast.scene(
-    flat, 1.0, flat, flat[:2, :2], np.zeros((0, 8)), nothing, np.zeros((1, 1, 4)), np.zeros(5, np.int32), nothing
-)
-clear = np.zeros(1, np.bool_)
-ground_truth._clear_lines(scene, np.array([1.2, 1.3, 1.0]), np.array([[1.7, 1.6, -1.0]]), clear)
-print(clear)
-"""
 SMALL = Simulation(
     frames=2, rate=1.0, width=400, height=300, relief_cells=512, abundance=0.12, color=False, noise=0.0,
     tilt_noise=0.0, frame_offset=0.0, seed=5,
@@ -420,21 +404,3 @@ def test_an_impossible_simulation_is_refused_with_the_parameters_name():
 
 def rotation(quaternion) -> np.ndarray:
     return Rotation.from_quat([quaternion.x, quaternion.y, quaternion.z, quaternion.w]).as_matrix()
-
-
-@pytest.mark.slow
-def test_no_machine_code_outlives_the_source_of_a_loop_that_it_calls(tmp_path):
-    for part in ("stages", "recordings"):
-        shutil.copytree(ROOT / part, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__"))
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
-
-    def what_is_hidden_below_ground():
-        script = [sys.executable, "-c", BELOW]
-        return subprocess.run(script, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
-
-    assert what_is_hidden_below_ground() == what_is_hidden_below_ground() == "[False]\n"
-    source = tmp_path / "recordings" / "simulator" / "raycast.py"
-    text, begin = source.read_text(), 'and facet of the first hit."""\n'
-    assert text.count(begin) == 1
-    source.write_text(text.replace(begin, f"{begin}    if far < 2.0:\n        return inf, SKY, 0\n"))
-    assert what_is_hidden_below_ground() == "[ True]\n"
