@@ -116,9 +116,11 @@ class Match(Stage):
         self._check(frame, prior)
         search = self._search(frame.camera)
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
-        around = windows(prior.pixels, self.around, search.start) if prior is not None and self.around else None
-        guide = None if prior is None else self._guide(prior, search, around)
-        excluded = None if prior is None else self._excluded(prior, search)
+        around = guide = excluded = None
+        if prior is not None:
+            around = windows(prior.pixels, self.around, search.start, self.threads) if self.around else None
+            guide = self._guide(prior, search, around)
+            excluded = self._excluded(prior, search)
         found = match(left, right, self._rule(search), guide, around, excluded, self.threads, self.memory << 20)
         layers = found.pixels, found.source, found.confidence
         if prior is not None and self.nearer == "prior" and not self.around:
@@ -186,8 +188,5 @@ class Match(Stage):
         )  # fmt: skip
 
     def _guide(self, prior: Disparity, search: range, around: Windows | None) -> tuple[Array, Array]:
-        weight, reach = self.prior_weight, self.prior_reach
-        if around is None:
-            return prior_costs(prior.pixels, search.start, lanes_for(len(search)), weight, reach)
-        apart = np.subtract(prior.pixels, around.first, dtype=np.float32)
-        return prior_costs(apart, 0, around.width.lanes, weight, reach)
+        start, lanes = (search.start, lanes_for(len(search))) if around is None else (around.first, around.width.lanes)
+        return prior_costs(prior.pixels, start, lanes, self.prior_weight, self.prior_reach, self.threads)

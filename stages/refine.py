@@ -112,10 +112,11 @@ class Refine(Stage):
             labels, count = superpixels(image, self._count(pixels.size), COMPACTNESS, threads=self.threads)
             pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
         filled, kinds = self._filled(pixels, weights, within, image, guide)
-        refined = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
+        guessed = kinds != KEPT
+        refined = self._sharpened(self._bilateral(filled, guide), guessed, guide)
         source, confidence = name_sources(
             matches, disparity.confidence, agreed, kinds, refined,
-            self._borne_out(refined, kinds != KEPT, guide, frame.right), self.inlier_distance, TRUST, self.threads,
+            self._borne_out(refined, guessed, guide, frame.right), self.inlier_distance, TRUST, self.threads,
         )  # fmt: skip
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
 
@@ -140,7 +141,7 @@ class Refine(Stage):
         sparse, regions = (layer[few].copy() for layer in (pixels, labels))
         sparse[weights[few] == 0] = np.nan  # what the first planes filled is no evidence for the second
         planes = fit_planes(
-            sparse, group[regions], groups, self.inlier_distance, self.hypotheses, seed + 1,
+            sparse, group.take(regions), groups, self.inlier_distance, self.hypotheses, seed + 1,
             np.ascontiguousarray(weights[few]), self.threads,
         )  # fmt: skip
         accepted = (self._accepted(planes, self.valid_share / 2, 2) * [0.5, 0.5, 1])[group]

@@ -98,6 +98,11 @@ def blind(streams: dict[str, Any], case: Case) -> Disparity:
     )
 
 
+def at_once(streams: dict[str, Any], case: Case) -> Disparity:
+    """The view from the right, of the whole range at full size."""
+    return Match(disparities=case.disparities, paths=4)(streams["swapped"])
+
+
 def unguided(streams: dict[str, Any], case: Case) -> Disparity:
     """The match at full size without the coarse one."""
     return Match(disparities=case.disparities)(case.frame)
@@ -152,6 +157,7 @@ VARIANTS: dict[str, Chain] = {
     "rover without the coarse match": remade(matched=unguided),
     "rover, coarse match not refined": remade(outline=lambda streams, _: streams["coarse"]),
     "rover without the right view": remade(backward=blind),
+    "rover, right view of whole range": remade(backward=at_once),
     "rover, not matched again": refined("checked"),
     "rover, again the whole range": remade(matched_again=everywhere),
     "rover, matched a third time": remade(matched_again=thrice),

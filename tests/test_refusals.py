@@ -74,7 +74,7 @@ def test_a_file_that_is_no_log_is_refused_in_one_sentence(tmp_path, capsys, cont
 
 
 def test_what_a_stage_cannot_do_without_is_asked_for_before_anything_runs(traverse, tmp_path, capsys):
-    assert roverflow("run", traverse, "--set", "backward.around=4", "-o", tmp_path / "out.mcap") == 2
+    assert roverflow("run", traverse, "--set", "rough.around=4", "-o", tmp_path / "out.mcap") == 2
     assert "Match.around = 4 px needs a `prior`" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

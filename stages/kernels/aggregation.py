@@ -22,7 +22,7 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.census import census_costs
 from stages.kernels.compiled import kernel, part
-from stages.kernels.halves import AtOnce, by_halves, in_turn
+from stages.kernels.sharing import AtOnce, by_bands, in_turn
 from stages.kernels.vectors import (
     Width,
     above_smallest,
@@ -54,7 +54,7 @@ def brightness_steps(image: Array, both: AtOnce = in_turn) -> Array:
     padded = cv2.copyMakeBorder(image, 1, 1, 2, 1 + stride - columns, cv2.BORDER_REPLICATE)
     steps = np.empty((len(SIDES), height + 1, stride), np.uint8)
     given = padded.reshape(-1), padded.shape[1], steps.reshape(-1), height + 1, stride
-    by_halves(both, height + 1, lambda first, end: _brightness_steps(*given, first, end, Width(BLOCK)))
+    by_bands(both, height + 1, lambda first, end: _brightness_steps(*given, first, end, Width(BLOCK)))
     return steps
 
 

@@ -19,9 +19,9 @@ from stages.kernels.aggregation import FAR, SIDES, next_path
 from stages.kernels.census import PLANES, census_costs
 from stages.kernels.compiled import kernel, part
 from stages.kernels.gradient import LARGEST, raw_costs
-from stages.kernels.halves import AtOnce
 from stages.kernels.pair import Pair, Rule
 from stages.kernels.selection import find_winner, fit_row
+from stages.kernels.sharing import AtOnce, by_bands, shared_by
 from stages.kernels.vectors import (
     Width,
     average,
@@ -51,15 +51,19 @@ class Windows(NamedTuple):
     width: Width
 
 
-def windows(prior: Array, reach: int, least: int) -> Windows:
+def windows(prior: Array, reach: int, least: int, threads: int = 1) -> Windows:
     """Windows that reach `reach` px from the prior to either side, where the image and `least` allow.
 
     prior: (H, W) float32, px, NaN = none: the window is then that of the pixel to the left; least: px, the smallest
-    disparity searched.
+    disparity searched; threads: 2 share the work, to the same result.
     """
     lanes = -(-(2 * (reach + EDGE) + STEP + 1) // 16) * 16
     first = np.empty(prior.shape, np.int32)
-    _begin(prior, lanes, least, first)
+
+    def work(top: int, end: int) -> None:
+        _begin(prior[top:end], lanes, least, first[top:end])
+
+    by_bands(shared_by(threads), len(prior), work)
     return Windows(first, Width(lanes))
 
 

@@ -1,7 +1,8 @@
 """Joint bilateral filter of a disparity image (paper, section 3.3): near in space, in gray level and in disparity.
 
 Both range weights are Cauchy functions 1 / (1 + (difference / scale)^2) instead of Gaussians: no exponential in the
-inner loop, which runs over whole rows with the tap's offset fixed.
+inner loop, which runs over whole rows with the tap's offset fixed. An unknown disparity stands there as one so far away
+that it weighs nothing: 1e-30 of a neighbour's.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel, kernel
-from stages.kernels.halves import by_halves, shared_by
+from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
+FAR = F32(1e15)  # in scales of the difference in disparity; its square is still far from the largest float32
 
 
 def joint_bilateral(
@@ -25,12 +27,13 @@ def joint_bilateral(
     disparity, px; threads: 2 share the work. Returns (H, W) float32.
     """
     height, filtered = disparity.shape[0], np.empty(disparity.shape, np.float32)
-    values, known, levels = np.empty((3, *disparity.shape), np.float32)
-    given = values, known, levels, radius, _spatial(radius, space), F32(1 / gray), F32(1 / range_scale)
+    values, levels = np.empty((2, *disparity.shape), np.float32)
+    scales = F32(1 / range_scale), F32(1 / gray)
     both = shared_by(threads)
-    by_halves(both, height, lambda first, end: _prepare(disparity, guide, values, known, levels, first, end))
-    by_halves(both, height, lambda first, end: _filter(*given, first, end, filtered))
-    by_halves(both, height, lambda first, end: _forget(disparity, first, end, filtered))
+    by_bands(both, height, lambda first, end: _prepare(disparity, guide, *scales, first, end, values, levels))
+    given = values, levels, _spatial(radius, space)
+    by_bands(both, height, lambda first, end: _filter(*given, first, end, filtered))
+    by_bands(both, height, lambda first, end: _finish(disparity, F32(range_scale), first, end, filtered))
     return filtered
 
 
@@ -40,26 +43,25 @@ def _spatial(radius: int, space: float) -> Array:
 
 
 @kernel
-def _prepare(disparity, guide, values, known, levels, first, end):  # type: ignore[no-untyped-def]
-    """values: the disparities, 0 where unknown; known: 1 or 0; levels: the guide."""
+def _prepare(disparity, guide, per_pixel, per_gray, first, end, values, levels):  # type: ignore[no-untyped-def]
+    """values: the disparities, levels: the guide, in their scales."""
     for y in range(first, end):
         for x in range(disparity.shape[1]):
-            finite = np.isfinite(disparity[y, x])
-            values[y, x] = disparity[y, x] if finite else F32(0)
-            known[y, x] = F32(1) if finite else F32(0)
-            levels[y, x] = guide[y, x]
+            values[y, x] = disparity[y, x] * per_pixel if np.isfinite(disparity[y, x]) else FAR
+            levels[y, x] = F32(guide[y, x]) * per_gray
 
 
 @kernel
-def _forget(disparity, first, end, filtered):  # type: ignore[no-untyped-def]
+def _finish(disparity, scale, first, end, filtered):  # type: ignore[no-untyped-def]
     for y in range(first, end):
         for x in range(disparity.shape[1]):
-            filtered[y, x] = filtered[y, x] if np.isfinite(disparity[y, x]) else F32(np.nan)
+            filtered[y, x] = filtered[y, x] * scale if np.isfinite(disparity[y, x]) else F32(np.nan)
 
 
 @fast_kernel
-def _filter(values, known, guide, radius, spatial, per_gray, per_pixel, first, end, filtered):  # type: ignore[no-untyped-def]
+def _filter(values, levels, spatial, first, end, filtered):  # type: ignore[no-untyped-def]
     height, width = values.shape
+    radius = spatial.shape[0] // 2
     sums, weights = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(first, end):
         sums[:] = F32(0)
@@ -69,17 +71,15 @@ def _filter(values, known, guide, radius, spatial, per_gray, per_pixel, first, e
                 tap = spatial[down + radius, across + radius]
                 start, stop = max(0, -across), min(width, width - across)
                 centre, near = values[y, start:stop], values[y + down, start + across : stop + across]
-                gray, near_gray = guide[y, start:stop], guide[y + down, start + across : stop + across]
-                near_known = known[y + down, start + across : stop + across]
+                level, near_level = levels[y, start:stop], levels[y + down, start + across : stop + across]
                 s, w = sums[start:stop], weights[start:stop]
                 for i in range(stop - start):
-                    e = (near[i] - centre[i]) * per_pixel
-                    g = (near_gray[i] - gray[i]) * per_gray
-                    weight = tap * near_known[i] / ((F32(1) + e * e) * (F32(1) + g * g))
+                    e, g = near[i] - centre[i], near_level[i] - level[i]
+                    weight = tap / ((F32(1) + e * e) * (F32(1) + g * g))
                     s[i] += weight * near[i]
                     w[i] += weight
         for x in range(width):
-            filtered[y, x] = sums[x] / weights[x] if weights[x] > F32(0) else F32(0)
+            filtered[y, x] = sums[x] / weights[x]  # a pixel's own weight is 1
 
 
 def joint_bilateral_reference(

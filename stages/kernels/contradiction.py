@@ -6,7 +6,7 @@ import numpy as np
 
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import by_halves, shared_by
+from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 UNKNOWN = int(Source.UNKNOWN)
@@ -27,7 +27,7 @@ def drop_contradicted(found: Layers, backward: Layers, tolerance: float, largest
         given, made = ([layer[rows] for layer in layers] for layers in (found, left))
         _drop(*given, backward[0][rows], backward[1][rows], F32(tolerance), F32(largest), *made)
 
-    by_halves(shared_by(threads), len(found[0]), drop)
+    by_bands(shared_by(threads), len(found[0]), drop)
     return left[0], left[1], left[2]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import kernel, part
-from stages.kernels.halves import by_halves, shared_by
+from stages.kernels.sharing import by_bands, shared_by
 
 RADIUS = 7  # px, of the square over which is correlated
 # Change along a row, of the image smoothed a little, which takes more from noise than from texture.
@@ -30,8 +30,8 @@ def correlation(disparity: Array, guessed: Array, left: Array, right: Array, thr
     both, height = shared_by(threads), len(disparity)
     changes = both(lambda: _changes(left), lambda: _changes(right))
     products, found = np.empty((3, *disparity.shape), np.int32), np.empty(disparity.shape, np.float32)
-    by_halves(both, height, lambda first, end: _multiply(disparity, guessed, *changes, first, end, products))
-    by_halves(both, height, lambda first, end: _correlate(products, first, end, found))
+    by_bands(both, height, lambda first, end: _multiply(disparity, guessed, *changes, first, end, products))
+    by_bands(both, height, lambda first, end: _correlate(products, first, end, found))
     return found
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_part, kernel, part
-from stages.kernels.halves import by_halves, shared_by
+from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 FINE = 16  # parts of a pixel, to which a median is found
@@ -40,7 +40,7 @@ def sharpen_edges(
     doubt = cv2.copyMakeBorder(guessed.view(np.uint8), *border, value=0)
     given = padded, doubt, cv2.copyMakeBorder(guide, *border, value=0), _taps(radius) @ [padded.shape[1], 1], radius
     rule = F32(jump), _weights(brightness)
-    by_halves(shared_by(threads), len(disparity), lambda first, end: _sharpen(*given, *rule, sharp, first, end))
+    by_bands(shared_by(threads), len(disparity), lambda first, end: _sharpen(*given, *rule, sharp, first, end))
     return sharp
 
 
@@ -62,25 +62,28 @@ def _sharpen(disparity, guessed, guide, taps, radius, jump, table, sharp, first,
     flat, doubt, levels = disparity.reshape(-1), guessed.reshape(-1), guide.reshape(-1)
     size = (taps.size + LANES - 1) // LANES * LANES  # whole vectors; what is over has no weight
     values, weights = np.zeros(size, np.float32), np.zeros(size, np.float32)
-    highest, lowest = np.empty(width + 2, np.float32), np.empty(width + 2, np.float32)
+    jumps = np.empty(width, np.bool_)
     for y in range(first, end):
-        highest[:], lowest[:] = F32(-np.inf), F32(np.inf)
-        for row in range(y + radius - 1, y + radius + 2):
-            for x in range(width + 2):
-                value = disparity[row, x + radius - 1]
-                highest[x] = value if value > highest[x] else highest[x]
-                lowest[x] = value if value < lowest[x] else lowest[x]
+        sharp[y] = disparity[y + radius, radius : radius + width]
+        _find_jumps(disparity, y + radius, radius, jump, jumps)
         for x in range(width):
-            at = np.uint64((y + radius) * stride + x + radius)
-            middle = flat[at]
-            sharp[y, x] = middle
-            above = max(highest[x], highest[x + 1], highest[x + 2]) - middle
-            below = middle - min(lowest[x], lowest[x + 1], lowest[x + 2])
-            if above > jump or below > jump:
+            if jumps[x]:
+                at = np.uint64((y + radius) * stride + x + radius)
                 near, low, high = _compare(flat, doubt, levels, taps, table, at, jump, values, weights)
                 total = _weight_up_to(values, weights, high)
                 if near < COMPANY * total:
                     sharp[y, x] = _median(values, weights, total, low, high) / F32(FINE)
+
+
+@part
+def _find_jumps(disparity, y, column, jump, jumps):  # type: ignore[no-untyped-def]
+    """Where in row y, from `column` on, one of the eight neighbours is a jump away."""
+    above, row, below = disparity[y - 1, column - 1 :], disparity[y, column - 1 :], disparity[y + 1, column - 1 :]
+    for x in range(jumps.size):
+        d = row[x + 1]
+        up = (abs(above[x] - d) > jump) | (abs(above[x + 1] - d) > jump) | (abs(above[x + 2] - d) > jump)
+        down = (abs(below[x] - d) > jump) | (abs(below[x + 1] - d) > jump) | (abs(below[x + 2] - d) > jump)
+        jumps[x] = up | down | (abs(row[x] - d) > jump) | (abs(row[x + 2] - d) > jump)
 
 
 @part

@@ -14,7 +14,7 @@ import numpy as np
 from stages.data import Array
 from stages.kernels.compiled import kernel
 from stages.kernels.extent import Extent
-from stages.kernels.halves import by_halves, shared_by
+from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 APART = 2.0  # px of disparity that make two surfaces
@@ -45,20 +45,19 @@ def fill_holes(
     and the kind of each pixel, (H, W) uint8: `KEPT`, `MISMATCH`, `OCCLUSION` or `OPEN`.
     """
     height, width = disparity.shape
-    filled, kinds = disparity.copy(), np.zeros((height, width), np.uint8)
-    colour = _packed(cv2.blur(image, (3, 3)))
-    first = np.zeros(height + 1, np.int64)
     both = shared_by(threads)
-    by_halves(both, height, lambda top, end: _count(disparity, top, end, first))
+    filled, colour = both(disparity.copy, lambda: _packed(cv2.blur(image, (3, 3))))
+    kinds, first = np.zeros((height, width), np.uint8), np.zeros(height + 1, np.int64)
+    by_bands(both, height, lambda top, end: _count(disparity, top, end, first))
     np.cumsum(first, out=first)
     holes, steps = np.empty(first[-1], np.int32), np.empty((8, first[-1]), np.int16)
-    by_halves(both, height, lambda top, end: _list(disparity, top, end, first, holes))
+    by_bands(both, height, lambda top, end: _list(disparity, top, end, first, holes))
     both(
         lambda: _trace(disparity, first, holes, 1, steps[:4]),
         lambda: _trace(disparity, first, holes, -1, steps[4:]),
     )
     given = disparity, colour, within, F32(reach), margin, first, holes, steps
-    by_halves(both, height, lambda top, end: _fill(*given, top, end, filled, kinds))
+    by_bands(both, height, lambda top, end: _fill(*given, top, end, filled, kinds))
     return filled, kinds
 
 

@@ -11,7 +11,7 @@ from stages.data import Array
 from stages.kernels.aggregation import brightness_steps
 from stages.kernels.census import census
 from stages.kernels.gradient import gradients
-from stages.kernels.halves import AtOnce, in_turn
+from stages.kernels.sharing import AtOnce, in_turn
 from stages.kernels.vectors import Width
 
 NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)

@@ -1,6 +1,6 @@
 """Matches and planes brought together: which matches count, and where a plane moves one or stands in for it.
 
-One pass over the image for each step, in two halves, where numpy would make a dozen.
+One pass over the image for each step, in bands of rows, where numpy would make a dozen.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import numpy as np
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
 from stages.kernels.extent import Extent
-from stages.kernels.halves import by_halves, shared_by
 from stages.kernels.holes import APART
+from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 MEASURED = int(Source.MEASURED)
@@ -31,7 +31,7 @@ def trusted_matches(
     def trust(first: int, end: int) -> None:
         _trust(F32(least), *(layer[first:end] for layer in layers))
 
-    by_halves(shared_by(threads), len(pixels), trust)
+    by_bands(shared_by(threads), len(pixels), trust)
     return matches, weights
 
 
@@ -40,16 +40,15 @@ def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Arr
 
     A match with fewer neighbours than holes about it has no median and stays. matches: (H, W) float32, NaN = unknown.
     """
-    low = np.fmax(matches, F32(-np.inf))  # -inf for NaN
     moved = np.empty(matches.shape, np.float32)
 
     def move(first: int, end: int) -> None:
-        if first < end:
-            start = max(first - side // 2, 0)
-            median = cv2.medianBlur(low[start : end + side // 2], side)[first - start : end - start]
-            _move_near(matches[first:end], median, F32(near), moved[first:end])
+        start = max(first - side // 2, 0)
+        low = np.fmax(matches[start : end + side // 2], F32(-np.inf))  # -inf for NaN
+        median = cv2.medianBlur(low, side)[first - start : end - start]
+        _move_near(matches[first:end], median, F32(near), moved[first:end])
 
-    by_halves(shared_by(threads), len(matches), move)
+    by_bands(shared_by(threads), len(matches), move)
     return moved
 
 
@@ -69,9 +68,10 @@ def pull_to_planes(
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     given = pixels, coefficients, labels, within, F32(near), F32(weight), margin
     both = shared_by(threads)
-    ranges = by_halves(both, len(pixels), lambda first, end: _range(pixels[first:end]))
+    middle = len(pixels) // 2
+    ranges = both(lambda: _range(pixels[:middle]), lambda: _range(pixels[middle:]))
     low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
-    by_halves(both, len(pixels), lambda first, end: _pull(*given, low, high, first, end, pulled, spoke))
+    by_bands(both, len(pixels), lambda first, end: _pull(*given, low, high, first, end, pulled, spoke))
     return pulled, spoke
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_part, kernel
-from stages.kernels.halves import AtOnce, in_turn, shared_by
+from stages.kernels.sharing import AtOnce, by_bands, in_turn, shared_by
 
 F32 = np.float32
 U64 = np.uint64
@@ -55,9 +55,8 @@ def fit_planes(
     weights = np.ones((1, 1), np.float32) if weights is None else weights
     both = shared_by(threads)
     points, start, sizes = known_points(disparity, labels, weights, count, both)
-    middle = int(np.searchsorted(start, start[-1] // 2))  # half of the points
     given = points, start, sizes, F32(threshold), hypotheses, U64(seed % 2**64)
-    both(lambda: _fit(*given, 0, middle, *planes), lambda: _fit(*given, middle, count, *planes))
+    by_bands(both, count, lambda first, end: _fit(*given, first, end, *planes))
     return planes
 
 

@@ -11,16 +11,20 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
+from stages.kernels.sharing import by_bands, shared_by
 
 PHASES = 4
 MARGIN = 16
 
 
-def prior_costs(prior: Array, minimum: int, lanes: int, weight: float, reach: float) -> tuple[Array, Array]:
+def prior_costs(
+    prior: Array, minimum: int | Array, lanes: int, weight: float, reach: float, threads: int = 1
+) -> tuple[Array, Array]:
     """Where each pixel's costs begin, and the table.
 
-    prior: (H, W) float32, px, NaN = none; weight: cost per pixel of distance, in the units of the matching cost; reach:
-    px beyond which it costs no more. Returns (H, W) int32 and (m,) uint8.
+    prior: (H, W) float32, px, NaN = none; minimum: the smallest disparity searched, px, or (H, W) int32 that of each
+    pixel; weight: cost per pixel of distance, in the units of the matching cost; reach: px beyond which it costs no
+    more; threads: 2 share the work, to the same result. Returns (H, W) int32 and (m,) uint8.
     """
     far = lanes + int(np.ceil(reach)) + MARGIN  # a prior so far outside the search range costs the same everywhere
     length = 2 * far + lanes
@@ -28,16 +32,21 @@ def prior_costs(prior: Array, minimum: int, lanes: int, weight: float, reach: fl
     phase = np.arange(PHASES)[:, np.newaxis] / PHASES
     costs = np.clip(np.round(weight * np.minimum(np.abs(place - phase), reach)), 0, 255)
     table = np.concatenate([costs.ravel(), np.zeros(lanes)]).astype(np.uint8)
-    begin = np.empty(prior.shape, np.int32)
-    _begin(prior, minimum, -PHASES * (far - lanes), PHASES * far, length, far, begin)
+    begin, least = np.empty(prior.shape, np.int32), np.broadcast_to(minimum, prior.shape)
+
+    def work(first: int, end: int) -> None:
+        apart = np.subtract(prior[first:end], least[first:end], dtype=np.float32)
+        _begin(apart, -PHASES * (far - lanes), PHASES * far, length, far, begin[first:end])
+
+    by_bands(shared_by(threads), len(prior), work)
     return begin, table
 
 
 @kernel
-def _begin(prior, minimum, least, most, length, far, begin):  # type: ignore[no-untyped-def]
-    for y in range(prior.shape[0]):
-        for x in range(prior.shape[1]):
-            quarters = np.rint((prior[y, x] - np.float32(minimum)) * np.float32(PHASES))
+def _begin(apart, least, most, length, far, begin):  # type: ignore[no-untyped-def]
+    for y in range(apart.shape[0]):
+        for x in range(apart.shape[1]):
+            quarters = np.rint(apart[y, x] * np.float32(PHASES))
             known = np.isfinite(quarters)
             whole = np.int64(min(max(quarters, least), most)) if known else 0
             begin[y, x] = (whole % PHASES) * length + far - whole // PHASES if known else PHASES * length

@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import by_halves, shared_by
+from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 LARGEST_STEP = 1.0  # px of the small image, within a surface
@@ -27,7 +27,7 @@ def doubled(small: Array, height: int, width: int, threads: int = 1) -> Array:
     """Values twice as large at every pixel of an image (height, width) float32 that `small`, (H, W) float32, is half of
     (rounded up); NaN = unknown."""
     large = np.empty((height, width), np.float32)
-    by_halves(shared_by(threads), height, lambda first, end: _double(small, large, first, end))
+    by_bands(shared_by(threads), height, lambda first, end: _double(small, large, first, end))
     return large
 
 

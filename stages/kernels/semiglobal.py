@@ -24,9 +24,9 @@ from stages.kernels.around import Windows, search_around
 from stages.kernels.blank import blank_windows, drop_blank
 from stages.kernels.compiled import kernel
 from stages.kernels.gradient import smoothed_costs
-from stages.kernels.halves import AtOnce, by_halves, shared_by
 from stages.kernels.pair import Pair, Rule, describe
 from stages.kernels.selection import find_partners, find_winners, fit_row
+from stages.kernels.sharing import AtOnce, by_bands, shared_by
 from stages.kernels.speckles import drop_speckles
 from stages.kernels.vectors import Width, lanes_in
 from stages.kernels.workspace import Workspace, Workspaces
@@ -89,14 +89,14 @@ def match(
         def drop(first: int, end: int) -> None:
             drop_blank(*(layer[first:end] for layer in (blank, partner, pixels, evidence)))
 
-        by_halves(both, len(left), drop)
+        by_bands(both, len(left), drop)
         drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, space, both)
         confidence, source = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
 
         def grade(first: int, end: int) -> None:
             _grade(rule.calibration, *(layer[first:end] for layer in (evidence, confidence, source)))
 
-        by_halves(both, len(left), grade)
+        by_bands(both, len(left), grade)
     return Matches(pixels, source, confidence)
 
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import fast_kernel, fast_part, kernel
-from stages.kernels.halves import AtOnce, by_halves, in_turn, shared_by
 from stages.kernels.scaling import halved
+from stages.kernels.sharing import AtOnce, by_bands, in_turn, shared_by
 from stages.kernels.union import join, root
 from stages.kernels.workspace import Workspaces
 
@@ -65,10 +65,9 @@ def _colours(image: Array, both: AtOnce = in_turn) -> Array:
     colour = np.empty(image.shape, np.uint8)
 
     def convert(first: int, end: int) -> None:
-        if first < end:
-            cv2.cvtColor(image[first:end], cv2.COLOR_RGB2LAB, dst=colour[first:end])
+        cv2.cvtColor(image[first:end], cv2.COLOR_RGB2LAB, dst=colour[first:end])
 
-    by_halves(both, len(image), convert)
+    by_bands(both, len(image), convert)
     return colour
 
 
@@ -182,9 +181,13 @@ def connect(labels: Array, smallest: int, scratch: Array, both: AtOnce = in_turn
     # Of each run of equal labels in a row: where it ends, a run of its component before it, and its component's number.
     ends, parent, number = scratch
     rows = np.empty((height, 2), np.int64)  # the first run of each row, and the first beyond
-    by_halves(both, height, lambda first, end: _join_runs(labels, first, end, rows, ends, parent))
-    total = int(_number(labels, height // 2, smallest, rows, ends, parent, number))
-    by_halves(both, height, lambda first, end: _write(labels, first, end, rows, ends, parent, number))
+    middle = height // 2
+    both(
+        lambda: _join_runs(labels, 0, middle, rows, ends, parent),
+        lambda: _join_runs(labels, middle, height, rows, ends, parent),
+    )
+    total = int(_number(labels, middle, smallest, rows, ends, parent, number))
+    by_bands(both, height, lambda first, end: _write(labels, first, end, rows, ends, parent, number))
     return total
 
 

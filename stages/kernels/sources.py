@@ -8,8 +8,8 @@ import numpy as np
 
 from stages.data import Array, Source
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import by_halves, shared_by
 from stages.kernels.holes import KEPT, MISMATCH
+from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 OWN = 0.5, 0.75, 1.0
@@ -50,7 +50,7 @@ def name_sources(
             tables, others, source[rows], worth[rows],
         )  # fmt: skip
 
-    by_halves(shared_by(threads), len(matches), name)
+    by_bands(shared_by(threads), len(matches), name)
     return source, worth
 
 

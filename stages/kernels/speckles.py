@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import AtOnce, in_turn
+from stages.kernels.sharing import AtOnce, in_turn
 from stages.kernels.union import join, root
 from stages.kernels.workspace import Workspace
 

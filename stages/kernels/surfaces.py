@@ -13,7 +13,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
-from stages.kernels.halves import shared_by
+from stages.kernels.sharing import shared_by
 
 ITERATIONS = 3
 AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.kernels.around import EDGE, Windows, search_around, search_around_reference, windows
-from stages.kernels.halves import shared_by
 from stages.kernels.pair import describe
 from stages.kernels.prior import prior_costs
+from stages.kernels.sharing import shared_by
 from stages.kernels.vectors import Width
 from stages.kernels.workspace import Workspace
 from tests.stages.test_census import rule_of

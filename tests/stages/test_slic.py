@@ -8,7 +8,7 @@ from scipy import ndimage
 from skimage import data, segmentation
 
 from stages.kernels import slic
-from stages.kernels.halves import in_turn
+from stages.kernels.sharing import in_turn
 
 
 @pytest.fixture(scope="module")

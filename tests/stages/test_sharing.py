@@ -1,4 +1,5 @@
-"""Two functions at once: both results or the first failure, nothing left running, in any thread and any process."""
+"""Two functions, or bands of rows, at once: all of it or the first failure, nothing left running, in any thread and any
+process."""
 
 import multiprocessing
 import threading
@@ -7,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from stages.kernels.halves import at_once, in_turn, shared_by
+from stages.kernels.sharing import BANDS, at_once, by_bands, in_turn, shared_by
 
 
 def test_both_results_come_back_and_from_two_threads_if_there_are_two():
@@ -46,6 +47,35 @@ def test_many_threads_may_ask_at_once():
     with ThreadPoolExecutor(24) as callers:
         results = list(callers.map(lambda i: at_once(lambda: i, lambda: -i), range(500)))
     assert results == [(i, -i) for i in range(500)]
+
+
+@pytest.mark.parametrize("both", [in_turn, at_once])
+@pytest.mark.parametrize("rows", [1, BANDS - 1, BANDS, 1000])
+def test_bands_hold_every_row_once_and_none_is_empty(both, rows):
+    taken = []
+    by_bands(both, rows, lambda first, end: taken.append(range(first, end)))
+    assert sorted(row for band in taken for row in band) == list(range(rows))
+    assert len(taken) == min(rows, BANDS)
+
+
+def test_bands_that_one_thread_has_no_time_for_the_other_takes():
+    slow, done = threading.Event(), []
+
+    def work(first, end):
+        if first == 0:
+            assert slow.wait(timeout=20)
+        done.append(first)
+        if len(done) == BANDS - 1:
+            slow.set()
+
+    by_bands(at_once, BANDS, work)
+    assert done[-1] == 0
+
+
+@pytest.mark.parametrize("both", [in_turn, at_once])
+def test_a_failure_in_a_band_is_raised(both):
+    with pytest.raises(ZeroDivisionError):
+        by_bands(both, 100, lambda first, _: 1 // first)
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")

@@ -1,12 +1,14 @@
-"""Two functions, one after the other or at once on two threads: how a kernel shares a frame between two cores."""
+"""How a kernel shares a frame between two cores: two functions, or bands of rows, in turn or at once."""
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
+BANDS = 8  # of rows: few enough to cost nothing, enough that neither thread waits long for the other
 AtOnce = Callable[[Callable[[], Any], Callable[[], Any]], tuple[Any, Any]]
 
 
@@ -50,7 +52,13 @@ def shared_by(threads: int) -> AtOnce:
     return in_turn if threads < 2 else at_once
 
 
-def by_halves(both: AtOnce, rows: int, work: Callable[[int, int], Any]) -> tuple[Any, Any]:
-    """Both results of `work(first, end)`, of the upper and of the lower half of so many rows."""
-    middle = rows // 2
-    return both(lambda: work(0, middle), lambda: work(middle, rows))
+def by_bands(both: AtOnce, rows: int, work: Callable[[int, int], Any]) -> None:
+    """Call `work(first, end)` for all rows once, in bands: whichever thread is free takes the next."""
+    cuts = [rows * i // BANDS for i in range(BANDS + 1)]
+    bands = iter([(first, end) for first, end in itertools.pairwise(cuts) if first < end])
+
+    def take() -> None:
+        for first, end in bands:
+            work(first, end)
+
+    both(take, take)
