@@ -110,7 +110,14 @@ def unguided(streams: dict[str, Any], case: Case) -> Disparity:
 
 def eight(streams: dict[str, Any], case: Case) -> Disparity:
     """The match at full size with 8 paths."""
-    return Match(disparities=case.disparities)(case.frame, streams["prior"])
+    match: Match = replace(stage("rover", "matched"), paths=8, disparities=case.disparities)
+    return match(case.frame, streams["prior"])
+
+
+def unbanded(streams: dict[str, Any], case: Case) -> Disparity:
+    """The match at full size of all rows for the whole range."""
+    match: Match = replace(stage("rover", "matched"), bands=0, disparities=case.disparities)
+    return match(case.frame, streams["prior"])
 
 
 def everywhere(streams: dict[str, Any], case: Case) -> Disparity:
@@ -159,6 +166,7 @@ VARIANTS: dict[str, Chain] = {
     "rover without the right view": remade(backward=blind),
     "rover, right view of whole range": remade(backward=at_once),
     "rover, not matched again": refined("checked"),
+    "rover, all rows the whole range": remade(matched=unbanded),
     "rover, again the whole range": remade(matched_again=everywhere),
     "rover, matched a third time": remade(matched_again=thrice),
     "rover with half the range": half_range,

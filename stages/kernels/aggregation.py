@@ -71,12 +71,13 @@ def _brightness_steps(image, image_stride, steps, rows, stride, first, end, widt
 
 @part
 def aggregate_row(  # type: ignore[no-untyped-def]
-    pair, rule, costs, paths, y, step, sums, place, total, final, width
+    pair, rule, first_lane, costs, paths, y, step, sums, place, total, final, width
 ):
     """Follow the paths of one sweep from the row before into row y, and add them up.
 
-    pair, rule: `pair.Pair` and `Rule`; costs: (W * n,) uint8, C of the row without the prior's costs, with
-    `rule.gradient`; else C is the census cost, made here, which saves writing and reading it; paths: (3 * W * n,)
+    pair, rule: `pair.Pair` and `Rule`; first_lane: the disparity of the first lane, less the smallest searched; costs:
+    (W * n,) uint8, C of the row without the prior's costs, with `rule.gradient`; else C is the census cost, made here,
+    which saves writing and reading it; paths: (3 * W * n,)
     uint8, L of the row before, all 0 at first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where
     the sums of the row go, from `place` on (W * n); final: instead, add what the other sweep left there, and put the
     whole into `total`.
@@ -104,7 +105,7 @@ def aggregate_row(  # type: ignore[no-untyped-def]
         if rule.gradient:
             cost = load(costs, x * n, width)
         else:
-            cost = census_costs(left, right, pair, rule.unseen, x, columns - 1 - x, width)
+            cost = census_costs(left, right, pair, rule.unseen, x, columns - 1 - x + first_lane, width)
         if pulled:
             cost = plus_capped(cost, load(pair.prior_costs, begin[x], width))
         path = _continued(path, cost, small_step, byte(table, byte(steps, beside)), width)

@@ -270,7 +270,7 @@ def search_around_reference(pair: Pair, rule: Rule, windows: Windows) -> tuple[A
         costs = _smoothed_reference(costs, searched)
     pull = pair.prior_costs[pair.prior[..., np.newaxis] + np.arange(n)]
     np.put_along_axis(costs, lanes, np.minimum(np.take_along_axis(costs, lanes, axis=2) + pull, 255), axis=2)
-    sums = sum(np.minimum(_paths_reference(pair, rule, costs, searched, sign), 255) for sign in (1, -1))
+    sums = sum(np.minimum(paths_reference(pair, rule, costs, searched, sign), 255) for sign in (1, -1))
     total = np.where(searched, np.minimum(sums, 255), 255)
     pixels, evidence = np.full(first.shape, np.nan, np.float32), np.zeros(first.shape, np.uint8)
     for y in range(first.shape[0]):
@@ -309,7 +309,7 @@ def _smoothed_reference(raw: Array, searched: Array) -> Array:
     return smoothed
 
 
-def _paths_reference(pair: Pair, rule: Rule, costs: Array, searched: Array, sign: int) -> Array:
+def paths_reference(pair: Pair, rule: Rule, costs: Array, searched: Array, sign: int) -> Array:
     """The sums of the paths of a sweep down (1) or up (-1), as of `aggregation.aggregate_reference`."""
     height, columns, n = costs.shape
     total = np.zeros(costs.shape, np.int64)

@@ -92,11 +92,12 @@ def gradients_reference(image: Array, mirrored: bool = False) -> Array:
 
 
 @part
-def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ignore[no-untyped-def]
+def smoothed_costs(pair, unseen, first_lane, ahead, column_sums, costs, width):  # type: ignore[no-untyped-def]
     """The costs of the row before row `ahead` of a sweep, all pixels and disparities: costs (W * n,) uint8.
 
-    pair, unseen: as of `census_costs`; ahead: may be one row outside the image, whose border then counts twice;
-    column_sums: (2, W * n) uint8, those of the two rows before `ahead`; the older are replaced by those of `ahead`.
+    pair, unseen: as of `census_costs`; first_lane: the disparity of the first lane, less the smallest searched; ahead:
+    may be one row outside the image, whose border then counts twice; column_sums: (2, W * n) uint8, those of the two
+    rows before `ahead`; the older are replaced by those of `ahead`.
     """
     n = lanes_in(width)
     columns = costs.size // n
@@ -106,7 +107,8 @@ def smoothed_costs(pair, unseen, ahead, column_sums, costs, width):  # type: ign
     nothing = spread(0, width)
     before = here = nothing
     for x in range(-1, columns):
-        after = raw_costs(left, right, pair, unseen, min(x + 1, columns - 1), max(columns - 2 - x, 0), width)
+        beside = min(x + 1, columns - 1)
+        after = raw_costs(left, right, pair, unseen, beside, columns - 1 - beside + first_lane, width)
         if x < 0:  # beyond the border, its pixel again
             before = here = after
             continue

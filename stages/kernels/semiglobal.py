@@ -7,6 +7,8 @@ the lower half up, then each goes on through the other's half. No path is cut, s
 The sums of a large image would not fit the memory. Then the first visit to a half leaves only the path costs at the
 head of each band of rows, and before the second sweep enters a band, its sums are made again from there: exact too,
 at 1.4 times the time.
+
+Bands of rows may be searched for a part of the range each (stages.kernels.ranges).
 """
 
 from __future__ import annotations
@@ -25,10 +27,11 @@ from stages.kernels.blank import blank_windows, drop_blank
 from stages.kernels.compiled import kernel
 from stages.kernels.gradient import smoothed_costs
 from stages.kernels.pair import Pair, Rule, describe
+from stages.kernels.ranges import Range, lanes_for, move_paths, within
 from stages.kernels.selection import find_partners, find_winners, fit_row
 from stages.kernels.sharing import AtOnce, by_bands, shared_by
 from stages.kernels.speckles import drop_speckles
-from stages.kernels.vectors import Width, lanes_in
+from stages.kernels.vectors import Width
 from stages.kernels.workspace import Workspace, Workspaces
 
 _workspaces = Workspaces()
@@ -43,7 +46,7 @@ class Matches(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Rows in the making, one set for each thread."""
+    """Rows in the making, one set for each thread and number of lanes."""
 
     costs: Array
     column_sums: Array
@@ -57,31 +60,26 @@ class Scratch(NamedTuple):
     guard: Array
 
 
-def lanes_for(disparities: int) -> int:
-    """The number of lanes that hold a search range: what the processor divides well, not less than 16."""
-    return next((n for n in (16, 32, 64, 96) if disparities <= n), -(-disparities // 64) * 64)
-
-
 def match(
-    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, windows: Windows | None,
+    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, search: Windows | list[Range],
     excluded: Array | None, threads: int, memory: int,
 ) -> Matches:  # fmt: skip
     """Disparities of a rectified pair of gray images.
 
-    left, right: (H, W) uint8; prior: of `prior.prior_costs`, or None; windows: where to search instead of the whole
-    range, from where on the prior's costs are then meant; excluded: (H, W) bool, pixels that have no match in the
-    range, or None; threads: more than 2 have nothing to do; memory: bytes that the sums of paths may take.
+    left, right: (H, W) uint8; prior: of `prior.prior_costs`, from where each pixel's search begins, or None; search:
+    where, and what for; excluded: (H, W) bool, pixels that have no match in the range, or None; threads: more than 2
+    have nothing to do; memory: bytes that the sums of paths may take.
     """
     pixels, evidence = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
     both = shared_by(threads)
     with _workspaces.one() as space:
-        if windows is None:
-            _search_all(left, right, rule, prior, memory, pixels, evidence, space, both)
-        else:
+        if isinstance(search, Windows):
             seen = rule._replace(minimum=0)
             search_around(
-                describe(left, right, seen, windows.width, prior, both), rule, windows, pixels, evidence, space, both
+                describe(left, right, seen, search.width, prior, both), rule, search, pixels, evidence, space, both
             )  # fmt: skip
+        else:
+            _search_rows(left, right, rule, prior, search, memory, pixels, evidence, space, both)
         blank, partner = both(lambda: blank_windows(left), lambda: blank_windows(right))
         if excluded is not None:
             blank[:, : left.shape[1]] |= excluded
@@ -100,14 +98,13 @@ def match(
     return Matches(pixels, source, confidence)
 
 
-def _search_all(
-    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, memory: int, pixels: Array,
-    evidence: Array, space: Workspace, both: AtOnce,
+def _search_rows(
+    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, ranges: list[Range], memory: int,
+    pixels: Array, evidence: Array, space: Workspace, both: AtOnce,
 ) -> None:  # fmt: skip
     """Fill in disparities and evidence; what that takes but the workspace is given back."""
-    width = Width(lanes_for(rule.disparities))
-    pair = describe(left, right, rule, width, prior, both)
-    upper, lower = _halves(pair, rule, space, width, memory, pixels, evidence)
+    pair = describe(left, right, rule, Width(lanes_for(rule.disparities)), prior, both)
+    upper, lower = _halves(pair, rule, space, ranges, memory, pixels, evidence)
     both(upper.arrive, lower.arrive)
     both(lambda: upper.cross(lower), lambda: lower.cross(upper))
 
@@ -122,18 +119,18 @@ def _grade(calibration, evidence, confidence, source):  # type: ignore[no-untype
 
 @kernel
 def _sweep(  # type: ignore[no-untyped-def]
-    pair, rule, width, pixels, evidence, scratch, paths, y, end, step, sums, origin, final
+    pair, rule, pixels, evidence, width, scratch, first_lane, top, paths, y, end, step, sums, origin, stride, final
 ):
-    """Rows y to end (exclusive) in steps of 1 or -1; the sums of row y are at (y - origin) * W * n of `sums`."""
-    size = pixels.shape[1] * lanes_in(width)
+    """Rows y to end (exclusive) in steps of 1 or -1; the sums of row y are at (y - origin) * stride of `sums`."""
     if rule.gradient:
         for ahead in (y - step, y):  # smoothed_costs needs the column sums of two rows before it can begin
-            smoothed_costs(pair, rule.unseen, ahead, scratch.column_sums, scratch.costs, width)
+            smoothed_costs(pair, rule.unseen, first_lane, ahead, scratch.column_sums, scratch.costs, width)
     while y != end:
         if rule.gradient:
-            smoothed_costs(pair, rule.unseen, y + step, scratch.column_sums, scratch.costs, width)
+            smoothed_costs(pair, rule.unseen, first_lane, y + step, scratch.column_sums, scratch.costs, width)
         aggregate_row(
-            pair, rule, scratch.costs, paths, y, step, sums, (y - origin) * size, scratch.total, final, width
+            pair, rule, first_lane, scratch.costs, paths, y, step, sums, (y - origin) * stride, scratch.total, final,
+            width,
         )  # fmt: skip
         if final:
             find_winners(
@@ -141,62 +138,81 @@ def _sweep(  # type: ignore[no-untyped-def]
             )
             find_partners(scratch.winner, scratch.right, scratch.partners)
             fit_row(
-                scratch.winner, scratch.votes, scratch.partners, scratch.first, rule.disparities - 1, rule, pixels[y],
-                evidence[y],
+                scratch.winner, scratch.votes, scratch.partners, scratch.first, top, rule, pixels[y], evidence[y]
             )  # fmt: skip
         y += step
 
 
 def _halves(
-    pair: Pair, rule: Rule, space: Workspace, width: Width, memory: int, pixels: Array, evidence: Array
+    pair: Pair, rule: Rule, space: Workspace, ranges: list[Range], memory: int, pixels: Array, evidence: Array
 ) -> list[_Half]:
     """Both halves of the image, in bands whose sums take no more than `memory` bytes together."""
     height, columns = pixels.shape
-    size = columns * width.lanes
+    size = columns * max(each.width.lanes for each in ranges)
     middle = height // 2
     largest = height - middle
     # Shorter bands would take more for their heads than they save.
     band = largest if 2 * largest * size <= memory else max(memory // (2 * size), math.isqrt(3 * largest))
     heads = 0 if band == largest else -(-largest // band)
-    space.reserve(2 * (size * (10 + band + 3 * heads) + 64 * (8 + heads)))
-    sweep = functools.partial(_sweep, pair, rule, width, pixels, evidence)
+    moves = 2 if len(ranges) > 1 else 0  # of paths, from one range to another
+    space.reserve(2 * (size * (10 + band + 3 * (heads + moves)) + 64 * (8 + heads + moves)))
+    sweep = functools.partial(_sweep, pair, rule, pixels, evidence)
     rows = range(middle), range(height - 1, middle - 1, -1)
-    return [_Half(part, band, heads > 0, space, sweep, columns, rule) for part in rows]
+    return [_Half(part, band, heads > 0, space, sweep, ranges, columns, rule) for part in rows]
+
+
+class _Paths:
+    """The costs of the paths that a sweep has come with, for the range of the row it has come to."""
+
+    def __init__(self, space: Workspace, size: int, moves: bool) -> None:
+        """size: bytes of a row; moves: whether there are several ranges."""
+        self.whole, self.spare = space.bytes(3 * size), space.bytes(3 * size) if moves else None
+        self.at: Range | None = None
+
+    def begin(self) -> None:
+        """Be at the image's border, where all paths begin."""
+        self.whole[:], self.at = 0, None
+
+    def take(self, other: _Paths) -> None:
+        """Be where the other is."""
+        self.whole[:], self.at = other.whole, other.at
+
+    def enter(self, at: Range, columns: int) -> Array:
+        """The costs, (3 * W * n,) uint8, for a range of n lanes."""
+        lanes, size = at.width.lanes, 3 * columns * at.width.lanes
+        if self.at is not None and self.spare is not None and at[2:] != self.at[2:]:
+            move_paths(self.whole, self.at.width.lanes, at.first - self.at.first, self.spare[:size], lanes)
+            self.whole, self.spare = self.spare, self.whole
+        self.at = at
+        return self.whole[:size]
 
 
 class _Half:
     """The rows from one end of the image to its middle, and the sweep that begins at that end."""
 
     def __init__(
-        self, rows: range, band: int, banded: bool, space: Workspace, sweep: Callable[..., None], columns: int,
-        rule: Rule,
+        self, rows: range, band: int, banded: bool, space: Workspace, sweep: Callable[..., None], ranges: list[Range],
+        columns: int, rule: Rule,
     ) -> None:  # fmt: skip
         """rows: from the end inwards; band: how many at a time; banded: one of the halves does not fit into a band, so
         that either has its sums made again, in the memory of the sweep that crosses it."""
-        lanes = lanes_for(rule.disparities)
-        size = columns * lanes
-        self.sweep, self.step = sweep, rows.step
+        widths = {each.width.lanes for each in ranges}
+        self.sweep, self.ranges, self.columns, self.minimum = sweep, ranges, columns, rule.minimum
+        self.size = size = columns * max(widths)
         self.bands = [rows[i : i + band] for i in range(0, len(rows), band)]
-        self.paths, self.again = space.bytes(3 * size), space.bytes(3 * size)
+        self.paths, self.again = (_Paths(space, size, len(ranges) > 1) for _ in range(2))
         self.sums = space.bytes(band * size)
-        self.heads = [space.bytes(3 * size) for _ in self.bands] if banded else []
-        index = np.uint8 if lanes <= 256 else np.uint16
-        guard = np.abs(np.arange(2 * lanes) - lanes) <= 1
-        self.scratch = Scratch(
-            costs=space.bytes(size), column_sums=space.bytes(2 * size).reshape(2, size), total=space.bytes(size),
-            winner=np.empty(columns, np.int16), votes=np.empty((4, columns), np.uint16),
-            right=np.empty(columns + lanes, index), partners=np.empty(columns, np.int16),
-            first=np.full(columns, rule.minimum, np.int32),
-            guard=np.where(guard, np.uint8(255), np.uint8(0)),
-            beyond=np.where(np.arange(lanes) < rule.disparities, np.uint8(0), np.uint8(255)),
-        )  # fmt: skip
+        self.heads = [_Paths(space, size, False) for _ in self.bands] if banded else []
+        rows_of_bytes = space.bytes(size), space.bytes(2 * size), space.bytes(size)
+        self.scratch = {lanes: _scratch(lanes, columns, rule.disparities, *rows_of_bytes) for lanes in widths}
+        self.tops = {lanes: min(lanes, rule.disparities) - 1 for lanes in widths}
 
     def arrive(self) -> None:
         """Sweep to the middle. The sums stay, or else the path costs at the head of each band."""
-        self.paths[:] = 0
+        self.paths.begin()
         for i, band in enumerate(self.bands):
             if self.heads:
-                self.heads[i][:] = self.paths
+                self.heads[i].take(self.paths)
             self._sweep(band, self.paths, self.sums, final=False)
 
     def cross(self, other: _Half) -> None:
@@ -205,10 +221,32 @@ class _Half:
             sums = other.sums
             if other.heads:
                 sums = self.sums
-                self.again[:] = other.heads[i]
+                self.again.take(other.heads[i])
                 self._sweep(band, self.again, sums, final=False)
             self._sweep(band[::-1], self.paths, sums, final=True)
 
-    def _sweep(self, rows: range, paths: Array, sums: Array, final: bool) -> None:
-        first, last = rows[0], rows[-1]
-        self.sweep(self.scratch, paths, first, last + rows.step, rows.step, sums, min(first, last), final)
+    def _sweep(self, rows: range, paths: _Paths, sums: Array, final: bool) -> None:
+        origin = min(rows[0], rows[-1])
+        for part, at in within(rows, self.ranges):
+            lanes = at.width.lanes
+            scratch = self.scratch[lanes]
+            scratch.first[:] = self.minimum + at.first
+            self.sweep(
+                at.width, scratch, at.first, self.tops[lanes], paths.enter(at, self.columns), part[0],
+                part[-1] + part.step, part.step, sums, origin, self.size, final,
+            )  # fmt: skip
+
+
+def _scratch(lanes: int, columns: int, disparities: int, costs: Array, column_sums: Array, total: Array) -> Scratch:
+    """Rows of so many lanes, in memory that has room for them."""
+    size = columns * lanes
+    index = np.uint8 if lanes <= 256 else np.uint16
+    guard = np.abs(np.arange(2 * lanes) - lanes) <= 1
+    return Scratch(
+        costs=costs[:size], column_sums=column_sums[: 2 * size].reshape(2, size), total=total[:size],
+        winner=np.empty(columns, np.int16), votes=np.empty((4, columns), np.uint16),
+        right=np.empty(columns + lanes, index), partners=np.empty(columns, np.int16),
+        first=np.empty(columns, np.int32),
+        guard=np.where(guard, np.uint8(255), np.uint8(0)),
+        beyond=np.where(np.arange(lanes) < disparities, np.uint8(0), np.uint8(255)),
+    )  # fmt: skip

@@ -18,7 +18,7 @@ def sweep(costs, pair, rule, paths, step, sums, total, final, width):
     height, size = costs.shape
     for i in range(height):
         y = i if step > 0 else height - 1 - i
-        aggregate_row(pair, rule, costs[y], paths, y, step, sums, y * size, total[y], final, width)
+        aggregate_row(pair, rule, 0, costs[y], paths, y, step, sums, y * size, total[y], final, width)
 
 
 @pytest.mark.parametrize("lanes", [16, 96, 192])

@@ -8,7 +8,7 @@ from stages.kernels.blank import blank_windows, blank_windows_reference
 from stages.kernels.census import census, census_costs, census_costs_reference, census_reference
 from stages.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
 from stages.kernels.pair import Rule, describe
-from stages.kernels.semiglobal import lanes_for
+from stages.kernels.ranges import lanes_for
 from stages.kernels.vectors import Width, lanes_in, store
 from tests.stages.test_match_opencv import textured
 
@@ -28,9 +28,9 @@ def rows_smoothed(pair, unseen, costs, sums, step, width):
     height = costs.shape[0]
     first = 0 if step > 0 else height - 1
     for ahead in (first - step, first):
-        smoothed_costs(pair, unseen, ahead, sums, costs[first], width)
+        smoothed_costs(pair, unseen, 0, ahead, sums, costs[first], width)
     for i in range(height):
-        smoothed_costs(pair, unseen, first + (i + 1) * step, sums, costs[first + i * step], width)
+        smoothed_costs(pair, unseen, 0, first + (i + 1) * step, sums, costs[first + i * step], width)
 
 
 def rule_of(gradient, disparities, minimum):
