@@ -22,6 +22,7 @@ from stages.kernels.extent import Extent, extent, within_reach
 from stages.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.kernels.planar import near_median, pull_to_planes, trusted_matches
 from stages.kernels.planes import Planes, fit_planes
+from stages.kernels.sharing import by_bands, shared_by, with_margin
 from stages.kernels.slic import superpixels
 from stages.kernels.smoother import smooth
 from stages.kernels.sources import Trust, name_sources
@@ -104,10 +105,10 @@ class Refine(Stage):
         guide = gray(image)
         matches, weights = trusted_matches(
             disparity.pixels, disparity.source, disparity.confidence, self.trusted,
-            _burnt_out(frame.left, guide, self.burnt_out), self.threads,
+            _burnt_out(frame.left, guide, self.burnt_out, self.threads), self.threads,
         )  # fmt: skip
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
-        within, labels, agreed = extent(pixels), None, np.zeros(pixels.shape, bool)
+        within, labels, agreed = extent(pixels, self.threads), None, np.zeros(pixels.shape, bool)
         if self.plane_weight or self.plane_fill:
             labels, count = superpixels(image, self._count(pixels.size), COMPACTNESS, threads=self.threads)
             pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
@@ -192,11 +193,18 @@ class Refine(Stage):
         return sharpen_edges(pixels, guessed, guide, self.edge_radius, JUMP, JUMP_GRAY, self.threads)
 
 
-def _burnt_out(image: Array, guide: Array, level: int) -> Array:
+def _burnt_out(image: Array, guide: Array, level: int, threads: int) -> Array:
     """Where the image is even and a colour of it burnt out, (H, W) bool: what is matched there is noise."""
-    if image.dtype != np.uint8:  # of more bits nothing tells where the sensor ends
-        return np.zeros(guide.shape, bool)
-    burnt: Array = image >= level if image.ndim == 2 else cv2.inRange(image, (0,) * 3, (level - 1,) * 3) == 0
-    if burnt.any():
-        burnt &= cv2.morphologyEx(guide, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) <= EVEN
+    burnt = np.zeros(guide.shape, bool)
+
+    def mark(first: int, end: int) -> None:
+        rows = image[first:end]
+        bright = rows >= level if image.ndim == 2 else cv2.inRange(rows, (0,) * 3, (level - 1,) * 3) == 0
+        if bright.any():
+            levels, own = with_margin(guide, first, end, 2)
+            step = cv2.morphologyEx(levels, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
+            burnt[first:end] = bright & (step[own] <= EVEN)
+
+    if image.dtype == np.uint8:  # of more bits nothing tells where the sensor ends
+        by_bands(shared_by(threads), len(image), mark)
     return burnt

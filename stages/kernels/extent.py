@@ -14,6 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
+from stages.kernels.sharing import by_bands, shared_by, with_margin
 
 SIDE = 15  # px, of the square about a pixel that tells evidence from a speck
 SHARE = 0.5  # of what such a square knows in the mean; what stands in one that knows less is a speck
@@ -27,17 +28,24 @@ class Extent(NamedTuple):
     last: Array  # (H,) int64, the last one
 
 
-def extent(disparity: Array) -> Extent:
-    """How far what is known reaches, but for specks. disparity: (H, W) float32, NaN = unknown."""
+def extent(disparity: Array, threads: int = 1) -> Extent:
+    """How far what is known reaches, but for specks.
+
+    disparity: (H, W) float32, NaN = unknown; threads: 2 share the work, to the same result.
+    """
     height, width = disparity.shape
-    known = ~np.isnan(disparity)
-    around = cv2.boxFilter(
-        known.view(np.uint8), cv2.CV_16U, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_REPLICATE
-    )
-    known &= around > int(SHARE * SIDE**2 * (np.count_nonzero(known) / known.size))
+    known, evidence = ~np.isnan(disparity), np.empty(disparity.shape, bool)
+    least = int(SHARE * SIDE**2 * (np.count_nonzero(known) / known.size))
     found = Extent(np.full(width, height, np.int64), np.full(height, 2 * width, np.int64), np.full(height, -width))
-    _find_top(known, found.top)
-    _find_ends(known, found.first, found.last)
+
+    def weed(first: int, end: int) -> None:
+        about, own = with_margin(known.view(np.uint8), first, end, SIDE // 2)
+        around = cv2.boxFilter(about, cv2.CV_16U, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_REPLICATE)
+        np.logical_and(known[first:end], around[own] > least, out=evidence[first:end])
+        _find_ends(evidence[first:end], found.first[first:end], found.last[first:end])
+
+    by_bands(shared_by(threads), height, weed)
+    _find_top(evidence, found.top)
     return found
 
 

@@ -12,7 +12,7 @@ from stages.data import Array, Source
 from stages.kernels.compiled import kernel
 from stages.kernels.extent import Extent
 from stages.kernels.holes import APART
-from stages.kernels.sharing import by_bands, shared_by
+from stages.kernels.sharing import by_bands, shared_by, with_margin
 
 F32 = np.float32
 MEASURED = int(Source.MEASURED)
@@ -43,9 +43,8 @@ def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Arr
     moved = np.empty(matches.shape, np.float32)
 
     def move(first: int, end: int) -> None:
-        start = max(first - side // 2, 0)
-        low = np.fmax(matches[start : end + side // 2], F32(-np.inf))  # -inf for NaN
-        median = cv2.medianBlur(low, side)[first - start : end - start]
+        about, own = with_margin(matches, first, end, side // 2)
+        median = cv2.medianBlur(np.fmax(about, F32(-np.inf)), side)[own]  # -inf for NaN
         _move_near(matches[first:end], median, F32(near), moved[first:end])
 
     by_bands(shared_by(threads), len(matches), move)

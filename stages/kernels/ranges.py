@@ -84,11 +84,12 @@ def within(rows: range, ranges: list[Range]) -> Iterator[tuple[range, Range]]:
 @kernel
 def _count(prior, top, end, minimum, counts):  # type: ignore[no-untyped-def]
     """Add up how many of rows top to end have each disparity; what is beyond the range is at its end."""
-    last = counts.size - 1
+    last = np.float32(counts.size - 1)
     for y in range(top, end):
         for x in range(prior.shape[1]):
-            if np.isfinite(prior[y, x]):
-                counts[min(max(np.int64(np.rint(prior[y, x])) - minimum, 0), last)] += 1
+            place = np.rint(prior[y, x]) - np.float32(minimum)
+            if np.isfinite(place):
+                counts[np.int64(min(max(place, np.float32(0)), last))] += 1
 
 
 @kernel

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
+from stages.data import Array
+
 BANDS = 8  # of rows: few enough to cost nothing, enough that neither thread waits long for the other
 AtOnce = Callable[[Callable[[], Any], Callable[[], Any]], tuple[Any, Any]]
 
@@ -62,3 +64,9 @@ def by_bands(both: AtOnce, rows: int, work: Callable[[int, int], Any]) -> None:
             work(first, end)
 
     both(take, take)
+
+
+def with_margin(image: Array, first: int, end: int, margin: int) -> tuple[Array, slice]:
+    """Rows first to end of an image and `margin` more to either side, where there are; and where in them they are."""
+    start = max(first - margin, 0)
+    return image[start : end + margin], slice(first - start, end - start)

@@ -51,6 +51,7 @@ def test_every_row_is_in_one_band_whose_range_holds_its_prior(rows, columns, ban
 def test_specks_do_not_widen_a_range_and_a_band_that_knows_little_has_the_whole():
     prior = np.full((128, 1000), 40, np.float32)
     prior[3, :30], prior[5, :30] = 150, 2  # 60 of 64000 pixels
+    prior[7, :3] = 1e30, -1e30, np.inf
     prior[64:, 90:] = np.nan
     one, other = ranges_of(prior, 64, 0, 192)
     assert (one.first, one.width.lanes) == (40 - 31, 64)
