@@ -57,8 +57,7 @@ def ranges_of(prior: Array, band: int, minimum: int, disparities: int, threads: 
             _count(prior, cuts[i], cuts[i + 1], minimum, counts[i])
 
     by_bands(shared_by(threads), len(counts), count)
-    most, whole = lanes_for(disparities), disparities
-    ranges = []
+    most, ranges = lanes_for(disparities), []
     for (top, end), number in zip(itertools.pairwise(cuts), counts, strict=True):
         up_to = np.cumsum(number)
         ignored = int(OUTLIERS * up_to[-1])
@@ -68,7 +67,7 @@ def ranges_of(prior: Array, band: int, minimum: int, disparities: int, threads: 
             ranges.append(Range(top, end, 0, Width(most)))
         else:
             first = low - (lanes - (high - low + 1)) // 2
-            ranges.append(Range(top, end, min(max(first, 0), whole - lanes), Width(lanes)))
+            ranges.append(Range(top, end, min(max(first, 0), disparities - lanes), Width(lanes)))
     return ranges
 
 
