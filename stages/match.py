@@ -66,8 +66,10 @@ class Match(Stage):
     at all where the prior is unknown or beyond `farthest`. Of each pixel `2 around + 7` disparities, rounded up to 16,
     are searched, which take 3 bytes each, whatever `memory` is.
 
-    With `bands` of rows, each is searched for what the prior has in it, and for 8 px more to either side or as much as
-    fills 64 lanes: rows of ground need little of the range, and so less time.
+    With a `band_height` each band of rows is searched for what the prior has in it, but for a thousandth at either end,
+    and for 8 px more to either side, in all for 64 or 128 disparities or, where that is not enough or the prior knows
+    less than half of the band, the whole range. Rows of ground need little of it, and so less time: the prior should
+    have few holes, for what is in them is found in the band's range only, and what it has outside that is unknown.
 
     The confidence is the probability that the disparity is right within 1 px, as far as the lead of the best sum of
     paths over the others tells, with the penalties that suit the cost and 8 paths.
@@ -93,8 +95,8 @@ class Match(Stage):
         0, "how far about the prior, at least, and nowhere else is searched; 0: the whole range",
         unit="px", low=0, high=64,
     )  # fmt: skip
-    bands: int = parameter(
-        0, "height of bands of rows, each of which is searched only for what the prior has in it; 0: the whole range",
+    band_height: int = parameter(
+        0, "of bands of rows, each of which is searched only for what the prior has in it; 0: the whole range",
         unit="px", low=0,
     )  # fmt: skip
     nearer: str = parameter(
@@ -102,11 +104,15 @@ class Match(Stage):
     )
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
     memory: int = parameter(
-        400, "for the sums of paths; larger frames are swept in bands, to the same result", unit="MB", low=1
+        400, "for the sums of paths; larger frames are swept in parts, to the same result", unit="MB", low=1
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.around and self.band_height:
+            raise ValueError(
+                "Match.band_height means nothing with Match.around, which searches less; let one of them be 0"
+            )
         largest, (p1, p2) = COSTS[self.cost].largest, self._penalties()
         if not p2 > p1:
             raise ValueError(f"Match.p2 must be above Match.p1 = {p1}, not {p2}")
@@ -115,7 +121,7 @@ class Match(Stage):
 
     def check_inputs(self, inputs: Collection[str]) -> None:
         """Refuse to search about a prior where none is among the `inputs`, names of ports."""
-        for name, value in (("around", self.around), ("bands", self.bands)):
+        for name, value in (("around", self.around), ("band_height", self.band_height)):
             if value and "prior" not in inputs:
                 raise ValueError(f"Match.{name} = {value} px needs a `prior` to search about; name one, or let it be 0")
 
@@ -140,8 +146,8 @@ class Match(Stage):
         """Where to search, and what for."""
         if prior is not None and self.around:
             return windows(prior.pixels, self.around, search.start, self.threads)
-        if prior is not None and self.bands:
-            return ranges_of(prior.pixels, self.bands, search.start, len(search), self.threads)
+        if prior is not None and self.band_height:
+            return ranges_of(prior.pixels, self.band_height, search.start, len(search), self.threads)
         return whole_range(rows, len(search))
 
     def _excluded(self, prior: Disparity, search: range, where: Windows | list[Range]) -> Array:

@@ -116,7 +116,7 @@ def eight(streams: dict[str, Any], case: Case) -> Disparity:
 
 def unbanded(streams: dict[str, Any], case: Case) -> Disparity:
     """The match at full size of all rows for the whole range."""
-    match: Match = replace(stage("rover", "matched"), bands=0, disparities=case.disparities)
+    match: Match = replace(stage("rover", "matched"), band_height=0, disparities=case.disparities)
     return match(case.frame, streams["prior"])
 
 

@@ -46,7 +46,7 @@ SIDES = ((0, -1), (-1, -1), (-1, 0), (-1, 1))  # (dy, dx) to q of a sweep down; 
 def brightness_steps(image: Array, both: AtOnce = in_turn) -> Array:
     """Absolute differences to the four neighbours of `SIDES`.
 
-    image: (H, W) uint8; both: calls two functions, for the upper and for the lower half. Returns (4, H + 1, S) uint8
+    image: (H, W) uint8; both: calls two functions, on one thread or two. Returns (4, H + 1, S) uint8
     with S >= W + 2: pixel (y, x) is at [:, y, x + 1], differences to pixels outside the image are arbitrary.
     """
     height, columns = image.shape
@@ -77,10 +77,9 @@ def aggregate_row(  # type: ignore[no-untyped-def]
 
     pair, rule: `pair.Pair` and `Rule`; first_lane: the disparity of the first lane, less the smallest searched; costs:
     (W * n,) uint8, C of the row without the prior's costs, with `rule.gradient`; else C is the census cost, made here,
-    which saves writing and reading it; paths: (3 * W * n,)
-    uint8, L of the row before, all 0 at first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where
-    the sums of the row go, from `place` on (W * n); final: instead, add what the other sweep left there, and put the
-    whole into `total`.
+    which saves writing and reading it; paths: (3 * W * n,) uint8, L of the row before, all 0 at first, updated; step: 1
+    for a sweep down, -1 for a sweep up; sums: uint8, where the sums of the row go, from `place` on (W * n); final:
+    instead, add what the other sweep left there, and put the whole into `total`.
     """
     n = lanes_in(width)
     columns = costs.size // n

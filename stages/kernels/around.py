@@ -309,8 +309,11 @@ def _smoothed_reference(raw: Array, searched: Array) -> Array:
     return smoothed
 
 
-def paths_reference(pair: Pair, rule: Rule, costs: Array, searched: Array, sign: int) -> Array:
-    """The sums of the paths of a sweep down (1) or up (-1), as of `aggregation.aggregate_reference`."""
+def paths_reference(pair: Pair, rule: Rule, costs: Array, searched: Array, sign: int, beside: bool = True) -> Array:
+    """The sums of the paths of a sweep down (1) or up (-1), as of `aggregation.aggregate_reference`.
+
+    beside: whether what only the pixel before has counts where it is next to what is searched.
+    """
     height, columns, n = costs.shape
     total = np.zeros(costs.shape, np.int64)
     for side, (dy, dx) in enumerate(SIDES):
@@ -321,12 +324,12 @@ def paths_reference(pair: Pair, rule: Rule, costs: Array, searched: Array, sign:
         before[1:-1, 1:-1] = FAR
         for y in range(height)[::sign]:
             for x in range(columns)[::sign]:
-                q = before[y + dy + 1, x + dx + 1]
+                q, own = before[y + dy + 1, x + dx + 1], searched[y, x]
+                q = q if beside else np.where(np.pad(own, 1), q, FAR)
                 up, left = (y, x) if sign > 0 else (y + dy, x + dx)
                 p2 = rule.table[pair.steps[side, up, left + 1]]
                 near = np.minimum(np.minimum(q[:-2], q[2:]) + rule.p1, np.minimum(q[1:-1], p2))
                 after = np.minimum(costs[y, x] + near, 255)
-                own = searched[y, x]
                 before[y + 1, x + 1, 1:-1][own] = after[own] - after[own].min()
         total += before[1:-1, 1:-1, 1:-1]
     return total

@@ -41,7 +41,7 @@ class Pair(NamedTuple):
     right: Array  # (H, planes, >= W + n) uint8: the same of the right image, backwards from the smallest disparity on
     steps: Array  # of `brightness_steps`
     outside: Array  # (W + n,) uint8: 255 where an element of `right` is outside the image
-    whole_from: int  # elements of `right` from which n and more are inside
+    whole_from: int  # elements of `right` from which n and more, of the whole range, are inside
     whole_to: int
     prior: Array  # (H, W) int32: where in `prior_costs` the costs of a pixel begin; or none
     prior_costs: Array  # (m,) uint8

@@ -22,9 +22,9 @@ def prior_costs(
 ) -> tuple[Array, Array]:
     """Where each pixel's costs begin, and the table.
 
-    prior: (H, W) float32, px, NaN = none; minimum: the smallest disparity searched, px, or (H, W) int32 that of each
-    pixel; weight: cost per pixel of distance, in the units of the matching cost; reach: px beyond which it costs no
-    more; threads: 2 share the work, to the same result. Returns (H, W) int32 and (m,) uint8.
+    prior: (H, W) float32, px, NaN = none; minimum: the smallest disparity searched, px, or that of each pixel, int32
+    that broadcasts to (H, W); weight: cost per pixel of distance, in the units of the matching cost; reach: px beyond
+    which it costs no more; threads: 2 share the work, to the same result. Returns (H, W) int32 and (m,) uint8.
     """
     far = lanes + int(np.ceil(reach)) + MARGIN  # a prior so far outside the search range costs the same everywhere
     length = 2 * far + lanes

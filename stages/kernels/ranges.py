@@ -20,8 +20,8 @@ from stages.kernels.vectors import Width
 
 MARGIN = 8  # px to either side of what the prior has in a band
 OUTLIERS = 0.001  # share of a band's prior, at either end, that does not count: it is less than a speck
-LEAST_KNOWN = 0.1  # share of a band's pixels below which its prior does not tell the range
-BLOCK = 64  # lanes are a multiple of it, so that few widths have to be compiled
+LEAST_KNOWN = 0.5  # share of a band's pixels below which its prior does not tell the range
+NARROW = (64, 128)  # lanes, but for the whole range; each number is compiled when it comes first
 
 
 class Range(NamedTuple):
@@ -43,13 +43,14 @@ def whole_range(rows: int, disparities: int) -> list[Range]:
     return [Range(0, rows, 0, Width(lanes_for(disparities)))]
 
 
-def ranges_of(prior: Array, band: int, minimum: int, disparities: int, threads: int = 1) -> list[Range]:
-    """The bands of an image, of `band` rows each, and their ranges.
+def ranges_of(prior: Array, height: int, minimum: int, disparities: int, threads: int = 1) -> list[Range]:
+    """The bands of an image, of `height` rows each, and their ranges.
 
-    prior: (H, W) float32, px, NaN = unknown; minimum, disparities: px, the whole range; threads: 2 share the work.
+    prior: (H, W) float32, px, NaN = unknown; minimum, disparities: px, the whole range; threads: 2 share the work, to
+    the same result.
     """
     rows, columns = prior.shape
-    cuts = [*range(0, rows, band), rows]
+    cuts = [*range(0, rows, height), rows]
     counts = np.zeros((len(cuts) - 1, disparities), np.int64)
 
     def count(first: int, end: int) -> None:
@@ -62,11 +63,13 @@ def ranges_of(prior: Array, band: int, minimum: int, disparities: int, threads: 
         up_to = np.cumsum(number)
         ignored = int(OUTLIERS * up_to[-1])
         low, high = np.searchsorted(up_to, [ignored, up_to[-1] - ignored - 1], side="right").tolist()
-        lanes = -(-(high - low + 1 + 2 * MARGIN) // BLOCK) * BLOCK
-        if lanes >= most or up_to[-1] < LEAST_KNOWN * (end - top) * columns:
+        low, high = max(low - MARGIN, 0), min(high + MARGIN, disparities - 1)
+        needed = high - low + 1
+        lanes = next((n for n in NARROW if needed <= n < most), most)
+        if lanes == most or up_to[-1] < LEAST_KNOWN * (end - top) * columns:
             ranges.append(Range(top, end, 0, Width(most)))
         else:
-            first = low - (lanes - (high - low + 1)) // 2
+            first = low - (lanes - needed) // 2
             ranges.append(Range(top, end, min(max(first, 0), disparities - lanes), Width(lanes)))
     return ranges
 

@@ -8,7 +8,7 @@ The sums of a large image would not fit the memory. Then the first visit to a ha
 head of each band of rows, and before the second sweep enters a band, its sums are made again from there: exact too,
 at 1.4 times the time.
 
-Bands of rows may be searched for a part of the range each (stages.kernels.ranges).
+Rows may be searched for a part of the range only, each band of them for its own (stages.kernels.ranges).
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ class _Paths:
     def enter(self, at: Range, columns: int) -> Array:
         """The costs, (3 * W * n,) uint8, for a range of n lanes."""
         lanes, size = at.width.lanes, 3 * columns * at.width.lanes
-        if self.at is not None and self.spare is not None and at[2:] != self.at[2:]:
+        if self.spare is not None and self.at is not None and (at.first, at.width) != (self.at.first, self.at.width):
             move_paths(self.whole, self.at.width.lanes, at.first - self.at.first, self.spare[:size], lanes)
             self.whole, self.spare = self.spare, self.whole
         self.at = at
@@ -238,7 +238,7 @@ class _Half:
 
 
 def _scratch(lanes: int, columns: int, disparities: int, costs: Array, column_sums: Array, total: Array) -> Scratch:
-    """Rows of so many lanes, in memory that has room for them."""
+    """Rows of so many lanes, in memory with room for them: of W * lanes bytes, of twice as many, and of as many."""
     size = columns * lanes
     index = np.uint8 if lanes <= 256 else np.uint16
     guard = np.abs(np.arange(2 * lanes) - lanes) <= 1

@@ -15,7 +15,7 @@ AtOnce = Callable[[Callable[[], Any], Callable[[], Any]], tuple[Any, Any]]
 
 
 class _Others:
-    """The threads of second halves: kept, for one takes a tenth of a millisecond to start."""
+    """The threads of second functions: kept, for one takes a tenth of a millisecond to start."""
 
     def __init__(self) -> None:
         self.renew()
@@ -23,7 +23,7 @@ class _Others:
 
     def renew(self) -> None:
         """Begin anew, without threads."""
-        self.pool = ThreadPoolExecutor(thread_name_prefix="half")
+        self.pool = ThreadPoolExecutor(thread_name_prefix="second")
 
 
 _others = _Others()

@@ -296,7 +296,7 @@ from stages import Match
 from tests.stages.test_match_opencv import slanted_pair
 frame, _ = slanted_pair(height=64, width=100)
 results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
-results += [Match(around=4)(frame, results[0]), Match(disparities=128, bands=32)(frame, results[0])]
+results += [Match(around=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
 print(hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).hexdigest())
 """
 
@@ -305,7 +305,7 @@ print(hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).he
 def test_processors_without_avx512_give_the_same_bits(processor):
     frame, _ = slanted_pair(height=64, width=100)
     results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
-    results += [Match(around=4)(frame, results[0]), Match(disparities=128, bands=32)(frame, results[0])]
+    results += [Match(around=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
     expected = b"".join(result.pixels.tobytes() for result in results)
     command = [sys.executable, "-c", DIGEST.format(root=str(ROOT))]
     environment = {**os.environ, "NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": FEATURES[processor]}

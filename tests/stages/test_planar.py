@@ -1,4 +1,4 @@
-"""Planes and matches brought together: equal to plain references, in one piece or two."""
+"""Planes and matches brought together: equal to plain references, on one thread or two."""
 
 import numpy as np
 from hypothesis import given, settings

@@ -1,5 +1,7 @@
 """Ranges of bands of rows: they hold what the prior has; the search in them is, bit for bit, that of the reference."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,10 +9,12 @@ from hypothesis import strategies as st
 
 from stages.data import Disparity, Source
 from stages.kernels.around import paths_reference
+from stages.kernels.blank import blank_windows_reference
+from stages.kernels.census import census_costs_reference
 from stages.kernels.gradient import smoothed_costs_reference
 from stages.kernels.pair import describe
 from stages.kernels.prior import prior_costs, prior_costs_reference
-from stages.kernels.ranges import MARGIN, Range, lanes_for, move_paths, ranges_of, within
+from stages.kernels.ranges import LEAST_KNOWN, MARGIN, NARROW, Range, lanes_for, move_paths, ranges_of, within
 from stages.kernels.selection import select_reference
 from stages.kernels.semiglobal import match
 from stages.kernels.vectors import Width
@@ -43,6 +47,8 @@ def test_every_row_is_in_one_band_whose_range_holds_its_prior(rows, columns, ban
         assert each.first + each.width.lanes <= disparities
         known = prior[each.top : each.end]
         known = np.clip(known[np.isfinite(known)], minimum, minimum + disparities - 1)
+        assert each.width.lanes in NARROW
+        assert np.isfinite(prior[each.top : each.end]).mean() >= LEAST_KNOWN
         assert first <= max(known.min() - MARGIN + 1, minimum)
         assert last >= min(known.max() + MARGIN - 1, minimum + disparities - 1)
     assert found == ranges_of(prior, band, minimum, disparities, threads=2)
@@ -52,7 +58,7 @@ def test_specks_do_not_widen_a_range_and_a_band_that_knows_little_has_the_whole(
     prior = np.full((128, 1000), 40, np.float32)
     prior[3, :30], prior[5, :30] = 150, 2  # 60 of 64000 pixels
     prior[7, :3] = 1e30, -1e30, np.inf
-    prior[64:, 90:] = np.nan
+    prior[64:, 450:] = np.nan
     one, other = ranges_of(prior, 64, 0, 192)
     assert (one.first, one.width.lanes) == (40 - 31, 64)
     assert (other.first, other.width.lanes) == (0, 192)
@@ -76,43 +82,53 @@ def test_moved_paths_keep_what_both_ranges_have(lanes, other_lanes, later):
     np.testing.assert_array_equal(moved.reshape(5, -1), wide[:, 400 + later : 400 + later + other_lanes])
 
 
-@pytest.mark.parametrize("diagonals", [True, False])
-@pytest.mark.parametrize("minimum", [0, -9])
-def test_disparities_are_those_of_a_search_that_lacks_the_rest_of_the_range(diagonals, minimum):
-    height, columns, disparities = 14, 60, 96
-    truth = np.where(np.arange(height) < 6, 5.0, 27.0)[:, np.newaxis] + np.where(np.arange(columns) < 30, 0, 9)
+@settings(max_examples=40, deadline=None)
+@given(
+    st.booleans(), st.booleans(), st.sampled_from([0, -9, -60, 7]), st.sampled_from([65, 96, 100, 130, 192]),
+    st.integers(0, 2**32 - 1),
+)  # fmt: skip
+def test_disparities_are_those_of_a_search_that_lacks_the_rest_of_the_range(
+    gradient, diagonals, minimum, disparities, seed
+):
+    rng = np.random.default_rng(seed)
+    height, columns, whole = 9, 40, lanes_for(disparities)
+    truth = rng.integers(2, 30) + np.where(np.arange(height) < 4, 0, 12)[:, np.newaxis] + np.zeros(columns)
     left, right = views(height, columns, truth)
-    prior = (truth + np.random.default_rng(1).normal(0, 2, truth.shape)).astype(np.float32)
-    ranges = [
-        Range(0, 3, 2, Width(64)),
-        Range(3, 8, 20, Width(64)),
-        Range(8, 9, 0, Width(96)),
-        Range(9, 14, 32, Width(64)),
-    ]
+    prior = (truth + rng.normal(0, 2, truth.shape)).astype(np.float32)
+    cuts = [0, *sorted(rng.choice(range(1, height), 3, replace=False).tolist()), height]
+    ranges = []
+    for top, end in itertools.pairwise(cuts):
+        lanes = int(rng.choice([n for n in (64, 128, whole) if n < disparities or n == whole]))
+        first = 0 if lanes == whole else int(rng.integers(0, disparities - lanes + 1))
+        ranges.append(Range(top, end, first, Width(lanes)))
     table = np.round(12 + 90 / (1 + np.arange(256) / 10)).astype(np.uint8)
-    rule = rule_of(True, disparities, minimum)._replace(diagonals=diagonals, table=table, uniqueness=1, speckle_size=0)
+    rule = rule_of(gradient, disparities, minimum)._replace(
+        diagonals=diagonals, table=table, uniqueness=1, calibration=np.linspace(0, 1, 256).astype(np.float32)
+    )
     first = np.concatenate([np.full((each.end - each.top, 1), minimum + each.first) for each in ranges])
-    guide = prior_costs(prior, first, disparities, 0.5, 4.0)
+    guide = prior_costs(prior, first, whole, 0.5, 4.0)
     found = match(left, right, rule, guide, ranges, None, 1, 1 << 30)
 
-    pair = describe(left, right, rule, Width(disparities))
-    planes = describe(right, right, rule, Width(disparities)).left[:, :, :columns]
-    costs = smoothed_costs_reference(pair.left[:, :, :columns], planes, disparities, minimum, rule.unseen)
-    costs = np.minimum(costs + prior_costs_reference(prior, minimum, disparities, 0.5, 4.0).astype(int), 255)
+    pair = describe(left, right, rule, Width(whole))
+    planes = describe(right, right, rule, Width(whole)).left[:, :, :columns]
+    raw_costs = smoothed_costs_reference if gradient else census_costs_reference
+    costs = raw_costs(pair.left[:, :, :columns], planes, whole, minimum, rule.unseen)
+    costs = np.minimum(costs + prior_costs_reference(prior, minimum, whole, 0.5, 4.0).astype(int), 255)
     searched = np.zeros(costs.shape, bool)
     for each in ranges:
         searched[each.top : each.end, :, each.first : each.first + each.width.lanes] = True
-    down, up = (np.minimum(paths_reference(pair, rule, costs, searched, sign), 255) for sign in (1, -1))
+    down, up = (np.minimum(paths_reference(pair, rule, costs, searched, sign, beside=False), 255) for sign in (1, -1))
     for each in ranges:
         lanes = slice(each.first, each.first + each.width.lanes)
         for y in range(each.top, each.end):
-            total = np.minimum(down + up, 255)[y, :, lanes]
             pixels, evidence = select_reference(
-                total, each.width.lanes, minimum + each.first, rule.uniqueness, rule.consistency
-            )
-            np.testing.assert_array_equal(found.pixels[y], pixels)
-            np.testing.assert_array_equal(found.source[y] > 0, evidence > 0)
-    assert np.isfinite(found.pixels).mean() > 0.3
+                np.minimum(down + up, 255)[y, :, lanes], min(each.width.lanes, disparities), minimum + each.first,
+                rule.uniqueness, rule.consistency,
+            )  # fmt: skip
+            blank = np.isnan(found.pixels[y]) & np.isfinite(pixels)  # windows of one gray value are never matched
+            assert blank_windows_reference(left)[y][blank].all()
+            np.testing.assert_array_equal(found.pixels[y][~blank], pixels[~blank])
+            np.testing.assert_array_equal(found.confidence[y][~blank], rule.calibration[evidence[~blank]])
     for threads, memory in ((2, 1 << 30), (1, 1), (2, 1)):
         again = match(left, right, rule, guide, ranges, None, threads, memory)
         np.testing.assert_array_equal(again.pixels, found.pixels)
@@ -132,12 +148,14 @@ def known(truth, source=Source.FILLED):
 def test_bands_find_what_the_whole_range_finds(slope, paths):
     frame, truth = slope
     whole = Match(disparities=192, paths=paths)
-    bands = Match(disparities=192, paths=paths, bands=16)
+    bands = Match(disparities=192, paths=paths, band_height=16)
     one, other = whole(frame, known(truth)), bands(frame, known(truth))
     visible = np.arange(320) >= truth + 2
     either = np.isfinite(one.pixels) | np.isfinite(other.pixels)
     assert (np.abs(one.pixels - other.pixels) < 0.3)[visible & either].mean() > 0.98
-    others = [Match(disparities=192, paths=paths, bands=16, threads=t, memory=m) for t, m in ((2, 400), (1, 1), (2, 1))]
+    others = [
+        Match(disparities=192, paths=paths, band_height=16, threads=t, memory=m) for t, m in ((2, 400), (1, 1), (2, 1))
+    ]
     assert all(same(each(frame, known(truth)), other) for each in others)
 
 
@@ -145,11 +163,13 @@ def test_a_match_that_the_prior_has_outside_its_bands_range_is_unknown(slope):
     frame, truth = slope
     moved = truth.copy()
     moved[40, 100:115] = 150  # 15 of 64 rows of 320 pixels: a speck
-    found = Match(disparities=192, bands=64)(frame, known(moved, Source.MEASURED))
+    found = Match(disparities=192, band_height=64)(frame, known(moved, Source.MEASURED))
     assert np.isnan(found.pixels[40, 100:115]).all()
     assert np.isfinite(found.pixels[41, 100:115]).all()
 
 
 def test_bands_need_a_prior(slope):
-    with pytest.raises(ValueError, match=r"Match.bands = 16 px needs a `prior`"):
-        Match(bands=16)(slope[0])
+    with pytest.raises(ValueError, match=r"Match.band_height = 16 px needs a `prior`"):
+        Match(band_height=16)(slope[0])
+    with pytest.raises(ValueError, match=r"band_height means nothing with Match.around"):
+        Match(band_height=16, around=4)
