@@ -217,7 +217,7 @@ def _events(log: Iterable[Event], stop: Stop) -> Iterator[Event]:
 def _peak_memory_mb() -> float:
     """Largest resident size of this process so far."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
+    return round(peak * (1 if sys.platform == "darwin" else 1024) / 1e6, 1)
 
 
 def _summary(
