@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from stages.data import Disparity, Source
 from stages.kernels.around import paths_reference
-from stages.kernels.blank import blank_windows_reference
+from stages.kernels.blank import blank_windows_reference, drop_blank
 from stages.kernels.census import census_costs_reference
 from stages.kernels.gradient import smoothed_costs_reference
 from stages.kernels.pair import describe
@@ -118,17 +118,17 @@ def test_disparities_are_those_of_a_search_that_lacks_the_rest_of_the_range(
     for each in ranges:
         searched[each.top : each.end, :, each.first : each.first + each.width.lanes] = True
     down, up = (np.minimum(paths_reference(pair, rule, costs, searched, sign, beside=False), 255) for sign in (1, -1))
+    pixels, evidence = np.empty(truth.shape, np.float32), np.empty(truth.shape, np.uint8)
     for each in ranges:
         lanes = slice(each.first, each.first + each.width.lanes)
         for y in range(each.top, each.end):
-            pixels, evidence = select_reference(
+            pixels[y], evidence[y] = select_reference(
                 np.minimum(down + up, 255)[y, :, lanes], min(each.width.lanes, disparities), minimum + each.first,
                 rule.uniqueness, rule.consistency,
             )  # fmt: skip
-            blank = np.isnan(found.pixels[y]) & np.isfinite(pixels)  # windows of one gray value are never matched
-            assert blank_windows_reference(left)[y][blank].all()
-            np.testing.assert_array_equal(found.pixels[y][~blank], pixels[~blank])
-            np.testing.assert_array_equal(found.confidence[y][~blank], rule.calibration[evidence[~blank]])
+    drop_blank(*(blank_windows_reference(image) for image in (left, right)), pixels, evidence)
+    np.testing.assert_array_equal(found.pixels, pixels)
+    np.testing.assert_array_equal(found.confidence, rule.calibration[evidence])
     for threads, memory in ((2, 1 << 30), (1, 1), (2, 1)):
         again = match(left, right, rule, guide, ranges, None, threads, memory)
         np.testing.assert_array_equal(again.pixels, found.pixels)

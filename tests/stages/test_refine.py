@@ -3,11 +3,12 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from stages.data import Disparity, Source, StereoCamera, StereoFrame
-from stages.refine import Refine
+from stages.refine import EVEN, Refine, _burnt_out
 from tests.bench.stereo_scores import paper_stages
 
 SHAPE = HEIGHT, WIDTH = 120, 160
@@ -392,6 +393,15 @@ def test_matches_of_a_burnt_out_sky_do_not_count():
     assert np.isnan(refined.pixels[:42]).all()  # the last rows show the ground in their windows, and 5 px are margin
     assert (refined.pixels[50:] < 9).all()
     assert (Refine(burnt_out=256)(sky, Disparity(5, pixels, source, confidence)).pixels[:40] > 50).all()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_what_is_burnt_out_does_not_depend_on_bands(threads):
+    image = cv2.blur(np.random.default_rng(3).integers(0, 256, (97, 60, 3), dtype=np.uint8), (9, 9))
+    image[20:70, 10:] = 253
+    guide = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    even = cv2.morphologyEx(guide, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) <= EVEN
+    np.testing.assert_array_equal(_burnt_out(image, guide, 250, threads), even & (image >= 250).any(axis=2))
 
 
 def test_a_match_that_the_images_do_not_bear_out_is_a_guess():
