@@ -17,6 +17,7 @@ import rerun as rr
 from recordings import paint
 from recordings.desk import LEDGER, Panel, Place
 from recordings.errors import counted
+from recordings.png import png16
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -39,9 +40,6 @@ from stages.data import (
 DISPARITY_STEPS = 8  # disparities are kept to 1/8 px: four fifths of the size that 1/16 px takes
 LIFT = 0.03  # m; hazards float that far above the ground, so that the surface does not swallow them
 LINE_SPACING = 2  # m, between the lines across a map
-FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
-if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # from OpenCV 4.12 on; else it tries all filters on every row
-    FAST_PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 AMBER: paint.Rgb = (255, 210, 60)
 TEXT: paint.Rgb = (225, 228, 235)
 CURVES: tuple[paint.Rgb, ...] = ((255, 210, 60), (95, 175, 255), (245, 120, 95), (125, 215, 140), (205, 145, 245))
@@ -179,8 +177,7 @@ def draw_stereo(canvas: Canvas, path: str, frame: StereoFrame) -> None:
 def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     """The disparities (hover reads them in px), where each comes from, and the superpixels' edges."""
     steps = np.minimum(np.fmax(disparity.pixels * np.float32(DISPARITY_STEPS) + np.float32(0.5), 0), 65535)
-    steps = steps.astype(np.uint16)  # of NaN, fmax has made 0
-    _, blob = cv2.imencode(".png", steps, FAST_PNG)
+    blob = png16(steps.astype(np.uint16))  # of NaN, fmax has made 0
     limit = paint.disparity_limit(disparity.pixels)
     image = rr.EncodedDepthImage(
         blob, media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
@@ -195,8 +192,8 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
         canvas.labels(f"{path}/source", disparity.source, paint.SOURCES, source)
     if disparity.segments is not None:
         edges = paint.segment_edges(disparity.segments).astype(np.uint8) * 255
-        _, blob = cv2.imencode(".png", edges, [*FAST_PNG, cv2.IMWRITE_PNG_BILEVEL, 1])
-        overlay = rr.EncodedImage(contents=blob, media_type="image/png", opacity=0.4, draw_order=10.0)
+        _, lines = cv2.imencode(".png", edges, [cv2.IMWRITE_PNG_BILEVEL, 1])
+        overlay = rr.EncodedImage(contents=lines, media_type="image/png", opacity=0.4, draw_order=10.0)
         place = Place(Panel.SUPERPIXELS, f"{path}/superpixels", f"{path}: superpixels")
         canvas.log(place.path, overlay, place)
     shares = (f"{percent[kind]:.0f} % {kind.name.lower()}" for kind in made)

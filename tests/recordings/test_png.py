@@ -1,0 +1,30 @@
+"""PNG of 16 bits, read back by OpenCV and by Pillow."""
+
+from __future__ import annotations
+
+import io
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from recordings.png import png16
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (9, 1), (2, 2), (61, 83), (480, 640)])
+@pytest.mark.parametrize("content", ["zero", "noise", "slope"])
+def test_other_readers_find_every_value(shape, content):
+    noise = np.random.default_rng(1).integers(0, 1 << 16, shape, np.uint16)
+    slope = np.arange(shape[0] * shape[1], dtype=np.uint32).reshape(shape) // 3
+    pixels = {"zero": np.zeros(shape, np.uint16), "noise": noise, "slope": slope.astype(np.uint16)}[content]
+    blob = png16(pixels)
+    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(blob, np.uint8), cv2.IMREAD_UNCHANGED), pixels)
+    with Image.open(io.BytesIO(blob)) as image:
+        image.verify()  # checksums of all parts
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(blob))), pixels)
+
+
+def test_rows_need_not_follow_each_other_in_memory():
+    pixels = np.random.default_rng(2).integers(0, 1 << 16, (30, 40), np.uint16)[::2, ::-1]
+    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(png16(pixels), np.uint8), cv2.IMREAD_UNCHANGED), pixels)
