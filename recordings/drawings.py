@@ -86,7 +86,11 @@ class Canvas:
         self.recording.log(path, archetype)
         self._now[path] = type(archetype)
         for place in places:
-            self.hung.setdefault((place.panel, place.path), place)
+            self.hang(place)
+
+    def hang(self, place: Place) -> None:
+        """Have the desk show what is logged there."""
+        self.hung.setdefault((place.panel, place.path), place)
 
     def keep(self, path: str, content: Hashable, draw: Callable[[], Any]) -> None:
         """Log what `draw()` makes, unless it hangs there since the frame before and has the same `content`."""
@@ -176,8 +180,9 @@ def draw_stereo(canvas: Canvas, path: str, frame: StereoFrame) -> None:
 @draws(Disparity)
 def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     """The disparities (hover reads them in px), where each comes from, and the superpixels' edges."""
-    steps = np.minimum(np.fmax(disparity.pixels * np.float32(DISPARITY_STEPS) + np.float32(0.5), 0), 65535)
-    blob = png16(steps.astype(np.uint16))  # of NaN, fmax has made 0
+    # Rounded; NaN and what is below 0 becomes 0.
+    steps: Array = cv2.multiply(disparity.pixels, DISPARITY_STEPS, dtype=cv2.CV_16U)  # type: ignore[call-overload]
+    blob = png16(steps)
     limit = paint.disparity_limit(disparity.pixels)
     image = rr.EncodedDepthImage(
         blob, media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
@@ -185,8 +190,9 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     )  # fmt: skip
     canvas.log(f"{path}/pixels", image, Place(Panel.DISPARITY, f"{path}/pixels", path))
     canvas.scale(f"{path}/pixels/scale", steps.shape, 0.0, limit, "px", cv2.COLORMAP_TURBO)
-    percent = [100.0 * np.count_nonzero(disparity.source == kind) / disparity.source.size for kind in Source]
-    made = [kind for kind in (Source.PLANE, Source.FILLED) if percent[kind]]
+    known = _percent(disparity.source)
+    shares = {kind: _percent(disparity.source == kind) for kind in (Source.PLANE, Source.FILLED)}
+    made = {kind: share for kind, share in shares.items() if share}
     if made:  # else it is measured wherever it is known
         source = Place(Panel.SOURCE, f"{path}/source", f"{path}: source")
         canvas.labels(f"{path}/source", disparity.source, paint.SOURCES, source)
@@ -196,8 +202,8 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
         overlay = rr.EncodedImage(contents=lines, media_type="image/png", opacity=0.4, draw_order=10.0)
         place = Place(Panel.SUPERPIXELS, f"{path}/superpixels", f"{path}: superpixels")
         canvas.log(place.path, overlay, place)
-    shares = (f"{percent[kind]:.0f} % {kind.name.lower()}" for kind in made)
-    return f"{path} {', '.join([f'{100.0 - percent[Source.UNKNOWN]:.0f} % known', *shares])}"
+    parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in made.items())
+    return f"{path} {', '.join([f'{known:.0f} % known', *parts])}"
 
 
 @draws(PointCloud)
@@ -343,6 +349,11 @@ def draw_hazards(canvas: Canvas, path: str, navigation: NavigationMap, terrain: 
         centres = np.column_stack([x[col], y[row], elevation[row, col] + LIFT])
         hazards = rr.Points3D(centres, colors=[paint.CELLS[Cell.HAZARD][1]], radii=0.4 * terrain.resolution)
         canvas.log(f"{path}/hazards", hazards, Place(Panel.TERRAIN, f"{path}/hazards", path, terrain.frame_id))
+
+
+def _percent(layer: Array) -> float:
+    """How much of it is not 0."""
+    return 100.0 * np.count_nonzero(layer) / layer.size
 
 
 def _frame_suffix(frame_id: str) -> str:

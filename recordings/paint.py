@@ -17,6 +17,7 @@ from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason, Source
 
 Rgb = tuple[int, int, int]
 
+SAMPLE = 4096  # values that a colour range is found from, at least, where there are so many
 BEHIND = 1.0  # m behind the rover that a picture shows where the camera has looked ahead only
 
 UNKNOWN_RGB: Rgb = (46, 47, 54)
@@ -75,8 +76,7 @@ def eight_bit(pixels: Array) -> Array:
 
 def disparity_limit(disparity: Array) -> float:
     """The upper end of the colour range, px: the 99.5th percentile rounded up to a multiple of 16, at least 16."""
-    sample = disparity[::4, ::4]
-    known = sample[np.isfinite(sample)]
+    known = _some_known(disparity[::4, ::4])
     return 16.0 * max(1.0, np.ceil(float(np.percentile(known, 99.5)) / 16.0)) if known.size else 16.0
 
 
@@ -122,7 +122,7 @@ def _behind(grid: ElevationMap | NavigationMap, known: Array) -> tuple[int, tupl
 
 def elevation_limits(elevation: Array) -> tuple[float, float]:
     """The colour range of a terrain, m: its 1st and 99th percentile rounded outwards to 0.1 m, at least 0.2 m apart."""
-    known = elevation[np.isfinite(elevation)]
+    known = _some_known(elevation)
     if not known.size:
         return 0.0, 1.0
     low, high = (float(value) for value in np.percentile(known, (1.0, 99.0)))
@@ -132,11 +132,17 @@ def elevation_limits(elevation: Array) -> tuple[float, float]:
 
 def value_limits(layer: Array) -> tuple[float, float]:
     """The colour range of any layer: its 1st and 99th percentile; (0, 1) where nothing is known, never empty."""
-    known = layer[np.isfinite(layer)]
+    known = _some_known(layer)
     if not known.size:
         return 0.0, 1.0
     low, high = (float(value) for value in np.percentile(known, (1.0, 99.0)))
     return low, high if high > low else low + 1.0
+
+
+def _some_known(layer: Array) -> Array:
+    """The known values of a layer, every n-th of many."""
+    known = layer[np.isfinite(layer)]
+    return known[:: max(1, known.size // SAMPLE)]
 
 
 def hillshade(elevation: Array, resolution: float, light: Array = _LIGHT) -> Array:

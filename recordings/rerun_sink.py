@@ -6,7 +6,7 @@ its default mere warnings, are raised.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -26,6 +26,7 @@ from recordings.whole_file import give_name, temporary_name, unwritable
 from stages.data import Array, ElevationMap, Pose, StereoFrame
 
 RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well
+PLOTTED = 32  # frames whose times and queues are sent at once
 END = b"RRF2FOOT"  # the last magic number of a whole recording, before a checksum of 4 bytes
 
 
@@ -61,6 +62,7 @@ class RerunSink:
         self._partial = temporary_name(self._path)
         self._stamp: int | None = None
         self._frames, self._hung = 0, -1
+        self._plots: dict[str, list[tuple[int, int, float]]] = {}  # path -> stamp, frame and value
         try:
             self._partial.open("wb").close()
         except OSError as error:
@@ -96,8 +98,7 @@ class RerunSink:
         with catch_and_log_exceptions(strict=True):
             self._set_clocks(record.stamp, self._frames)
             captions = self._draw(record.items)
-            self._plot(SECONDS, record.seconds)
-            self._plot(QUEUES, record.queues)
+            self._plot(record)
             self._canvas.clear_the_rest()
             text = "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions])
             self._recording.log(LEDGER, rr.TextLog(text, level=rr.TextLogLevel.INFO))
@@ -128,6 +129,7 @@ class RerunSink:
 
     def _conclude(self, summary: Mapping[str, Any]) -> None:
         """Enter what there is to say of the whole run."""
+        self._send_plots()
         verdict = str(summary.get("verdict", "INCOMPLETE"))
         last = max(0, self._frames - 1)
         drops = [f"{count} {reason}" for reason, count in dict(summary.get("drops", {})).items()]
@@ -179,20 +181,30 @@ class RerunSink:
                     captions.append(draw(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
         return [caption for caption in captions if caption]
 
-    def _plot(self, root: str, values: Mapping[str, float]) -> None:
-        for stage, value in values.items():
-            path = f"{root}/{rr.escape_entity_path_part(stage)}"
-            self._canvas.log(path, rr.Scalars(float(value)), Place(Panel.STAGE, path, stage))
+    def _plot(self, record: FrameRecord) -> None:
+        """Stage times and queues: kept, and sent for many frames at once, for they would be half of all calls."""
+        for root, values in ((SECONDS, record.seconds), (QUEUES, record.queues)):
+            for stage, value in values.items():
+                path = f"{root}/{rr.escape_entity_path_part(stage)}"
+                self._canvas.hang(Place(Panel.STAGE, path, stage))
+                self._plots.setdefault(path, []).append((record.stamp, self._frames, float(value)))
+        if (self._frames + 1) % PLOTTED == 0:
+            self._send_plots()
+
+    def _send_plots(self) -> None:
+        for path, points in self._plots.items():
+            stamps, frames, values = zip(*points, strict=True)
+            columns = rr.Scalars.columns(scalars=values)
+            self._recording.send_columns(path, indexes=_clocks(stamps, frames), columns=columns, strict=True)
+        self._plots.clear()
 
     def _enter(self, entries: Iterable[LossEntry], frame: int) -> None:
         """Losses, at their own stamps on the log's clock."""
         losses = sorted(entries, key=lambda entry: entry.stamp)
         if not losses:
             return
-        stamps = np.array([entry.stamp for entry in losses], "datetime64[ns]")
         texts = [f"{entry.stage} lost {entry.stream}: {entry.reason}. {entry.detail}" for entry in losses]
-        frames = np.full(len(losses), frame)
-        clocks = [rr.TimeColumn(CLOCK, timestamp=stamps), rr.TimeColumn(FRAME, sequence=frames)]
+        clocks = _clocks([entry.stamp for entry in losses], [frame] * len(losses))
         columns = rr.TextLog.columns(text=texts, level=[rr.TextLogLevel.WARN] * len(losses))
         self._recording.send_columns(LEDGER, indexes=clocks, columns=columns, strict=True)
         self._stamp = max(losses[-1].stamp, self._stamp if self._stamp is not None else losses[-1].stamp)
@@ -202,6 +214,12 @@ class RerunSink:
         if len(self._canvas.hung) != self._hung:
             self._hung = len(self._canvas.hung)
             self._recording.send_blueprint(desk(self._canvas.hung.values()))
+
+
+def _clocks(stamps: Sequence[int], frames: Sequence[int]) -> list[rr.TimeColumn]:
+    """The recording's two clocks at these stamps, ns, and frames."""
+    times = np.array(stamps, "datetime64[ns]")
+    return [rr.TimeColumn(CLOCK, timestamp=times), rr.TimeColumn(FRAME, sequence=frames)]
 
 
 def _together(items: Mapping[str, Any], kinds: tuple[type, ...]) -> Iterator[list[str]]:
