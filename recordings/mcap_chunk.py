@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 from typing import BinaryIO
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
+from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 
 from recordings.mcap_index import RECORD, read
@@ -68,7 +68,7 @@ def unpacked(content: bytes) -> bytes:
     if len(data) != size:
         more = "more than" if len(data) > size else f"{len(data)} bytes, not"
         raise ValueError(f"it unpacks to {more} {size}")
-    if checksum and zlib.crc32(data) != checksum:
+    if checksum and crc32(data) != checksum:
         raise ValueError("its CRC does not match")
     return data
 

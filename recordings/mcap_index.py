@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import struct
-import zlib
 from array import array
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -17,6 +16,7 @@ from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import zstandard
+from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -185,7 +185,7 @@ def summary(file: BinaryIO, size: int) -> Index | None:
     if length > _SECTION:
         return None
     section = read(file, footer.summary_start, length)
-    if footer.summary_crc and zlib.crc32(tail[: RECORD.size + 16], zlib.crc32(section)) != footer.summary_crc:
+    if footer.summary_crc and crc32(tail[: RECORD.size + 16], crc32(section)) != footer.summary_crc:
         return None
     index = Index()
     try:

@@ -8,10 +8,10 @@ each loss is noted.
 from __future__ import annotations
 
 import struct
-import zlib
 from contextlib import suppress
 from typing import BinaryIO
 
+from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
@@ -44,7 +44,7 @@ def walk(file: BinaryIO, size: int) -> Index:
     own = summary(file, size) or Index()  # what it defines may be lost in the data section
     index = Index(own.schemas, own.channels, expected=own.expected, walked=True)
     position, before = len(MAGIC), 0
-    checksum: int | None = zlib.crc32(MAGIC)  # None: bytes were passed over
+    checksum: int | None = crc32(MAGIC)  # None: bytes were passed over
     while True:
         head = read(file, position, HEAD)
         opcode, length = RECORD.unpack_from(head) if len(head) >= RECORD.size else (0, 0)
@@ -67,7 +67,7 @@ def walk(file: BinaryIO, size: int) -> Index:
         except BROKEN as error:
             index.lose(f"the record at byte {position} is broken ({said(error)})")
         if checksum is not None:
-            checksum = zlib.crc32(content, zlib.crc32(head[: RECORD.size], checksum))
+            checksum = crc32(content, crc32(head[: RECORD.size], checksum))
             checksum = _checksum(file, position + RECORD.size + len(content), length - len(content), checksum)
         position, before = position + RECORD.size + length, opcode
 
@@ -75,7 +75,7 @@ def walk(file: BinaryIO, size: int) -> Index:
 def _checksum(file: BinaryIO, position: int, length: int, checksum: int) -> int:
     """The CRC, continued over so many bytes from `position`."""
     for start in range(0, length, _BLOCK):
-        checksum = zlib.crc32(read(file, position + start, min(_BLOCK, length - start)), checksum)
+        checksum = crc32(read(file, position + start, min(_BLOCK, length - start)), checksum)
     return checksum
 
 

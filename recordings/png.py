@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from isal import isal_zlib
+from isal.isal_zlib import compress, crc32
 
 from stages.data import Array
 
@@ -23,10 +23,10 @@ def png16(pixels: Array) -> bytes:
     rows[:, 1:3] = halves[:, :2]
     np.subtract(halves[:, 2:], halves[:, :-2], out=rows[:, 3:])
     header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
-    parts = (b"IHDR", header), (b"IDAT", isal_zlib.compress(rows, _LEVEL)), (b"IEND", b"")
+    parts = (b"IHDR", header), (b"IDAT", compress(rows, _LEVEL)), (b"IEND", b"")
     return _SIGNATURE + b"".join(_chunk(kind, content) for kind, content in parts)
 
 
 def _chunk(kind: bytes, content: bytes) -> bytes:
-    checksum = isal_zlib.crc32(content, isal_zlib.crc32(kind))
+    checksum = crc32(content, crc32(kind))
     return b"".join((struct.pack(">I", len(content)), kind, content, struct.pack(">I", checksum)))

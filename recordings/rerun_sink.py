@@ -185,9 +185,9 @@ class RerunSink:
         """Stage times and queues: kept, and sent for many frames at once, for they would be half of all calls."""
         for root, values in ((SECONDS, record.seconds), (QUEUES, record.queues)):
             for stage, value in values.items():
-                path = f"{root}/{rr.escape_entity_path_part(stage)}"
+                path, point = f"{root}/{rr.escape_entity_path_part(stage)}", (record.stamp, self._frames, float(value))
                 self._canvas.hang(Place(Panel.STAGE, path, stage))
-                self._plots.setdefault(path, []).append((record.stamp, self._frames, float(value)))
+                self._plots.setdefault(path, []).append(point)
         if (self._frames + 1) % PLOTTED == 0:
             self._send_plots()
 
