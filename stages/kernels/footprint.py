@@ -2,6 +2,7 @@
 
 A fit needs nine sums over the window. They are kept running, first down the columns and then along the row, so a cell
 costs the same whatever the window's size; coordinates are shifted to the window's centroid before anything is divided.
+The sums of a row are written down first and then solved without a branch, so that the processor takes several at once.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ def fit_planes(heights: Array, use: Array, radius: int, leverage: float) -> Arra
     Returns (4, rows, cols) float64: the plane's height at the cell, its slopes per cell along columns (x) and rows (y),
     and the root mean square of the window's residuals. NaN where the cells used are too few, or too nearly in a line.
     """
-    planes = np.full((4, *heights.shape), np.nan)
+    planes = np.empty((4, *heights.shape))
     _fit_planes(np.ascontiguousarray(heights), np.ascontiguousarray(use), int(radius), float(leverage), planes)
     return planes
 
@@ -50,7 +51,8 @@ def _add_row(sums, heights, use, row, sign):  # type: ignore[no-untyped-def]
 @kernel
 def _fit_planes(heights, use, radius, leverage, planes):  # type: ignore[no-untyped-def]
     rows, cols = heights.shape
-    sums = np.zeros((cols, 6), np.float64)
+    sums = np.zeros((cols, 6))
+    windows = np.empty((10, cols))
     for row in range(min(radius, rows)):
         _add_row(sums, heights, use, row, 1.0)
     for row in range(rows):
@@ -58,46 +60,60 @@ def _fit_planes(heights, use, radius, leverage, planes):  # type: ignore[no-unty
             _add_row(sums, heights, use, row + radius, 1.0)
         if row - radius - 1 >= 0:
             _add_row(sums, heights, use, row - radius - 1, -1.0)
-        n = sx = sxx = sy = syy = sxy = sz = sxz = syz = szz = 0.0
-        for ahead in range(-radius, cols):
-            for side in range(2):
-                # The column that enters on the right, then the one that leaves on the left.
-                col = ahead + radius if side == 0 else ahead - radius - 1
-                if col < 0 or col >= cols:
-                    continue
-                sign = 1.0 if side == 0 else -1.0
-                x, s = np.float64(col), sums[col]
-                n += sign * s[0]
-                sx += sign * x * s[0]
-                sxx += sign * x * x * s[0]
-                sy += sign * s[1]
-                sxy += sign * x * s[1]
-                syy += sign * s[2]
-                sz += sign * s[3]
-                sxz += sign * x * s[3]
-                syz += sign * s[4]
-                szz += sign * s[5]
-            if ahead >= 0 and n >= 3.0:
-                _solve(planes[:, row, ahead], row, ahead, leverage, n, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz)
+        _sum_up(sums, radius, windows)
+        _solve(windows, row, leverage, planes[0, row], planes[1, row], planes[2, row], planes[3, row])
 
 
 @kernel
-def _solve(plane, row, col, leverage, n, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz):  # type: ignore[no-untyped-def]
-    mx, my, mz = sx / n, sy / n, sz / n
-    vxx, vxy, vyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
-    vxz, vyz, vzz = sxz / n - mx * mz, syz / n - my * mz, szz / n - mz * mz
-    determinant = vxx * vyy - vxy * vxy
-    if determinant < _NARROWEST * (vxx + vyy):
-        return
-    dx, dy = col - mx, row - my
-    if 1.0 + (vyy * dx * dx - 2.0 * vxy * dx * dy + vxx * dy * dy) / determinant > leverage * n:
-        return
-    gx = (vyy * vxz - vxy * vyz) / determinant
-    gy = (vxx * vyz - vxy * vxz) / determinant
-    plane[0] = mz + gx * dx + gy * dy
-    plane[1] = gx
-    plane[2] = gy
-    plane[3] = np.sqrt(max(0.0, vzz - gx * vxz - gy * vyz))
+def _sum_up(sums, radius, windows):  # type: ignore[no-untyped-def]
+    """The ten sums of every window of a row: windows (10, cols), of 1, x, y, z, xx, xy, yy, xz, yz and zz."""
+    cols = len(sums)
+    n = sx = sxx = sy = syy = sxy = sz = sxz = syz = szz = 0.0
+    for ahead in range(-radius, cols):
+        for side in range(2):
+            # The column that enters on the right, then the one that leaves on the left.
+            col = ahead + radius if side == 0 else ahead - radius - 1
+            if col < 0 or col >= cols:
+                continue
+            sign = 1.0 if side == 0 else -1.0
+            x, s = np.float64(col), sums[col]
+            n += sign * s[0]
+            sx += sign * x * s[0]
+            sxx += sign * x * x * s[0]
+            sy += sign * s[1]
+            sxy += sign * x * s[1]
+            syy += sign * s[2]
+            sz += sign * s[3]
+            sxz += sign * x * s[3]
+            syz += sign * s[4]
+            szz += sign * s[5]
+        if ahead >= 0:
+            for i, total in enumerate((n, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz)):
+                windows[i, ahead] = total
+
+
+@kernel
+def _solve(windows, row, leverage, height, along, across, rough):  # type: ignore[no-untyped-def]
+    """The planes, (cols,) each of their four numbers, of a row's windows; those of no points are NaN throughout."""
+    for col in range(windows.shape[1]):
+        n, sx, sy, sz = windows[0, col], windows[1, col], windows[2, col], windows[3, col]
+        sxx, sxy, syy = windows[4, col], windows[5, col], windows[6, col]
+        sxz, syz, szz = windows[7, col], windows[8, col], windows[9, col]
+        mx, my, mz = sx / n, sy / n, sz / n
+        vxx, vxy, vyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+        vxz, vyz, vzz = sxz / n - mx * mz, syz / n - my * mz, szz / n - mz * mz
+        determinant = vxx * vyy - vxy * vxy
+        dx, dy = col - mx, row - my
+        gx = (vyy * vxz - vxy * vyz) / determinant
+        gy = (vxx * vyz - vxy * vxz) / determinant
+        variance = 1.0 + (vyy * dx * dx - 2.0 * vxy * dx * dy + vxx * dy * dy) / determinant  # in cells, times n
+        spread = determinant >= _NARROWEST * (vxx + vyy)
+        known = (n >= 3.0) & spread & (variance <= leverage * n)
+        residual = vzz - gx * vxz - gy * vyz
+        height[col] = mz + gx * dx + gy * dy if known else np.nan
+        along[col] = gx if known else np.nan
+        across[col] = gy if known else np.nan
+        rough[col] = np.sqrt(residual if residual > 0.0 else 0.0) if known else np.nan
 
 
 def fit_planes_reference(heights: Array, use: Array, radius: int, leverage: float) -> Array:

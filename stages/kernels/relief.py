@@ -21,9 +21,15 @@ def lowest_around(heights: Array, use: Array, trend: Array, radius: int) -> tupl
     Returns two (rows, cols) float64: that height, NaN where `use` is not, at most the cell's own; and the share of the
     disc's cells that count, those beyond the grid's border being missing.
     """
-    return _lowest_around(  # type: ignore[no-any-return]
-        np.ascontiguousarray(heights), np.ascontiguousarray(use), np.ascontiguousarray(trend), _disc(radius)
-    )
+    shape = heights.shape
+    lowest, share = np.full(shape, np.nan), np.zeros(shape)
+    framed = np.pad(np.where(use, heights, np.inf), ((0, 0), (radius, radius)), constant_values=np.inf)
+    count = np.pad(np.cumsum(use, axis=1, dtype=np.int32), ((0, 0), (radius + 1, 0)))
+    count = np.pad(count, ((0, 0), (0, radius)), mode="edge")
+    disc = _disc(radius)
+    reach = np.array([disc[disc[:, 0] == row, 1].max() for row in range(-radius, radius + 1)])
+    _lowest_around(framed, count, np.ascontiguousarray(use), np.ascontiguousarray(trend), reach, lowest, share)
+    return lowest, share
 
 
 def _disc(radius: int) -> Array:
@@ -34,25 +40,32 @@ def _disc(radius: int) -> Array:
 
 
 @kernel
-def _lowest_around(heights, use, trend, disc):  # type: ignore[no-untyped-def]
-    rows, cols = heights.shape
-    lowest = np.full((rows, cols), np.nan)
-    share = np.zeros((rows, cols))
+def _lowest_around(heights, count, use, trend, reach, lowest, share):  # type: ignore[no-untyped-def]
+    """heights: infinite where not in use, with `radius` more columns to either side; count: of cells in use, up to and
+    with one column less; reach: of the disc along columns, in each of its rows. One offset at a time for a whole row,
+    so that the processor takes several cells at once."""
+    rows, cols = use.shape
+    radius = len(reach) // 2
+    size = (2 * reach + 1).sum()
+    least, found = np.empty(cols), np.empty(cols, np.int32)
     for row in range(rows):
+        least[:] = np.inf
+        found[:] = 0
+        east, north = trend[0, row], trend[1, row]
+        for other in range(max(row - radius, 0), min(row + radius + 1, rows)):
+            far, y = reach[other - row + radius], np.float64(other - row)
+            before, after = count[other, radius - far :], count[other, radius + far + 1 :]
+            for col in range(cols):
+                found[col] += after[col] - before[col]
+            for offset in range(-far, far + 1):
+                beside, x = heights[other, radius + offset :], np.float64(offset)
+                for col in range(cols):
+                    height = beside[col] - east[col] * x - north[col] * y
+                    least[col] = height if height < least[col] else least[col]
         for col in range(cols):
-            if not use[row, col]:
-                continue
-            least, found = heights[row, col], 0
-            east, north = trend[0, row, col], trend[1, row, col]
-            for k in range(disc.shape[0]):
-                r, c = row + disc[k, 0], col + disc[k, 1]
-                if r < 0 or c < 0 or r >= rows or c >= cols or not use[r, c]:
-                    continue
-                found += 1
-                least = min(least, heights[r, c] - east * disc[k, 1] - north * disc[k, 0])
-            lowest[row, col] = least
-            share[row, col] = found / disc.shape[0]
-    return lowest, share
+            if use[row, col]:
+                lowest[row, col] = least[col]
+                share[row, col] = found[col] / size
 
 
 def lowest_around_reference(heights: Array, use: Array, trend: Array, radius: int) -> tuple[Array, Array]:
