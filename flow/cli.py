@@ -13,6 +13,7 @@ import os
 import shlex
 import shutil
 import sys
+import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -41,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except Exception as error:
         if options.debug:
-            raise
+            traceback.print_exc()
         print(f"roverflow: {_sentence(error)}", file=sys.stderr)
         return _exit_code(error)
 

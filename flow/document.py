@@ -93,7 +93,8 @@ def settled(tree: Value, overrides: Iterable[str]) -> Value:
         elif inner:
             raise value.place.error(f"there is no stream '{name}'{nearest(name, [*entries, *settings])}")
         elif name in entries:
-            raise value.place.error(f"say which parameter of '{name}' to set, as in {name}.param=value")
+            said = f"say which parameter of '{name}' to set, as in {name}.param=value"
+            raise value.place.error(f"{said}{nearest(name, settings)}")
         else:
             raise value.place.error(f"the pipeline has no setting '{name}'{nearest(name, settings)}")
     tree = _filled_in(tree, settings)

@@ -129,7 +129,7 @@ class _Builder:
         try:
             getattr(actor, "check_inputs", lambda inputs: None)(set(inputs))
         except ValueError as error:
-            raise item.place.error(str(error)) from error
+            raise item.place.error(f"stream '{name}': {error}") from error
         output = output_of(actor, {port: kinds[stream] for port, stream in inputs.items()}, item.place)
         clock = clock_of(name, actor, {port: clocks[stream] for port, stream in inputs.items()}, item.place)
         return Node(name, self._use(item, name), actor, inputs, output, clock, optional.value, item.place)

@@ -33,7 +33,7 @@ def coerced(value: Any, kind: Any, parameter: Field[Any]) -> Any:
 
 
 def _number(value: Any, kind: type, parameter: Field[Any]) -> float | int:
-    unit = parameter.metadata.get("unit", "")
+    unit, given = parameter.metadata.get("unit", ""), value
     if isinstance(value, str):
         value = quantity(value, unit)
         if kind is int and float(value).is_integer():
@@ -50,5 +50,5 @@ def _number(value: Any, kind: type, parameter: Field[Any]) -> float | int:
         (high is not None and value > high, f"at most {high}"),
     ):
         if wrong:
-            raise ValueError(f"must be {wanted}{f' {unit}' if unit else ''}, not {value}")
+            raise ValueError(f"must be {wanted}{f' {unit}' if unit else ''}, not {given}")
     return kind(value)  # type: ignore[no-any-return]

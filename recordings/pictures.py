@@ -131,7 +131,8 @@ def _bar(page: Array, low: float, high: float, palette: int) -> None:
     ramp = paint.colours(np.linspace(high, low, length), low, high, palette)
     page[top : top + length, left : left + 28] = ramp[:, None]
     for share in np.linspace(0.0, 1.0, 5):
-        _text(page, f"{high + share * (low - high):.3g}", (left + 36, round(top + share * (length - 1)) + 6))
+        value = high + share * (low - high)
+        _text(page, f"{round(value, 9) + 0.0:.3g}", (left + 36, round(top + share * (length - 1)) + 6))
     _swatch(page, (left, top + length + 20), "unknown", paint.UNKNOWN_RGB)
 
 

@@ -176,7 +176,8 @@ class Match(Stage):
             raise ValueError(f"Match: the prior must be a stages.Disparity, not a {type(prior).__name__}")
         if prior is not None and prior.pixels.shape != (height, width):
             raise ValueError(
-                f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; resize it before"
+                f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; "
+                "stages.Enlarge makes a coarser one fit"
             )
 
     def _penalties(self) -> tuple[int, int]:

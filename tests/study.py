@@ -131,9 +131,9 @@ def thrice(streams: dict[str, Any], case: Case) -> Disparity:
     return again(case.frame, streams["disparity"])
 
 
-def half_range(streams: dict[str, Any], case: Case) -> Disparity:
-    """`rover` with half the search range; what is nearer is found in smaller images first."""
-    return stereo_part("rover", case.frame, case.disparities // 2, entry="rectified")["disparity"]  # type: ignore[no-any-return]
+def part_of_range(part: int) -> Chain:
+    """`rover` with one `part` of the search range; what is nearer is found in smaller images first."""
+    return lambda _, case: stereo_part("rover", case.frame, case.disparities // part, entry="rectified")["disparity"]
 
 
 def by_rows(streams: dict[str, Any], case: Case) -> Disparity:
@@ -169,7 +169,8 @@ VARIANTS: dict[str, Chain] = {
     "rover, all rows the whole range": remade(matched=unbanded),
     "rover, again the whole range": remade(matched_again=everywhere),
     "rover, matched a third time": remade(matched_again=thrice),
-    "rover with half the range": half_range,
+    "rover with half the range": part_of_range(2),
+    "rover with a third of the range": part_of_range(3),
     "rover without planes": refined("checked_again", plane_weight=0, plane_fill=False, surface=0),
     "rover without surfaces": refined("checked_again", surface=0),
     "rover, planes draw more: 0.7": refined("checked_again", plane_weight=0.7),

@@ -75,8 +75,23 @@ def test_a_file_that_is_no_log_is_refused_in_one_sentence(tmp_path, capsys, cont
 
 def test_what_a_stage_cannot_do_without_is_asked_for_before_anything_runs(traverse, tmp_path, capsys):
     assert roverflow("run", traverse, "--set", "rough.around=4", "-o", tmp_path / "out.mcap") == 2
-    assert "Match.around = 4 px needs a `prior`" in capsys.readouterr().err
+    assert "stream 'rough': Match.around = 4 px needs a `prior`" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("disparity=96", "disparity.param=value; did you mean 'disparities'?"),
+        ("max_slope=95deg", "must be at most 1.5 rad, not 95deg"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_told_as_it_was_written(traverse, tmp_path, capsys, change, words):
+    for more in ((), ("--debug",)):  # which shows the way there, and changes no exit code
+        assert roverflow("run", traverse, "--set", change, "-o", tmp_path / "out.mcap", *more) == 2
+        said = capsys.readouterr().err
+        assert said.endswith(f"{words}\n")
+        assert ("Traceback" in said) == bool(more)
 
 
 @pytest.mark.parametrize("option", ["-o", "--rrd", "--summary"])
