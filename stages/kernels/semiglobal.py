@@ -5,7 +5,7 @@ disparities. Meeting in the middle lets two threads share a frame: one sweeps th
 the lower half up, then each goes on through the other's half. No path is cut, so the result has the same bits.
 
 The sums of a large image would not fit the memory. Then the first visit to a half leaves only the path costs at the
-head of each band of rows, and before the second sweep enters a band, its sums are made again from there: exact too,
+head of each stripe of rows, and before the second sweep enters a stripe, its sums are made again from there: exact too,
 at 1.4 times the time.
 
 Rows may be searched for a part of the range only, each band of them for its own (stages.kernels.ranges).
@@ -146,19 +146,19 @@ def _sweep(  # type: ignore[no-untyped-def]
 def _halves(
     pair: Pair, rule: Rule, space: Workspace, ranges: list[Range], memory: int, pixels: Array, evidence: Array
 ) -> list[_Half]:
-    """Both halves of the image, in bands whose sums take no more than `memory` bytes together."""
+    """Both halves of the image, in stripes whose sums take no more than `memory` bytes together."""
     height, columns = pixels.shape
     size = columns * max(each.width.lanes for each in ranges)
     middle = height // 2
     largest = height - middle
-    # Shorter bands would take more for their heads than they save.
-    band = largest if 2 * largest * size <= memory else max(memory // (2 * size), math.isqrt(3 * largest))
-    heads = 0 if band == largest else -(-largest // band)
+    # Shorter stripes would take more for their heads than they save.
+    stripe = largest if 2 * largest * size <= memory else max(memory // (2 * size), math.isqrt(3 * largest))
+    heads = 0 if stripe == largest else -(-largest // stripe)
     moves = 2 if len(ranges) > 1 else 0  # of paths, from one range to another
-    space.reserve(2 * (size * (10 + band + 3 * (heads + moves)) + 64 * (8 + heads + moves)))
+    space.reserve(2 * (size * (10 + stripe + 3 * (heads + moves)) + 64 * (8 + heads + moves)))
     sweep = functools.partial(_sweep, pair, rule, pixels, evidence)
     rows = range(middle), range(height - 1, middle - 1, -1)
-    return [_Half(part, band, heads > 0, space, sweep, ranges, columns, rule) for part in rows]
+    return [_Half(part, stripe, heads > 0, space, sweep, ranges, columns, rule) for part in rows]
 
 
 class _Paths:
@@ -191,39 +191,39 @@ class _Half:
     """The rows from one end of the image to its middle, and the sweep that begins at that end."""
 
     def __init__(
-        self, rows: range, band: int, banded: bool, space: Workspace, sweep: Callable[..., None], ranges: list[Range],
-        columns: int, rule: Rule,
+        self, rows: range, stripe: int, striped: bool, space: Workspace, sweep: Callable[..., None],
+        ranges: list[Range], columns: int, rule: Rule,
     ) -> None:  # fmt: skip
-        """rows: from the end inwards; band: how many at a time; banded: one of the halves does not fit into a band, so
-        that either has its sums made again, in the memory of the sweep that crosses it."""
+        """rows: from the end inwards; stripe: how many at a time; striped: one of the halves does not fit into a
+        stripe, so that either has its sums made again, in the memory of the sweep that crosses it."""
         widths = {each.width.lanes for each in ranges}
         self.sweep, self.ranges, self.columns, self.minimum = sweep, ranges, columns, rule.minimum
         self.size = size = columns * max(widths)
-        self.bands = [rows[i : i + band] for i in range(0, len(rows), band)]
+        self.stripes = [rows[i : i + stripe] for i in range(0, len(rows), stripe)]
         self.paths, self.again = (_Paths(space, size, len(ranges) > 1) for _ in range(2))
-        self.sums = space.bytes(band * size)
-        self.heads = [_Paths(space, size, False) for _ in self.bands] if banded else []
+        self.sums = space.bytes(stripe * size)
+        self.heads = [_Paths(space, size, False) for _ in self.stripes] if striped else []
         rows_of_bytes = space.bytes(size), space.bytes(2 * size), space.bytes(size)
         self.scratch = {lanes: _scratch(lanes, columns, rule.disparities, *rows_of_bytes) for lanes in widths}
         self.tops = {lanes: min(lanes, rule.disparities) - 1 for lanes in widths}
 
     def arrive(self) -> None:
-        """Sweep to the middle. The sums stay, or else the path costs at the head of each band."""
+        """Sweep to the middle. The sums stay, or else the path costs at the head of each stripe."""
         self.paths.begin()
-        for i, band in enumerate(self.bands):
+        for i, stripe in enumerate(self.stripes):
             if self.heads:
                 self.heads[i].take(self.paths)
-            self._sweep(band, self.paths, self.sums, final=False)
+            self._sweep(stripe, self.paths, self.sums, final=False)
 
     def cross(self, other: _Half) -> None:
         """Sweep on from the middle to the other end, and select the disparities of that half."""
-        for i, band in reversed(list(enumerate(other.bands))):
+        for i, stripe in reversed(list(enumerate(other.stripes))):
             sums = other.sums
             if other.heads:
                 sums = self.sums
                 self.again.take(other.heads[i])
-                self._sweep(band, self.again, sums, final=False)
-            self._sweep(band[::-1], self.paths, sums, final=True)
+                self._sweep(stripe, self.again, sums, final=False)
+            self._sweep(stripe[::-1], self.paths, sums, final=True)
 
     def _sweep(self, rows: range, paths: _Paths, sums: Array, final: bool) -> None:
         origin = min(rows[0], rows[-1])

@@ -197,7 +197,7 @@ def test_the_bits_depend_neither_on_threads_nor_on_memory_nor_on_company(slope, 
     alone = match(frame)
     with ThreadPoolExecutor(3) as workers:
         others = list(workers.map(lambda stage: stage(frame), [replace(match, threads=t) for t in (1, 2, 3, 2)]))
-    # 200 rows of 320 * 64 bytes are 4 MB: bands of 25 rows
+    # 200 rows of 320 * 64 bytes are 4 MB: stripes of 25 rows
     others += [replace(match, memory=1, threads=threads)(frame) for threads in (1, 2)]
     assert all(same(other, alone) for other in others)
 
@@ -336,14 +336,14 @@ def test_real_scenes_are_matched_better_than_by_opencv():
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("height", [24, 25, 26, 27])  # a band holds 12 rows of 640 * 64 bytes: one half, both, or none
-def test_bands_give_the_same_bits_when_the_halves_differ(height, threads):
+@pytest.mark.parametrize("height", [24, 25, 26, 27])  # a stripe: 12 rows of 640 * 64 bytes: one half, both, none
+def test_stripes_give_the_same_bits_when_the_halves_differ(height, threads):
     frame, _ = slanted_pair(height=height, width=640)
-    whole, bands = (Match(disparities=64, memory=memory, threads=threads)(frame) for memory in (400, 1))
-    assert same(bands, whole)
+    whole, stripes = (Match(disparities=64, memory=memory, threads=threads)(frame) for memory in (400, 1))
+    assert same(stripes, whole)
 
 
-def test_a_frame_larger_than_the_memory_is_matched_in_bands():
+def test_a_frame_larger_than_the_memory_is_matched_in_stripes():
     frame, truth = slanted_pair(height=256, width=1024, near=500.0, far=450.0)
     result = Match(disparities=512, memory=20)(StereoFrame(0, frame.left, frame.right, frame.camera))
     visible = np.arange(1024) >= truth + 2
