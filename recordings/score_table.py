@@ -20,8 +20,29 @@ def format_score(found: Score) -> str:
         parts.append(_disparity_lines(found.disparity))
     if found.terrain is not None:
         parts.append(format_terrain(found.terrain))
-    parts.append([*_tilt_lines(found), *(format_pose(found.pose) if found.pose is not None else [])])
+    parts.append(_pose_lines(found))
     return "\n\n".join("\n".join(lines) for lines in parts if lines)
+
+
+def format_brief(found: Score) -> str:
+    """The main figures in a few lines for a terminal."""
+    lines = _frame_lines(found)
+    if found.disparity is not None:
+        seen = found.disparity["whole_image"]["nonocc"]
+        off = f"{_percent(seen['bad_1'])} off by over 1 px, or unknown"
+        lines.append(f"disparity    of what both cameras see, {off}; RMS error {_number(seen['rmse'], 2)} px")
+    if found.terrain is not None:
+        rings, hazards, rocks = (found.terrain[name] for name in ("heights", "hazards", "rocks"))
+        known = _percent(rings["0-8 m"]["completeness"])
+        near, far = (_number(100 * rings[ring]["raw"]["rmse"], 1) for ring in ("0-4 m", "0-8 m"))
+        recall, missed, alarms = (_percent(hazards[name]) for name in ("recall", "false_safe", "false_alarm"))
+        in_view = (f"{rock['found']:.0f} of {rock['in_view']:.0f}" for rock in rocks.values())
+        lines += [
+            f"elevation    {known} of seen cells known; RMS error {near} cm to 4 m away, {far} cm to 8 m",
+            f"hazards      {recall} of their cells found, {missed} called free; of free cells {alarms} called hazards",
+            f"rocks        {' of 0.2 m and higher in view found, '.join(in_view)} of 0.3 m and higher",
+        ]
+    return "\n".join([*lines, *_pose_lines(found)])
 
 
 def _frame_lines(found: Score) -> list[str]:
@@ -73,6 +94,10 @@ def _region_line(name: str, m: dict[str, float]) -> str:
 def _known_line(name: str, m: dict[str, float]) -> str:
     bad = "".join(f"{_percent(m[f'bad_{limit:g}_known']):>8}" for limit in THRESHOLDS)
     return f"               {f'{name}, of the known':<33} |{bad} |"
+
+
+def _pose_lines(found: Score) -> list[str]:
+    return [*_tilt_lines(found), *(format_pose(found.pose) if found.pose is not None else [])]
 
 
 def _tilt_lines(found: Score) -> list[str]:

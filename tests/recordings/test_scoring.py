@@ -18,7 +18,7 @@ from flow.cli import main
 from recordings import ros2, scoring
 from recordings.errors import LogError
 from recordings.ros2 import Ros2Writer
-from recordings.score_table import format_score
+from recordings.score_table import format_brief, format_score
 from recordings.simulator import Simulation, log
 from recordings.terrain_measures import ROWS, format_terrain
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
@@ -378,10 +378,16 @@ def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
     ]  # fmt: skip
     assert max(map(len, table.splitlines())) <= 100
     assert all(label in table for label in ROWS)
+    brief = format_brief(found).splitlines()
+    assert brief[:2] == table.splitlines()[:2]
+    figures = {line.split()[0]: line for line in brief}
+    assert {"disparity", "elevation", "hazards", "rocks", "tilt"} <= figures.keys()
+    assert "RMS error 2.0 cm to 4 m away, 2.0 cm to 8 m" in figures["elevation"]
+    assert max(map(len, brief)) <= 100
     read = json.loads(found.to_json())
     assert read["terrain"]["heights"]["0-4 m"]["raw"]["bias"] == pytest.approx(0.02, abs=1e-6)
     assert read["per_frame"][0]["stamp"] == SMALL.stamp(0)
     empty = scored(tmp_path, truth, frames, elevation=lambda layer: np.full_like(layer, np.nan))
     assert json.loads(empty.to_json())["terrain"]["heights"]["0-4 m"]["raw"]["rmse"] is None
-    assert "nan" not in format_score(empty)
+    assert "nan" not in format_score(empty) + format_brief(empty)
     assert " 0.00% |      -      -      -      -            -" in format_score(empty)
