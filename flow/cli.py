@@ -38,27 +38,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.getLogger("numba").setLevel(logging.WARNING)
     try:
         return int(options.command(options))
-    except KeyboardInterrupt:
-        print("roverflow: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:
+        if _interrupted(error):
+            print("roverflow: interrupted", file=sys.stderr)
+            return INTERRUPTED
         if options.debug:
             traceback.print_exc()
-        print(f"roverflow: {_sentence(error)}", file=sys.stderr)
+        print(f"roverflow: {_sentence(error, options.debug)}", file=sys.stderr)
         return _exit_code(error)
 
 
-def _sentence(error: Exception) -> str:
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether an interrupt is behind it: of one that comes while compiled code runs, Python makes a SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _sentence(error: BaseException, shown: bool) -> str:
+    """What is wrong; shown: whether the way there is shown already."""
     if isinstance(error, RoverflowError | LogError):
         return str(error)
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'the output'}: {error.strerror}"
     if "cannot cache function" in str(error):  # numba, whose own words name neither the reason nor the remedy
         return "there is no folder to keep compiled kernels in; set NUMBA_CACHE_DIR to one that can be written"
-    return f"internal failure, {type(error).__name__}: {error} (--debug shows where)"
+    return f"internal failure, {type(error).__name__}: {error}{'' if shown else ' (--debug shows where)'}"
 
 
-def _exit_code(error: Exception) -> int:
+def _exit_code(error: BaseException) -> int:
     if isinstance(error, RoverflowError):
         return error.exit_code
     return UNUSABLE if isinstance(error, LogError) and not isinstance(error, UnwritableError) else FAILED

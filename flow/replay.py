@@ -39,7 +39,6 @@ def replay(
         if path is not None:
             outputs[use] = path
     keep_freed_memory()
-    sys.setswitchinterval(0.0002)  # s; a worker whose kernel is through must not wait long for one that draws
     cv2.setNumThreads(1)  # frames in flight fill the cores, not threads inside one call
     stop = Stop()
     with graph.source.open(log, start=start, end=end) as opened, threadpool_limits(1):

@@ -50,7 +50,9 @@ def quantity(text: str, unit: str) -> float:
         raise ValueError(f"'{text}' has the unknown unit '{given}'; expected {', '.join(known)}")
     kind, size = UNITS[given]
     if kind != wanted:
-        raise ValueError(f"'{text}' is {_a(kind)}; expected {f'{_a(wanted)} in {unit}' if unit else 'a plain number'}")
+        usual = _WRITTEN.get(wanted, (unit,))
+        units = unit if unit in usual else " or ".join(usual)
+        raise ValueError(f"'{text}' is {_a(kind)}; expected {f'{_a(wanted)} in {units}' if unit else 'a plain number'}")
     if given == unit or number == 0 or not math.isfinite(number):
         return number
     return float(Fraction(match[1]) * Fraction(size) / Fraction(base))  # 4.1 ms are 4100000 ns, not a bit less

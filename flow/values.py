@@ -42,7 +42,7 @@ def _number(value: Any, kind: type, parameter: Field[Any]) -> float | int:
         check_bare(value, unit)
     if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
         wanted = {"int": "a whole number", "float": "a number"}[kind.__name__]
-        raise ValueError(f"expected {wanted}{f' in {unit}' if unit else ''}, not {value!r}")
+        raise ValueError(f"expected {wanted}{f' in {unit}' if unit else ''}, not {given!r}")
     low, high = parameter.metadata.get("low"), parameter.metadata.get("high")
     for wrong, wanted in (
         (not math.isfinite(value), "finite"),

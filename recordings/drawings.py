@@ -134,7 +134,7 @@ class Canvas:
         """The legend of a colour map: three of its values above the picture."""
         values = np.linspace(low, high, 3)
         colours = [(int(r), int(g), int(b)) for r, g, b in paint.colours(values, low, high, palette)]
-        names = [f"{value:.3g} {unit}" for value in values]
+        names = [f"{paint.figure(value)} {unit}" for value in values]
         self.legend(path, shape, zip(names, colours, strict=True))
 
     def legend(self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, paint.Rgb]]) -> None:

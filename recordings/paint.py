@@ -121,7 +121,8 @@ def _behind(grid: ElevationMap | NavigationMap, known: Array) -> tuple[int, tupl
 
 
 def elevation_limits(elevation: Array) -> tuple[float, float]:
-    """The colour range of a terrain, m: its 1st and 99th percentile rounded outwards to 0.1 m, at least 0.2 m apart."""
+    """The colour range of a terrain, m: the 1st and 99th percentile of some of its cells rounded outwards to 0.1 m, at
+    least 0.2 m apart."""
     known = _some_known(elevation)
     if not known.size:
         return 0.0, 1.0
@@ -131,12 +132,18 @@ def elevation_limits(elevation: Array) -> tuple[float, float]:
 
 
 def value_limits(layer: Array) -> tuple[float, float]:
-    """The colour range of any layer: its 1st and 99th percentile; (0, 1) where nothing is known, never empty."""
+    """The colour range of any layer: the 1st and 99th percentile of some of its cells; (0, 1) where nothing is known,
+    never empty."""
     known = _some_known(layer)
     if not known.size:
         return 0.0, 1.0
     low, high = (float(value) for value in np.percentile(known, (1.0, 99.0)))
     return low, high if high > low else low + 1.0
+
+
+def figure(value: float) -> str:
+    """A value of a colour scale in three digits, 0 without a sign."""
+    return f"{round(value, 9) + 0.0:.3g}"
 
 
 def _some_known(layer: Array) -> Array:

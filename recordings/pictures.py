@@ -132,7 +132,7 @@ def _bar(page: Array, low: float, high: float, palette: int) -> None:
     page[top : top + length, left : left + 28] = ramp[:, None]
     for share in np.linspace(0.0, 1.0, 5):
         value = high + share * (low - high)
-        _text(page, f"{round(value, 9) + 0.0:.3g}", (left + 36, round(top + share * (length - 1)) + 6))
+        _text(page, paint.figure(value), (left + 36, round(top + share * (length - 1)) + 6))
     _swatch(page, (left, top + length + 20), "unknown", paint.UNKNOWN_RGB)
 
 

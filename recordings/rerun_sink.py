@@ -6,6 +6,7 @@ its default mere warnings, are raised.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -62,7 +63,7 @@ class RerunSink:
         self._partial = temporary_name(self._path)
         self._stamp: int | None = None
         self._frames, self._hung = 0, -1
-        self._plots: dict[str, list[tuple[int, int, float]]] = {}  # path -> stamp, frame and value
+        self._plots: list[tuple[int, int, dict[str, float]]] = []  # of frames: stamp, number, value of each path
         try:
             self._partial.open("wb").close()
         except OSError as error:
@@ -183,20 +184,25 @@ class RerunSink:
 
     def _plot(self, record: FrameRecord) -> None:
         """Stage times and queues: kept, and sent for many frames at once, for they would be half of all calls."""
-        for root, values in ((SECONDS, record.seconds), (QUEUES, record.queues)):
-            for stage, value in values.items():
-                path, point = f"{root}/{rr.escape_entity_path_part(stage)}", (record.stamp, self._frames, float(value))
+        values = {}
+        for root, numbers in ((SECONDS, record.seconds), (QUEUES, record.queues)):
+            for stage, number in numbers.items():
+                path = f"{root}/{rr.escape_entity_path_part(stage)}"
+                values[path] = float(number)
                 self._canvas.hang(Place(Panel.STAGE, path, stage))
-                self._plots.setdefault(path, []).append(point)
-        if (self._frames + 1) % PLOTTED == 0:
+        self._plots.append((record.stamp, self._frames, values))
+        if len(self._plots) == PLOTTED:
             self._send_plots()
 
     def _send_plots(self) -> None:
-        for path, points in self._plots.items():
-            stamps, frames, values = zip(*points, strict=True)
-            columns = rr.Scalars.columns(scalars=values)
-            self._recording.send_columns(path, indexes=_clocks(stamps, frames), columns=columns, strict=True)
-        self._plots.clear()
+        """Send what is kept; a frame without a stage has a gap in its line."""
+        if not self._plots:
+            return
+        stamps, frames, kept = zip(*self._plots, strict=True)
+        self._plots, clocks = [], _clocks(stamps, frames)
+        for path in [place.path for place in self._canvas.hung.values() if place.panel is Panel.STAGE]:
+            columns = rr.Scalars.columns(scalars=[values.get(path, math.nan) for values in kept])
+            self._recording.send_columns(path, indexes=clocks, columns=columns, strict=True)
 
     def _enter(self, entries: Iterable[LossEntry], frame: int) -> None:
         """Losses, at their own stamps on the log's clock."""

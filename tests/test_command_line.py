@@ -336,6 +336,15 @@ def test_an_interrupted_demo_reports_what_there_is_and_goes_on_to_nothing_else(t
     assert json.loads((folder / "summary.json").read_text())["interrupted"]
 
 
+def test_an_interrupt_inside_compiled_code_is_an_interrupt(traverse, capsys, monkeypatch):
+    def compiled(*arguments, **more):
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr("flow.cli.replay", compiled)
+    assert roverflow("run", traverse, "-o", traverse.with_name("interrupted.mcap")) == 130
+    assert capsys.readouterr().err == "roverflow: interrupted\n"
+
+
 ON_IMPORT = """
 sys.addaudithook(lambda event, what: event == "import" and what[0] == "{}" and os.kill(os.getpid(), signal.SIGINT))
 """

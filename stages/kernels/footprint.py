@@ -1,6 +1,6 @@
 """Least-squares planes over a square window about every cell of a grid, cells without weight left out.
 
-A fit needs nine sums over the window. They are kept running, first down the columns and then along the row, so a cell
+A fit needs ten sums over the window. They are kept running, first down the columns and then along the row, so a cell
 costs the same whatever the window's size; coordinates are shifted to the window's centroid before anything is divided.
 The sums of a row are written down first and then solved without a branch, so that the processor takes several at once.
 """
@@ -94,7 +94,8 @@ def _sum_up(sums, radius, windows):  # type: ignore[no-untyped-def]
 
 @kernel
 def _solve(windows, row, leverage, height, along, across, rough):  # type: ignore[no-untyped-def]
-    """The planes, (cols,) each of their four numbers, of a row's windows; those of no points are NaN throughout."""
+    """The planes, (cols,) each of their four numbers, of a row's windows; NaN where the points are too few, or too
+    nearly in a line."""
     for col in range(windows.shape[1]):
         n, sx, sy, sz = windows[0, col], windows[1, col], windows[2, col], windows[3, col]
         sxx, sxy, syy = windows[4, col], windows[5, col], windows[6, col]
@@ -106,7 +107,8 @@ def _solve(windows, row, leverage, height, along, across, rough):  # type: ignor
         dx, dy = col - mx, row - my
         gx = (vyy * vxz - vxy * vyz) / determinant
         gy = (vxx * vyz - vxy * vxz) / determinant
-        variance = 1.0 + (vyy * dx * dx - 2.0 * vxy * dx * dy + vxx * dy * dy) / determinant  # in cells, times n
+        # Of the height at the cell, in n-ths of one cell's variance
+        variance = 1.0 + (vyy * dx * dx - 2.0 * vxy * dx * dy + vxx * dy * dy) / determinant
         spread = determinant >= _NARROWEST * (vxx + vyy)
         known = (n >= 3.0) & spread & (variance <= leverage * n)
         residual = vzz - gx * vxz - gy * vyz

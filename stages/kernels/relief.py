@@ -16,7 +16,8 @@ def lowest_around(heights: Array, use: Array, trend: Array, radius: int) -> tupl
     """The lowest of the cells about each cell, as it would lie were it moved there along the trend.
 
     heights: (rows, cols) float64, finite where `use`; use: (rows, cols) bool, the cells that count; trend: (2, rows,
-    cols) float64, the slope about each cell, rise per cell along columns (x) and rows (y); radius: cells, of a disc.
+    cols) float64, finite, the slope about each cell, rise per cell along columns (x) and rows (y); radius: cells, of a
+    disc.
 
     Returns two (rows, cols) float64: that height, NaN where `use` is not, at most the cell's own; and the share of the
     disc's cells that count, those beyond the grid's border being missing.

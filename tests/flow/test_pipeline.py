@@ -112,6 +112,7 @@ def test_a_key_of_a_setting_is_replaced_wherever_it_is_named_or_in_one_place_alo
         ("25 cm", "quick", 5, ["factor", "'quick' is not a number"]),
         ("25 cm", "25 ms", 5, ["'25 ms' is a time", "expected a length in m"]),
         ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'; expected mm, cm, m, km"]),
+        ("5 ms", "5 m", 3, ["'5 m' is a length; expected a time in ms or s"]),
         ("25 cm", "25 rad", 5, ["'25 rad' is an angle; expected a length in m"]),
         ("25 cm", "25 px", 5, ["'25 px' is a number of pixels; expected a length in m"]),
         ("25 cm", "-1 m", 5, ["at least 0 m"]),

@@ -188,3 +188,15 @@ def test_a_picture_leaves_out_what_lies_behind_the_rover_unless_something_is_kno
     assert paint.navigation_ahead(navigation).cells[1, 30] == 0
     behind = np.where(np.arange(80) == 3, np.float32(1.0), elevation)
     assert paint.terrain_ahead(ElevationMap(0, {"elevation": behind}, 0.05, (-2.0, 0.0), "level")).shape == (4, 80)
+
+
+@pytest.mark.parametrize(("value", "said"), [(-0.0, "0"), (-5.55e-17, "0"), (-0.25, "-0.25"), (112.0, "112")])
+def test_a_scale_names_its_values_in_few_digits_and_has_no_minus_zero(value, said):
+    assert paint.figure(value) == said
+
+
+def test_a_colour_range_is_that_of_the_whole_layer_though_found_from_a_part():
+    layer = np.linspace(-1.0, 1.0, 20 * paint.SAMPLE, dtype=np.float32).reshape(-1, 64)
+    assert paint.value_limits(layer) == pytest.approx((-0.98, 0.98), abs=1e-3)
+    assert paint.elevation_limits(layer) == pytest.approx((-1.0, 1.0))
+    assert paint.disparity_limit(100.0 * layer) == 112.0

@@ -25,6 +25,7 @@ def test_other_readers_find_every_value(shape, content):
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(blob))), pixels)
 
 
-def test_rows_need_not_follow_each_other_in_memory():
-    pixels = np.random.default_rng(2).integers(0, 1 << 16, (30, 40), np.uint16)[::2, ::-1]
+@pytest.mark.parametrize("lie", [lambda pixels: pixels[::2, ::-1], np.transpose, lambda pixels: pixels.astype(">u2")])
+def test_pixels_may_lie_in_memory_in_any_way(lie):
+    pixels = lie(np.random.default_rng(2).integers(0, 1 << 16, (30, 40), np.uint16))
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(png16(pixels), np.uint8), cv2.IMREAD_UNCHANGED), pixels)

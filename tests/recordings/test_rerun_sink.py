@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import resource
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import rerun as rr
 
 from recordings.desk import CLOCK, FRAME
 from recordings.errors import LogError
-from recordings.rerun_sink import RESERVE, RerunSink
+from recordings.rerun_sink import PLOTTED, RESERVE, RerunSink
 from stages.data import Mount
 from tests.recordings.recorded_scene import START, STEP, STREAMS, Loss, Record, entities, record_of, rows, scene
 
@@ -69,6 +70,33 @@ def test_what_a_frame_lacks_is_cleared_at_that_frame(tmp_path: Path) -> None:
     ):  # fmt: skip
         blobs = [value for *_, value in rows(path, entity, f"{kind}:blob")]
         assert [bool(blob) for blob in blobs] == [True, False, True], entity
+
+
+def test_the_times_of_every_frame_are_there_once_and_have_a_gap_where_a_frame_lacks_a_stage(tmp_path: Path) -> None:
+    """However many frames are sent at once."""
+    count, without = 2 * PLOTTED + 1, (5, PLOTTED)
+    records = [
+        Record(START + n * STEP, {}, seconds={"matched": float(n)} if n not in without else {}, queues={"matched": n})
+        for n in range(count)
+    ]
+    path = record_of(tmp_path / "long.rrd", records)
+    expected = [(START + n * STEP, n, [float(n)]) for n in range(count)]
+    assert rows(path, "/queues/matched", "Scalars:scalars") == expected
+    times = rows(path, "/seconds/matched", "Scalars:scalars")
+    assert [row[:2] for row in times] == [row[:2] for row in expected]
+    assert [n for _, n, (value,) in times if math.isnan(value)] == list(without)
+    assert [value for _, n, value in times if n not in without] == [row[2] for row in expected if row[1] not in without]
+
+
+def test_a_sink_that_is_opened_again_knows_nothing_of_the_recording_before(tmp_path: Path) -> None:
+    sink = RerunSink()
+    for name, end in (("given up", sink.discard), ("second", lambda: sink.close({"verdict": "COMPLETE"}))):
+        sink.open(tmp_path / f"{name}.rrd", STREAMS, {})
+        sink.write(Record(START, scene(), seconds={name: 1.0}))
+        end()
+    assert [path.name for path in tmp_path.iterdir()] == ["second.rrd"]
+    drawn = {entity for entity in entities(tmp_path / "second.rrd") if entity.startswith("/seconds/")}
+    assert drawn == {"/seconds/second"}
 
 
 def test_losses_are_told_at_their_own_stamps(tmp_path: Path) -> None:
