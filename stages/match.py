@@ -64,7 +64,7 @@ class Match(Stage):
 
     With `around` only what is near to the prior is searched: in a fraction of the time, beyond the range, too, and not
     at all where the prior is unknown or beyond `farthest`. Of each pixel `2 around + 7` disparities, rounded up to 16,
-    are searched, which take 3 bytes each, whatever `memory` is.
+    are searched, which take 2 bytes each, whatever `memory` is.
 
     With a `band_height` each band of rows is searched for what the prior has in it, but for a thousandth at either end,
     and for 8 px more to either side, in all for 64 or 128 disparities or, where that is not enough or the prior knows

@@ -91,16 +91,17 @@ def search_around(
     first, width = windows
     height, columns = pixels.shape
     size, slots = columns * width.lanes, _slots(columns, width.lanes)
-    space.reserve(3 * (height * size + 64) + 14 * (slots + 64))
-    costs, down, up = (space.array((height, size), np.uint8) for _ in range(3))
+    space.reserve(2 * (height * size + 64) + 14 * (slots + 64))
+    costs, sums = (space.array((height, size), np.uint8) for _ in range(2))
     one, other = (space.array((7, slots), np.uint8) for _ in range(2))
     upper, lower = (0, height // 2), (height // 2, height)
     make = functools.partial(_costs, pair, rule, width, first, costs)
-    sweep = functools.partial(_sweep, pair.steps, rule, width, first, costs)
-    select = functools.partial(_select, rule, width, first, int(first.min()), int(first.max()), down, up)
+    arrive = functools.partial(_arrive, pair.steps, rule, width, first, costs, sums)
+    lanes = int(first.min()), int(first.max())
+    cross = functools.partial(_cross, pair.steps, rule, width, first, costs, sums, *lanes, pixels, evidence)
     both(lambda: make(upper, one), lambda: make(lower, other))
-    both(lambda: sweep(1, one, down), lambda: sweep(-1, other, up))
-    both(lambda: select(upper, pixels, evidence), lambda: select(lower, pixels, evidence))
+    both(lambda: arrive(upper, 1, one), lambda: arrive(lower, -1, other))
+    both(lambda: cross(lower, 1, one), lambda: cross(upper, -1, other))
 
 
 def _slots(columns: int, lanes: int) -> int:
@@ -181,35 +182,42 @@ def _smooth(pair, first, y, rows, costs, width):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sweep(steps, rule, width, first, costs, step, rows, sums):  # type: ignore[no-untyped-def]
-    """The sums of the paths of a sweep down (step 1) or up (-1), as `aggregation.aggregate_row` follows them."""
-    n, (height, columns) = lanes_in(width), first.shape
-    nothing, p1, table = spread(0, width), spread(rule.p1, width), rule.table
+def _arrive(steps, rule, width, first, costs, sums, span, step, rows):  # type: ignore[no-untyped-def]
+    """The sums of the paths of a sweep down (step 1) or up (-1) in rows span[0] to span[1] (exclusive), with which it
+    begins; the paths stay in `rows`."""
     rows[:] = FAR
     for k in range(6):
-        for x in range(-1, columns + 1):
-            store(rows[k], _slot(x, width), nothing)  # a path begins here
+        for x in range(-1, first.shape[1] + 1):
+            store(rows[k], _slot(x, width), spread(0, width))  # a path begins here
+    for i in range(span[1] - span[0]):
+        y = span[0] + i if step > 0 else span[1] - 1 - i
+        _add_paths(steps, rule, width, first, y, step, costs[y], rows, sums[y])
+
+
+@part
+def _add_paths(steps, rule, width, first, y, step, from_cost, rows, total):  # type: ignore[no-untyped-def]
+    """Row y of a sweep: its paths, as `aggregation.aggregate_row` follows them, and their sums."""
+    n, (height, columns) = lanes_in(width), first.shape
+    nothing, p1, table = spread(0, width), spread(rule.p1, width), rule.table
     up = 1 if step < 0 else 0  # steps of brightness are those from above and from the left
-    for i in range(height):
-        y = i if step > 0 else height - 1 - i
-        before, after = 3 * (i & 1), 3 * (1 - (i & 1))
-        path, begin, from_cost, total = nothing, 0, costs[y], sums[y]
-        for j in range(columns):
-            x = j if step > 0 else columns - 1 - j
-            cost, here = load(from_cost, x * n, width), first[y, x]
-            later = here - begin if j > 0 else 0
-            path = _next_beside(path, rows[6], later, cost, p1, byte(table, byte(steps[0, y], x + 1 + up)), width)
-            begin, so_far = here, path
-            for side in range(1, 4):
-                if side == 2 or rule.diagonals:
-                    across = (side - 2) * step
-                    inside = i > 0 and 0 <= x + across < columns
-                    later = here - first[y - step, x + across] if inside else 0
-                    p2 = byte(table, byte(steps[side, y + up], x + 1 - up * (side - 2)))
-                    moved = _next_from(rows[before + side - 1], _place(x + across, later, width), cost, p1, p2, width)
-                    store(rows[after + side - 1], _slot(x, width), moved)
-                    so_far = plus_capped(so_far, moved)
-            store(total, x * n, so_far)
+    before, after = 3 * (y & 1), 3 * (1 - (y & 1))
+    path, begin = nothing, 0
+    for j in range(columns):
+        x = j if step > 0 else columns - 1 - j
+        cost, here = load(from_cost, x * n, width), first[y, x]
+        later = here - begin if j > 0 else 0
+        path = _next_beside(path, rows[6], later, cost, p1, byte(table, byte(steps[0, y], x + 1 + up)), width)
+        begin, so_far = here, path
+        for side in range(1, 4):
+            if side == 2 or rule.diagonals:
+                across = (side - 2) * step
+                inside = 0 <= y - step < height and 0 <= x + across < columns
+                later = here - first[y - step, x + across] if inside else 0
+                p2 = byte(table, byte(steps[side, y + up], x + 1 - up * (side - 2)))
+                moved = _next_from(rows[before + side - 1], _place(x + across, later, width), cost, p1, p2, width)
+                store(rows[after + side - 1], _slot(x, width), moved)
+                so_far = plus_capped(so_far, moved)
+        store(total, x * n, so_far)
 
 
 @part
@@ -229,8 +237,11 @@ def _next_from(row, place, cost, p1, p2, width):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _select(rule, width, first, lowest, highest, down, up, span, pixels, evidence):  # type: ignore[no-untyped-def]
-    """Disparities and evidence of rows span[0] to span[1] (exclusive), as `selection` finds and checks them."""
+def _cross(  # type: ignore[no-untyped-def]
+    steps, rule, width, first, costs, sums, lowest, highest, pixels, evidence, span, step, rows
+):
+    """Disparities and evidence of rows span[0] to span[1] (exclusive), into which a sweep goes on that has come with
+    the paths in `rows`; the sums of the other are there. As `selection` finds and checks them."""
     n, columns = lanes_in(width), first.shape[1]
     total, best = np.empty(columns * n, np.uint8), np.empty(columns + n, np.uint8)
     order = np.arange(highest - lowest + n).astype(np.uint16)
@@ -241,17 +252,19 @@ def _select(rule, width, first, lowest, highest, down, up, span, pixels, evidenc
         np.empty((4, columns), np.uint16),
         np.empty(columns, np.int16),
     )
-    for y in range(span[0], span[1]):
+    for i in range(span[1] - span[0]):
+        y = span[0] + i if step > 0 else span[1] - 1 - i
+        _add_paths(steps, rule, width, first, y, step, costs[y], rows, total)
         best[:] = 255
-        one, other, begin = down[y], up[y], first[y]
+        other, begin = sums[y], first[y]
         for x in range(columns):
-            sums = plus_capped(load(one, x * n, width), load(other, x * n, width))
-            store(total, x * n, sums)
-            find_winner(sums, total, guard, x, winner, votes, width)
+            both = plus_capped(load(total, x * n, width), load(other, x * n, width))
+            store(total, x * n, both)
+            find_winner(both, total, guard, x, winner, votes, width)
             right = columns - 1 - x + begin[x]
             known, here = load(best, right, width), load(order, begin[x] - lowest, width)
-            store(chosen, right, where_less(sums, known, here, load(chosen, right, width)))
-            store(best, right, lesser(sums, known))
+            store(chosen, right, where_less(both, known, here, load(chosen, right, width)))
+            store(best, right, lesser(both, known))
         for x in range(columns):
             partners[x] = chosen[columns - 1 - x + begin[x] + winner[x]] + lowest - begin[x]
         fit_row(winner, votes, partners, begin, n - 1, rule, pixels[y], evidence[y])
