@@ -28,6 +28,7 @@ from stages.data import Array, ElevationMap, Pose, StereoFrame
 
 RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well
 PLOTTED = 32  # frames whose times and queues are sent at once
+STEPS = rr.components.InterpolationMode.StepAfter  # how numbers of frames are drawn
 END = b"RRF2FOOT"  # the last magic number of a whole recording, before a checksum of 4 bytes
 
 
@@ -189,6 +190,8 @@ class RerunSink:
             for stage, number in numbers.items():
                 path = f"{root}/{rr.escape_entity_path_part(stage)}"
                 values[path] = float(number)
+                if root == QUEUES and (Panel.STAGE, path) not in self._canvas.hung:
+                    self._recording.log(path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
                 self._canvas.hang(Place(Panel.STAGE, path, stage))
         self._plots.append((record.stamp, self._frames, values))
         if len(self._plots) == PLOTTED:

@@ -122,6 +122,8 @@ def test_the_camera_stands_where_the_cloud_was_seen_from(rrd: Path) -> None:
 def test_scalars_are_those_of_the_frame(rrd: Path) -> None:
     assert [value for *_, value in rows(rrd, "/seconds/disparity", "Scalars:scalars")] == [[0.5]] * 3
     assert [value for *_, value in rows(rrd, "/queues/matched", "Scalars:scalars")] == [[3.0]] * 3
+    steps = rows(rrd, "/queues/matched", "SeriesLines:interpolation_mode")
+    assert [value for *_, value in steps] == [[rr.components.InterpolationMode.StepAfter.value]]  # for all frames
     tilt = rows(rrd, "/tilt/x\\ axis\\ up", "Scalars:scalars")[0][2]
     assert tilt == [pytest.approx(np.degrees(0.1))]
 
