@@ -1,11 +1,11 @@
 """Maps against the exact truth of simulated traverses: `rover` and `paper`, and `rover` given true disparity and tilt.
 
-Run as `python -m tests.bench.terrain [--seeds 11 12 13] [--rocks 0.05 0.15] [--frames 30] [--stride 1] [--json FILE]`;
-a stride of 10 makes a short form. Ground of 5 degrees RMS over 1 m, that is slopes to 15 degrees and a few beyond;
-inclinometer noise 0.3 degrees; everything else is the simulator's default. Each frame goes through the stages as the
-pipelines set them, one after the other on one core. Whether stated sigmas with the tilt's hold is counted for every
-frame with the tilt errors of all frames, and of as many times between: what they are off by, a frame's cells are off
-by together.
+Run as `python -m tests.bench.terrain [--seeds 11 12 13] [--rocks 0.05 0.15] [--frames 30] [--stride 1] [--size WxH]
+[--json FILE]`; a stride of 10 makes a short form. Ground of 5 degrees RMS over 1 m, that is slopes to 15 degrees and a
+few beyond; inclinometer noise 0.3 degrees; everything else is the simulator's default. Each frame goes through the
+stages as the pipelines set them, one after the other on one core. Whether stated sigmas with the tilt's hold is counted
+for every frame with the tilt errors of all frames, and of as many times between: what they are off by, a frame's cells
+are off by together.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flow import arguments
 from flow.align import Token
 from flow.allocator import keep_freed_memory
 from flow.pipeline import load
@@ -158,29 +159,31 @@ def figures(run: Run) -> list[str]:
     return [*terrain_figures(run.tally.measures()), f"{1e3 * float(np.median(run.seconds)):.0f}"]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(given: Sequence[str] | None = None) -> None:
     """Print the table for each abundance of rocks."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.terrain", description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12, 13])
     parser.add_argument("--rocks", type=float, nargs="+", default=[0.05, 0.15], help="k of Golombek's law")
     parser.add_argument("--frames", type=int, default=30, help="frames of each traverse")
     parser.add_argument("--stride", type=int, default=1, help="of which every so many are scored")
+    parser.add_argument("--size", type=arguments.size, default=(1280, 960), metavar="WxH", help="of the images")
     parser.add_argument("--runs", nargs="+", choices=[*RUNS, "true"], default=list(RUNS))
     parser.add_argument("--rings", action="store_true", help="the score by distance, too")
     parser.add_argument("--json", type=Path, help="all measures into this file")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(given)
     cv2.setNumThreads(1)
     keep_freed_memory()  # as a run does
     runs = {name: RUNS[name] for name in RUNS if name in options.runs or ("true" in options.runs and "true" in name)}
+    width, height = options.size
     everything = {}
     for rocks in options.rocks:
         simulations = [
             Simulation(frames=options.frames, seed=seed, abundance=rocks, slope=float(SLOPE), threads=1,
-                       tilt_noise=float(TILT_NOISE)) for seed in options.seeds
+                       tilt_noise=float(TILT_NOISE), width=width, height=height) for seed in options.seeds
         ]  # fmt: skip
         found = score(simulations, options.stride, runs)
         count = len(next(iter(found.values())).seconds)
-        print(f"\nrocks k = {rocks}, {count} frames of 1280x960, seeds {', '.join(map(str, options.seeds))}")
+        print(f"\nrocks k = {rocks}, {count} frames of {width}x{height}, seeds {', '.join(map(str, options.seeds))}")
         columns = [[*ROWS, "disparity to navigation map, ms on one core"], *(figures(run) for run in found.values())]
         print(f"{'':66}" + "".join(f"{name.split(',')[-1].strip():>26}" for name in found))
         for label, *cells in zip(*columns, strict=True):
