@@ -366,6 +366,6 @@ def _select_reference(
         low, before, after = total[x, d], total[x, d - 1], total[x, d + 1]
         lead = min([255, *total[x, : d - 1], *total[x, d + 2 :]]) - low
         if abs(right[partner] - d - lowest) <= rule.consistency and lead > rule.uniqueness:
-            bend = max(before + after - 2 * low, 1)
-            pixels[x] = np.float32(lowest + d) + np.float32(before - after) / np.float32(2 * bend)
+            rise = max(max(before, after) - low, 1)
+            pixels[x] = np.float32(lowest + d) + np.float32(before - after) / np.float32(2 * rise)
             evidence[x] = lead

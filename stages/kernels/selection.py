@@ -1,9 +1,11 @@
 """Selection: the disparity of each pixel from the sums of its paths, and whether it can be believed.
 
-The smallest sum wins, to a fraction of a pixel by the parabola through it and its neighbours. A winner must beat every
-disparity that is not its neighbour (uniqueness), and the right image's pixel must choose the same from the same sums
-(left-right check). That choice needs all sums of a row along a diagonal; the trick is to keep the best so far of n
-right pixels in the lanes of one vector, which moves by one lane from pixel to pixel, as the partners do.
+The smallest sum wins, to a fraction of a pixel by two lines through it and its neighbours, of equal and opposite slopes
+(Shimizu and Okutomi, 2001): the sums fall and rise like a V, and a parabola through them would draw disparities towards
+whole numbers, by up to 0.1 px more. A winner must beat every disparity that is not its neighbour (uniqueness), and the
+right image's pixel must choose the same from the same sums (left-right check). That choice needs all sums of a row
+along a diagonal; the trick is to keep the best so far of n right pixels in the lanes of one vector, which moves by one
+lane from pixel to pixel, as the partners do.
 """
 
 from __future__ import annotations
@@ -88,8 +90,8 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):  # typ
     top: the last lane that is a disparity; rule: `pair.Rule`; into pixels (W,) float32, px, NaN = unknown, and
     evidence (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown.
 
-    A winner at an end of the search range, or with a neighbour outside the right image, is none: its parabola would
-    lean on a sum that says nothing, and the smallest may lie beyond.
+    A winner at an end of the search range, or with a neighbour outside the right image, is none: its lines would lean
+    on a sum that says nothing, and the smallest may lie beyond.
     """
     columns = winner.size
     last, top = np.int32(columns - 1), np.int32(top)
@@ -102,8 +104,8 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):  # typ
         apart = abs(np.int32(np.int32(partners[x]) - d))
         lead = np.int32(next_best - low)
         sound = (d > 0) & (d < top) & (partner > 0) & (partner < last) & (apart <= tolerance) & (lead > margin)
-        bend = max(np.int32(lower + upper - low - low), np.int32(1))
-        value = np.float32(first[x] + d) + np.float32(lower - upper) / np.float32(bend + bend)
+        rise = max(np.int32(max(lower, upper) - low), np.int32(1))
+        value = np.float32(first[x] + d) + np.float32(lower - upper) / np.float32(rise + rise)
         pixels[x] = value if sound else np.float32(np.nan)
         evidence[x] = np.uint8(lead) if sound else np.uint8(0)
 
@@ -128,7 +130,7 @@ def select_reference(
         low, before, after = sums[x, d], sums[x, d - 1], sums[x, d + 1]
         lead = min([255, *sums[x, : d - 1], *sums[x, d + 2 :]]) - low
         if abs(right[partner] - d) <= consistency and lead > uniqueness:
-            bend = max(before + after - 2 * low, 1)
-            pixels[x] = np.float32(minimum + d) + np.float32(before - after) / np.float32(2 * bend)
+            rise = max(max(before, after) - low, 1)
+            pixels[x] = np.float32(minimum + d) + np.float32(before - after) / np.float32(2 * rise)
             evidence[x] = lead
     return pixels, evidence

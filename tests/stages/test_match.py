@@ -42,9 +42,18 @@ def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(slope, cost, paths
     known = np.isfinite(result.pixels)
     assert known[visible].mean() > (0.95 if paths == 8 else 0.85)
     error = np.abs(result.pixels - truth)[known & visible]
-    assert np.median(error) < 0.13
+    assert np.median(error) < 0.11
     assert (error > 1).mean() < 0.01
     assert (result.stamp, result.camera) == (frame.stamp, frame.camera)
+
+
+@pytest.mark.parametrize("cost", COSTS)
+def test_disparities_are_not_drawn_to_whole_numbers(slope, cost):
+    frame, truth = slope
+    error = Match(disparities=48, cost=cost)(frame).pixels - truth
+    part = (10 * (truth % 1)).astype(int)
+    bias = [np.nanmedian(error[(part == i) & (np.abs(error) < 1)]) for i in range(10)]
+    assert np.abs(bias).max() < 0.06, bias
 
 
 def test_the_left_margin_is_matched_where_the_right_image_sees_it_and_only_there(slope):
@@ -176,7 +185,7 @@ def test_around_a_prior_disparities_are_found_beyond_the_range_too_and_nowhere_e
     assert np.isnan(found.pixels[~guided]).all()
     assert np.isfinite(found.pixels[guided]).mean() > 0.9
     error = np.abs(found.pixels - truth)[np.isfinite(found.pixels)]
-    assert np.median(error) < 0.13
+    assert np.median(error) < 0.11
     assert (error > 1).mean() < 0.01
     assert same(found, replace(near, threads=2)(frame, known))
     assert same(found, replace(near, disparities=48, nearer="prior")(frame, known))
