@@ -22,13 +22,14 @@ from typing import Any
 
 from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, share, size, workers
 from flow.errors import RoverflowError, SinkError, UsageError
+from flow.program import INTERRUPTED
 from flow.replay import as_json, product_version, replay
 from flow.report import counted, headline, report, say
 from recordings.errors import LogError, UnwritableError
 from recordings.whole_file import is_ours, writing, written
 
 BEGINNING = 0.6  # s of the demo's traverse, one frame
-COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130
+COMPLETE, FAILED, UNUSABLE, INCOMPLETE = 0, 1, 2, 3
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

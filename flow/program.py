@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import sys
 
+INTERRUPTED = 130
+
 
 def program() -> int:
     """`flow.cli.main` for a process of its own: while it begins and when it is through, too, an interrupt is no
-    traceback."""
+    traceback, and the exit code is that of `main`."""
     try:
         _open_what_is_closed()
         from flow.cli import main
 
         code = main()
-        _leave_workers_behind(code)
     except KeyboardInterrupt:
         print("roverflow: interrupted", file=sys.stderr)
-        code = 130
+        code = INTERRUPTED
     import os
     import signal
 
     signal.signal(signal.SIGINT, lambda *_: os._exit(code))
+    # Python itself, asked to run a module, may end an interrupted process by the signal; and native code that the
+    # interpreter is torn down under may abort it, where a stage of an abandoned frame still works.
+    if code == INTERRUPTED or _working():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     return code
 
 
@@ -33,16 +40,11 @@ def _open_what_is_closed() -> None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115
 
 
-def _leave_workers_behind(code: int) -> None:
-    """End at once where a stage of an abandoned frame still works: native code that the interpreter is torn down
-    under may abort the process."""
-    import os
+def _working() -> bool:
+    """Whether a stage still works."""
     import threading
 
-    if any(thread.name.startswith("worker-") for thread in threading.enumerate()):
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+    return any(thread.name.startswith("worker-") for thread in threading.enumerate())
 
 
 if __name__ == "__main__":

@@ -75,7 +75,10 @@ class Match(Stage):
     paths over the others tells, with the penalties that suit the cost and 8 paths.
     """
 
-    disparities: int = parameter(192, "size of the search range", unit="px", low=1, high=1024)
+    disparities: int = parameter(
+        192, "size of the search range, of which the first and the last only bound the others and are not found",
+        unit="px", low=1, high=1024,
+    )  # fmt: skip
     minimum: int = parameter(0, "smallest disparity searched", unit="px", low=-1024, high=1024)
     farthest: float = parameter(
         0.0, "depth beyond which nothing is of interest and disparities are not searched; 0: no limit", unit="m", low=0
@@ -191,12 +194,12 @@ class Match(Stage):
             return search
         largest = camera.width if self.around else search.stop - 1
         reach = camera.fx * camera.baseline / self.farthest - (camera.cx_right - camera.cx)
-        if reach >= largest + 1:
+        if reach >= largest:
             raise ValueError(
                 f"Match.farthest = {self.farthest} m leaves nothing to search: a depth of {self.farthest} m is a "
                 f"disparity of {reach:.0f} px, and {largest} px is the largest searched"
             )
-        limit = math.floor(reach)
+        limit = math.floor(reach) - 1  # the first that is searched is not found
         return range(max(search.start, limit), max(search.stop, limit + 1))
 
     def _rule(self, search: range) -> Rule:

@@ -125,7 +125,7 @@ def off_level(least: float, frames: int) -> Diagnosis | None:
     every = "the only frame" if frames == 1 else f"every one of {frames} frames"
     sentence = (
         f"the ground in view is off level by {_deg(least)} or more in {every}, which is steeper than terrain is on the "
-        "whole; look at the sign of pitch, the inclinometer's axes and its mount (source.pitch.sign, "
+        "whole; look at the unit and the sign of pitch, the inclinometer's axes and its mount (source.pitch.sign, "
         "source.camera_from_inclinometer, --pitch-down of an import)"
     )
     return Diagnosis(OFF_GROUND, sentence, False)
@@ -268,7 +268,10 @@ def _wild(evidence: Evidence) -> Diagnosis | None:
         return None
     ups, cameras = evidence.ups, evidence.cameras
     swings = np.arccos(np.clip(np.sum(ups[near] * ups[near + 1], axis=1), -1, 1))
-    turns = Rotation.from_matrix(np.swapaxes(cameras[near], 1, 2) @ cameras[near + 1]).magnitude()
+    turned = np.swapaxes(cameras[near], 1, 2) @ cameras[near + 1]
+    turns = Rotation.from_matrix(turned).magnitude()
+    if np.isfinite(normals := evidence.ground[near]).all():  # a turn about the ground's own normal swings no up
+        turns = np.arccos(np.clip(np.einsum("ki,kij,kj->k", normals, turned, normals), -1, 1))
     swing, turn = (float(np.median(angles)) for angles in (swings, turns))
     if not swing > max(WILD * turn, WILD_ANGLE):
         return None

@@ -42,6 +42,11 @@ def test_wrong_signs_axes_and_units_are_named(drive, change, name):
     assert found.fault.startswith(name), found.sentence
 
 
+def test_a_wrong_unit_is_named_on_nearly_level_ground_though_the_rover_steers():
+    found = diagnose(Drive(7, slope=0.3, noise=0.1).evidence(change=degrees_as_radians))
+    assert found.fault == "degrees are taken for radians", found.sentence
+
+
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("turned", [about("x", 5), about("y", -5), about("z", 5), about("z", -5), about("x", 90)])
 def test_a_wrong_mount_is_named_and_the_sentence_has_the_right_one(drive, turned):
