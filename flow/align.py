@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, get_type_hints
 
 from flow.ledger import Absent, Entry, Reason, failure
@@ -29,6 +30,7 @@ class Token:
 # How long, ns of log time, samples are kept for messages that are logged later than they are stamped.
 HISTORY = 10_000_000_000
 SMOOTHED = 3  # samples that smoothing needs; a line through two smooths nothing
+GIVEN_UP = 100  # messages without a partner that are remembered, to say by how much their partner came too late
 
 Answer = Token | Entry
 Answers = Iterable[Answer]
@@ -38,8 +40,8 @@ def _parameter(default: int | None, help: str) -> Any:
     return field(default=default, metadata={"help": help, "unit": "ns", "low": 0})
 
 
-def _ms(nanoseconds: int) -> str:
-    return f"{nanoseconds / 1e6:.1f} ms"
+def _time(nanoseconds: int) -> str:
+    return f"{round(nanoseconds / 1e6, 3)} ms" if nanoseconds < 10_000_000_000 else f"{nanoseconds / 1e9:.1f} s"
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ class PairState:
     def __init__(self, rule: Pair, name: str, inputs: dict[str, str]) -> None:
         self.rule, self.name, self.inputs = rule, name, inputs
         self.waiting: dict[str, deque[tuple[int, Token]]] = {"left": deque(), "right": deque()}
+        self.given_up = {port: deque[tuple[int, int]](maxlen=GIVEN_UP) for port in self.waiting}  # stamp, log time
 
     def push(self, port: str, log_time: int, token: Token) -> Answers:
         """A message of `port` has arrived."""
@@ -87,10 +90,8 @@ class PairState:
         while lefts and rights:
             left, right = lefts[0][1], rights[0][1]
             apart = right.stamp - left.stamp
-            if apart > self.rule.slop:
-                yield self._unmatched("left", f"the next {self.inputs['right']} is {_ms(apart)} later")
-            elif apart < -self.rule.slop:
-                yield self._unmatched("right", f"the next {self.inputs['left']} is {_ms(-apart)} later")
+            if abs(apart) > self.rule.slop:
+                yield self._unmatched("left" if apart > 0 else "right")
             else:
                 lefts.popleft(), rights.popleft()
                 yield Token(left.stamp, _paired(self.name, left, right))
@@ -99,7 +100,8 @@ class PairState:
         """The log's clock has moved to `log_time`."""
         for port, queue in self.waiting.items():
             while queue and queue[0][0] + self.rule.patience < log_time:
-                yield self._unmatched(port, f"no partner within {_ms(self.rule.patience)} of log time")
+                limit = f"{_time(self.rule.patience)} of log time ({self.name}.patience)"
+                yield self._unmatched(port, f"no partner within {limit}")
 
     def end(self) -> Answers:
         """The log has ended."""
@@ -107,8 +109,20 @@ class PairState:
             while queue:
                 yield self._unmatched(port, "the log ended before its partner came")
 
-    def _unmatched(self, port: str, why: str) -> Entry:
-        _, token = self.waiting[port].popleft()
+    def _unmatched(self, port: str, why: str = "") -> Entry:
+        """Give up the first that waits. why: what to say unless its partner was given up before it came; where there is
+        nothing, how far off the nearest is that waits or was given up."""
+        other = "left" if port == "right" else "right"
+        arrived, token = self.waiting[port].popleft()
+        others = [*self.given_up[other], *((first.stamp, at) for at, first in islice(self.waiting[other], 1))]
+        apart, logged = min(((abs(stamp - token.stamp), at) for stamp, at in others), default=(None, 0))
+        if apart is not None and apart <= self.rule.slop:
+            late = f"it was logged {_time(arrived - logged)} after its {self.inputs[other]}"
+            why = f"{late}, more than {_time(self.rule.patience)} ({self.name}.patience)"
+        elif apart is not None and not why:
+            limit = f"{_time(self.rule.slop)} ({self.name}.slop)"
+            why = f"the nearest {self.inputs[other]} is {_time(apart)} away, more than {limit}"
+        self.given_up[port].append((token.stamp, arrived))
         return Entry(self.inputs[port], token.stamp, self.name, Reason.UNMATCHED, why)
 
 
@@ -133,9 +147,12 @@ class _Sampler:
         """A running aligner; `inputs` maps ports to stream names."""
         return SamplerState(self, name, inputs)
 
-    def choose(self, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
+    def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         """The value at `stamp`, or a sentence (str) why there is none, or None to wait (never when `final`, which tells
-        of the stream, `name`, that what is not there yet does not come). May raise what the samples' type does."""
+        until when the stream, `name`, was waited for). May raise what the samples' type does.
+
+        node: whose settings the sentence names.
+        """
         raise NotImplementedError
 
 
@@ -163,7 +180,7 @@ class Interpolate(_Sampler):
                 raise TypeError(f"a {kinds['stream'].__name__} cannot be {method}")
         return kinds["stream"]
 
-    def choose(self, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
+    def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         before, after = _neighbours(samples, stamp)
         exact = before is not None and before.stamp == stamp
         if not final and (after is None or samples[-1].stamp < stamp + self.smooth) and (self.smooth or not exact):
@@ -171,9 +188,10 @@ class Interpolate(_Sampler):
         if before is not None and exact and (after is None or not self.smooth):
             return before.value
         if before is None or after is None:
-            return f"no {name} sample before it" if before is None else f"{name} {final}"
+            return _none(name, stamp, samples, final)
         if after.stamp - before.stamp > self.max_gap:
-            return f"{name} has a gap of {_ms(after.stamp - before.stamp)}, more than {_ms(self.max_gap)}"
+            limit = f"{_time(self.max_gap)} ({node}.max_gap)"
+            return f"{name} has a gap of {_time(after.stamp - before.stamp)}, more than {limit}"
         near = self._near(samples, stamp)
         if len(near) >= SMOOTHED:
             return before.value.smoothed(near, stamp)
@@ -194,13 +212,16 @@ class Nearest(_Sampler):
     slop: int = _parameter(50_000_000, "largest distance from the stamp")
     patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for a nearer sample")
 
-    def choose(self, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
+    def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         before, after = _neighbours(samples, stamp)
         if after is None and not final and not (before is not None and before.stamp == stamp):
             return None
         found = min((s for s in (before, after) if s is not None), key=lambda s: abs(s.stamp - stamp), default=None)
-        if found is None or abs(found.stamp - stamp) > self.slop:
-            return f"no {name} sample within {_ms(self.slop)}"
+        if found is None:
+            return _none(name, stamp, samples, final)
+        if abs(found.stamp - stamp) > self.slop:
+            nearest = f"the nearest {name} sample{'' if after else final} is {_time(abs(found.stamp - stamp))} away"
+            return f"{nearest}, more than {_time(self.slop)} ({node}.slop)"
         return found.value
 
 
@@ -211,14 +232,15 @@ class Latest(_Sampler):
     max_age: int | None = _parameter(None, "oldest sample that still counts; none: any age")
     patience: int = _parameter(0, "how long on the log's clock to wait for samples that are logged late")
 
-    def choose(self, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
+    def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         before, after = _neighbours(samples, stamp)
         if after is None and not final and self.patience:
             return None
         if before is None:
-            return f"no {name} sample at or before it"
+            return _none(name, stamp, samples, final or f" logged by then ({node}.patience)")
         if self.max_age is not None and stamp - before.stamp > self.max_age:
-            return f"the last {name} sample is {_ms(stamp - before.stamp)} old, more than {_ms(self.max_age)}"
+            limit = f"{_time(self.max_age)} ({node}.max_age)"
+            return f"the last {name} sample is {_time(stamp - before.stamp)} old, more than {limit}"
         return before.value
 
 
@@ -256,11 +278,11 @@ class SamplerState:
             arrived, token = self.wanted[0]
             final = ""
             if log_time is None:
-                final = "has no sample after it"
+                final = " by the log's end"
             elif arrived + self.rule.patience < log_time:
-                final = f"has a gap: no sample after it within {_ms(self.rule.patience)} of log time"
+                final = f" within {_time(self.rule.patience)} of log time ({self.name}.patience)"
             try:
-                value = self.rule.choose(self.stream, token.stamp, self.samples, final)
+                value = self.rule.choose(self.name, self.stream, token.stamp, self.samples, final)
             except Exception as error:
                 value = Absent(Entry(self.name, token.stamp, self.name, Reason.FAILED, failure(error)))
             if value is None:
@@ -288,6 +310,15 @@ def _neighbours(samples: deque[Token], stamp: int) -> tuple[Token | None, Token 
             return before, sample
         before = sample
     return before, None
+
+
+def _none(name: str, stamp: int, samples: deque[Token], final: str) -> str:
+    """That there is no sample, or none on one side of the stamp: which then, and by how much the nearest is off."""
+    if not samples:
+        return f"no {name} sample{final}"
+    if samples[0].stamp > stamp:
+        return f"the first {name} sample at hand is {_time(samples[0].stamp - stamp)} after it"
+    return f"no {name} sample after it{final}; the last is {_time(stamp - samples[-1].stamp)} before it"
 
 
 def _paired(name: str, left: Token, right: Token) -> Any:

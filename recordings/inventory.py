@@ -3,6 +3,7 @@ up, how much of the traverse has a tilt, what is missing and what is damaged."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +17,21 @@ from recordings.mcap_opening import CAMERAS, peek_stamp
 from recordings.mcap_source import McapSource
 from stages.data import StereoCamera, Tilt
 
-SLOP = 5_000_000  # ns between the two images of a frame
-TILT_GAP = 200_000_000  # ns between the tilts around a frame
-
 Stamps = NDArray[np.int64]
 
 
-def describe(path: Path, source: McapSource) -> dict[str, Any]:
+def describe(path: Path, source: McapSource, slop: int = 5_000_000, max_gap: int = 200_000_000) -> dict[str, Any]:
     """The inventory of a log, as plain JSON values. Raises LogError where the file is no log that can be read.
 
-    source: how the log's streams are found, as in a pipeline file.
+    source: how the log's streams are found, as in a pipeline file; slop: largest difference between the stamps of the
+    two images of a frame, ns; max_gap: largest distance between the tilts around a frame, ns. Only stamps count here: a
+    run waits for none that is logged too late.
     """
     with source.open(Path(path)) as log:
         damage = sorted({lost.reason for lost in log.file.index.lost} | {str(problem) for _, problem in log.problems})
         stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
-        tilted = _tilted(stamps["left"], _tilts(log, damage))
+        stamps["inclinometer"] = _tilts(log, damage)
+        left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
         return {
             "path": str(path),
             "size_bytes": log.file.size,
@@ -46,10 +47,10 @@ def describe(path: Path, source: McapSource) -> dict[str, Any]:
             "frames": {
                 "left": len(stamps["left"]),
                 "right": len(stamps["right"]),
-                "pairs": _pairs(stamps["left"], stamps["right"]),
-                "slop_s": SLOP / 1e9,
-                "with_tilt": tilted,
-                "tilt_gap_s": TILT_GAP / 1e9,
+                "pairs": _pairs(left, right, slop),
+                "slop_s": slop / 1e9,
+                "with_tilt": _tilted(left, tilts, max_gap),
+                "tilt_gap_s": max_gap / 1e9,
             },
             "transforms": log.static.listed(),
             "mount": _mount(log),
@@ -85,11 +86,13 @@ def format_description(description: dict[str, Any]) -> str:
             f"baseline {camera['baseline']:.4f} m, {state}, frame '{camera['frame_id']}'"
         )
         lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
-    frames = d["frames"]
-    lines.append(
-        f"frames: {counted(frames['pairs'], 'pair')} within {frames['slop_s'] * 1e3:g} ms of {frames['left']} left "
-        f"and {counted(frames['right'], 'right image')}; {frames['with_tilt']} with a tilt around them"
-    )
+    if all(side in d["streams"] for side in CAMERAS):
+        frames = d["frames"]
+        lines.append(
+            f"frames: by their stamps, {counted(frames['pairs'], 'pair')} within {frames['slop_s'] * 1e3:g} ms of "
+            f"{frames['left']} left and {counted(frames['right'], 'right image')}; {frames['with_tilt']} left with "
+            f"tilts around them, at most {frames['tilt_gap_s'] * 1e3:g} ms apart"
+        )
     if d["mount"]:
         down = "unknown" if d["mount"]["base"] is None else f"in '{d['mount']['base']}' at {d['mount']['position']}"
         lines.append(f"mount: camera {down}")
@@ -98,7 +101,7 @@ def format_description(description: dict[str, Any]) -> str:
         lines.append(f"missing: {', '.join(stream for stream in d['missing'] if d['missing'][stream] == why)}: {why}")
     lines += [f"note: {stream}: {said}" for stream, said in d["notes"].items()]
     lines += [d["undecodable"]] if d["undecodable"] else []
-    lines += [f"damaged: {what}" for what in d["damage"]]
+    lines += [f"damaged: {what}" for what in _grouped(d["damage"])]
     return "\n".join(lines)
 
 
@@ -122,57 +125,74 @@ def _topics(log: McapLog) -> list[dict[str, Any]]:
     return found
 
 
-def _stamps(log: McapLog, stream: str, damage: list[str]) -> Stamps:
-    """The stamps of a camera's images, ns, sorted, without decoding them; what is lost goes to `damage`."""
+def _grouped(damage: list[str]) -> list[str]:
+    """The sentences, those that differ in numbers alone as one: how many there are, and the first."""
+    groups: dict[str, list[str]] = {}
+    for what in damage:
+        groups.setdefault(re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", what), []).append(what)
+    return [f"{len(alike)} alike, first: {alike[0]}" if len(alike) > 1 else alike[0] for alike in groups.values()]
+
+
+def _stamps(log: McapLog, stream: str, damage: list[str]) -> list[int]:
+    """The stamps of a camera's images, ns, without decoding them; what is lost goes to `damage`."""
     if stream not in log.topics:
-        return np.zeros(0, np.int64)
+        return []
     topic, stamps = log.topics[stream], []
     for raw in log.file.messages(log.channels(stream)):
         if not isinstance(raw, Lost):
             stamps.append(peek_stamp(raw.data) or raw.log_time)
         elif raw.channel is not None:
             damage.append(f"{topic} at {raw.log_time} ns: {raw.reason}")
-    return np.sort(np.array(stamps, np.int64))
+    return stamps
 
 
-def _tilts(log: McapLog, damage: list[str]) -> Stamps:
-    """The stamps of the tilts, ns, sorted; what cannot be read goes to `damage`."""
+def _tilts(log: McapLog, damage: list[str]) -> list[int]:
+    """The stamps of the tilts, ns; what cannot be read goes to `damage`."""
     stamps = []
     for _, stream, item in log.events(("inclinometer",)):
         if isinstance(item, Tilt):
             stamps.append(item.stamp)
         elif stream == "inclinometer":
             damage.append(str(item))
-    return np.sort(np.array(stamps, np.int64))
+    return stamps
 
 
-def _pairs(left: Stamps, right: Stamps) -> int:
+def _distinct(log: McapLog, stream: str, damage: list[str], stamps: list[int]) -> Stamps:
+    """The stamps, sorted, each once, as a run takes them; that some are repeated goes to `damage`."""
+    distinct = np.unique(np.array(stamps, np.int64))
+    if repeated := len(stamps) - distinct.size:
+        of = f"{repeated} of {len(stamps)}"
+        damage.append(f"{log.topics[stream]}: messages that repeat a stamp, which a run drops: {of}")
+    return distinct
+
+
+def _pairs(left: Stamps, right: Stamps, slop: int) -> int:
     """How many left images have a right one within the slop, each right image used once."""
     pairs = place = 0
     for stamp in left.tolist():
-        while place < right.size and right[place] < stamp - SLOP:
+        while place < right.size and right[place] < stamp - slop:
             place += 1
-        if place < right.size and right[place] <= stamp + SLOP:
+        if place < right.size and right[place] <= stamp + slop:
             pairs, place = pairs + 1, place + 1
     return pairs
 
 
-def _tilted(left: Stamps, tilt: Stamps) -> int:
-    """How many left images lie between two tilts that are close enough to interpolate."""
+def _tilted(left: Stamps, tilt: Stamps, max_gap: int) -> int:
+    """How many left images have the stamp of a tilt, or lie between two that are close enough to interpolate."""
     if not tilt.size:
         return 0
     after = np.searchsorted(tilt, left)
     inside = after < tilt.size
     later = tilt[np.minimum(after, tilt.size - 1)]
     earlier = tilt[np.maximum(after - 1, 0)]
-    return int(np.sum(inside & ((later == left) | ((after > 0) & (later - earlier <= TILT_GAP)))))
+    return int(np.sum(inside & ((later == left) | ((after > 0) & (later - earlier <= max_gap)))))
 
 
 def _calibration(log: McapLog) -> dict[str, Any] | None:
     if log.cameras is None:
         return None
     left, right = log.cameras
-    camera = StereoCamera.from_models(left.model, right.model, left.frame_id, left.rectified)
+    camera = StereoCamera.from_models(left.model, right.model, left.image_frame, left.rectified)
     names = ("width", "height", "fx", "fy", "cx", "cy", "cx_right", "baseline", "frame_id")
     values = {name: getattr(camera, name) for name in names}
     return values | {"rectified": left.rectified, "doubts": list(camera.doubts)}

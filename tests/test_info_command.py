@@ -7,6 +7,7 @@ import json
 from flow.cli import main
 from flow.pipeline import SHIPPED
 from tests.conftest import FRAMES
+from tests.recordings.sample_log import RIGHT, TILT, write_sample
 
 
 def roverflow(*arguments: object) -> int:
@@ -31,6 +32,36 @@ def test_info_looks_at_a_log_as_a_run_with_that_pipeline_would(traverse, tmp_pat
     assert streams()["odometry"] == "/odometry"
     assert streams("-p", pipeline, "--set", "source.odometry=/odometry") == streams()
     assert "odometry" not in streams("-p", pipeline)
+
+
+def test_info_counts_pairs_and_tilts_by_the_tolerances_of_the_pipeline(tmp_path, capsys):
+    def edit(topic, number, message):
+        if topic in (RIGHT, TILT):
+            message.header.stamp.nanosec += 8_000_000
+        return message
+
+    log, pipeline = write_sample(tmp_path / "log.mcap", edit), tmp_path / "named.yaml"
+
+    def frames(*given):
+        assert roverflow("info", log, "--json", *given) == 0
+        found = json.loads(capsys.readouterr().out)["frames"]
+        return found["pairs"], found["slop_s"], found["with_tilt"], found["tilt_gap_s"]
+
+    assert frames() == (0, 0.005, 4, 0.2)
+    assert frames("--set", "stereo.slop=10 ms") == (5, 0.01, 4, 0.2)
+    assert frames("--set", "tilt.max_gap=1 ms", "--set", "logged.max_gap=2 s") == (0, 0.005, 0, 0.001)
+    pipeline.write_text("""
+source: {use: recordings.McapSource}
+streams:
+  eyes:    {use: flow.align.pair, left: left, right: right, slop: 9 ms}
+  up:      {use: flow.align.interpolate, stream: inclinometer, at: eyes, max_gap: 50 ms}
+  resting: {use: flow.align.interpolate, stream: odometry, at: eyes, max_gap: 3 s}
+  half:    {use: stages.Rectify, frame: eyes}
+sinks: [{use: recordings.McapSink}]
+""")
+    assert frames("-p", pipeline) == (5, 0.009, 0, 0.05)
+    pipeline.write_text(pipeline.read_text().replace("stream: inclinometer", "stream: odometry"))
+    assert frames("-p", pipeline) == (5, 0.009, 4, 0.2)
 
 
 def test_info_says_that_it_cannot_look_through_a_source_of_another_kind(traverse, tmp_path, capsys):

@@ -1,7 +1,7 @@
 """Alignment joins clocks as the stamps say, gives up in bounded time, and accounts for every message."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 from hypothesis import given
@@ -66,6 +66,29 @@ def test_a_partner_that_does_not_come_is_given_up_after_the_patience_of_log_time
     assert "1000.0 ms" in first.detail
 
 
+def test_partners_too_far_apart_are_told_by_how_much_and_which_setting_decides():
+    frames = [(side, at * MS + (side == "right") * 8_020_000, 1.0) for at in (0, 500) for side in ("left", "right")]
+    details = [entry.detail for entry in pairing(*frames)]
+    assert details[:3] == [
+        "the nearest right is 8.02 ms away, more than 5.0 ms (stereo.slop)",
+        "the nearest left is 8.02 ms away, more than 5.0 ms (stereo.slop)",
+        "the nearest right is 8.02 ms away, more than 5.0 ms (stereo.slop)",
+    ]
+    assert len(pairing(*frames, slop=10 * MS)) == 2
+
+
+def test_a_partner_logged_too_late_is_told_by_how_much_and_which_setting_decides():
+    frames = [(side, at * MS, 1.0, (at + 1500 * (side == "right")) * MS) for at in range(0, 3000, 500)
+              for side in ("left", "right")]  # fmt: skip
+    frames.sort(key=lambda frame: frame[3])
+    details = {(entry.stream, entry.detail) for entry in pairing(*frames)}
+    assert details == {
+        ("left", "no partner within 1000.0 ms of log time (stereo.patience)"),
+        ("right", "it was logged 1500.0 ms after its left, more than 1000.0 ms (stereo.patience)"),
+    }
+    assert len(values(pairing(*frames, patience=1500 * MS))) == 6
+
+
 def test_items_that_do_not_fit_make_a_frame_that_is_lost_with_its_reason():
     (answer,) = pairing(("left", 10, -1.0), ("right", 10, 2.0))
     assert answer.stamp == 10
@@ -106,10 +129,43 @@ def test_a_gap_longer_than_the_patience_is_a_gap_for_every_frame_in_it():
     messages = sorted([*frames, *samples], key=lambda message: message[1])
     details = [answer.value.cause.detail for answer in sampling(Interpolate(), *messages)]
     assert details == [
-        "level has a gap: no sample after it within 1000.0 ms of log time",
-        "level has a gap of 1400.0 ms, more than 200.0 ms",
-        "level has no sample after it",
+        "no level sample after it within 1000.0 ms of log time (tilt.patience); the last is 50.0 ms before it",
+        "level has a gap of 1400.0 ms, more than 200.0 ms (tilt.max_gap)",
+        "no level sample after it by the log's end; the last is 50.0 ms before it",
     ]
+
+
+RULES = [Interpolate(), Nearest(), Latest(patience=1000 * MS)]
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: type(rule).__name__)
+def test_samples_logged_too_late_are_told_to_have_been_waited_for_and_by_which_setting(rule):
+    messages = [("at", 100 * MS, 0.0), *(("stream", at * MS, 0.0, (at + 2500) * MS) for at in range(0, 300, 50))]
+    (answer,) = sampling(rule, *messages)
+    assert answer.value.cause.detail == "no level sample within 1000.0 ms of log time (tilt.patience)"
+    assert len(values(sampling(replace(rule, patience=5000 * MS), *messages))) == 1
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: type(rule).__name__)
+def test_clocks_that_are_far_apart_are_told_by_how_much(rule):
+    hour = 3_600_000 * MS
+    (early,) = sampling(rule, ("stream", hour, 0.0, 0), ("at", 0, 0.0, 0))
+    assert "3600.0 s " in early.value.cause.detail
+    if not isinstance(rule, Latest):  # to which no sample is too old
+        (late,) = sampling(rule, ("stream", 0, 0.0, 0), ("at", hour, 0.0, 0))
+        assert "3600.0 s " in late.value.cause.detail
+
+
+def test_what_a_sample_falls_short_of_is_named():
+    def detail(rule, *messages):
+        return sampling(rule, *messages)[0].value.cause.detail
+
+    messages = [("stream", 0, 1.0), ("at", 60 * MS, 0.0), ("stream", 200 * MS, 2.0)]
+    assert detail(Nearest(), *messages) == "the nearest level sample is 60.0 ms away, more than 50.0 ms (tilt.slop)"
+    assert (
+        detail(Latest(max_age=MS), *messages) == "the last level sample is 60.0 ms old, more than 1.0 ms (tilt.max_age)"
+    )
+    assert detail(Latest(), *messages[1:]) == "no level sample logged by then (tilt.patience)"
 
 
 def test_interpolation_never_extrapolates():

@@ -60,7 +60,8 @@ def test_the_text_names_every_topic_its_stream_and_what_is_missing(tmp_path: Pat
     line = next(line for line in text.splitlines() if line.startswith(LEFT))
     assert line.split() == [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100", "s", "left"]
     assert "missing: odometry: the log has no nav_msgs/Odometry" in text
-    assert "frames: 5 pairs within 5 ms of 5 left and 5 right images; 5 with a tilt around them" in text
+    frames = "frames: by their stamps, 5 pairs within 5 ms of 5 left and 5 right images"
+    assert f"{frames}; 5 left with tilts around them, at most 200 ms apart" in text
 
 
 def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: Path) -> None:
@@ -71,9 +72,50 @@ def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: P
             return None
         return message
 
-    frames = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())["frames"]
+    path = write_sample(tmp_path / "log.mcap", edit)
+    frames = describe(path, McapSource())["frames"]
     assert frames["pairs"] == FRAMES - 1
     assert frames["with_tilt"] == 2  # the first and the last frame, which have a tilt of their own
+    wider = describe(path, McapSource(), slop=6_000_000, max_gap=400_000_000)
+    assert (wider["frames"]["pairs"], wider["frames"]["with_tilt"]) == (FRAMES, FRAMES)
+    assert "5 pairs within 6 ms of 5 left and 5 right images; 5 left with tilts" in format_description(wider)
+    assert "around them, at most 400 ms apart" in format_description(wider)
+
+
+def test_repeated_stamps_count_once_and_are_told(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic in (LEFT, RIGHT, TILT) and number == 2:
+            message.header.stamp.nanosec -= PERIOD
+        return message
+
+    described = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())
+    frames = described["frames"]
+    assert (frames["left"], frames["right"]) == (FRAMES, FRAMES)
+    assert (frames["pairs"], frames["with_tilt"]) == (FRAMES - 1, FRAMES - 1)
+    said = "messages that repeat a stamp, which a run drops: 1 of 5"
+    assert described["damage"] == [f"{topic}: {said}" for topic in (LEFT, RIGHT, TILT)]
+
+
+def test_of_cameras_that_are_missing_no_pairs_are_told(tmp_path: Path) -> None:
+    edit = lambda topic, _, message: None if topic.endswith("camera_info") else message  # noqa: E731
+    text = format_description(describe(write_sample(tmp_path / "log.mcap", edit), McapSource()))
+    assert "missing: left: no CameraInfo belongs to" in text
+    assert "frames:" not in text
+
+
+def test_tilts_that_cannot_be_read_are_told_in_a_line_with_the_first_of_them(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == TILT and number:
+            message.orientation.x = message.orientation.y = message.orientation.z = 0.0
+            message.orientation.w = 0.0 if number < 3 else 0.25
+        return message
+
+    described = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())
+    assert len(described["damage"]) == FRAMES - 1
+    (line,) = (line for line in format_description(described).splitlines() if line.startswith("damaged"))
+    assert line.startswith(
+        f"damaged: 4 alike, first: {TILT} at {START + PERIOD} ns: the quaternion of the inclinometer"
+    )
 
 
 def test_streams_whose_headers_have_no_stamp_are_told_to_go_by_the_time_of_the_log(tmp_path: Path) -> None:
@@ -168,7 +210,7 @@ def test_topics_that_cannot_be_decoded_are_listed_once(tmp_path: Path) -> None:
 def test_one_is_not_many(tmp_path: Path) -> None:
     edit = lambda topic, number, message: None if number else message  # noqa: E731
     text = format_description(describe(write_sample(tmp_path / "log.mcap", edit), McapSource()))
-    assert "frames: 1 pair within 5 ms of 1 left and 1 right image; 1 with a tilt" in text
+    assert "1 pair within 5 ms of 1 left and 1 right image; 1 left with tilts" in text
 
 
 def test_damage_is_told(tmp_path: Path) -> None:
