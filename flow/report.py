@@ -52,7 +52,7 @@ def report(summary: dict[str, Any]) -> None:
     for reason, number in summary["drops"].items():
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
         say(f"  {number} {reason}, first: {first['stream']} at {first['stamp']}: {first['detail']}")
-    if summary["interrupted"] and not summary["outputs"]:
+    if not summary["outputs"] and not summary["frames_out"]:
         say("  no output was written: no frame was through")
     for path in map(Path, summary["outputs"]):
         say(f"  {path} ({path.stat().st_size / 1e6:.1f} MB)")

@@ -124,8 +124,8 @@ def run(
 
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
-    closed and readable by then. A run that is stopped before its first frame is through leaves no output, and those of
-    an earlier run as they are. Of the summary's wall_seconds, start_seconds were over before the first frame.
+    closed and readable by then. A run of which no frame gets through leaves no output, and those of an earlier run as
+    they are. Of the summary's wall_seconds, start_seconds were over before the first frame.
     """
     for why in log.refused.values():
         raise UsageError(why)
@@ -159,7 +159,7 @@ def run(
         times["cpu_seconds"] = time.process_time() - cpu
         kept = engine is not None and engine.whole == engine.admitted and not len(ledger)
         whole = finished and kept and not sinks.errors
-        if stop.finishing() and not (engine and engine.through):
+        if not (engine and engine.through):
             sinks.discard()
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),

@@ -142,6 +142,14 @@ def test_a_run_that_is_stopped_before_a_frame_is_through_leaves_no_output(tmp_pa
     assert (sink.summary is None) == discards
 
 
+def test_a_run_of_which_no_frame_gets_through_leaves_no_output(tmp_path, monkeypatch):
+    given_up = []
+    monkeypatch.setattr(Keep, "discard", lambda self: given_up.append(self), raising=False)
+    events = [event for event in traverse(3) if event[1] != "right"]
+    sink, summary = replayed(graph(tmp_path), events)
+    assert (summary["verdict"], summary["outputs"], given_up) == ("INCOMPLETE", [], [sink])
+
+
 def test_what_tells_of_an_interrupt_may_fail_and_the_run_still_ends_properly():
     stop = Stop()
 
@@ -334,7 +342,7 @@ def test_patience_runs_on_the_clock_of_the_whole_log(tmp_path):
     events += [(at, "level", Number(at, 0.0)) for at in range(0, 3000 * MS, 50 * MS)]
     _, summary = replayed(graph(tmp_path), events)
     (entry,) = summary["ledger"]
-    assert entry["detail"] == "no partner within 1000.0 ms of log time"
+    assert entry["detail"] == "no partner within 1000.0 ms of log time (both.patience)"
 
 
 def test_a_log_that_lacks_what_a_stage_needs_is_refused_with_the_logs_own_words(tmp_path):
