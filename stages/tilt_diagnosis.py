@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from stages.data import Array
 
-NOISE = float(np.deg2rad(0.2))  # of a tilt, against which the camera's own drift is weighed; the real one is estimated
+NOISE = float(np.deg2rad(0.2))  # of a tilt, against which the camera's own drift is weighed until more is known
 LEAST_NOISE = float(np.deg2rad(0.05))
 GROUND = float(np.deg2rad(8))  # standard deviation of the slope of all ground in view
 STEEPEST = float(np.deg2rad(20))  # ground that is steeper in every frame is taken for a wrong tilt
@@ -66,7 +66,8 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False)
 class _Cause:
-    """One explanation of the evidence, and how badly it fits: `misfit` in units of NOISE^2, `ground` of its own."""
+    """One explanation of the evidence, and how badly it fits: `misfit` in units of a tilt's variance, `ground` of its
+    own."""
 
     fault: str
     remedy: str
@@ -74,17 +75,19 @@ class _Cause:
     ground: float
     parameters: int = 0
     size: float = np.inf  # how large it is, over the least that counts
-    error: float = 0.0  # standard deviation of that, for tilts with a noise of NOISE
+    error: float = 0.0  # standard deviation of that, for tilts with that variance
     undone: Array | None = None  # what then turns the inclinometer's vectors into the camera's
 
     def score(self, variance: float) -> float:
         return self.misfit / variance + self.ground + PARAMETER * self.parameters
 
 
-def diagnose(evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_offset: float = 0.08) -> Diagnosis:
+def diagnose(
+    evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_offset: float = 0.08, noise: float = NOISE
+) -> Diagnosis:
     """The fault that explains the evidence; none where the tilt is sound or where nothing can be told.
 
-    least_angle: rad, least error of the mount that is a fault; least_offset: s, and of the time.
+    least_angle: rad, least error of the mount that is a fault; least_offset: s, and of the time; noise: rad, of a tilt.
     """
     n = len(evidence.stamps)
     wild = _wild(evidence)
@@ -93,9 +96,9 @@ def diagnose(evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_off
     free = 2 * (n - len(np.unique(evidence.segments)))
     if n < LEAST_FRAMES or free < LEAST_FRAMES:
         return Diagnosis("", f"too few frames to judge the tilt ({n})", False)
-    fit = _Fit(evidence)
+    fit = _Fit(evidence, noise)
     sound = _Cause("", "", fit.misfit(np.eye(3)), fit.slope(np.eye(3)))
-    mount, offset = _mount(fit, least_angle), _offset(evidence, sound, least_offset)
+    mount, offset = _mount(fit, least_angle), _offset(fit, sound, least_offset)
     axes = [
         _Cause(fault, remedy, fit.misfit(undo), fit.slope(undo), 1, undone=evidence.mount @ undo)
         for fault, remedy, undo in _exchanges()
@@ -104,11 +107,13 @@ def diagnose(evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_off
     causes = [*axes, *_scaled(fit), mount, *([offset] if offset else [])]
     # Noise is what the best explanation leaves; the ground has no say in that.
     least = min(cause.misfit for cause in [sound, *causes])
-    variance = max(least / free, (LEAST_NOISE / NOISE) ** 2)
+    variance = max(least / free, (LEAST_NOISE / noise) ** 2)
     best = min(causes, key=lambda cause: cause.score(variance))
     gain = sound.score(variance) - best.score(variance)
-    before, after = (NOISE * np.sqrt(cause.misfit / free) for cause in (sound, best))
+    before, after = (noise * np.sqrt(cause.misfit / free) for cause in (sound, best))
     if gain > MARGIN and best.size > 1:
+        if variance < 1 and noise == NOISE:  # then the drift of the camera weighs more: a fault must stand that, too
+            return diagnose(evidence, least_angle, least_offset, noise * float(np.sqrt(variance)))
         near = best.score(variance) + RIVAL
         rivals = [cause for cause in causes if cause is not best and cause.size > 1 and cause.score(variance) < near]
         return _named(best, rivals, n, float(before), float(after))
@@ -185,10 +190,10 @@ def _passed(
 class _Fit:
     """How well tilts, changed by some hypothesis, agree once the camera's turns carry them to one frame."""
 
-    def __init__(self, evidence: Evidence) -> None:
-        self.evidence = evidence
+    def __init__(self, evidence: Evidence, noise: float) -> None:
+        self.evidence, self.noise = evidence, noise
         self.ups = evidence.ups @ evidence.mount.T
-        self.operator = _operator(evidence.segments, evidence.drift)
+        self.operator = _operator(evidence.segments, evidence.drift, noise)
         known = np.isfinite(evidence.ground).all(axis=1)
         self.normal = evidence.ground[known].mean(axis=0) if known.any() else None
         self.known = known
@@ -214,13 +219,13 @@ class _Fit:
         return float(np.sum(np.square(self.normal - ups[self.known].mean(axis=0)))) / GROUND**2
 
 
-def _operator(segments: Array, drift: Array) -> Array:
+def _operator(segments: Array, drift: Array, noise: float) -> Array:
     """The matrix (n, n) that whitens the residuals of each segment and takes its mean away."""
     n = len(segments)
     covariance = np.where(segments[:, None] == segments, np.minimum(drift[:, None], drift), 0.0)
     first = np.array([drift[segments == segment].min() for segment in segments])
     covariance -= np.where(segments[:, None] == segments, np.minimum(first[:, None], first), 0.0)
-    whitening = np.linalg.inv(np.linalg.cholesky(NOISE**2 * np.eye(n) + covariance))
+    whitening = np.linalg.inv(np.linalg.cholesky(noise**2 * np.eye(n) + covariance))
     means = whitening @ (segments[:, None] == np.unique(segments)).astype(float)
     basis = np.linalg.qr(means)[0]
     operator: Array = whitening - basis @ (basis.T @ whitening)
@@ -326,8 +331,9 @@ def _mount(fit: _Fit, least: float) -> _Cause:
     return _Cause(fault, remedy, misfit, fit.slope_of(ups), 3, angle / least, spread / least, turn @ mount)
 
 
-def _offset(evidence: Evidence, sound: _Cause, least: float) -> _Cause | None:
+def _offset(whole: _Fit, sound: _Cause, least: float) -> _Cause | None:
     """The time by which the tilt's stamps are late; None where frames are too far apart or too few to tell."""
+    evidence = whole.evidence
     within, splines = _splines(evidence)
     kept = within >= 0
     if np.count_nonzero(kept) < LEAST_FRAMES:
@@ -336,7 +342,7 @@ def _offset(evidence: Evidence, sound: _Cause, least: float) -> _Cause | None:
         evidence.stamps[kept], evidence.segments[kept], evidence.cameras[kept], evidence.drift[kept],
         evidence.ups[kept], evidence.mount, evidence.ground[kept],
     )  # fmt: skip
-    fit = _Fit(part)
+    fit = _Fit(part, whole.noise)
     seconds = (part.stamps - evidence.stamps[0]) / 1e9
 
     def misfit(late: float) -> float:

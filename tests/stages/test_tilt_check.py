@@ -112,7 +112,7 @@ def test_ground_far_off_level_in_every_frame_is_a_warning_however_few_they_are(f
     found = stage.finding()
     assert found.severity is Severity.WARNING
     assert re.search(r"off level by 29\.\d degrees or more in (the only|every)", found.sentence), found.sentence
-    assert "look at the sign of pitch, the inclinometer's axes and its mount" in found.sentence
+    assert "look at the unit and the sign of pitch, the inclinometer's axes and its mount" in found.sentence
 
 
 def test_steep_ground_is_no_fault_nor_is_a_bank_that_only_some_frames_show():

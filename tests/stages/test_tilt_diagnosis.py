@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -69,6 +69,7 @@ def test_a_time_offset_is_named_with_its_size(drive, late):
 
 
 @settings(max_examples=40, deadline=None)
+@example(seed=31, slope=2.0, noise=0.03, frames=22, odometry=0.05)  # the camera's drift is more than the tilt's noise
 @given(
     seed=st.integers(10, 49), slope=st.sampled_from([2.0, 4.0, 8.0]), noise=st.sampled_from([0.03, 0.1, 0.3, 0.6]),
     frames=st.integers(3, 50), odometry=st.sampled_from([0.0, 0.01, 0.05]),
