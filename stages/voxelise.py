@@ -45,23 +45,23 @@ class Voxelise(Stage):
       where the cloud has such points;
     - percentile_P for each P in `percentiles`, m.
 
-    The random variance of a mean of n points is noise * (systematic + min(1, correlated / n)) + shape: noise is the
-    mean square of what the points' depth errors do to a height, on a slope more or less than on the level, and the mean
-    of points that share one error is as sure as one of them; shape is what the mean of some points misses of an uneven
-    cell, by its scatter beyond the slope's and the noise's and by its height off its neighbours; few points miss more
-    (`sampling`^2 / n), and so does a cell beside an empty one, of which they may show one side (`rim`). Errors have
-    longer tails than a Gaussian's: where 92 to 95 % are within two such sigmas, 69 to 74 % are within one.
+    The random variance of a mean of n points is tails * noise * (systematic + min(1, correlated / n)) + shape: noise is
+    the mean square of what the points' depth sigmas do to a height, on a slope more or less than on the level, and the
+    mean of points that share one error is as sure as one of them; shape is what the mean of some points misses of an
+    uneven cell, by its scatter beyond the slope's and the noise's and by its height off its neighbours; a cell beside
+    an empty one, of which they may show one side, misses more (`rim`). Errors have longer tails than a Gaussian's:
+    where 92 to 95 % are within two such sigmas, 69 to 74 % are within one.
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
     region: float = parameter(8.0, "horizontal range from the level frame's origin kept in the map", unit="m", low=0.1)
-    correlated: float = parameter(6.0, "neighbouring points that share one matching error", low=1.0)
-    systematic: float = parameter(0.05, "share of the points' variance that no averaging removes", low=0.0, high=1.0)
-    scatter: float = parameter(0.6, "share of the scatter beyond slope and noise in the variance", low=0.0)
-    bend: float = parameter(0.8, "share of the square of the height off the neighbours in the variance", low=0.0)
-    sampling: float = parameter(0.003, "what a single point may miss of its cell", unit="m", low=0.0)
+    tails: float = parameter(1.2, "variance of a point over the square of its sigma, within which 68 % are", low=0.0)
+    correlated: float = parameter(12.0, "neighbouring points that share one matching error", low=1.0)
+    systematic: float = parameter(0.06, "share of the points' variance that no averaging removes", low=0.0, high=1.0)
+    scatter: float = parameter(0.15, "share of the scatter beyond slope and noise in the variance", low=0.0)
+    bend: float = parameter(0.4, "share of the square of the height off the neighbours in the variance", low=0.0)
     rim: float = parameter(
-        0.15, "share of the square of its rise in the variance of a cell beside an empty one", low=0.0
+        0.12, "share of the square of its rise in the variance of a cell beside an empty one", low=0.0
     )
     reach: float = parameter(
         0.0, "how far along its line of sight, in standard deviations of its depth, a measured point speaks for cells "
@@ -150,10 +150,9 @@ class Voxelise(Stage):
         uneven = np.maximum(scatter - rise / 12 - SHOWING * noise, 0.0)
         beside = ~binary_erosion(np.isfinite(mean), np.ones((3, 3)))
         return np.asarray(
-            noise * (self.systematic + np.minimum(1.0, self.correlated / n))
+            self.tails * noise * (self.systematic + np.minimum(1.0, self.correlated / n))
             + self.scatter * uneven
             + self.bend * bend * bend
-            + self.sampling**2 / n
             + np.where(beside, self.rim * rise, 0.0)
         )
 

@@ -80,7 +80,7 @@ def test_the_order_of_points_moves_at_most_the_last_bits_and_one_order_gives_the
 def test_the_layers_of_one_cell_are_those_of_its_points() -> None:
     heights = np.array([0.1, 0.2, 0.6])
     points = np.column_stack([np.full(3, 2.01), np.full(3, -1.02), heights])
-    grid = Voxelise(percentiles=(50.0, 75.0), sampling=0.0, scatter=1.0)(cloud_of(points, sigma=0.0))
+    grid = Voxelise(percentiles=(50.0, 75.0), scatter=1.0)(cloud_of(points, sigma=0.0))
     row, col = int((-1.02 - grid.origin[1]) / 0.05), int((2.01 - grid.origin[0]) / 0.05)
     value = {name: float(layer[row, col]) for name, layer in grid.layers.items()}
     assert value == pytest.approx(
@@ -150,7 +150,7 @@ def test_a_hole_stays_a_hole_and_an_empty_cloud_is_an_empty_map_of_the_usual_sha
         np.testing.assert_array_equal(np.isnan(full.layers[name]), full.layers["count"] == 0)
 
 
-PURE = Voxelise(correlated=1.0, systematic=0.0, scatter=0.0, bend=0.0, sampling=0.0, rim=0.0)
+PURE = Voxelise(tails=1.0, correlated=1.0, systematic=0.0, scatter=0.0, bend=0.0, rim=0.0)
 
 
 @pytest.mark.parametrize("slope", [-0.1, 0.0, 0.3])
