@@ -152,10 +152,15 @@ def _converted(pixels: Array, conversion: int | None) -> Array:
 
 
 def camera_model(info: Any) -> CameraModel:
-    """The calibration of a sensor_msgs/CameraInfo, as it stands."""
+    """The calibration of a sensor_msgs/CameraInfo, for the part of the sensor and the binning that it tells."""
+    roi, across, down = info.roi, max(int(info.binning_x), 1), max(int(info.binning_y), 1)
+    x, y = float(roi.x_offset), float(roi.y_offset)
+    taken = np.array([[1 / across, 0, -x / across], [0, 1 / down, -y / down], [0, 0, 1]])
+    k, p = info.k.reshape(3, 3), info.p.reshape(3, 4)
     return CameraModel(
-        width=int(info.width), height=int(info.height), k=info.k.reshape(3, 3), d=info.d, r=info.r.reshape(3, 3),
-        p=info.p.reshape(3, 4), model=info.distortion_model or "plumb_bob",
+        width=int(roi.width or info.width) // across, height=int(roi.height or info.height) // down,
+        k=taken @ k if k.any() else k, d=info.d, r=info.r.reshape(3, 3), p=taken @ p if p.any() else p,
+        model=info.distortion_model or "plumb_bob",
     )  # fmt: skip
 
 

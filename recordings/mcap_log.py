@@ -24,7 +24,7 @@ from recordings.mcap_index import Lost, Raw, said
 from recordings.mcap_opening import CAMERAS, Decoder, Opening, peek_stamp
 from recordings.mcap_reader import McapFile
 from recordings.rig import Camera, Frames
-from stages.data import CameraImage, CameraModel, Mount, Tilt
+from stages.data import CameraImage, CameraModel, Mount, Pose, Tilt
 
 if TYPE_CHECKING:
     from recordings.mcap_source import McapSource
@@ -274,7 +274,7 @@ class McapLog:
         tilt, base_frame = self.source.angles() or tilt_of, self.source.base_frame
         made: dict[str, Callable[[Any, int], Any]] = {
             "inclinometer": lambda message, log_time: self._of_the_mount(tilt(message, log_time)),
-            "odometry": lambda message, log_time: pose_of(message, log_time, base_frame),
+            "odometry": lambda message, log_time: self._of_the_image(pose_of(message, log_time, base_frame)),
         }
         for side, camera in zip(CAMERAS, self.cameras or (), strict=False):
             made[side] = _Images(camera, calibrations[side])
@@ -287,6 +287,9 @@ class McapLog:
         if known and tilt.frame_id != known:
             raise LogError(f"its frame is '{tilt.frame_id}', but the mount was found for '{known}'")
         return tilt
+
+    def _of_the_image(self, pose: Pose | None) -> Pose | None:
+        return pose if pose is None or self.cameras is None else self.cameras[0].of_image(pose)
 
     def _reading(self, stream: str, topic: str, item: Callable[[Any, int], Any]) -> Reading:
         decoders = {number: self._opening.decoders[number] for number in self._opening.channels_of(topic)}
@@ -307,7 +310,7 @@ class _Images:
     def __call__(self, message: Any, log_time: int) -> CameraImage:
         model, stamp = self.camera.model, stamp_or(message.header, log_time)
         self.calibrations.check(stamp)
-        frame = self.camera.frame_id or message.header.frame_id.lstrip("/")
+        frame = self.camera.image_frame or message.header.frame_id.lstrip("/")
         pixels = pixels_of(message, (model.width, model.height))
         return CameraImage(stamp, pixels, model, frame, self.camera.rectified)
 

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 CAMERAS = ("left", "right")
 EVER = 0  # ns, the stamp of what holds throughout: frames may be before the log's first message, or of another clock
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
-_LOOKED_AT = 20  # messages of an Imu; an orientation filter may begin with nonsense
+_LOOKED_AT = 20  # messages of a topic, of which one can be read
+_PLACES = 4  # in a log, from which messages of an Imu are looked at; an orientation filter may begin with nonsense
 _TRANSFORMS_LOOKED_AT = 100  # messages from the first one of the rover on; others may come more rarely
 _LISTED = 5  # topics in a sentence
 
@@ -201,8 +202,8 @@ class Opening:
                     self.missing[side] = f"{self.topics[side]}: {unread}; record it in one of these"
 
     def _check_pixels(self) -> None:
-        """Cameras whose first and last images do not fit their calibration, or each other, are missing: so hardly any
-        frame could be made."""
+        """Cameras whose first and last images cannot be read, or do not fit their calibration or each other, are
+        missing: so hardly any frame could be made."""
         if any(side not in self.infos or side in self.missing for side in CAMERAS):
             return
         first = {side: self._pixels(side) for side in CAMERAS}
@@ -210,30 +211,35 @@ class Opening:
             last = self._misfits({side: self._pixels(side, last=True) for side in CAMERAS})
             self.missing.update((side, why) for side, why in self._misfits(first).items() if side in last)
 
-    def _misfits(self, images: dict[str, Array | None]) -> dict[str, str]:
-        """Side -> why its image does not fit its calibration or that of the other side."""
+    def _misfits(self, images: dict[str, Array | LogError]) -> dict[str, str]:
+        """Side -> why there is no image, or it does not fit its calibration or that of the other side."""
         said = dict[str, str]()
         for side, pixels in images.items():
             topic, (info, model) = self.topics[side], self.infos[side]
-            if pixels is not None and pixels.shape[:2] != (model.height, model.width):
+            if isinstance(pixels, LogError):
+                said[side] = f"{topic}: {pixels}"
+            elif pixels.shape[:2] != (model.height, model.width):
                 size = f"{pixels.shape[1]}x{pixels.shape[0]}"
                 said[side] = (
                     f"the images on {topic} are {size}, but {info} is the calibration of images of "
                     f"{model.width}x{model.height}; set '{side}_info' of the source to that of these, or record it"
                 )
         left, right = (images[side] for side in CAMERAS)
-        if not said and left is not None and right is not None and _kind(left) != _kind(right):
+        if not (said or isinstance(left, LogError) or isinstance(right, LogError)) and _kind(left) != _kind(right):
             one, other = self.topics["left"], self.topics["right"]
             why = f"the images on {one} are {_kind(left)}, those on {other} {_kind(right)}; record both alike"
             said.update(left=why, right=why)
         return said
 
-    def _pixels(self, side: str, last: bool = False) -> Array | None:
-        """The first image of a side that can be decoded, or its last; None where it cannot."""
+    def _pixels(self, side: str, last: bool = False) -> Array | LogError:
+        """The first image of a side that can be decoded, or its last; else why that cannot."""
         topic = self.topics[side]
         start = max(self.file.times(self.channels_of(topic)).tolist(), default=None) if last else None
-        made = islice(self._made(topic, pixels_of, start), _LOOKED_AT)
-        return next((pixels for pixels in made if not isinstance(pixels, LogError)), None)
+        found: Array | LogError = LogError("it has no messages")
+        for found in islice(self._made(topic, pixels_of, start), _LOOKED_AT):
+            if not isinstance(found, LogError):
+                break
+        return found
 
     def _tell_sealed(self) -> None:
         """Messages of a chosen topic that came in another encoding, or by another schema, are lost."""
@@ -250,13 +256,14 @@ class Opening:
         return "" if isinstance(frame, LogError) else frame
 
     def _untilted(self, topic: str) -> str | None:
-        """Why the first messages of an Imu tell no tilt; None where one does."""
-        why: LogError | None = LogError("it has no messages")
-        made = self._made(topic, lambda message: tilt_of(message, 0), any_order=True)
-        for tilt in islice(made, _LOOKED_AT):
-            if not isinstance(tilt, LogError):
-                return None
-            why = tilt
+        """Why the messages of an Imu tell no tilt, as far as some from all over the log show; None where one does."""
+        why = LogError("it has no messages")
+        for start in range(self.file.start, self.file.end + 1, max((self.file.end - self.file.start) // _PLACES, 1)):
+            made = self._made(topic, lambda message: tilt_of(message, 0), start, any_order=True)
+            for tilt in islice(made, _LOOKED_AT):
+                if not isinstance(tilt, LogError):
+                    return None
+                why = tilt
         return str(why)
 
     def _unplaced(self, topic: str) -> str | None:

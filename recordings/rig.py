@@ -1,7 +1,7 @@
 """How the rover is built, from its log: static transforms, the calibrated pair, and how the camera sits on the rover.
 
 Rectified coordinates are what a camera's own turn into by its rectifying rotation R (CameraInfo); the transforms of a
-log speak of the camera's own frame, so R is applied where they meet the rectified image.
+log speak of the camera's own frame, so R is applied where they meet the rectified image, whose frame has another name.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from recordings.decode import transform_of
 from recordings.discovery import looks_rectified
 from recordings.errors import LogError
-from stages.data import Array, CameraModel, Mount, StereoCamera, Transform
+from stages.data import Array, CameraModel, Mount, Pose, StereoCamera, Transform
 
 # A camera's axes (x right, y down, z forward) in the rover's (x forward, y left, z up), when it looks straight ahead.
 BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -80,11 +80,24 @@ def _same(one: Transform, other: Transform) -> bool:
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera: its calibration, whether its images are rectified, its frame."""
+    """One camera: its calibration, whether its images are rectified, its own frame."""
 
     model: CameraModel
     rectified: bool
     frame_id: str
+
+    @property
+    def image_frame(self) -> str:
+        """The frame of its rectified image: its own, or where R turns that, another of a name made from its own."""
+        turned = not np.allclose(self.model.r, np.eye(3), rtol=0, atol=_SAME)
+        return f"{self.frame_id}_rectified" if turned and self.frame_id else self.frame_id
+
+    def of_image(self, pose: Pose) -> Pose:
+        """A pose of the camera's own frame as that of its rectified image; any other as it is."""
+        if pose.child_frame_id != self.frame_id or self.image_frame == self.frame_id:
+            return pose
+        turned = Rotation.from_quat(pose.quaternion) * Rotation.from_matrix(self.model.r.T)
+        return replace(pose, quaternion=turned.as_quat(), child_frame_id=self.image_frame)
 
 
 def calibrated_pair(
@@ -109,8 +122,9 @@ def calibrated_pair(
             f"{topics[0]} and {topics[1]} are called rectified, but the static transform between them says that "
             "they are not parallel; record the stereo calibration, or the images before rectification"
         )
-    if not rectified and min(left.k[0, 0], right.k[0, 0]) <= 0:
-        raise LogError(f"{topics[0]} and {topics[1]} are not rectified, and K of a CameraInfo is 0; calibrate them")
+    for model, topic in zip((left, right), topics, strict=True):
+        if not rectified and model.unusable:
+            raise LogError(f"the images on {topic} cannot be rectified by their CameraInfo: {model.unusable}")
     if placed is not None:
         left, right = (_joined if rectified else _rectifying)(left, right, placed)
     baseline = float(left.p[0, 3]) / float(left.p[0, 0]) - float(right.p[0, 3]) / float(right.p[0, 0])
@@ -153,7 +167,9 @@ def baseline_note(
 
 
 def is_ideal(model: CameraModel) -> bool:
-    """Whether raw and rectified image are the same: no distortion, no rotation, K = P."""
+    """Whether raw and rectified image are the same: no distortion, no rotation, K = P; or there is no K."""
+    if not np.any(model.k):
+        return True
     return not np.any(model.d) and np.allclose(model.r, np.eye(3)) and np.allclose(model.k, model.p[:, :3])
 
 
@@ -164,6 +180,8 @@ def _checked(model: CameraModel, topic: str) -> CameraModel:
         raise LogError(f"the camera of {topic} is not calibrated (K and P of its CameraInfo are 0); calibrate it")
     if not np.any(model.r):
         model = replace(model, r=np.eye(3))
+    if not model.turns:
+        raise LogError(f"R of {whose} is not a rotation; calibrate the camera again")
     if not np.any(model.p):
         model = replace(model, p=np.hstack([model.k, np.zeros((3, 1))]))
     if model.p[0, 0] <= 0 or model.p[1, 1] <= 0:
@@ -252,7 +270,7 @@ def mounted(
     coordinates, where the user gave it. Raises LogError where nothing tells that rotation.
     """
     based = frames.between(base, camera.frame_id)
-    rectified = Transform(camera.frame_id, camera.frame_id, camera.model.r.T, np.zeros(3))
+    rectified = Transform(camera.frame_id, camera.image_frame, camera.model.r.T, np.zeros(3))
     base_from_camera = based.after(rectified) if based is not None else None
     return Mount(stamp, _camera_from_inclinometer(camera, inclinometer, frames, given), base_from_camera)
 

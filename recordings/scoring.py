@@ -34,6 +34,7 @@ TRUTHS = (
     "/truth/tilt", "/truth/pose",
 )  # fmt: skip
 PATIENCE = 5_000_000_000  # ns of log time after which no log adds to a frame any more
+ALIKE = 1e-3  # of the focal length or baseline; cameras that differ by less see alike
 FIRST = 9  # stamps that tell how far the clock of the logging is from theirs
 
 
@@ -168,9 +169,12 @@ class _Tally:
         thing, rocks that were lost another."""
         lacking = (needed | (besides & self.truths)) - frame.keys()
         for topic in needed & frame.keys() if lacking else ():
-            counts, why = self.unscored.setdefault(topic, {}), f"the truth has no {', '.join(sorted(lacking))} there"
-            counts[why] = counts.get(why, 0) + 1
+            self._leave_out(topic, f"the truth has no {', '.join(sorted(lacking))} there")
         return not lacking
+
+    def _leave_out(self, topic: str, why: str) -> None:
+        counts = self.unscored.setdefault(topic, {})
+        counts[why] = counts.get(why, 0) + 1
 
     def _add_disparity(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
         true = ros2.read_disparity(frame["/truth/disparity"])
@@ -181,6 +185,10 @@ class _Tally:
                 f"{self.result}: /nav/disparity at {stamp} ns is {estimate.shape[1]}x{estimate.shape[0]}, the truth in "
                 f"{self.truth} is {true.shape[1]}x{true.shape[0]}; score a run of that very log"
             )
+        if given is not None and not _alike(given, frame["/truth/disparity"]):
+            why = f"{_lens(given)}, the truth's has {_lens(frame['/truth/disparity'])}: they are not of the same image"
+            self._leave_out("/nav/disparity", f"its camera has {why}")
+            return {}
         columns = cropped_columns(frame["/truth/disparity"].max_disparity)
         errors = StereoErrors.of(estimate, true, self._occlusion(stamp, frame, true.shape), columns)
         self.disparity = self.disparity + errors if self.disparity else errors
@@ -276,6 +284,15 @@ class _Tally:
             pose=self.pose.measures(),
             per_frame=self.per_frame,
         )  # fmt: skip
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two DisparityImages are of cameras with one focal length and baseline, as far as both tell."""
+    return bool(np.isnan([one.f, one.t]).any() or np.allclose((one.f, one.t), (other.f, other.t), rtol=ALIKE, atol=0))
+
+
+def _lens(disparity: Any) -> str:
+    return f"f = {disparity.f:.6g} px and a baseline of {disparity.t:.4g} m"
 
 
 def _rotation(quaternion: Any) -> Array:

@@ -28,6 +28,8 @@ from stages.publish import publish, publish_image, publish_vector, read_only
 from stages.tiles import Tiles as Tiles
 
 LEVEL_FRAME = "level"
+_OPENCV = (0, 4, 5, 8, 12, 14)  # coefficients; how many there are tells the model, whatever a driver calls it
+DISTORTION_SIZES = {"plumb_bob": _OPENCV, "rational_polynomial": _OPENCV, "equidistant": (4,)}
 
 
 class Source(IntEnum):
@@ -86,6 +88,26 @@ class CameraModel:
     def __post_init__(self) -> None:
         for name, shape in (("k", (3, 3)), ("d", (np.size(self.d),)), ("r", (3, 3)), ("p", (3, 4))):
             publish_vector(self, name, shape)
+
+    @property
+    def turns(self) -> bool:
+        """Whether R is a rotation."""
+        return bool(np.allclose(self.r @ self.r.T, np.eye(3), atol=1e-3) and np.linalg.det(self.r) > 0)
+
+    @property
+    def unusable(self) -> str:
+        """Why a raw image cannot be rectified with it, empty where it can."""
+        sizes = DISTORTION_SIZES.get(self.model)
+        if sizes is None:
+            return f"unknown distortion model '{self.model}'; use {', '.join(DISTORTION_SIZES)}"
+        if self.d.size not in sizes:
+            wanted = " or ".join(map(str, sizes))
+            return f"a {self.model} camera has {wanted} distortion coefficients, the calibration has {self.d.size}"
+        if not min(self.k[0, 0], self.k[1, 1]) > 0:
+            return "the calibration of a raw image has no focal length in K"
+        if not self.turns:
+            return "R of the calibration is not a rotation"
+        return ""
 
 
 @dataclass(frozen=True, eq=False)

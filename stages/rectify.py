@@ -22,7 +22,6 @@ from stages.intensity import eight_bit, gray
 from stages.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
 from stages.stage import Finding, Severity, Stage, counted, parameter
 
-DISTORTION_SIZES = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 LARGEST_OFFSET = 64.0  # px
 UNUSUAL = 8.0  # px, more than a calibration leaves
 MOST_CROSSED = 0.5  # of the features
@@ -146,18 +145,8 @@ def _rectifying_maps(
     """Where in the raw image each rectified pixel lies, moved down by the offset, in cv2.remap's fixed point."""
     numbers = np.frombuffer(values)
     k, r, p, d = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:30].reshape(3, 4), numbers[30:]
-    if model not in DISTORTION_SIZES:
-        raise ValueError(f"Rectify: unknown distortion model '{model}'; use {', '.join(DISTORTION_SIZES)}")
-    if d.size not in DISTORTION_SIZES[model]:
-        raise ValueError(
-            f"Rectify: a {model} camera has {' or '.join(map(str, DISTORTION_SIZES[model]))} distortion coefficients, "
-            f"the calibration has {d.size}"
-        )
-    if not (min(k[0, 0], k[1, 1]) > 0 and np.allclose(r @ r.T, np.eye(3), atol=1e-3)):
-        raise ValueError(
-            "Rectify: the calibration of a raw image has no focal length in K, or its R is not a rotation; mend it, or "
-            "say that the images are rectified"
-        )
+    if wrong := CameraModel(width, height, k, d, r, p, model).unusable:
+        raise ValueError(f"Rectify: {wrong}")
     undistort = cv2.fisheye.initUndistortRectifyMap if model == "equidistant" else cv2.initUndistortRectifyMap
     down = offset_field(terms, width, height)
     above = int(np.ceil(np.abs(down).max())) if terms else 0  # rows beyond the image that the offset may look up

@@ -108,6 +108,8 @@ class Simulation:
             if (value := getattr(self, name)) > high:
                 shown = f"at most {high * scale:g}{unit}, not {value * scale:g}{unit}"
                 raise ValueError(f"Simulation.{name} must be {shown}")
+        if not abs(self.pitch_down) <= np.pi / 2:
+            raise ValueError(f"Simulation.pitch_down must be at most 90 degrees, not {np.degrees(self.pitch_down):g}")
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
         if not 0 < self.sun_elevation <= np.pi / 2:

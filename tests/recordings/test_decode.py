@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from recordings.decode import pixels_of, pose_of, up_of
+from recordings.decode import camera_model, pixels_of, pose_of, up_of
 from recordings.errors import LogError
-from recordings.ros2 import header, image, make
+from recordings.ros2 import camera_info, header, image, make
+from stages.data import CameraModel
 from tests.recordings.sample_log import HEIGHT, WIDTH, picture
 
 
@@ -35,6 +36,19 @@ def test_up_agrees_with_a_rover_that_is_turned(pitch: float, roll: float, yaw: f
 def test_angles_that_no_attitude_has_are_refused() -> None:
     with pytest.raises(LogError, match="check unit and tilt_model"):
         up_of(1.2, 1.2, "axis")
+
+
+def test_a_calibration_is_that_of_the_part_of_the_sensor_that_was_read() -> None:
+    k = np.array([[500.0, 0, 330], [0, 510, 250], [0, 0, 1]])
+    p = np.array([[490.0, 0, 320, -120], [0, 490, 240, 0], [0, 0, 1, 0]])
+    message = camera_info(1, "cam", CameraModel(640, 480, k, np.zeros(5), np.eye(3), p))
+    message.binning_x, message.binning_y = 2, 4
+    message.roi.x_offset, message.roi.y_offset, message.roi.width, message.roi.height = 100, 40, 400, 320
+    taken, points = camera_model(message), np.array([[0.1, 0.2, 1], [-0.3, 0.05, 1]]).T
+    assert (taken.width, taken.height) == (200, 80)
+    np.testing.assert_allclose((taken.k @ points)[:2].T, ((k @ points)[:2].T - [100, 40]) / [2, 4])
+    np.testing.assert_allclose(taken.p[0, 3] / taken.p[0, 0], -120 / 490)  # the baseline stays
+    np.testing.assert_allclose((taken.p[:, :3] @ points)[:2].T, ((p[:, :3] @ points)[:2].T - [100, 40]) / [2, 4])
 
 
 def raw_image(encoding: str, rows: np.ndarray, width: int, big: bool = False) -> Any:

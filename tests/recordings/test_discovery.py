@@ -181,6 +181,17 @@ def test_an_imu_that_begins_with_nonsense_is_still_an_inclinometer(tmp_path: Pat
     assert [stream for stream, _ in losses] == ["inclinometer"]
 
 
+def test_an_imu_that_is_nonsense_for_long_is_still_an_inclinometer(tmp_path: Path, monkeypatch: Any) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == TILT and number < FRAMES - 2:
+            message.orientation_covariance = np.full(9, -1.0)
+        return message
+
+    monkeypatch.setattr("recordings.mcap_opening._LOOKED_AT", 1)
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert log.missing == {}
+
+
 def test_both_names_of_the_sample_are_its_pair(sample: Path) -> None:
     with McapSource().open(sample) as log:
         assert (log.topics["left"], log.topics["right"]) == (LEFT, RIGHT)

@@ -275,6 +275,17 @@ def test_a_camera_whose_images_nobody_can_read_is_missing_before_the_run(tmp_pat
     assert (described["frames"]["pairs"], described["missing"]) == (0, log.missing)
 
 
+def test_a_camera_whose_images_are_all_broken_is_missing_before_the_run(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == RIGHT:
+            message.data = message.data[:-5]
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert list(log.missing) == ["right"]
+        assert log.missing["right"].startswith(f"{RIGHT}: the image is cut: ")
+
+
 def gray(message: Any) -> Any:
     message.encoding, message.step, message.data = "mono8", WIDTH, message.data[: WIDTH * HEIGHT]
     return message

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from recordings.errors import LogError
 from recordings.rig import Frames, calibrated_pair
 from recordings.ros2 import transform_message
 from stages.data import CameraModel, Transform
-from tests.recordings.sample_log import LEFT, START, TRANSFORMS, model, write_sample
+from tests.recordings.sample_log import FRAMES, LEFT, START, TRANSFORMS, model, tilt_quaternion, write_sample
 
 RAW = ("/left/image_raw", "/right/image_raw")
 RECTIFIED = ("/left/image_rect", "/right/image_rect")
@@ -101,6 +102,7 @@ def test_exchanged_cameras_are_named_so(tmp_path: Path, names: tuple[str, str]) 
         ({"d": np.full(5, np.nan)}, "must be finite"),
         ({"p": np.full(12, np.nan)}, "must be finite"),
         ({"p": np.hstack([np.diag([0.0, 20, 1]), np.zeros((3, 1))]).reshape(-1)}, "focal lengths in P .* not positive"),
+        ({"r": np.diag([1.0, 1.0, 0.5]).reshape(-1)}, "R of the CameraInfo of .* is not a rotation"),
         ({"width": 11}, r"principal point \(11.5, 7.5\) in P of the CameraInfo of .* lies outside its 11x16 images"),
         ({"height": 7}, "lies outside its 24x7 images"),
         ({"width": 0}, "is for images of 0x16"),
@@ -116,6 +118,35 @@ def test_a_calibration_that_cannot_be_is_told_as_such(tmp_path: Path, values: di
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log, pytest.raises(LogError, match=said):
         raise LogError(log.missing["left"])
+
+
+@pytest.mark.parametrize(
+    ("model", "count", "said"),
+    [
+        ("fisheye", 4, "cannot be rectified by their CameraInfo: unknown distortion model 'fisheye'"),
+        ("plumb_bob", 3, "a plumb_bob camera has 0 or 4 or 5 or .* coefficients, the calibration has 3"),
+        ("plumb_bob", 8, ""),  # as many drivers call a rational polynomial
+    ],
+)
+def test_a_lens_that_cannot_be_undone_is_told_before_the_run(tmp_path: Path, model: str, count: int, said: str) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic.endswith("camera_info"):
+            message.distortion_model, message.d = model, np.full(count, 1e-3)
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=RAW)) as log:
+        assert re.search(said, log.missing["left"]) if said else not log.missing
+
+
+def test_a_calibration_of_the_projection_alone_is_that_of_rectified_images(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic.endswith("camera_info"):
+            message.k = np.zeros(9)
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert log.cameras is not None
+        assert all(camera.rectified for camera in log.cameras)
 
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
@@ -143,6 +174,28 @@ def test_lenses_that_leave_no_image_are_refused() -> None:
         frames.add(item)
     with pytest.raises(LogError, match="no image of 640x480 px can be rectified with these lenses"):
         calibrated_pair((lens, lens), ("l", "r"), RAW, frames)
+
+
+def test_a_rectified_image_has_a_frame_of_its_own_where_r_turns_the_camera(tmp_path: Path) -> None:
+    """Everything that speaks of the camera's own frame, transforms and poses, is turned by R on its way in."""
+    by = turned("y", 2.0) @ turned("x", -1.0)
+
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic.endswith("camera_info"):
+            message.r = by.ravel()
+        if topic == "/odom":
+            message.child_frame_id = "left_optical"
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=RECTIFIED)) as log:
+        found = {stream: item for _, stream, item in log if stream in ("left", "mount", "odometry")}
+        camera, mount, pose = found["left"], found["mount"].base_from_camera, found["odometry"]
+    assert camera.frame_id == mount.child == pose.child_frame_id == "left_optical_rectified"
+    own = TRANSFORMS[0].rotation  # of the camera on the rover
+    np.testing.assert_allclose(mount.rotation @ by, own, atol=1e-12)
+    np.testing.assert_allclose(mount.translation, TRANSFORMS[0].translation)
+    given = Rotation.from_quat(tilt_quaternion(FRAMES - 1)).as_matrix()
+    np.testing.assert_allclose(Rotation.from_quat(pose.quaternion).as_matrix() @ by, given, atol=1e-9)
 
 
 def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:

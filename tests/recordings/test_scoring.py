@@ -55,6 +55,7 @@ class Run:
     shift: dict[int, int] = field(default_factory=dict)
     only: tuple[str, ...] = field(default=(*scoring.RESULTS, "/tf"))
     camera: str = "left_camera_optical"
+    lens: dict[str, float] = field(default_factory=dict)
     blind: tuple[int, ...] = ()  # frames that say unknown everywhere
 
     def write(self, path: Path, frames) -> Path:
@@ -72,7 +73,8 @@ class Run:
     def messages(self, stamp, frame):
         true = log.true_disparity(SMALL, stamp, frame)
         disparity = Disparity(
-            stamp, self.disparity(true.pixels.copy()), true.source, true.confidence, camera=SMALL.camera
+            stamp, self.disparity(true.pixels.copy()), true.source, true.confidence,
+            camera=replace(SMALL.camera, **self.lens),
         )  # fmt: skip
         terrain, navigation = log.truth_maps(SMALL, stamp, frame)
         inside = slice(self.crop, 320 - self.crop), slice(self.crop, 320 - 2 * self.crop)
@@ -145,6 +147,16 @@ def test_disparity_errors_are_told_apart_from_missing_disparity(tmp_path, truth,
     assert found["bad_0.5"] == found["bad_0.5_known"] == 1
     assert found["bad_1_known"] == 0
     assert (found["rmse"], found["mae"]) == pytest.approx((0.75, 0.75), abs=1e-5)
+
+
+@pytest.mark.parametrize("changed", [{"fx": 200.0}, {"baseline": 0.25}])
+def test_disparities_of_another_camera_are_not_compared(tmp_path, truth, frames, changed):
+    found = scored(tmp_path, truth, frames, lens=changed)
+    assert found.disparity is None
+    ((why, count),) = found.unscored["/nav/disparity"].items()
+    assert "its camera has f = " in why
+    assert count == 2
+    assert found.terrain is not None
 
 
 def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth, frames):
