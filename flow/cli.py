@@ -22,6 +22,7 @@ from typing import Any
 
 from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, share, size, workers
 from flow.errors import RoverflowError, SinkError, UsageError
+from flow.graph import Graph
 from flow.program import INTERRUPTED
 from flow.replay import as_json, product_version, replay
 from flow.report import counted, headline, report, say
@@ -190,9 +191,22 @@ def _info(options: argparse.Namespace) -> int:
     graph = load(options.pipeline, options.set)
     if not isinstance(graph.source, McapSource):
         raise UsageError(f"{graph.source_use} is no recordings.McapSource, through which alone info can look at a log")
-    description = describe(options.log, graph.source)
+    description = describe(options.log, graph.source, **_tolerances(graph))
     say(json.dumps(description, indent=2) if options.json else format_description(description))
     return COMPLETE
+
+
+def _tolerances(graph: Graph) -> dict[str, int]:
+    """How far apart the pipeline lets the two images of a frame be, and the tilts around one, ns; if it aligns them."""
+    from flow.align import Interpolate, Pair
+
+    found = {}
+    for node in graph.aligners:
+        if isinstance(node.actor, Pair) and {*node.inputs.values()} == {"left", "right"}:
+            found["slop"] = node.actor.slop
+        if isinstance(node.actor, Interpolate) and node.inputs["stream"] == "inclinometer":
+            found["max_gap"] = node.actor.max_gap
+    return found
 
 
 def _graph_arguments(sub: argparse.ArgumentParser) -> None:
@@ -213,6 +227,9 @@ def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--frames", type=count, help="stereo frames (default 12)")
     sub.add_argument("--seed", type=int, help="another seed, another terrain (1)")
     sub.add_argument("--size", type=size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
+    sub.add_argument("--baseline", type=magnitude, metavar="M", help="distance between the cameras (0.24)")
+    sub.add_argument("--camera-height", type=magnitude, metavar="M", help="of the cameras above the ground (0.9)")
+    sub.add_argument("--pitch-down", type=magnitude, metavar="DEG", help="how far the cameras look down (15)")
     sub.add_argument("--rocks", type=magnitude, metavar="K", help="share of ground under rocks (Golombek's k, 0.1)")
     sub.add_argument("--slope", type=magnitude, metavar="DEG", help="RMS slope of the terrain (4)")
     sub.add_argument("--tilt-noise", type=magnitude, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
@@ -224,9 +241,9 @@ def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
 
 def _simulate(options: argparse.Namespace) -> int:
     check_outputs({"input log": options.out}, [], is_ours)
-    settings = {name: getattr(options, name) for name in ("frames", "seed", "odometry_scale")}
-    settings["abundance"] = options.rocks
-    for name in ("slope", "tilt_noise", "odometry_turn"):
+    plain = ("frames", "seed", "baseline", "camera_height", "odometry_scale")
+    settings = {name: getattr(options, name) for name in plain} | {"abundance": options.rocks}
+    for name in ("pitch_down", "slope", "tilt_noise", "odometry_turn"):
         degrees = getattr(options, name)
         settings[name] = None if degrees is None else math.radians(degrees)
     settings["width"], settings["height"] = options.size

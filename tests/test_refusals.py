@@ -259,6 +259,9 @@ def test_an_export_that_fails_leaves_nothing_in_the_way_of_another(result, tmp_p
         ("--slope", "80", "--slope must be at most 45 degrees, not 80 degrees"),
         ("--rocks", "2", "--rocks must be at most 0.5, not 2"),
         ("--size", "1x20", "the width of --size must be at least 16"),
+        ("--baseline", "0", "--baseline must be at least 0.001"),
+        ("--camera-height", "0.01", "--camera-height must be at least 0.1"),
+        ("--pitch-down", "120", "--pitch-down must be at most 90 degrees, not 120"),
     ],
 )
 def test_a_simulation_beyond_its_limits_is_refused_in_the_words_of_the_options(tmp_path, capsys, option, value, said):

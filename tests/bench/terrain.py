@@ -1,11 +1,11 @@
 """Maps against the exact truth of simulated traverses: `rover` and `paper`, and `rover` given true disparity and tilt.
 
 Run as `python -m tests.bench.terrain [--seeds 11 12 13] [--rocks 0.05 0.15] [--frames 30] [--stride 1] [--size WxH]
-[--json FILE]`; a stride of 10 makes a short form. Ground of 5 degrees RMS over 1 m, that is slopes to 15 degrees and a
-few beyond; inclinometer noise 0.3 degrees; everything else is the simulator's default. Each frame goes through the
-stages as the pipelines set them, one after the other on one core. Whether stated sigmas with the tilt's hold is counted
-for every frame with the tilt errors of all frames, and of as many times between: what they are off by, a frame's cells
-are off by together.
+[--camera BASELINE HEIGHT DEG] [--json FILE]`; a stride of 10 makes a short form. Ground of 5 degrees RMS over 1 m, that
+is slopes to 15 degrees and a few beyond; inclinometer noise 0.3 degrees; everything else is the simulator's default.
+Each frame goes through the stages as the pipelines set them, one after the other on one core. Whether stated sigmas
+with the tilt's hold is counted for every frame with the tilt errors of all frames, and of as many times between: what
+they are off by, a frame's cells are off by together.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
         up = Rotation.from_quat(reading).as_matrix()[2]
         samples.append(Token(at, Tilt(at, up / np.linalg.norm(up))))
     aligner = next(node.actor for node in nodes(pipeline) if node.name == "tilt")
-    tilt = aligner.choose("inclinometer", stamp, samples, True)
+    tilt = aligner.choose("tilt", "inclinometer", stamp, samples, " by the log's end")
     assert isinstance(tilt, Tilt), tilt
     return tilt
 
@@ -166,6 +166,9 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--rocks", type=float, nargs="+", default=[0.05, 0.15], help="k of Golombek's law")
     parser.add_argument("--frames", type=int, default=30, help="frames of each traverse")
     parser.add_argument("--stride", type=int, default=1, help="of which every so many are scored")
+    camera = "distance between the cameras and their height, m, and how far they look down"
+    names, default = ("BASELINE", "HEIGHT", "DEG"), (0.24, 0.9, 15.0)
+    parser.add_argument("--camera", type=float, nargs=3, default=default, metavar=names, help=camera)
     parser.add_argument("--size", type=arguments.size, default=(1280, 960), metavar="WxH", help="of the images")
     parser.add_argument("--runs", nargs="+", choices=[*RUNS, "true"], default=list(RUNS))
     parser.add_argument("--rings", action="store_true", help="the score by distance, too")
@@ -174,12 +177,13 @@ def main(given: Sequence[str] | None = None) -> None:
     cv2.setNumThreads(1)
     keep_freed_memory()  # as a run does
     runs = {name: RUNS[name] for name in RUNS if name in options.runs or ("true" in options.runs and "true" in name)}
-    width, height = options.size
+    (width, height), (baseline, above, down) = options.size, options.camera
     everything = {}
     for rocks in options.rocks:
         simulations = [
             Simulation(frames=options.frames, seed=seed, abundance=rocks, slope=float(SLOPE), threads=1,
-                       tilt_noise=float(TILT_NOISE), width=width, height=height) for seed in options.seeds
+                       tilt_noise=float(TILT_NOISE), width=width, height=height, baseline=baseline,
+                       camera_height=above, pitch_down=float(np.radians(down))) for seed in options.seeds
         ]  # fmt: skip
         found = score(simulations, options.stride, runs)
         count = len(next(iter(found.values())).seconds)
