@@ -121,7 +121,7 @@ class PairState:
             why = f"{late}, more than {_time(self.rule.patience)} ({self.name}.patience)"
         elif apart is not None and not why:
             limit = f"{_time(self.rule.slop)} ({self.name}.slop)"
-            why = f"the nearest {self.inputs[other]} is {_time(apart)} away, more than {limit}"
+            why = f"the nearest {self.inputs[other]} without a partner is {_time(apart)} away, more than {limit}"
         self.given_up[port].append((token.stamp, arrived))
         return Entry(self.inputs[port], token.stamp, self.name, Reason.UNMATCHED, why)
 

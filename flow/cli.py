@@ -191,22 +191,23 @@ def _info(options: argparse.Namespace) -> int:
     graph = load(options.pipeline, options.set)
     if not isinstance(graph.source, McapSource):
         raise UsageError(f"{graph.source_use} is no recordings.McapSource, through which alone info can look at a log")
-    description = describe(options.log, graph.source, **_tolerances(graph))
+    description = describe(options.log, graph.source, *_tolerances(graph))
     say(json.dumps(description, indent=2) if options.json else format_description(description))
     return COMPLETE
 
 
-def _tolerances(graph: Graph) -> dict[str, int]:
-    """How far apart the pipeline lets the two images of a frame be, and the tilts around one, ns; if it aligns them."""
+def _tolerances(graph: Graph) -> tuple[int, int | None]:
+    """How far apart the pipeline lets the two images of a frame be, and the tilts around one, ns; None where it does
+    not interpolate them."""
     from flow.align import Interpolate, Pair
 
-    found = {}
+    slop, max_gap = Pair.slop, None
     for node in graph.aligners:
         if isinstance(node.actor, Pair) and {*node.inputs.values()} == {"left", "right"}:
-            found["slop"] = node.actor.slop
+            slop = node.actor.slop
         if isinstance(node.actor, Interpolate) and node.inputs["stream"] == "inclinometer":
-            found["max_gap"] = node.actor.max_gap
-    return found
+            max_gap = node.actor.max_gap
+    return slop, max_gap
 
 
 def _graph_arguments(sub: argparse.ArgumentParser) -> None:

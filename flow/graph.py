@@ -42,7 +42,8 @@ class Sink(Protocol):
     """Where frames go. `write` is called once for every frame, in stamp order, by one thread at a time.
 
     A sink whose parameters name streams says which do, in `names_streams`, for pipeline files to be checked. With a
-    method `discard` it gives up what `open` began, where another output of the run could not be opened.
+    method `discard` it gives up what `open` began, where another output of the run could not be opened, or no frame
+    got through.
     """
 
     suffix: str

@@ -92,7 +92,7 @@ class _Outputs:
             discard = getattr(self.sinks[use][0], "discard", None)
             if discard is not None:
                 self.opened.remove(use)
-                with suppress(Exception):  # the output that could not be opened is the one to tell of
+                with suppress(Exception):  # why it is given up is what to tell of
                     discard()
 
     def close(self, summary: dict[str, Any]) -> None:
@@ -125,7 +125,8 @@ def run(
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
     closed and readable by then. A run of which no frame gets through leaves no output, and those of an earlier run as
-    they are. Of the summary's wall_seconds, start_seconds were over before the first frame.
+    they are, as far as its sinks can `discard`. Of the summary's wall_seconds, start_seconds were over before the first
+    frame.
     """
     for why in log.refused.values():
         raise UsageError(why)
@@ -230,6 +231,7 @@ def _summary(
         "pipeline": graph.name,
         "frames_in": engine.admitted if engine else 0,
         "frames_out": frames_out,
+        "frames_through": engine.through if engine else 0,  # whole or not
         "drops": ledger.counts(),
         "messages": dict(sorted(feeder.messages.items())),
         "seconds": {name: round(value, 6) for name, value in (engine.seconds if engine else {}).items()},

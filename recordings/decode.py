@@ -152,7 +152,8 @@ def _converted(pixels: Array, conversion: int | None) -> Array:
 
 
 def camera_model(info: Any) -> CameraModel:
-    """The calibration of a sensor_msgs/CameraInfo, for the part of the sensor and the binning that it tells."""
+    """The calibration of a sensor_msgs/CameraInfo, for the part of the sensor and the binning that it tells, in which a
+    pixel at u lies at u / binning (as image_geometry has it)."""
     roi, across, down = info.roi, max(int(info.binning_x), 1), max(int(info.binning_y), 1)
     x, y = float(roi.x_offset), float(roi.y_offset)
     taken = np.array([[1 / across, 0, -x / across], [0, 1 / down, -y / down], [0, 0, 1]])

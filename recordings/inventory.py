@@ -20,12 +20,14 @@ from stages.data import StereoCamera, Tilt
 Stamps = NDArray[np.int64]
 
 
-def describe(path: Path, source: McapSource, slop: int = 5_000_000, max_gap: int = 200_000_000) -> dict[str, Any]:
+def describe(
+    path: Path, source: McapSource, slop: int = 5_000_000, max_gap: int | None = 200_000_000
+) -> dict[str, Any]:
     """The inventory of a log, as plain JSON values. Raises LogError where the file is no log that can be read.
 
     source: how the log's streams are found, as in a pipeline file; slop: largest difference between the stamps of the
-    two images of a frame, ns; max_gap: largest distance between the tilts around a frame, ns. Only stamps count here: a
-    run waits for none that is logged too late.
+    two images of a frame, ns; max_gap: largest distance between the tilts around a frame, ns, None: they are not
+    counted. Only stamps count here: a run waits for none that is logged too late.
     """
     with source.open(Path(path)) as log:
         damage = sorted({lost.reason for lost in log.file.index.lost} | {str(problem) for _, problem in log.problems})
@@ -49,8 +51,8 @@ def describe(path: Path, source: McapSource, slop: int = 5_000_000, max_gap: int
                 "right": len(stamps["right"]),
                 "pairs": _pairs(left, right, slop),
                 "slop_s": slop / 1e9,
-                "with_tilt": _tilted(left, tilts, max_gap),
-                "tilt_gap_s": max_gap / 1e9,
+                "with_tilt": None if max_gap is None else _tilted(left, tilts, max_gap),
+                "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
             },
             "transforms": log.static.listed(),
             "mount": _mount(log),
@@ -88,11 +90,14 @@ def format_description(description: dict[str, Any]) -> str:
         lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
     if all(side in d["streams"] for side in CAMERAS):
         frames = d["frames"]
-        lines.append(
+        paired = (
             f"frames: by their stamps, {counted(frames['pairs'], 'pair')} within {frames['slop_s'] * 1e3:g} ms of "
-            f"{frames['left']} left and {counted(frames['right'], 'right image')}; {frames['with_tilt']} left with "
-            f"tilts around them, at most {frames['tilt_gap_s'] * 1e3:g} ms apart"
+            f"{frames['left']} left and {counted(frames['right'], 'right image')}"
         )
+        if frames["with_tilt"] is not None:
+            gap = f"at most {frames['tilt_gap_s'] * 1e3:g} ms apart"
+            paired += f"; {frames['with_tilt']} left with tilts around them, {gap}"
+        lines.append(paired)
     if d["mount"]:
         down = "unknown" if d["mount"]["base"] is None else f"in '{d['mount']['base']}' at {d['mount']['position']}"
         lines.append(f"mount: camera {down}")
@@ -126,10 +131,11 @@ def _topics(log: McapLog) -> list[dict[str, Any]]:
 
 
 def _grouped(damage: list[str]) -> list[str]:
-    """The sentences, those that differ in numbers alone as one: how many there are, and the first."""
+    """The sentences; of those about single messages that differ in numbers alone, how many there are, and the first."""
     groups: dict[str, list[str]] = {}
     for what in damage:
-        groups.setdefault(re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", what), []).append(what)
+        alike = re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", what) if re.search(r" at \d+ ns\b", what) else what
+        groups.setdefault(alike, []).append(what)
     return [f"{len(alike)} alike, first: {alike[0]}" if len(alike) > 1 else alike[0] for alike in groups.values()]
 
 
@@ -158,7 +164,7 @@ def _tilts(log: McapLog, damage: list[str]) -> list[int]:
 
 
 def _distinct(log: McapLog, stream: str, damage: list[str], stamps: list[int]) -> Stamps:
-    """The stamps, sorted, each once, as a run takes them; that some are repeated goes to `damage`."""
+    """The stamps, sorted, each once; that some are repeated goes to `damage`."""
     distinct = np.unique(np.array(stamps, np.int64))
     if repeated := len(stamps) - distinct.size:
         of = f"{repeated} of {len(stamps)}"

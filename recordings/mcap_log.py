@@ -9,7 +9,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.decode import camera_model, pixels_of, pose_of, stamp_or, tilt_of
+from recordings.decode import camera_model, frame_of, pixels_of, pose_of, stamp_or, tilt_of
 from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import LogError
 from recordings.mcap_index import Lost, Raw, said
@@ -310,9 +310,9 @@ class _Images:
     def __call__(self, message: Any, log_time: int) -> CameraImage:
         model, stamp = self.camera.model, stamp_or(message.header, log_time)
         self.calibrations.check(stamp)
-        frame = self.camera.image_frame or message.header.frame_id.lstrip("/")
+        camera = self.camera if self.camera.frame_id else replace(self.camera, frame_id=frame_of(message))
         pixels = pixels_of(message, (model.width, model.height))
-        return CameraImage(stamp, pixels, model, frame, self.camera.rectified)
+        return CameraImage(stamp, pixels, model, camera.image_frame, camera.rectified)
 
 
 def _ahead(raws: Iterable[Raw | Lost], early: dict[int, Reading]) -> Iterator[tuple[Raw | Lost, Any]]:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 from mcap.records import Channel
 
 from recordings.decode import camera_model, frame_name, frame_of, pixels_of, pose_of, tilt_of, unread_encoding
@@ -29,13 +30,17 @@ if TYPE_CHECKING:
 CAMERAS = ("left", "right")
 EVER = 0  # ns, the stamp of what holds throughout: frames may be before the log's first message, or of another clock
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
-_LOOKED_AT = 20  # messages of a topic, of which one can be read
-_PLACES = 4  # in a log, from which messages of an Imu are looked at; an orientation filter may begin with nonsense
+_PLACES = 4  # in a log, at which messages are looked at until one can be read: a filter may begin with nonsense
+_LOOKED_AT = 20  # messages at most at each of them
 _TRANSFORMS_LOOKED_AT = 100  # messages from the first one of the rover on; others may come more rarely
 _LISTED = 5  # topics in a sentence
 
 Decoder = Callable[[bytes | memoryview], Any]
 T = TypeVar("T")
+
+
+class _GoneError(LogError):
+    """A message that the file does not hold any more."""
 
 
 class Opening:
@@ -181,7 +186,7 @@ class Opening:
             return
         topic, camera = self.topics["odometry"], self.cameras[0].frame_id
         moving = self._first(topic, lambda message: _pose_of(message, self.source.base_frame).child_frame_id)
-        if isinstance(moving, LogError) or moving == camera:
+        if isinstance(moving, LogError) or moving in (camera, self.cameras[0].image_frame):
             return
         base = self.mount.base_from_camera if self.mount is not None else self.static.between(moving, camera)
         if base is None or base.parent != moving:
@@ -202,8 +207,8 @@ class Opening:
                     self.missing[side] = f"{self.topics[side]}: {unread}; record it in one of these"
 
     def _check_pixels(self) -> None:
-        """Cameras whose first and last images cannot be read, or do not fit their calibration or each other, are
-        missing: so hardly any frame could be made."""
+        """Cameras whose images cannot be read wherever one looks, or of which the first and the last do not fit their
+        calibration or each other, are missing: so hardly any frame could be made."""
         if any(side not in self.infos or side in self.missing for side in CAMERAS):
             return
         first = {side: self._pixels(side) for side in CAMERAS}
@@ -211,32 +216,37 @@ class Opening:
             last = self._misfits({side: self._pixels(side, last=True) for side in CAMERAS})
             self.missing.update((side, why) for side, why in self._misfits(first).items() if side in last)
 
-    def _misfits(self, images: dict[str, Array | LogError]) -> dict[str, str]:
+    def _misfits(self, images: dict[str, Array | LogError | None]) -> dict[str, str]:
         """Side -> why there is no image, or it does not fit its calibration or that of the other side."""
         said = dict[str, str]()
         for side, pixels in images.items():
             topic, (info, model) = self.topics[side], self.infos[side]
             if isinstance(pixels, LogError):
                 said[side] = f"{topic}: {pixels}"
-            elif pixels.shape[:2] != (model.height, model.width):
+            elif pixels is not None and pixels.shape[:2] != (model.height, model.width):
                 size = f"{pixels.shape[1]}x{pixels.shape[0]}"
                 said[side] = (
-                    f"the images on {topic} are {size}, but {info} is the calibration of images of "
-                    f"{model.width}x{model.height}; set '{side}_info' of the source to that of these, or record it"
+                    f"the images on {topic} are {size}, but {info}, its binning and region of "
+                    f"interest counted, is the calibration of images of {model.width}x{model.height}; set "
+                    f"'{side}_info' of the source to that of these, or record it"
                 )
         left, right = (images[side] for side in CAMERAS)
-        if not (said or isinstance(left, LogError) or isinstance(right, LogError)) and _kind(left) != _kind(right):
+        if said or not isinstance(left, np.ndarray) or not isinstance(right, np.ndarray):
+            return said
+        if _kind(left) != _kind(right):
             one, other = self.topics["left"], self.topics["right"]
             why = f"the images on {one} are {_kind(left)}, those on {other} {_kind(right)}; record both alike"
             said.update(left=why, right=why)
         return said
 
-    def _pixels(self, side: str, last: bool = False) -> Array | LogError:
-        """The first image of a side that can be decoded, or its last; else why that cannot."""
-        topic = self.topics[side]
-        start = max(self.file.times(self.channels_of(topic)).tolist(), default=None) if last else None
-        found: Array | LogError = LogError("it has no messages")
-        for found in islice(self._made(topic, pixels_of, start), _LOOKED_AT):
+    def _pixels(self, side: str, last: bool = False) -> Array | LogError | None:
+        """The first image of a side that can be decoded, or its last; else why not; None where nothing is known."""
+        topic, found = self.topics[side], None
+        if last:
+            made = self._made(topic, pixels_of, max(self.file.times(self.channels_of(topic)).tolist(), default=None))
+        else:
+            made = self._looked_at(topic, pixels_of)
+        for found in made:
             if not isinstance(found, LogError):
                 break
         return found
@@ -258,12 +268,10 @@ class Opening:
     def _untilted(self, topic: str) -> str | None:
         """Why the messages of an Imu tell no tilt, as far as some from all over the log show; None where one does."""
         why = LogError("it has no messages")
-        for start in range(self.file.start, self.file.end + 1, max((self.file.end - self.file.start) // _PLACES, 1)):
-            made = self._made(topic, lambda message: tilt_of(message, 0), start, any_order=True)
-            for tilt in islice(made, _LOOKED_AT):
-                if not isinstance(tilt, LogError):
-                    return None
-                why = tilt
+        for tilt in self._looked_at(topic, lambda message: tilt_of(message, 0)):
+            if not isinstance(tilt, LogError):
+                return None
+            why = tilt
         return str(why)
 
     def _unplaced(self, topic: str) -> str | None:
@@ -290,6 +298,13 @@ class Opening:
             )
         return None
 
+    def _looked_at(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
+        """What `make` makes of some messages of a topic from all over the log that the file still holds."""
+        for place in range(_PLACES):
+            start = self.file.start + (self.file.end - self.file.start) * place // _PLACES
+            made = self._made(topic, make, start, any_order=True)
+            yield from islice((each for each in made if not isinstance(each, _GoneError)), _LOOKED_AT)
+
     def _made(
         self, topic: str, make: Callable[[Any], T], start: int | None = None, any_order: bool = False
     ) -> Iterator[T | LogError]:
@@ -299,7 +314,7 @@ class Opening:
             if not isinstance(raw, Lost):
                 yield _attempt(lambda data, decoder: make(decoder(data)), raw.data, self.decoders[raw.channel])
             elif raw.channel is not None:
-                yield LogError(raw.reason)
+                yield _GoneError(raw.reason)
 
     def _first(self, topic: str, make: Callable[[Any], T]) -> T | LogError:
         """What `make` makes of the first message of which it makes anything, else the LogError of the last."""

@@ -168,9 +168,8 @@ def baseline_note(
 
 def is_ideal(model: CameraModel) -> bool:
     """Whether raw and rectified image are the same: no distortion, no rotation, K = P; or there is no K."""
-    if not np.any(model.k):
-        return True
-    return not np.any(model.d) and np.allclose(model.r, np.eye(3)) and np.allclose(model.k, model.p[:, :3])
+    alike = not np.any(model.k) or np.allclose(model.k, model.p[:, :3])
+    return not np.any(model.d) and np.allclose(model.r, np.eye(3)) and alike
 
 
 def _checked(model: CameraModel, topic: str) -> CameraModel:

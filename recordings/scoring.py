@@ -44,7 +44,7 @@ class Score:
 
     frames: in the truth; compared: those with at least one result; missing: result topic -> stamps of true frames that
     it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without truth;
-    unscored: truth topic -> why -> frames that have it but lack another, which it is scored with;
+    unscored: topic -> why -> frames that have it and cannot be scored;
     lost: log -> why -> messages that could not be read; a true frame that lacks one is scored as far as it goes;
     disparity: `StereoErrors.measures`, cropped by the truth's max_disparity (the data set's range where it has one,
     else the frame's largest), rounded up to 16;
@@ -288,7 +288,9 @@ class _Tally:
 
 def _alike(one: Any, other: Any) -> bool:
     """Whether two DisparityImages are of cameras with one focal length and baseline, as far as both tell."""
-    return bool(np.isnan([one.f, one.t]).any() or np.allclose((one.f, one.t), (other.f, other.t), rtol=ALIKE, atol=0))
+    ours, theirs = (one.f, one.t), (other.f, other.t)
+    told = min(*ours, *theirs) > 0  # neither NaN nor left out
+    return not told or np.allclose(ours, theirs, rtol=ALIKE, atol=0)
 
 
 def _lens(disparity: Any) -> str:

@@ -82,12 +82,10 @@ class _Cause:
         return self.misfit / variance + self.ground + PARAMETER * self.parameters
 
 
-def diagnose(
-    evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_offset: float = 0.08, noise: float = NOISE
-) -> Diagnosis:
+def diagnose(evidence: Evidence, least_angle: float = np.deg2rad(2.0), least_offset: float = 0.08) -> Diagnosis:
     """The fault that explains the evidence; none where the tilt is sound or where nothing can be told.
 
-    least_angle: rad, least error of the mount that is a fault; least_offset: s, and of the time; noise: rad, of a tilt.
+    least_angle: rad, least error of the mount that is a fault; least_offset: s, and of the time.
     """
     n = len(evidence.stamps)
     wild = _wild(evidence)
@@ -96,7 +94,18 @@ def diagnose(
     free = 2 * (n - len(np.unique(evidence.segments)))
     if n < LEAST_FRAMES or free < LEAST_FRAMES:
         return Diagnosis("", f"too few frames to judge the tilt ({n})", False)
-    fit = _Fit(evidence, noise)
+    found, noise = _judged(evidence, free, NOISE, least_angle, least_offset)
+    if found.fault and noise < NOISE:  # then the camera's drift weighs more than was thought: it must stand that, too
+        found, _ = _judged(evidence, free, noise, least_angle, least_offset)
+    return found
+
+
+def _judged(
+    evidence: Evidence, free: int, noise: float, least_angle: float, least_offset: float
+) -> tuple[Diagnosis, float]:
+    """The diagnosis for tilts with that noise, rad, against the camera's drift; and what noise the tilts then seem to
+    have. free: degrees of freedom."""
+    n, fit = len(evidence.stamps), _Fit(evidence, noise)
     sound = _Cause("", "", fit.misfit(np.eye(3)), fit.slope(np.eye(3)))
     mount, offset = _mount(fit, least_angle), _offset(fit, sound, least_offset)
     axes = [
@@ -111,13 +120,12 @@ def diagnose(
     best = min(causes, key=lambda cause: cause.score(variance))
     gain = sound.score(variance) - best.score(variance)
     before, after = (noise * np.sqrt(cause.misfit / free) for cause in (sound, best))
+    seems = noise * float(np.sqrt(variance))
     if gain > MARGIN and best.size > 1:
-        if variance < 1 and noise == NOISE:  # then the drift of the camera weighs more: a fault must stand that, too
-            return diagnose(evidence, least_angle, least_offset, noise * float(np.sqrt(variance)))
         near = best.score(variance) + RIVAL
         rivals = [cause for cause in causes if cause is not best and cause.size > 1 and cause.score(variance) < near]
-        return _named(best, rivals, n, float(before), float(after))
-    return _passed(sound, axes, mount, offset, variance, n, float(before))
+        return _named(best, rivals, n, float(before), float(after)), seems
+    return _passed(sound, axes, mount, offset, variance, n, float(before)), seems
 
 
 def off_level(least: float, frames: int) -> Diagnosis | None:
@@ -267,7 +275,8 @@ def _scaled(fit: _Fit) -> list[_Cause]:
 
 
 def _wild(evidence: Evidence) -> Diagnosis | None:
-    """Degrees taken for radians: up turns much more than the camera, which nothing fixed to it can do."""
+    """Degrees taken for radians: up turns much more than the camera, which nothing fixed to it can do. How far the
+    camera's turn may swing it, the ground's normal tells, from which up leans by `STEEPEST` at most."""
     near = np.flatnonzero(evidence.segments[1:] == evidence.segments[:-1])
     if len(near) < LEAST_FRAMES - 1:
         return None
@@ -275,14 +284,15 @@ def _wild(evidence: Evidence) -> Diagnosis | None:
     swings = np.arccos(np.clip(np.sum(ups[near] * ups[near + 1], axis=1), -1, 1))
     turned = np.swapaxes(cameras[near], 1, 2) @ cameras[near + 1]
     turns = Rotation.from_matrix(turned).magnitude()
-    if np.isfinite(normals := evidence.ground[near]).all():  # a turn about the ground's own normal swings no up
-        turns = np.arccos(np.clip(np.einsum("ki,kij,kj->k", normals, turned, normals), -1, 1))
-    swing, turn = (float(np.median(angles)) for angles in (swings, turns))
-    if not swing > max(WILD * turn, WILD_ANGLE):
+    normals = evidence.ground[near]
+    with_ground = np.arccos(np.clip(np.einsum("ki,kij,kj->k", normals, turned, normals), -1, 1))
+    lean = 2 * np.sin(STEEPEST) * np.sin(turns / 2)
+    swing, most = float(np.median(swings)), float(np.median(np.fmin(turns, with_ground + lean)))  # NaN: no ground
+    if not swing > max(float(np.median(np.fmin(WILD * turns, WILD * with_ground + lean))), WILD_ANGLE):
         return None
     sentence = (
-        f"degrees are taken for radians: between frames up swings by {_deg(swing)} while the camera turns by "
-        f"{_deg(turn)} ({len(near)} pairs of frames); check the unit of source.pitch and source.roll (deg, not rad), "
+        f"degrees are taken for radians: between frames up swings by {_deg(swing)}, by the camera's turns {_deg(most)} "
+        f"at most ({len(near)} pairs of frames); check the unit of source.pitch and source.roll (deg, not rad), "
         "or the inclinometer's driver"
     )
     return Diagnosis("degrees are taken for radians", sentence, True)

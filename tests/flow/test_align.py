@@ -70,9 +70,9 @@ def test_partners_too_far_apart_are_told_by_how_much_and_which_setting_decides()
     frames = [(side, at * MS + (side == "right") * 8_020_000, 1.0) for at in (0, 500) for side in ("left", "right")]
     details = [entry.detail for entry in pairing(*frames)]
     assert details[:3] == [
-        "the nearest right is 8.02 ms away, more than 5.0 ms (stereo.slop)",
-        "the nearest left is 8.02 ms away, more than 5.0 ms (stereo.slop)",
-        "the nearest right is 8.02 ms away, more than 5.0 ms (stereo.slop)",
+        "the nearest right without a partner is 8.02 ms away, more than 5.0 ms (stereo.slop)",
+        "the nearest left without a partner is 8.02 ms away, more than 5.0 ms (stereo.slop)",
+        "the nearest right without a partner is 8.02 ms away, more than 5.0 ms (stereo.slop)",
     ]
     assert len(pairing(*frames, slop=10 * MS)) == 2
 

@@ -275,15 +275,20 @@ def test_a_camera_whose_images_nobody_can_read_is_missing_before_the_run(tmp_pat
     assert (described["frames"]["pairs"], described["missing"]) == (0, log.missing)
 
 
-def test_a_camera_whose_images_are_all_broken_is_missing_before_the_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize("whole", [None, FRAMES // 2])
+def test_a_camera_whose_images_are_all_broken_is_missing_before_the_run(
+    tmp_path: Path, whole: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == RIGHT:
+        if topic == RIGHT and number != whole:
             message.data = message.data[:-5]
         return message
 
+    monkeypatch.setattr("recordings.mcap_opening._LOOKED_AT", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        assert list(log.missing) == ["right"]
-        assert log.missing["right"].startswith(f"{RIGHT}: the image is cut: ")
+        assert list(log.missing) == (["right"] if whole is None else [])
+        if whole is None:
+            assert log.missing["right"].startswith(f"{RIGHT}: the image is cut: ")
 
 
 def gray(message: Any) -> Any:
@@ -311,8 +316,8 @@ def cropped(message: Any) -> Any:
         (
             LEFT, cropped,
             {
-                "left": f"the images on {LEFT} are 24x14, but {INFO} is the calibration of images of 24x16; "
-                "set 'left_info' of the source to that of these, or record it"
+                "left": f"the images on {LEFT} are 24x14, but {INFO}, its binning and region of interest counted, is "
+                "the calibration of images of 24x16; set 'left_info' of the source to that of these, or record it"
             },
         ),
     ],

@@ -138,15 +138,19 @@ def test_a_lens_that_cannot_be_undone_is_told_before_the_run(tmp_path: Path, mod
         assert re.search(said, log.missing["left"]) if said else not log.missing
 
 
-def test_a_calibration_of_the_projection_alone_is_that_of_rectified_images(tmp_path: Path) -> None:
+@pytest.mark.parametrize("distorted", [False, True])
+def test_a_calibration_of_the_projection_alone_is_that_of_rectified_images(tmp_path: Path, distorted: bool) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic.endswith("camera_info"):
-            message.k = np.zeros(9)
+            message.k, message.d = np.zeros(9), np.full(5, 0.1 * distorted)
         return message
 
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        assert log.cameras is not None
-        assert all(camera.rectified for camera in log.cameras)
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=RAW)) as log:
+        if distorted:
+            assert "no focal length in K" in log.missing["left"]
+        else:
+            assert log.cameras is not None
+            assert all(camera.rectified for camera in log.cameras)
 
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])

@@ -47,6 +47,25 @@ def test_a_wrong_unit_is_named_on_nearly_level_ground_though_the_rover_steers():
     assert found.fault == "degrees are taken for radians", found.sentence
 
 
+def test_a_wrong_unit_is_named_though_the_ground_was_not_always_seen():
+    evidence = Drive(7, slope=0.3, noise=0.1).evidence(change=degrees_as_radians)
+    evidence.ground[::5] = np.nan
+    assert diagnose(evidence).fault == "degrees are taken for radians"
+
+
+@pytest.mark.parametrize(("slope", "yaw"), [(8, 30), (12, 20), (15, 17), (19, 15), (0, 40)])
+def test_a_rover_that_turns_on_a_slope_has_no_wrong_unit(slope, yaw):
+    """Its up goes round the normal of the ground, as far as it leans."""
+    frames, lean = 20, Rotation.from_euler("x", slope, degrees=True)
+    cameras = [lean * Rotation.from_euler("z", yaw * i, degrees=True) for i in range(frames)]  # z off the ground
+    turns = np.array([(cameras[0].inv() * camera).as_matrix() for camera in cameras])
+    ups = np.array([camera.as_matrix()[2] for camera in cameras])
+    ground = np.tile([0.0, 0.0, 1.0], (frames, 1))
+    stamps, drift = np.arange(frames) * 500_000_000, np.full(frames, 1e-12)
+    found = diagnose(Evidence(stamps, np.ones(frames, int), turns, drift, ups, np.eye(3), ground))
+    assert found.fault == "", found.sentence
+
+
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("turned", [about("x", 5), about("y", -5), about("z", 5), about("z", -5), about("x", 90)])
 def test_a_wrong_mount_is_named_and_the_sentence_has_the_right_one(drive, turned):
