@@ -152,7 +152,7 @@ class Opening:
                 self.missing[side] = f"the calibration on {topic} cannot be read: {info}"
             else:
                 self.infos[side] = topic, info[0]
-                frames.append(info[1])
+                frames.append(info[1] or self._frame_of(found.chosen[side]))
         if len(frames) < len(CAMERAS):
             return
         topics = (found.chosen["left"], found.chosen["right"])

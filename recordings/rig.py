@@ -284,7 +284,12 @@ def _camera_from_inclinometer(
     placed = frames.between(camera.frame_id, inclinometer)
     if placed is None:
         raise LogError(
-            f"no static transform joins the camera ('{camera.frame_id}') and the inclinometer ('{inclinometer}'); "
+            f"no static transform joins the camera ({_frame(camera.frame_id)}) and the inclinometer "
+            f"({_frame(inclinometer)}); "
             "record /tf_static, or set 'camera_from_inclinometer' (quaternion x, y, z, w) of the source"
         )
     return np.asarray(camera.model.r @ placed.rotation)
+
+
+def _frame(name: str) -> str:
+    return f"'{name}'" if name else "whose frame_id is empty"

@@ -211,7 +211,18 @@ def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:
     assert Frames().between("", "") is None
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.mount is None
-        assert "no static transform joins the camera ('') and the inclinometer ('')" in log.missing["mount"]
+        assert "joins the camera (whose frame_id is empty) and the inclinometer (whose frame_id" in log.missing["mount"]
+
+
+def test_a_calibration_without_a_frame_is_of_its_images_frame(tmp_path: Path) -> None:
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic.endswith("camera_info"):
+            message.header.frame_id = ""
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert log.missing == {}
+        assert [camera.frame_id for camera in log.cameras or ()] == ["left_optical", "right_optical"]
 
 
 def with_transforms(path: Path, *more: Transform) -> Path:
