@@ -96,7 +96,7 @@ def format_description(description: dict[str, Any]) -> str:
         )
         if frames["with_tilt"] is not None:
             gap = f"at most {frames['tilt_gap_s'] * 1e3:g} ms apart"
-            paired += f"; {frames['with_tilt']} left with tilts around them, {gap}"
+            paired += f"; tilts around {frames['with_tilt']} of the left ones, {gap}"
         lines.append(paired)
     if d["mount"]:
         down = "unknown" if d["mount"]["base"] is None else f"in '{d['mount']['base']}' at {d['mount']['position']}"

@@ -143,6 +143,10 @@ class Match(Stage):
             taken &= prior.pixels > search.stop - BEYOND
             for layer, known in zip(layers, (prior.pixels, prior.source, prior.confidence), strict=True):
                 np.copyto(layer, known, where=taken)
+        if self.farthest:  # what bounds the range reaches a little beyond
+            beyond = found.pixels < self._reach(frame.camera)
+            for layer, unknown in zip(layers, (np.nan, Source.UNKNOWN, 0), strict=True):
+                layer[beyond] = unknown
         return Disparity(frame.stamp, *layers, camera=frame.camera)
 
     def _where(self, prior: Disparity | None, search: range, rows: int) -> Windows | list[Range]:
@@ -193,7 +197,7 @@ class Match(Stage):
         if not self.farthest:
             return search
         largest = camera.width if self.around else search.stop - 1
-        reach = camera.fx * camera.baseline / self.farthest - (camera.cx_right - camera.cx)
+        reach = self._reach(camera)
         if reach >= largest:
             raise ValueError(
                 f"Match.farthest = {self.farthest} m leaves nothing to search: a depth of {self.farthest} m is a "
@@ -201,6 +205,10 @@ class Match(Stage):
             )
         limit = math.floor(reach) - 1  # the first that is searched is not found
         return range(max(search.start, limit), max(search.stop, limit + 1))
+
+    def _reach(self, camera: StereoCamera) -> float:
+        """The disparity of `farthest`, px."""
+        return camera.fx * camera.baseline / self.farthest - (camera.cx_right - camera.cx)
 
     def _rule(self, search: range) -> Rule:
         cost, (p1, p2) = COSTS[self.cost], self._penalties()

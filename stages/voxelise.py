@@ -50,7 +50,7 @@ class Voxelise(Stage):
     mean of points that share one error is as sure as one of them; shape is what the mean of some points misses of an
     uneven cell, by its scatter beyond the slope's and the noise's and by its height off its neighbours; a cell beside
     an empty one, of which they may show one side, misses more (`rim`). Errors have longer tails than a Gaussian's:
-    where 92 to 95 % are within two such sigmas, 69 to 74 % are within one.
+    where 92 to 94 % are within two such sigmas, 69 to 73 % are within one.
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)

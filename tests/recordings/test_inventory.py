@@ -61,7 +61,7 @@ def test_the_text_names_every_topic_its_stream_and_what_is_missing(tmp_path: Pat
     assert line.split() == [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100", "s", "left"]
     assert "missing: odometry: the log has no nav_msgs/Odometry" in text
     frames = "frames: by their stamps, 5 pairs within 5 ms of 5 left and 5 right images"
-    assert f"{frames}; 5 left with tilts around them, at most 200 ms apart" in text
+    assert f"{frames}; tilts around 5 of the left ones, at most 200 ms apart" in text
 
 
 def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: Path) -> None:
@@ -78,8 +78,8 @@ def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: P
     assert frames["with_tilt"] == 2  # the first and the last frame, which have a tilt of their own
     wider = describe(path, McapSource(), slop=6_000_000, max_gap=400_000_000)
     assert (wider["frames"]["pairs"], wider["frames"]["with_tilt"]) == (FRAMES, FRAMES)
-    assert "5 pairs within 6 ms of 5 left and 5 right images; 5 left with tilts" in format_description(wider)
-    assert "around them, at most 400 ms apart" in format_description(wider)
+    assert "5 pairs within 6 ms of 5 left and 5 right images; tilts around 5 of the left" in format_description(wider)
+    assert "of the left ones, at most 400 ms apart" in format_description(wider)
 
 
 def test_repeated_stamps_count_once_and_are_told(tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_topics_that_cannot_be_decoded_are_listed_once(tmp_path: Path) -> None:
 def test_one_is_not_many(tmp_path: Path) -> None:
     edit = lambda topic, number, message: None if number else message  # noqa: E731
     text = format_description(describe(write_sample(tmp_path / "log.mcap", edit), McapSource()))
-    assert "1 pair within 5 ms of 1 left and 1 right image; 1 left with tilts" in text
+    assert "1 pair within 5 ms of 1 left and 1 right image; tilts around 1 of the left" in text
 
 
 def test_damage_is_told(tmp_path: Path) -> None:

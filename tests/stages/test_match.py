@@ -91,15 +91,17 @@ def test_what_lies_beyond_the_farthest_of_interest_is_neither_searched_nor_made_
     prior = Disparity(0, coarse, np.ones(truth.shape, np.uint8), np.ones(truth.shape, np.float32))
     whole, near = (Match(disparities=48)(frame, prior).pixels, match(frame, prior).pixels)
     visible = np.arange(320) >= truth + 2
-    assert np.nanmin(near) >= 19.5
+    assert np.nanmin(near) >= 20
     assert np.isnan(near[visible & (truth < 17)]).all()
     within = visible & (truth > 20)
     assert np.isfinite(near[within]).mean() > 0.95
     assert np.isfinite(near[visible & (truth > 20) & (truth < 21)]).mean() > 0.8
+    result = match(frame, prior)
+    assert not result.confidence[np.isnan(result.pixels)].any()
     assert np.nanmedian(np.abs(near - whole)[within]) < 0.02
     # A camera whose principal points differ sees the same depth at another disparity.
     moved = replace(frame, camera=replace(frame.camera, cx_right=frame.camera.cx + 5))
-    assert 14.5 <= np.nanmin(match(moved).pixels) < 19
+    assert 15 <= np.nanmin(match(moved).pixels) < 20
 
 
 def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
@@ -195,7 +197,7 @@ def test_around_a_prior_disparities_are_found_beyond_the_range_too_and_nowhere_e
 def test_around_a_prior_nothing_is_found_beyond_the_farthest_of_interest(slope, known):
     frame, truth = slope
     pixels = Match(around=4, farthest=1.5)(frame, known).pixels  # 20 px
-    assert np.nanmin(pixels) >= 19.5
+    assert np.nanmin(pixels) >= 20
     assert np.isnan(pixels[truth < 15]).all()
     assert np.isfinite(pixels)[(truth > 24) & np.isfinite(known.pixels)].mean() > 0.95
 
