@@ -1,20 +1,24 @@
-"""Keeps freed memory in the process: every stage of every frame allocates and frees large arrays, and fresh pages from
-the operating system cost a tenth of the time."""
+"""Keeps freed memory in the process, and all of it in one heap, for every stage of every frame allocates and frees large
+arrays: fresh pages from the operating system cost a tenth of the time, a heap for each thread a tenth of the memory."""
 
 from __future__ import annotations
 
 import ctypes
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of mallopt(3)
 _KEPT = 512 << 20  # bytes that may stay free at the end of the heap
 _LARGEST = 32 << 20  # bytes, the largest piece that glibc takes from the heap at all
 
 
 def keep_freed_memory() -> None:
-    """Have glibc keep freed memory for later, of the whole process. Elsewhere than with glibc it does nothing."""
+    """Have glibc keep freed memory for later, of the whole process. Elsewhere than with glibc it does nothing.
+
+    To be called before the first thread begins, numpy's among them: glibc then looks up how many heaps there may be.
+    """
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
         return
     mallopt(_MMAP_THRESHOLD, _LARGEST)
     mallopt(_TRIM_THRESHOLD, _KEPT)
+    mallopt(_ARENA_MAX, 1)

@@ -12,6 +12,9 @@ def program() -> int:
     traceback, and the exit code is that of `main`."""
     try:
         _open_what_is_closed()
+        from flow.allocator import keep_freed_memory
+
+        keep_freed_memory()
         from flow.cli import main
 
         code = main()

@@ -29,7 +29,6 @@ def replay(
     from tqdm import tqdm
 
     from flow import pipeline as pipelines
-    from flow.allocator import keep_freed_memory
     from flow.run import Stop, interrupts, run
 
     graph = pipelines.load(pipeline, overrides)
@@ -38,7 +37,6 @@ def replay(
         path = {".mcap": out, ".rrd": rrd}.get(sink.suffix)
         if path is not None:
             outputs[use] = path
-    keep_freed_memory()
     cv2.setNumThreads(1)  # frames in flight fill the cores, not threads inside one call
     stop = Stop()
     with graph.source.open(log, start=start, end=end) as opened, threadpool_limits(1):
