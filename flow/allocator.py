@@ -1,5 +1,5 @@
-"""Keeps freed memory in the process, and all of it in one heap, for every stage of every frame allocates and frees large
-arrays: fresh pages from the operating system cost a tenth of the time, a heap for each thread a tenth of the memory."""
+"""Keeps freed memory in the process, and all of it in one heap: every stage of every frame allocates and frees large
+arrays, fresh pages from the operating system cost a tenth of the time, and a heap for each thread a tenth of memory."""
 
 from __future__ import annotations
 

@@ -7,13 +7,15 @@ a row has a hundred times fewer of them, and a patch is dropped run by run.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
-from stages.kernels.sharing import AtOnce, in_turn
+from stages.kernels.sharing import AtOnce, by_bands, in_turn
 from stages.kernels.union import join, root
 from stages.kernels.workspace import Workspace
 
@@ -24,38 +26,34 @@ def drop_speckles(
     """Set patches of at most `largest` pixels to NaN, and their evidence to 0, in place.
 
     disparity: (H, W) float32, px, NaN = unknown; evidence: (H, W) uint8; step: px; space: where the runs are kept;
-    both: calls two functions, one for the upper and one for the lower half of the image.
+    both: calls two functions, on one thread or two.
     """
     if largest == 0:
         return
-    height, columns = disparity.shape
-    middle = height // 2
-    halves = (0, middle), (middle, height)
+    columns, limit = disparity.shape[1], np.float32(step)
     space.reserve(4 * (4 * disparity.size + 64))
     # As many runs as pixels at most. What is not touched never becomes memory.
     runs = tuple(space.array((disparity.size,), np.int32) for _ in ("start", "end", "parent", "area"))
-    seam = np.full((2, columns), -1, np.int32)
-    limit, counts = np.float32(step), [0, 0]
+    bands = dict[int, tuple[int, Array]]()  # first row -> end of the runs; those of the first and the last row
 
-    def find(half: int) -> None:
-        first, end = halves[half]
-        last = end - 1 if half == 0 else first  # the row next to the other half
-        goes_on = np.zeros(columns + 1, np.bool_)
-        counts[half] = _find_runs(disparity, first, end, limit, runs, seam[half], last, goes_on)
+    def find(first: int, end: int) -> None:
+        seams, goes_on = np.full((2, columns), -1, np.int32), np.zeros(columns + 1, np.bool_)
+        bands[first] = _find_runs(disparity, first, end, limit, runs, seams, goes_on), seams
 
-    def drop(half: int) -> None:
-        first = halves[half][0] * columns
-        _drop(disparity.reshape(-1), evidence.reshape(-1), runs, first, first + counts[half], largest)
+    def drop(first: int, _: int) -> None:
+        _drop(disparity.reshape(-1), evidence.reshape(-1), runs, first * columns, bands[first][0], largest)
 
-    both(lambda: find(0), lambda: find(1))
-    _join_halves(disparity, middle, limit, runs, seam)
-    both(lambda: drop(0), lambda: drop(1))
+    by_bands(both, len(disparity), find)
+    for upper, lower in itertools.pairwise(sorted(bands)):
+        _join_bands(disparity, lower, limit, runs, bands[upper][1][1], bands[lower][1][0])
+    by_bands(both, len(disparity), drop)
 
 
 @kernel
-def _find_runs(disparity, first_row, end_row, step, runs, seam, seam_row, goes_on):  # type: ignore[no-untyped-def]
-    """Runs of some rows, joined among themselves; returns how many. `seam` takes those of `seam_row`, pixel by pixel.
+def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):  # type: ignore[no-untyped-def]
+    """Runs of some rows, joined among themselves, from place first_row * W on; returns the place behind the last.
 
+    `seams`, (2, W), all -1, takes the runs of the first and of the last row, pixel by pixel.
     A run that is its own parent has the area of its patch, in pixels. goes_on: (W + 1,) bool, False at both ends.
     """
     start, end, parent, area = runs
@@ -84,23 +82,26 @@ def _find_runs(disparity, first_row, end_row, step, runs, seam, seam_row, goes_o
                         join(parent, count, other)
                         break
                 other += 1
-            if y == seam_row:
-                seam[first:x] = count
+            if y == first_row:
+                seams[0, first:x] = count
+            if y == end_row - 1:
+                seams[1, first:x] = count
             count += 1
         above = above_end
     for run in range(begin, count):
         parent[run] = root(parent, run)
         if parent[run] != run:
             area[parent[run]] += area[run]
-    return count - begin
+    return count
 
 
 @kernel
-def _join_halves(disparity, middle, step, runs, seam):  # type: ignore[no-untyped-def]
+def _join_bands(disparity, y, step, runs, above, below):  # type: ignore[no-untyped-def]
+    """Join the runs of row y - 1, `above`, and of row y, `below`, pixel by pixel."""
     _, _, parent, area = runs
     for x in range(disparity.shape[1]):
-        if seam[0, x] >= 0 and seam[1, x] >= 0 and abs(disparity[middle, x] - disparity[middle - 1, x]) <= step:
-            upper, lower = root(parent, seam[0, x]), root(parent, seam[1, x])
+        if above[x] >= 0 and below[x] >= 0 and abs(disparity[y, x] - disparity[y - 1, x]) <= step:
+            upper, lower = root(parent, above[x]), root(parent, below[x])
             if upper != lower:
                 join(parent, upper, lower)
                 area[min(upper, lower)] += area[max(upper, lower)]
@@ -111,7 +112,7 @@ def _drop(pixels, strength, runs, first, last, largest):  # type: ignore[no-unty
     start, end, parent, area = runs
     for run in range(first, last):
         patch = run
-        while parent[patch] != patch:  # both halves at once: read only
+        while parent[patch] != patch:  # many threads at once: read only
             patch = parent[patch]
         if area[patch] <= largest:
             for i in range(start[run], end[run]):
