@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -132,10 +133,7 @@ class Canvas:
 
     def scale(self, path: str, shape: tuple[int, ...], low: float, high: float, unit: str, palette: int) -> None:
         """The legend of a colour map: three of its values above the picture."""
-        values = np.linspace(low, high, 3)
-        colours = [(int(r), int(g), int(b)) for r, g, b in paint.colours(values, low, high, palette)]
-        names = [f"{paint.figure(value)} {unit}" for value in values]
-        self.legend(path, shape, zip(names, colours, strict=True))
+        self.legend(path, shape, _scale(low, high, unit, palette))
 
     def legend(self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, paint.Rgb]]) -> None:
         """Named dots above a picture of (H, W)."""
@@ -160,6 +158,14 @@ class Canvas:
             else:
                 self.recording.log(path, rr.Clear(recursive=False))
         self._before, self._now = self._now, {}
+
+
+@lru_cache(maxsize=256)
+def _scale(low: float, high: float, unit: str, palette: int) -> list[tuple[str, paint.Rgb]]:
+    """Three values of a colour map, with their colours."""
+    values = np.linspace(low, high, 3)
+    colours = [(int(r), int(g), int(b)) for r, g, b in paint.colours(values, low, high, palette)]
+    return [(f"{paint.figure(value)} {unit}", colour) for value, colour in zip(values, colours, strict=True)]
 
 
 def same_view(one: StereoCamera, other: StereoCamera) -> bool:

@@ -6,6 +6,7 @@ colour of its own that no value can have, and ranges are rounded, so that neighb
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -77,7 +78,7 @@ def eight_bit(pixels: Array) -> Array:
 def disparity_limit(disparity: Array) -> float:
     """The upper end of the colour range, px: the 99.5th percentile rounded up to a multiple of 16, at least 16."""
     known = _some_known(disparity[::4, ::4])
-    return 16.0 * max(1.0, np.ceil(float(np.percentile(known, 99.5)) / 16.0)) if known.size else 16.0
+    return 16.0 * max(1.0, math.ceil(_percentiles(known, 99.5)[0] / 16.0)) if known.size else 16.0
 
 
 def paint_disparity(disparity: Array, limit: float | None = None) -> Array:
@@ -126,9 +127,9 @@ def elevation_limits(elevation: Array) -> tuple[float, float]:
     known = _some_known(elevation)
     if not known.size:
         return 0.0, 1.0
-    low, high = (float(value) for value in np.percentile(known, (1.0, 99.0)))
-    low = np.floor(low * 10.0) / 10.0
-    return low, max(np.ceil(high * 10.0) / 10.0, low + 0.2)
+    low, high = _percentiles(known, 1.0, 99.0)
+    low = math.floor(low * 10.0) / 10.0
+    return low, max(math.ceil(high * 10.0) / 10.0, low + 0.2)
 
 
 def value_limits(layer: Array) -> tuple[float, float]:
@@ -137,7 +138,7 @@ def value_limits(layer: Array) -> tuple[float, float]:
     known = _some_known(layer)
     if not known.size:
         return 0.0, 1.0
-    low, high = (float(value) for value in np.percentile(known, (1.0, 99.0)))
+    low, high = _percentiles(known, 1.0, 99.0)
     return low, high if high > low else low + 1.0
 
 
@@ -150,6 +151,13 @@ def _some_known(layer: Array) -> Array:
     """The known values of a layer, every n-th of many."""
     known = layer[np.isfinite(layer)]
     return known[:: max(1, known.size // SAMPLE)]
+
+
+def _percentiles(values: Array, *ranks: float) -> list[float]:
+    """The values of these ranks, percent: each the nearest that there is, at a tenth of np.percentile's time."""
+    places = [round(rank / 100.0 * (values.size - 1)) for rank in ranks]
+    ordered = np.partition(values, places)
+    return [float(ordered[place]) for place in places]
 
 
 def hillshade(elevation: Array, resolution: float, light: Array = _LIGHT) -> Array:
