@@ -112,7 +112,7 @@ class Voxelise(Stage):
         return cloud.only(measured), cloud.only(~measured)
 
     def _reached(self, figures: Array, cloud: PointCloud, grid: Grid) -> Array:
-        """The figures of `cell_statistics`, with those of empty cells that lie within the reach of points."""
+        """The figures of `cell_statistics`, those of empty cells that lie within the reach of points filled in."""
         sensor = cloud.sensor
         least = FINEST * self.resolution
         if sensor is None or self.reach == 0 or self.reach_limit < least:
@@ -120,8 +120,10 @@ class Voxelise(Stage):
         points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.reach, least, self.reach_limit)
         near = cell_statistics(points, sigma, *grid)
         reached = (figures[:, :, 0] == 0) & (near[:, :, 0] >= WITNESSES)
-        near[:, :, SUMS] *= REACHED / np.maximum(near[:, :, :1], WITNESSES)
-        return np.where(reached[:, :, None], near, figures)
+        spoken_for = near[reached]
+        spoken_for[:, SUMS] *= REACHED / spoken_for[:, :1]
+        figures[reached] = spoken_for
+        return figures
 
     def _layers(self, figures: Array, cloud: PointCloud, origin: tuple[float, float]) -> dict[str, Array]:
         count, total, squares, minimum, maximum, noise = (figures[:, :, i] for i in range(len(FIGURES)))
