@@ -26,9 +26,10 @@ from recordings.errors import LogError
 from recordings.mcap_reader import McapFile, iter_decoded, without_results
 from recordings.pose_measures import PoseTally
 from recordings.stereo_measures import StereoErrors, cropped_columns
-from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap
+from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")
+MAPS = {"/nav/elevation_map", "/nav/navigation_map"}
 TRUTHS = (
     "/truth/disparity", "/truth/occlusion", "/truth/elevation_map", "/truth/navigation_map", "/truth/rocks",
     "/truth/tilt", "/truth/pose",
@@ -75,7 +76,7 @@ class Score:
 def score(result: Path, truth: Path) -> Score:
     """Compare the log `result` of a run with the truth topics of the log `truth`.
 
-    Raises LogError where either has nothing to compare, or where their grids or images do not fit.
+    Raises LogError where either has nothing to compare, or where their images do not fit.
     """
     tally = _Tally(Path(result), Path(truth))
     for stamp, frame in _frames(Path(result), Path(truth), tally):
@@ -208,40 +209,24 @@ class _Tally:
 
     def _add_terrain(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
         true = ros2.read_grid_map(frame["/truth/elevation_map"])
-        hazard = self._cells(self.truth, stamp, frame["/truth/navigation_map"], true) == Cell.HAZARD
+        try:
+            hazard = _cells(frame["/truth/navigation_map"], true) == Cell.HAZARD
+        except ValueError as error:
+            where = f"{self.truth}: /truth/navigation_map at {stamp} ns"
+            raise LogError(f"{where}: {error}; make the truth again") from error
         rocks = _rocks(frame["/truth/rocks"]) if "/truth/rocks" in frame else np.zeros((0, 6))
         ground = terrain_measures.TrueGround.of(true, hazard, rocks)
         if ground is None:
             raise LogError(f"{self.truth}: /truth at {stamp} ns lacks what maps are scored with; make the truth again")
-        layers: dict[str, Array] = {}
-        if "/nav/elevation_map" in frame:
-            given = ros2.read_grid_map(frame["/nav/elevation_map"])
-            wanted = given.layers.keys() & {"elevation", "variance", "common_variance"}
-            layers = {name: self._aligned(self.result, stamp, given, given.layers[name], true, np.nan)
-                      for name in sorted(wanted)}  # fmt: skip
-        message = frame.get("/nav/navigation_map")
-        cells = None if message is None else self._cells(self.result, stamp, message, true)
+        try:
+            layers = _layers(frame["/nav/elevation_map"], true) if "/nav/elevation_map" in frame else {}
+            cells = _cells(frame["/nav/navigation_map"], true) if "/nav/navigation_map" in frame else None
+        except ValueError as error:
+            for topic in MAPS & frame.keys():
+                self._leave_out(topic, str(error))
+            return {}
         self.terrain = self.terrain or terrain_measures.TerrainTally()
         return self.terrain.add(ground, layers, cells)
-
-    def _cells(self, log: Path, stamp: int, message: Any, true: ElevationMap) -> Array:
-        grid = ros2.read_occupancy_grid(message)
-        return self._aligned(log, stamp, grid, grid.cells, true, Cell.UNKNOWN)
-
-    def _aligned(
-        self, log: Path, stamp: int, grid: Any, values: Array, onto: ElevationMap, missing: float
-    ) -> Array:  # fmt: skip
-        where = f"{log}: {type(grid).__name__} at {stamp} ns"
-        if abs(grid.resolution - onto.resolution) > 1e-4 * onto.resolution:
-            raise LogError(
-                f"{where} has cells of {grid.resolution} m, the truth has {onto.resolution} m; run with that resolution"
-            )
-        if grid.frame_id != onto.frame_id:
-            raise LogError(f"{where} is in frame '{grid.frame_id}', the truth is in '{onto.frame_id}'")
-        try:
-            return measures.aligned(values, grid.origin, onto.shape, onto.origin, onto.resolution, missing)
-        except ValueError as error:
-            raise LogError(f"{where}: {error}; run with whole cells about base_link") from error
 
     def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:
         item, true = frame.get("/tf"), frame["/truth/tilt"]
@@ -284,6 +269,27 @@ class _Tally:
             pose=self.pose.measures(),
             per_frame=self.per_frame,
         )  # fmt: skip
+
+
+def _layers(message: Any, onto: ElevationMap) -> dict[str, Array]:
+    """What is scored of a GridMap, in the cells of `onto`. Raises ValueError where it does not fit."""
+    grid = ros2.read_grid_map(message)
+    wanted = sorted(grid.layers.keys() & {"elevation", "variance", "common_variance"})
+    return {name: _fitted(grid, grid.layers[name], onto, np.nan) for name in wanted}
+
+
+def _cells(message: Any, onto: ElevationMap) -> Array:
+    """The cells of an OccupancyGrid, in the cells of `onto`. Raises ValueError where it does not fit."""
+    grid = ros2.read_occupancy_grid(message)
+    return _fitted(grid, grid.cells, onto, Cell.UNKNOWN)
+
+
+def _fitted(grid: ElevationMap | NavigationMap, values: Array, onto: ElevationMap, missing: float) -> Array:
+    if abs(grid.resolution - onto.resolution) > 1e-4 * onto.resolution:
+        raise ValueError(f"its cells are {grid.resolution:g} m wide, the truth's {onto.resolution:g} m")
+    if grid.frame_id != onto.frame_id:
+        raise ValueError(f"it is in frame '{grid.frame_id}', the truth in '{onto.frame_id}'")
+    return measures.aligned(values, grid.origin, onto.shape, onto.origin, onto.resolution, missing)
 
 
 def _alike(one: Any, other: Any) -> bool:

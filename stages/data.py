@@ -24,7 +24,7 @@ from stages.motion import Tilt as Tilt
 from stages.motion import TiltHealth as TiltHealth
 from stages.motion import Transform as Transform
 from stages.publish import Array as Array
-from stages.publish import publish, publish_image, publish_vector, read_only
+from stages.publish import check_resolution, check_stamp, publish, publish_image, publish_vector, read_only
 from stages.tiles import Tiles as Tiles
 
 LEVEL_FRAME = "level"
@@ -176,6 +176,7 @@ class CameraImage:
     rectified: bool
 
     def __post_init__(self) -> None:
+        check_stamp(self)
         publish_image(self, "pixels")
 
     def pair_with(self, right: CameraImage) -> StereoFrame:
@@ -196,6 +197,7 @@ class StereoFrame:
     camera: StereoCamera
 
     def __post_init__(self) -> None:
+        check_stamp(self)
         publish_image(self, "left")
         publish_image(self, "right")
         if self.left.shape != self.right.shape:
@@ -226,6 +228,7 @@ class Disparity:
     camera: StereoCamera | None = None
 
     def __post_init__(self) -> None:
+        check_stamp(self)
         publish(self, "pixels", (None, None), np.float32)
         publish(self, "source", self.pixels.shape, np.uint8)
         publish(self, "confidence", self.pixels.shape, np.float32)
@@ -256,6 +259,7 @@ class PointCloud:
     tilt_sigma: float = 0.0
 
     def __post_init__(self) -> None:
+        check_stamp(self)
         publish(self, "points", (None, 3), np.float32)
         n = len(self.points)
         publish(self, "colors", (n, 3), np.uint8)
@@ -302,6 +306,8 @@ class ElevationMap:
     shape: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
+        check_stamp(self)
+        check_resolution(self)
         layers = {name: np.asarray(layer) for name, layer in self.layers.items()}
         if "elevation" not in layers:
             raise ValueError("ElevationMap has no layer 'elevation'")
@@ -309,8 +315,6 @@ class ElevationMap:
         for name, layer in layers.items():
             if layer.shape != (rows, cols) or layer.dtype != np.float32:
                 raise ValueError(f"ElevationMap layer '{name}' must be float32 ({rows}, {cols})")
-        if not self.resolution > 0:
-            raise ValueError(f"ElevationMap.resolution must be positive, not {self.resolution}")
         object.__setattr__(self, "layers", MappingProxyType({n: read_only(layer) for n, layer in layers.items()}))
         object.__setattr__(self, "shape", (rows, cols))
 
@@ -331,6 +335,8 @@ class VoxelMap:
     frame_id: str
 
     def __post_init__(self) -> None:
+        check_stamp(self)
+        check_resolution(self)
         publish(self, "index", (None, 3), np.int32)
         publish(self, "colors", (len(self.index), 3), np.uint8)
         publish(self, "count", (len(self.index),), np.int32)
@@ -352,6 +358,8 @@ class NavigationMap:
     frame_id: str
 
     def __post_init__(self) -> None:
+        check_stamp(self)
+        check_resolution(self)
         publish(self, "cells", (None, None), np.int8)
         publish(self, "reason", self.cells.shape, np.uint8)
 

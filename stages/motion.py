@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stages.publish import Array, check_rotation, publish_vector
+from stages.publish import Array, check_rotation, check_stamp, publish_vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +53,7 @@ class Tilt:
     frame_id: str = "inclinometer"
 
     def __post_init__(self) -> None:
+        check_stamp(self)
         publish_vector(self, "up", (3,))
         if not abs(float(np.linalg.norm(self.up)) - 1.0) < 1e-6:
             raise ValueError(f"Tilt.up must be a unit vector, not {self.up.tolist()}")
@@ -89,6 +90,7 @@ class Pose:
     covariance: Array | None = None
 
     def __post_init__(self) -> None:
+        check_stamp(self)
         publish_vector(self, "position", (3,))
         publish_vector(self, "quaternion", (4,))
         if self.covariance is not None:
@@ -123,6 +125,7 @@ class Mount:
     base_from_camera: Transform | None = None
 
     def __post_init__(self) -> None:
+        check_stamp(self)
         publish_vector(self, "camera_from_inclinometer", (3, 3))
         check_rotation(self.camera_from_inclinometer, "Mount.camera_from_inclinometer")
 

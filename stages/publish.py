@@ -5,6 +5,8 @@ An error names the type and its field, for the types are made from logs as well 
 
 from __future__ import annotations
 
+import math
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,18 @@ def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: boo
         raise ValueError(f"{type(owner).__name__}.{name} must be finite, not {values.tolist()}")
     object.__setattr__(owner, name, values)
     publish(owner, name, shape, np.float64)
+
+
+def check_stamp(owner: Any) -> None:
+    """Raise ValueError unless the field `stamp` holds whole nanoseconds."""
+    if not isinstance(owner.stamp, Integral):
+        raise ValueError(f"{type(owner).__name__}.stamp must be whole nanoseconds, not {owner.stamp!r}")
+
+
+def check_resolution(owner: Any) -> None:
+    """Raise ValueError unless the field `resolution`, the size of a cell, is a length."""
+    if not 0 < owner.resolution < math.inf:
+        raise ValueError(f"{type(owner).__name__}.resolution must be positive and finite, not {owner.resolution} m")
 
 
 def read_only(array: Array) -> Array:

@@ -159,6 +159,16 @@ def test_disparities_of_another_camera_are_not_compared(tmp_path, truth, frames,
     assert found.terrain is not None
 
 
+def test_maps_of_other_cells_are_not_compared_and_all_else_is(tmp_path, truth, frames):
+    found = scored(tmp_path, truth, frames, resolution=0.1)
+    assert found.terrain is None
+    reasons = {"its cells are 0.1 m wide, the truth's 0.05 m": 2}
+    assert found.unscored == {"/nav/elevation_map": reasons, "/nav/navigation_map": reasons}
+    assert found.disparity["bad_1"] == 0
+    assert found.tilt["frames"] == 2
+    assert "not scored   /nav/navigation_map: 2 frames: its cells are 0.1 m wide" in format_score(found)
+
+
 def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth, frames):
     widths = [
         math.ceil(np.nanmax(log.true_disparity(SMALL, 0, frame).pixels) / 16) * 16 for frame in frames
@@ -346,8 +356,6 @@ def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
         writer.write("/nav/dense", ros2.grid_map(ElevationMap(1, ones, 0.05, (0, 0), "level")), 1)
     with pytest.raises(LogError, match=r"none of /nav/disparity, .*, only /nav/dense: the run made none, or"):
         scoring.score(tmp_path / "other.mcap", truth)
-    with pytest.raises(LogError, match=r"cells of 0\.1 m, the truth has 0\.05 m"):
-        scored(tmp_path, truth, frames, resolution=0.1)
 
 
 def test_a_damaged_truth_costs_what_it_held_and_nothing_is_scored_against_it(tmp_path, truth, frames):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from stages.data import (
     StereoFrame,
     Tilt,
     Transform,
+    VoxelMap,
 )
 from stages.match import Match
 from stages.stage import Stage, parameter
@@ -100,6 +101,30 @@ def test_small_arrays_are_copied_so_that_their_givers_keep_theirs() -> None:
 def test_what_is_not_finite_is_refused_by_name(make: Callable[[float], Any], message: str, bad: float) -> None:
     with pytest.raises(ValueError, match=message):
         make(bad)
+
+
+@pytest.mark.parametrize("stamp", [1.5e9, "0", None, np.float64(7)])
+@pytest.mark.parametrize("make", [make for make in MAKERS if hasattr(make(), "stamp")])
+def test_a_stamp_is_whole_nanoseconds(make: Callable[[], Any], stamp: object) -> None:
+    item = make()
+    assert replace(item, stamp=np.int64(7)).stamp == 7
+    with pytest.raises(ValueError, match=rf"{type(item).__name__}\.stamp must be whole nanoseconds"):
+        replace(item, stamp=stamp)
+
+
+@pytest.mark.parametrize("resolution", [0.0, -0.05, np.nan, np.inf])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda size: ElevationMap(0, {"elevation": FLAT}, size, (0.0, 0.0), "level"),
+        lambda size: NavigationMap(0, np.zeros((2, 3), np.int8), np.zeros((2, 3), U8), size, (0.0, 0.0), "level"),
+        lambda size: VoxelMap(0, np.zeros((1, 3), np.int32), np.zeros((1, 3), U8), np.ones(1, np.int32), size, "level"),
+    ],
+)
+def test_a_cell_has_a_size(make: Callable[[float], Any], resolution: float) -> None:
+    assert make(0.05).resolution == 0.05
+    with pytest.raises(ValueError, match=r"Map\.resolution must be positive and finite"):
+        make(resolution)
 
 
 def test_an_unknown_covariance_may_be_infinite() -> None:
