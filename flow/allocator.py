@@ -13,7 +13,8 @@ _LARGEST = 32 << 20  # bytes, the largest piece that glibc takes from the heap a
 def keep_freed_memory() -> None:
     """Have glibc keep freed memory for later, of the whole process. Elsewhere than with glibc it does nothing.
 
-    To be called before the first thread begins, numpy's among them: glibc then looks up how many heaps there may be.
+    The program calls it as it begins, before other threads do: the heaps that they have made stay. Who uses the runtime
+    as a library may call it as well.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -124,7 +124,7 @@ def aligned(values: Array, origin: tuple[float, float], onto: tuple[int, int], o
     shift = [(mine - theirs) / resolution for mine, theirs in zip(origin, onto_origin, strict=True)]
     column, row = (round(cells) for cells in shift)
     if max(abs(shift[0] - column), abs(shift[1] - row)) > 0.01:
-        raise ValueError(f"grid origins {origin} and {onto_origin} differ by a fraction of a {resolution} m cell")
+        raise ValueError(f"grid origins differ by a fraction of a {resolution:g} m cell")
     out = np.full(onto, missing, values.dtype)
     low_r, high_r = max(row, 0), min(row + values.shape[0], onto[0])
     low_c, high_c = max(column, 0), min(column + values.shape[1], onto[1])

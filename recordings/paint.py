@@ -154,7 +154,7 @@ def _some_known(layer: Array) -> Array:
 
 
 def _percentiles(values: Array, *ranks: float) -> list[float]:
-    """The values of these ranks, percent: each the nearest that there is, at a tenth of np.percentile's time."""
+    """The values of these ranks, percent, each the nearest that there is."""
     places = [round(rank / 100.0 * (values.size - 1)) for rank in ranks]
     ordered = np.partition(values, places)
     return [float(ordered[place]) for place in places]

@@ -51,12 +51,18 @@ def _frame_lines(found: Score) -> list[str]:
         lines.append(f"missing      {topic}: {len(stamps)} of {counted(found.frames, 'frame')}, scored as all unknown")
     for topic, count in found.unmatched.items():
         lines.append(f"unmatched    {topic}: {counted(count, 'message')} at stamps without truth, not scored")
-    for topic, reasons in found.unscored.items():
-        lines += [f"not scored   {topic}: {counted(count, 'frame')}: {why}" for why, count in reasons.items()]
-    for log, reasons in found.lost.items():
-        for why, count in reasons.items():
-            told = f"lost         {counted(count, 'message')} of {log}: {why}"
-            lines += wrap(told, 100, subsequent_indent=" " * 13, break_long_words=False, break_on_hyphens=False)
+    told = [
+        f"not scored   {topic}: {counted(count, 'frame')}: {why}"
+        for topic, reasons in found.unscored.items()
+        for why, count in reasons.items()
+    ]
+    told += [
+        f"lost         {counted(count, 'message')} of {log}: {why}"
+        for log, reasons in found.lost.items()
+        for why, count in reasons.items()
+    ]
+    for line in told:
+        lines += wrap(line, 100, subsequent_indent=" " * 13, break_long_words=False, break_on_hyphens=False)
     return lines
 
 

@@ -29,7 +29,6 @@ from recordings.stereo_measures import StereoErrors, cropped_columns
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")
-MAPS = {"/nav/elevation_map", "/nav/navigation_map"}
 TRUTHS = (
     "/truth/disparity", "/truth/occlusion", "/truth/elevation_map", "/truth/navigation_map", "/truth/rocks",
     "/truth/tilt", "/truth/pose",
@@ -43,16 +42,16 @@ FIRST = 9  # stamps that tell how far the clock of the logging is from theirs
 class Score:
     """Errors of a run. Shares 0 to 1, lengths m, disparities px, angles rad; NaN where there was nothing to measure.
 
-    frames: in the truth; compared: those with at least one result; missing: result topic -> stamps of true frames that
-    it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without truth;
-    unscored: topic -> why -> frames that have it and cannot be scored;
+    frames: in the truth; compared: those with at least one result that was scored; missing: result topic -> stamps of
+    true frames that it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without
+    truth; unscored: topic -> why -> frames that have it and cannot be scored;
     lost: log -> why -> messages that could not be read; a true frame that lacks one is scored as far as it goes;
     disparity: `StereoErrors.measures`, cropped by the truth's max_disparity (the data set's range where it has one,
     else the frame's largest), rounded up to 16;
     terrain: `terrain_measures.TerrainTally.measures`;
     tilt: frames, mean, max; untilted: why -> frames with a true tilt whose own could not be scored;
     pose: `PoseTally.measures`; per_frame: the main figures of each frame.
-    None where the truth has no such topics (tilt: where no frame has both).
+    None where the truth has no such topics, or nothing of the result fits them (tilt: where no frame has both).
     """
 
     frames: int
@@ -76,7 +75,7 @@ class Score:
 def score(result: Path, truth: Path) -> Score:
     """Compare the log `result` of a run with the truth topics of the log `truth`.
 
-    Raises LogError where either has nothing to compare, or where their images do not fit.
+    Raises LogError where either has nothing to compare, where their images do not fit, or the truth's own maps.
     """
     tally = _Tally(Path(result), Path(truth))
     for stamp, frame in _frames(Path(result), Path(truth), tally):
@@ -130,6 +129,7 @@ class _Tally:
         self.missing: dict[str, list[int]] = {topic: [] for topic in RESULTS}
         self.unmatched: dict[str, int] = {}
         self.unscored: dict[str, dict[str, int]] = {}
+        self.left_out: set[str] = set()  # topics, of the frame that is being added
         self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
         with McapFile(truth) as log:  # recorders note topics of which no message came; of a damaged log, some may have
             channels = log.index.channels
@@ -150,7 +150,7 @@ class _Tally:
                 self.unmatched[topic] = self.unmatched.get(topic, 0) + 1
             return
         self.frames += 1
-        self.compared += bool(results)
+        self.left_out = set()
         for topic in RESULTS:
             if topic not in frame and topic.replace("/nav/", "/truth/") in frame:
                 self.missing[topic].append(stamp)
@@ -163,17 +163,19 @@ class _Tally:
             row |= self._add_tilt(frame)
         if "/truth/pose" in frame:
             row |= self.pose.add(frame["/truth/pose"], frame.get("/nav/pose"))
+        self.compared += not self.left_out.issuperset(results)
         self.per_frame.append(row)
 
     def _has(self, needed: set[str], besides: set[str], frame: dict[str, Any]) -> bool:
         """Whether a frame has the truth `needed`, and `besides` what the log has of this: no rocks there were is one
         thing, rocks that were lost another."""
         lacking = (needed | (besides & self.truths)) - frame.keys()
-        for topic in needed & frame.keys() if lacking else ():
+        for topic in sorted(needed & frame.keys()) if lacking else ():
             self._leave_out(topic, f"the truth has no {', '.join(sorted(lacking))} there")
         return not lacking
 
     def _leave_out(self, topic: str, why: str) -> None:
+        self.left_out.add(topic)
         counts = self.unscored.setdefault(topic, {})
         counts[why] = counts.get(why, 0) + 1
 
@@ -218,15 +220,19 @@ class _Tally:
         ground = terrain_measures.TrueGround.of(true, hazard, rocks)
         if ground is None:
             raise LogError(f"{self.truth}: /truth at {stamp} ns lacks what maps are scored with; make the truth again")
-        try:
-            layers = _layers(frame["/nav/elevation_map"], true) if "/nav/elevation_map" in frame else {}
-            cells = _cells(frame["/nav/navigation_map"], true) if "/nav/navigation_map" in frame else None
-        except ValueError as error:
-            for topic in MAPS & frame.keys():
-                self._leave_out(topic, str(error))
+        fitting, unfit = dict[str, Any](), dict[str, str]()
+        for topic, read in (("/nav/elevation_map", _layers), ("/nav/navigation_map", _cells)):
+            try:
+                if topic in frame:
+                    fitting[topic] = read(frame[topic], true)
+            except ValueError as error:
+                unfit[topic] = str(error)
+        if unfit:
+            for topic, why in (unfit | dict.fromkeys(fitting, "the frame's other map does not fit the truth")).items():
+                self._leave_out(topic, why)
             return {}
         self.terrain = self.terrain or terrain_measures.TerrainTally()
-        return self.terrain.add(ground, layers, cells)
+        return self.terrain.add(ground, fitting.get("/nav/elevation_map", {}), fitting.get("/nav/navigation_map"))
 
     def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:
         item, true = frame.get("/tf"), frame["/truth/tilt"]
@@ -254,6 +260,9 @@ class _Tally:
         if not self.seen_results:
             raise without_results(self.result, RESULTS)
         if not self.compared:
+            unfit = [f"of {topic}, {why}" for topic in RESULTS for why in self.unscored.get(topic, ())]
+            if unfit:
+                raise LogError(f"{self.result}: nothing in it fits the truth in {self.truth}: {unfit[0]}")
             raise LogError(f"no result of {self.result} has the stamp of a true frame of {self.truth}; is it its run?")
         tilts = self.tilts
         return Score(
@@ -286,7 +295,8 @@ def _cells(message: Any, onto: ElevationMap) -> Array:
 
 def _fitted(grid: ElevationMap | NavigationMap, values: Array, onto: ElevationMap, missing: float) -> Array:
     if abs(grid.resolution - onto.resolution) > 1e-4 * onto.resolution:
-        raise ValueError(f"its cells are {grid.resolution:g} m wide, the truth's {onto.resolution:g} m")
+        cells = f"its cells are {grid.resolution:g} m wide, the truth's {onto.resolution:g} m"
+        raise ValueError(f"{cells}; run with that resolution")
     if grid.frame_id != onto.frame_id:
         raise ValueError(f"it is in frame '{grid.frame_id}', the truth in '{onto.frame_id}'")
     return measures.aligned(values, grid.origin, onto.shape, onto.origin, onto.resolution, missing)

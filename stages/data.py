@@ -371,3 +371,6 @@ class MatchHealth:
     stamp: int
     all: float
     near: float
+
+    def __post_init__(self) -> None:
+        check_stamp(self)

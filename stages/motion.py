@@ -149,6 +149,7 @@ class CameraMotion:
     lost: str = ""
 
     def __post_init__(self) -> None:
+        check_stamp(self)
         publish_vector(self, "covariance", (6, 6))
 
 
@@ -167,6 +168,9 @@ class TiltHealth:
     frames: int
     fault: str
     judgement: str
+
+    def __post_init__(self) -> None:
+        check_stamp(self)
 
 
 def _share(first: int, last: int, stamp: int) -> float:

@@ -57,10 +57,8 @@ def shared_by(threads: int) -> AtOnce:
 def by_bands(both: AtOnce, rows: int, work: Callable[[int, int], Any]) -> None:
     """Call `work(first, end)` for all rows once: in bands, of which a thread that is free takes the next, or all the
     rows in one call where there is one thread."""
-    if both is in_turn:
-        work(0, rows)
-        return
-    cuts = [rows * i // BANDS for i in range(BANDS + 1)]
+    count = 1 if both is in_turn else BANDS
+    cuts = [rows * i // count for i in range(count + 1)]
     bands = iter([(first, end) for first, end in itertools.pairwise(cuts) if first < end])
 
     def take() -> None:

@@ -112,7 +112,7 @@ def _drop(pixels, strength, runs, first, last, largest):  # type: ignore[no-unty
     start, end, parent, area = runs
     for run in range(first, last):
         patch = run
-        while parent[patch] != patch:  # many threads at once: read only
+        while parent[patch] != patch:  # two threads at once: read only
             patch = parent[patch]
         if area[patch] <= largest:
             for i in range(start[run], end[run]):

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from flow import arguments
 from flow.align import Token
+from flow.allocator import keep_freed_memory
 from flow.pipeline import load
 from recordings.simulator import log, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
@@ -174,6 +175,7 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="all measures into this file")
     options = parser.parse_args(given)
     cv2.setNumThreads(1)
+    keep_freed_memory()  # as a run does
     runs = {name: RUNS[name] for name in RUNS if name in options.runs or ("true" in options.runs and "true" in name)}
     (width, height), (baseline, above, down) = options.size, options.camera
     everything = {}

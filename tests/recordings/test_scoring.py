@@ -51,6 +51,7 @@ class Run:
     tilt_error: float = 0.0
     crop: int = 0
     resolution: float = 0.05
+    navigation: float | None = None  # its resolution, where it is another
     skipped: tuple[int, ...] = ()
     shift: dict[int, int] = field(default_factory=dict)
     only: tuple[str, ...] = field(default=(*scoring.RESULTS, "/tf"))
@@ -92,7 +93,7 @@ class Run:
                 ElevationMap(stamp, {"elevation": layer}, self.resolution, origin, "level")
             ),
             "/nav/navigation_map": ros2.occupancy_grid(
-                NavigationMap(stamp, cells, reason, self.resolution, origin, "level")
+                NavigationMap(stamp, cells, reason, self.navigation or self.resolution, origin, "level")
             ),
             "/tf": ros2.transform_message([(found, stamp)]),
         }
@@ -162,11 +163,29 @@ def test_disparities_of_another_camera_are_not_compared(tmp_path, truth, frames,
 def test_maps_of_other_cells_are_not_compared_and_all_else_is(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, resolution=0.1)
     assert found.terrain is None
-    reasons = {"its cells are 0.1 m wide, the truth's 0.05 m": 2}
+    reasons = {"its cells are 0.1 m wide, the truth's 0.05 m; run with that resolution": 2}
     assert found.unscored == {"/nav/elevation_map": reasons, "/nav/navigation_map": reasons}
     assert found.disparity["bad_1"] == 0
     assert found.tilt["frames"] == 2
     assert "not scored   /nav/navigation_map: 2 frames: its cells are 0.1 m wide" in format_score(found)
+    assert max(map(len, format_score(found).splitlines())) <= 100
+
+
+def test_a_map_whose_companion_does_not_fit_is_left_out_for_that(tmp_path, truth, frames):
+    found = scored(tmp_path, truth, frames, resolution=0.1, navigation=0.05)
+    assert found.terrain is None
+    assert found.unscored == {
+        "/nav/elevation_map": {"its cells are 0.1 m wide, the truth's 0.05 m; run with that resolution": 2},
+        "/nav/navigation_map": {"the frame's other map does not fit the truth": 2},
+    }
+
+
+def test_a_run_of_which_nothing_fits_is_no_score(tmp_path, truth, frames):
+    only = ("/nav/elevation_map", "/nav/navigation_map")
+    with pytest.raises(
+        LogError, match=r"nothing in it fits the truth in .*: of /nav/elevation_map, its cells"
+    ):
+        scored(tmp_path, truth, frames, only=only, resolution=0.1)
 
 
 def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth, frames):

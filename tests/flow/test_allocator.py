@@ -1,0 +1,35 @@
+"""Whether the program's threads share one heap, by what glibc itself says of its heaps."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+THREADS = """
+import ctypes, threading
+together = threading.Barrier(4)
+
+def work():
+    together.wait()  # all at once, so that each would want a heap of its own
+    for _ in range(100):
+        bytes(100_000)
+    together.wait()
+
+threads = [threading.Thread(target=work) for _ in range(4)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+ctypes.CDLL(None).malloc_stats()
+"""
+PROGRAM = "import sys; sys.argv = ['roverflow', 'graph']; from flow.program import program; program()\n"
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left alone")
+@pytest.mark.parametrize(("before", "several"), [("", True), (PROGRAM, False)])
+def test_the_threads_of_the_program_share_one_heap(before, several):
+    said = subprocess.run([sys.executable, "-c", before + THREADS], check=True, capture_output=True, text=True).stderr
+    assert (said.count("Arena ") > 1) == several
