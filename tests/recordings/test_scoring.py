@@ -182,9 +182,7 @@ def test_a_map_whose_companion_does_not_fit_is_left_out_for_that(tmp_path, truth
 
 def test_a_run_of_which_nothing_fits_is_no_score(tmp_path, truth, frames):
     only = ("/nav/elevation_map", "/nav/navigation_map")
-    with pytest.raises(
-        LogError, match=r"nothing in it fits the truth in .*: of /nav/elevation_map, its cells"
-    ):
+    with pytest.raises(LogError, match=r"nothing in it fits the truth in .*: of /nav/elevation_map, its cells"):
         scored(tmp_path, truth, frames, only=only, resolution=0.1)
 
 
