@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return int(options.command(options))
     except (Exception, KeyboardInterrupt) as error:
         if _interrupted(error):
-            print("roverflow: interrupted", file=sys.stderr)
+            print("roverflow: interrupted; no unfinished file is kept", file=sys.stderr)
             return INTERRUPTED
         if options.debug:
             traceback.print_exc()

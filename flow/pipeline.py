@@ -226,7 +226,7 @@ class _Builder:
             listed = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
             known = [n for n in listed if is_dataclass(getattr(module, n, None))]
             if hasattr(module, name):
-                raise place.error(f"{use} is no dataclass, as what a pipeline uses must be{nearest(name, known)}")
+                raise place.error(f"{use} is no dataclass, and a pipeline uses no other class; give it @dataclass")
             raise place.error(f"'{module_name}' has no '{name}' that a pipeline can use{nearest(name, known)}")
         if (
             what.startswith("stream")

@@ -24,7 +24,7 @@ from stages.motion import Tilt as Tilt
 from stages.motion import TiltHealth as TiltHealth
 from stages.motion import Transform as Transform
 from stages.publish import Array as Array
-from stages.publish import check_resolution, check_stamp, publish, publish_image, publish_vector, read_only
+from stages.publish import check_resolution, publish, publish_image, publish_stamp, publish_vector, read_only
 from stages.tiles import Tiles as Tiles
 
 LEVEL_FRAME = "level"
@@ -176,7 +176,7 @@ class CameraImage:
     rectified: bool
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         publish_image(self, "pixels")
 
     def pair_with(self, right: CameraImage) -> StereoFrame:
@@ -197,7 +197,7 @@ class StereoFrame:
     camera: StereoCamera
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         publish_image(self, "left")
         publish_image(self, "right")
         if self.left.shape != self.right.shape:
@@ -228,7 +228,7 @@ class Disparity:
     camera: StereoCamera | None = None
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         publish(self, "pixels", (None, None), np.float32)
         publish(self, "source", self.pixels.shape, np.uint8)
         publish(self, "confidence", self.pixels.shape, np.float32)
@@ -259,7 +259,7 @@ class PointCloud:
     tilt_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         publish(self, "points", (None, 3), np.float32)
         n = len(self.points)
         publish(self, "colors", (n, 3), np.uint8)
@@ -306,7 +306,7 @@ class ElevationMap:
     shape: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         check_resolution(self)
         layers = {name: np.asarray(layer) for name, layer in self.layers.items()}
         if "elevation" not in layers:
@@ -335,7 +335,7 @@ class VoxelMap:
     frame_id: str
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         check_resolution(self)
         publish(self, "index", (None, 3), np.int32)
         publish(self, "colors", (len(self.index), 3), np.uint8)
@@ -358,7 +358,7 @@ class NavigationMap:
     frame_id: str
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         check_resolution(self)
         publish(self, "cells", (None, None), np.int8)
         publish(self, "reason", self.cells.shape, np.uint8)
@@ -373,4 +373,4 @@ class MatchHealth:
     near: float
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)

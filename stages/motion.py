@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stages.publish import Array, check_rotation, check_stamp, publish_vector
+from stages.publish import Array, check_rotation, publish_stamp, publish_vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Tilt:
     frame_id: str = "inclinometer"
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         publish_vector(self, "up", (3,))
         if not abs(float(np.linalg.norm(self.up)) - 1.0) < 1e-6:
             raise ValueError(f"Tilt.up must be a unit vector, not {self.up.tolist()}")
@@ -90,7 +90,7 @@ class Pose:
     covariance: Array | None = None
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         publish_vector(self, "position", (3,))
         publish_vector(self, "quaternion", (4,))
         if self.covariance is not None:
@@ -125,7 +125,7 @@ class Mount:
     base_from_camera: Transform | None = None
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         publish_vector(self, "camera_from_inclinometer", (3, 3))
         check_rotation(self.camera_from_inclinometer, "Mount.camera_from_inclinometer")
 
@@ -149,7 +149,7 @@ class CameraMotion:
     lost: str = ""
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
         publish_vector(self, "covariance", (6, 6))
 
 
@@ -170,7 +170,7 @@ class TiltHealth:
     judgement: str
 
     def __post_init__(self) -> None:
-        check_stamp(self)
+        publish_stamp(self)
 
 
 def _share(first: int, last: int, stamp: int) -> float:

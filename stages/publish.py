@@ -35,7 +35,9 @@ def publish_image(owner: object, name: str) -> None:
     pixels = np.asarray(getattr(owner, name))
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{type(owner).__name__}.{name} must be uint8 or uint16, not {pixels.dtype}")
-    publish(owner, name, (None, None) if pixels.ndim == 2 else (None, None, 3), pixels.dtype)
+    if pixels.ndim != 2 and pixels.shape[2:] != (3,):
+        raise ValueError(f"{type(owner).__name__}.{name} must be (H, W) gray or (H, W, 3) RGB, not {pixels.shape}")
+    publish(owner, name, pixels.shape, pixels.dtype)
 
 
 def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: bool = True) -> None:
@@ -47,10 +49,11 @@ def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: boo
     publish(owner, name, shape, np.float64)
 
 
-def check_stamp(owner: Any) -> None:
-    """Raise ValueError unless the field `stamp` holds whole nanoseconds."""
+def publish_stamp(owner: Any) -> None:
+    """Check that the field `stamp` holds whole nanoseconds, and make them an int."""
     if not isinstance(owner.stamp, Integral):
         raise ValueError(f"{type(owner).__name__}.stamp must be whole nanoseconds, not {owner.stamp!r}")
+    object.__setattr__(owner, "stamp", int(owner.stamp))
 
 
 def check_resolution(owner: Any) -> None:

@@ -342,7 +342,7 @@ def test_an_interrupt_inside_compiled_code_is_an_interrupt(traverse, capsys, mon
 
     monkeypatch.setattr("flow.cli.replay", compiled)
     assert roverflow("run", traverse, "-o", traverse.with_name("interrupted.mcap")) == 130
-    assert capsys.readouterr().err == "roverflow: interrupted\n"
+    assert capsys.readouterr().err == "roverflow: interrupted; no unfinished file is kept\n"
 
 
 ON_IMPORT = """

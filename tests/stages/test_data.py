@@ -107,7 +107,7 @@ def test_what_is_not_finite_is_refused_by_name(make: Callable[[float], Any], mes
 @pytest.mark.parametrize("make", [make for make in MAKERS if hasattr(make(), "stamp")])
 def test_a_stamp_is_whole_nanoseconds(make: Callable[[], Any], stamp: object) -> None:
     item = make()
-    assert replace(item, stamp=np.int64(7)).stamp == 7
+    assert type(replace(item, stamp=np.int64(7)).stamp) is int
     with pytest.raises(ValueError, match=rf"{type(item).__name__}\.stamp must be whole nanoseconds"):
         replace(item, stamp=stamp)
 
