@@ -1,5 +1,5 @@
 """Keeps freed memory in the process, and all of it in one heap: every stage of every frame allocates and frees large
-arrays, fresh pages from the operating system cost a tenth of the time, and several heaps keep more than one."""
+arrays, fresh pages from the operating system cost a tenth of the time, and what one thread freed serves the others."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return int(options.command(options))
     except (Exception, KeyboardInterrupt) as error:
         if _interrupted(error):
-            print("roverflow: interrupted; no unfinished file is kept", file=sys.stderr)
+            print("roverflow: interrupted", file=sys.stderr)
             return INTERRUPTED
         if options.debug:
             traceback.print_exc()
@@ -80,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
         prog="roverflow",
         description="Replay rover traverses into terrain one can trust.",
         epilog="Exit codes: 0 complete; 1 an output or the program failed; 2 usage, or a log that cannot be used; "
-        "3 finished but incomplete; 130 interrupted, with the outputs closed and readable.",
+        "3 finished but incomplete; 130 interrupted, with the outputs of a run closed and readable.",
     )
     top.add_argument("--version", action="version", version=f"roverflow {product_version()}")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
@@ -343,7 +343,7 @@ def _score(options: argparse.Namespace) -> int:
     result = score(options.result, truth)
     _write(options.json, result.to_json())
     say(format_score(result))
-    return INCOMPLETE if result.lost else COMPLETE
+    return INCOMPLETE if result.lost or result.unscored else COMPLETE
 
 
 def _export_arguments(sub: argparse.ArgumentParser) -> None:

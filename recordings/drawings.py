@@ -161,11 +161,11 @@ class Canvas:
 
 
 @lru_cache(maxsize=256)
-def _scale(low: float, high: float, unit: str, palette: int) -> list[tuple[str, paint.Rgb]]:
+def _scale(low: float, high: float, unit: str, palette: int) -> tuple[tuple[str, paint.Rgb], ...]:
     """Three values of a colour map, with their colours."""
     values = np.linspace(low, high, 3)
     colours = [(int(r), int(g), int(b)) for r, g, b in paint.colours(values, low, high, palette)]
-    return [(f"{paint.figure(value)} {unit}", colour) for value, colour in zip(values, colours, strict=True)]
+    return tuple((f"{paint.figure(value)} {unit}", colour) for value, colour in zip(values, colours, strict=True))
 
 
 def same_view(one: StereoCamera, other: StereoCamera) -> bool:

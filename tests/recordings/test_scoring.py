@@ -169,6 +169,7 @@ def test_maps_of_other_cells_are_not_compared_and_all_else_is(tmp_path, truth, f
     assert found.tilt["frames"] == 2
     assert "not scored   /nav/navigation_map: 2 frames: its cells are 0.1 m wide" in format_score(found)
     assert max(map(len, format_score(found).splitlines())) <= 100
+    assert main(["score", str(tmp_path / "out.mcap"), "--truth", str(truth)]) == 3
 
 
 def test_a_map_whose_companion_does_not_fit_is_left_out_for_that(tmp_path, truth, frames):
