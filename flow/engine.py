@@ -110,7 +110,8 @@ class Engine:
         frame = _Frame(self.admitted, stamp, dict(values), list(entries))
         frame.entries += [value.cause for value in values.values() if isinstance(value, Absent)]
         with self._condition:
-            while not self._room_for(frame):
+            first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
+            while not self._has_room(first, frame):
                 if self.failure or stop():
                     return False
                 self._condition.wait(0.1)
@@ -118,7 +119,6 @@ class Engine:
                 return False
             self.admitted += 1
             self._frames.append(frame)
-            self._expect(frame)
             self._pass_absence(frame)
             retired = list(self._retire())  # a frame that has nothing to work on is through at once
             self._condition.notify_all()
@@ -190,14 +190,14 @@ class Engine:
         if self._closed or self.failure:
             return None
         for work in reversed(self._work):
-            for frame in self._frames:
-                if work in frame.begun or not self._ready(work, frame):
+            for frame in self._frames if work.inbox else ():
+                if frame.index not in work.inbox or not self._ready(work, frame):
                     continue
                 if self._has_room(work.consumers, frame):
                     frame.begun.add(work)
                     work.inbox.discard(frame.index)
                     if work.output:
-                        self._expect(frame, work.output)
+                        self._expect(frame, work.consumers, work.output)
                     else:
                         self._writing += 1
                     return work, frame
@@ -214,13 +214,9 @@ class Engine:
             return True
         return all(len(c.inbox) < self._capacity or frame.index in c.inbox for c in consumers)
 
-    def _room_for(self, frame: _Frame) -> bool:
-        first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
-        return self._has_room(first, frame)
-
-    def _expect(self, frame: _Frame, coming: str = "") -> None:
-        """Note `frame` in the inbox of every node whose inputs are all there, counting `coming` as there."""
-        for work in self._work:
+    def _expect(self, frame: _Frame, nodes: Iterable[_Work], coming: str = "") -> None:
+        """Note `frame` in the inbox of every one of the nodes whose inputs are all there, counting `coming` as there."""
+        for work in nodes:
             if work not in frame.begun and all(s in frame.values or s == coming for s in work.inputs):
                 work.inbox.add(frame.index)
 
@@ -236,7 +232,10 @@ class Engine:
         if work.output:
             frame.values[work.output] = value
         self._complete(work, frame)
-        self._pass_absence(frame)
+        if isinstance(value, Absent):
+            self._pass_absence(frame)
+        else:
+            self._expect(frame, work.consumers)
         return list(self._retire())
 
     def _complete(self, work: _Work, frame: _Frame) -> None:
@@ -255,7 +254,7 @@ class Engine:
                 work.inbox.discard(frame.index)
                 frame.values[work.output] = lost[0]
                 self._complete(work, frame)
-        self._expect(frame)
+        self._expect(frame, self._work)
 
     def _retire(self) -> Iterator[bool]:
         """Let go of the frames, oldest first, that are through."""
