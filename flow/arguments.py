@@ -44,17 +44,6 @@ def magnitude(text: str, what: str = "a number of at least 0") -> float:
     return value
 
 
-def share(text: str) -> float:
-    """A percentage that is no less than -50, as a share."""
-    try:
-        value = float(text) / 100
-    except ValueError:
-        value = math.nan
-    if not -0.5 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a percentage of at least -50, not '{text}'")
-    return value
-
-
 def seconds(text: str) -> float:
     """Seconds after a log's first message."""
     value = magnitude(text, what := "seconds after the log's first message")

@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, share, size, workers
+from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, size, workers
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.graph import Graph
 from flow.program import INTERRUPTED
@@ -235,24 +235,25 @@ def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--slope", type=magnitude, metavar="DEG", help="RMS slope of the terrain (4)")
     sub.add_argument("--tilt-noise", type=magnitude, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
     scale = "by how much odometry overstates the way (1); 0, with --odometry-turn 0, is exact"
-    sub.add_argument("--odometry-scale", type=share, metavar="PERCENT", help=scale)
+    sub.add_argument("--odometry-scale", type=float, metavar="PERCENT", help=scale)
     turn = "drift of odometry's heading, one sigma after 1 m; it grows with the root of the way (0.2)"
     sub.add_argument("--odometry-turn", type=magnitude, metavar="DEG", help=turn)
 
 
 def _simulate(options: argparse.Namespace) -> int:
     check_outputs({"input log": options.out}, [], is_ours)
-    plain = ("frames", "seed", "baseline", "camera_height", "odometry_scale")
+    plain = ("frames", "seed", "baseline", "camera_height")
     settings = {name: getattr(options, name) for name in plain} | {"abundance": options.rocks}
-    for name in ("pitch_down", "slope", "tilt_noise", "odometry_turn"):
-        degrees = getattr(options, name)
-        settings[name] = None if degrees is None else math.radians(degrees)
+    units = dict.fromkeys(("pitch_down", "slope", "tilt_noise", "odometry_turn"), math.radians(1))
+    for name, unit in {**units, "odometry_scale": 0.01}.items():
+        given = getattr(options, name)
+        settings[name] = None if given is None else given * unit
     settings["width"], settings["height"] = options.size
     try:
         simulate(options.out, **{name: value for name, value in settings.items() if value is not None})
     except UsageError as error:
-        given = {"abundance": "--rocks", "width": "the width of --size", "height": "the height of --size"}
-        named = {f"Simulation.{name} ": given.get(name, f"--{name.replace('_', '-')}") for name in settings}
+        other = {"abundance": "--rocks", "width": "the width of --size", "height": "the height of --size"}
+        named = {f"Simulation.{name} ": other.get(name, f"--{name.replace('_', '-')}") for name in settings}
         sentence = str(error)
         for name, option in named.items():
             sentence = sentence.replace(name, f"{option} ")

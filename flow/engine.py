@@ -215,7 +215,7 @@ class Engine:
         return all(len(c.inbox) < self._capacity or frame.index in c.inbox for c in consumers)
 
     def _expect(self, frame: _Frame, nodes: Iterable[_Work], coming: str = "") -> None:
-        """Note `frame` in the inbox of every one of the nodes whose inputs are all there, counting `coming` as there."""
+        """Note `frame` in the inbox of those of the nodes whose inputs are all there, counting `coming` as there."""
         for work in nodes:
             if work not in frame.begun and all(s in frame.values or s == coming for s in work.inputs):
                 work.inbox.add(frame.index)

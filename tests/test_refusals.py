@@ -256,12 +256,18 @@ def test_an_export_that_fails_leaves_nothing_in_the_way_of_another(result, tmp_p
 @pytest.mark.parametrize(
     ("option", "value", "said"),
     [
-        ("--slope", "80", "--slope must be at most 45 degrees, not 80 degrees"),
-        ("--rocks", "2", "--rocks must be at most 0.5, not 2"),
-        ("--size", "1x20", "the width of --size must be at least 16"),
-        ("--baseline", "0", "--baseline must be at least 0.001"),
-        ("--camera-height", "0.01", "--camera-height must be at least 0.1"),
-        ("--pitch-down", "120", "--pitch-down must be at most 90 degrees, not 120"),
+        ("--slope", "80", "--slope must be 0 to 45 degrees, not 80 degrees"),
+        ("--rocks", "2", "--rocks must be 0 to 0.5, not 2"),
+        ("--size", "1x20", "the width of --size must be 16 to 8192 px, not 1 px"),
+        ("--baseline", "0", "--baseline must be 0.001 to 10 m, not 0 m"),
+        ("--baseline", "1e9", "--baseline must be 0.001 to 10 m"),
+        ("--camera-height", "0.01", "--camera-height must be 0.1 to 100 m, not 0.01 m"),
+        ("--pitch-down", "120", "--pitch-down must be -90 to 90 degrees, not 120 degrees"),
+        ("--frames", "9" * 20, "--frames must be 1 to 100000, not"),
+        ("--seed", "-1", "--seed must be 0 to 1e+15, not -1"),
+        ("--tilt-noise", "400", "--tilt-noise must be 0 to 45 degrees, not 400 degrees"),
+        ("--odometry-scale", "300", "--odometry-scale must be -50 to 100 %, not 300 %"),
+        ("--odometry-scale", "nan", "--odometry-scale must be -50 to 100 %, not nan %"),
     ],
 )
 def test_a_simulation_beyond_its_limits_is_refused_in_the_words_of_the_options(tmp_path, capsys, option, value, said):

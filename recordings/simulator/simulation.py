@@ -29,6 +29,18 @@ BLOCK = 32  # rows a thread takes at a time
 # The Devon Island rover's rectified camera (1280 pixels wide).
 DEVON_WIDTH, DEVON_F, DEVON_CX, DEVON_CY, DEVON_HEIGHT = 1280, 968.999694824, 635.139038086, 463.537109375, 960
 
+UNITS = {"degrees": 180 / np.pi, "%": 100}  # of a limit, in those of a simulation's field
+LIMITS: dict[str, tuple[float, float, str]] = {  # per field the least and the most that it may be
+    "frames": (1, 100_000, ""), "rate": (0.001, 100, "Hz"), "speed": (0, 10, "m/s"), "seed": (0, 10**15, ""),
+    "width": (16, 8192, "px"), "height": (16, 8192, "px"), "baseline": (0.001, 10, "m"),
+    "camera_height": (0.1, 100, "m"), "pitch_down": (-90, 90, "degrees"), "slope": (0, 45, "degrees"),
+    "relief_resolution": (0.001, 10, "m"), "abundance": (0, 0.5, ""), "smallest_rock": (0.01, 10, "m"),
+    "sun_elevation": (0.1, 90, "degrees"), "noise": (0, 1, ""), "tilt_noise": (0, 45, "degrees"),
+    "tilt_rate": (1, 1000, "Hz"), "odometry_rate": (1, 1000, "Hz"), "odometry_scale": (-50, 100, "%"),
+    "odometry_turn": (0, 90, "degrees"), "map_half_width": (0.5, 100, "m"), "map_resolution": (0.001, 10, "m"),
+    "threads": (1, 1024, ""),
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class FrameTruth:
@@ -93,27 +105,13 @@ class Simulation:
     threads: int = 2
 
     def __post_init__(self) -> None:
-        least = {
-            "frames": 1, "rate": 1e-3, "speed": 0, "width": 16, "height": 16, "baseline": 1e-3, "camera_height": 0.1,
-            "slope": 0, "relief_resolution": 1e-3, "abundance": 0, "smallest_rock": 0.01, "noise": 0, "tilt_noise": 0,
-            "seed": 0, "tilt_rate": 1, "odometry_rate": 1, "map_half_width": 0.5, "map_resolution": 1e-3, "threads": 1,
-            "odometry_scale": -0.5, "odometry_turn": 0,
-        }  # fmt: skip
-        for name, low in least.items():
-            if not low <= getattr(self, name) < np.inf:
-                raise ValueError(f"Simulation.{name} must be at least {low} and finite, not {getattr(self, name)}")
-        most = {"width": (8192, " px", 1), "height": (8192, " px", 1), "abundance": (0.5, "", 1),
-                "slope": (np.pi / 4, " degrees", 180 / np.pi)}  # fmt: skip
-        for name, (high, unit, scale) in most.items():
-            if (value := getattr(self, name)) > high:
-                shown = f"at most {high * scale:g}{unit}, not {value * scale:g}{unit}"
-                raise ValueError(f"Simulation.{name} must be {shown}")
-        if not abs(self.pitch_down) <= np.pi / 2:
-            raise ValueError(f"Simulation.pitch_down must be at most 90 degrees, not {np.degrees(self.pitch_down):g}")
+        for name, (low, high, unit) in LIMITS.items():
+            value = getattr(self, name) * UNITS.get(unit, 1)
+            if not low <= value <= high:
+                shown = f"{low:.9g} to {high:.9g} {unit}".rstrip()
+                raise ValueError(f"Simulation.{name} must be {shown}, not {value:.9g}{f' {unit}' if unit else ''}")
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
-        if not 0 < self.sun_elevation <= np.pi / 2:
-            raise ValueError(f"Simulation.sun_elevation must be between 0 and pi/2 rad, not {self.sun_elevation}")
 
     @cached_property
     def camera(self) -> StereoCamera:
