@@ -193,7 +193,7 @@ def _info(options: argparse.Namespace) -> int:
         raise UsageError(f"{graph.source_use} is no recordings.McapSource, through which alone info can look at a log")
     description = describe(options.log, graph.source, *_tolerances(graph))
     say(json.dumps(description, indent=2) if options.json else format_description(description))
-    return COMPLETE
+    return INCOMPLETE if description["damage"] else COMPLETE
 
 
 def _tolerances(graph: Graph) -> tuple[int, int | None]:

@@ -21,6 +21,13 @@ def test_info_says_what_a_log_holds(traverse, capsys):
     assert f"{FRAMES}" in said
 
 
+def test_info_of_a_log_that_is_cut_short_says_so_and_ends_incomplete(traverse, tmp_path, capsys):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(traverse.read_bytes()[: traverse.stat().st_size * 2 // 3])
+    assert roverflow("info", cut) == 3
+    assert "damaged" in capsys.readouterr().out
+
+
 def test_info_looks_at_a_log_as_a_run_with_that_pipeline_would(traverse, tmp_path, capsys):
     def streams(*given):
         assert roverflow("info", traverse, "--json", *given) == 0
