@@ -33,22 +33,16 @@ def workers(text: str) -> int:
     return value
 
 
-def magnitude(text: str, what: str = "a number of at least 0") -> float:
-    """A number of at least 0."""
+def seconds(text: str) -> float:
+    """Seconds after a log's first message."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be {what}, not '{text}'")
-    return value
-
-
-def seconds(text: str) -> float:
-    """Seconds after a log's first message."""
-    value = magnitude(text, what := "seconds after the log's first message")
-    if value > _LATEST:
-        raise argparse.ArgumentTypeError(f"must be {what}, at most {_LATEST:g}, not '{text}'")
+    if not 0 <= value <= _LATEST:
+        raise argparse.ArgumentTypeError(
+            f"must be seconds after the log's first message, at most {_LATEST:g}, not '{text}'"
+        )
     return value
 
 

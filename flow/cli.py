@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flow.arguments import check_demo, check_outputs, count, magnitude, seconds, size, workers
+from flow.arguments import check_demo, check_outputs, count, seconds, size, workers
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.graph import Graph
 from flow.program import INTERRUPTED
@@ -185,6 +185,7 @@ def _info_arguments(sub: argparse.ArgumentParser) -> None:
 
 def _info(options: argparse.Namespace) -> int:
     from flow.pipeline import load
+    from flow.run import fitted
     from recordings import McapSource
     from recordings.inventory import describe, format_description
 
@@ -192,7 +193,15 @@ def _info(options: argparse.Namespace) -> int:
     if not isinstance(graph.source, McapSource):
         raise UsageError(f"{graph.source_use} is no recordings.McapSource, through which alone info can look at a log")
     description = describe(options.log, graph.source, *_tolerances(graph))
+    with graph.source.open(options.log) as log:
+        try:
+            description["refused"] = fitted(graph, log) and ""
+        except UsageError as error:
+            description["refused"] = str(error)
     say(json.dumps(description, indent=2) if options.json else format_description(description))
+    if not options.json:
+        why = description["refused"]
+        say(f"run -p {options.pipeline}: {f'would be refused: {why}' if why else 'has all it needs'}")
     return INCOMPLETE if description["damage"] else COMPLETE
 
 
@@ -225,19 +234,19 @@ def _graph(options: argparse.Namespace) -> int:
 
 def _simulate_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("out", type=Path, metavar="OUT.mcap")
-    sub.add_argument("--frames", type=count, help="stereo frames (default 12)")
+    sub.add_argument("--frames", type=int, help="stereo frames (default 12)")
     sub.add_argument("--seed", type=int, help="another seed, another terrain (1)")
     sub.add_argument("--size", type=size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
-    sub.add_argument("--baseline", type=magnitude, metavar="M", help="distance between the cameras (0.24)")
-    sub.add_argument("--camera-height", type=magnitude, metavar="M", help="of the cameras above the ground (0.9)")
-    sub.add_argument("--pitch-down", type=magnitude, metavar="DEG", help="how far the cameras look down (15)")
-    sub.add_argument("--rocks", type=magnitude, metavar="K", help="share of ground under rocks (Golombek's k, 0.1)")
-    sub.add_argument("--slope", type=magnitude, metavar="DEG", help="RMS slope of the terrain (4)")
-    sub.add_argument("--tilt-noise", type=magnitude, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
+    sub.add_argument("--baseline", type=float, metavar="M", help="distance between the cameras (0.24)")
+    sub.add_argument("--camera-height", type=float, metavar="M", help="of the cameras above the ground (0.9)")
+    sub.add_argument("--pitch-down", type=float, metavar="DEG", help="how far the cameras look down (15)")
+    sub.add_argument("--rocks", type=float, metavar="K", help="share of ground under rocks (Golombek's k, 0.1)")
+    sub.add_argument("--slope", type=float, metavar="DEG", help="RMS slope of the terrain (4)")
+    sub.add_argument("--tilt-noise", type=float, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
     scale = "by how much odometry overstates the way (1); 0, with --odometry-turn 0, is exact"
     sub.add_argument("--odometry-scale", type=float, metavar="PERCENT", help=scale)
     turn = "drift of odometry's heading, one sigma after 1 m; it grows with the root of the way (0.2)"
-    sub.add_argument("--odometry-turn", type=magnitude, metavar="DEG", help=turn)
+    sub.add_argument("--odometry-turn", type=float, metavar="DEG", help=turn)
 
 
 def _simulate(options: argparse.Namespace) -> int:

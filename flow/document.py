@@ -35,7 +35,7 @@ class Value:
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """The end of a sentence about a `name` that is none of the valid: which of them may be meant, if any."""
-    close = get_close_matches(name, list(valid), n=1, cutoff=0.5)
+    close = get_close_matches(name, list(valid), n=1, cutoff=0.6)
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
@@ -90,6 +90,8 @@ def settled(tree: Value, overrides: Iterable[str]) -> Value:
             of_entries.append((name, inner, value))
         elif name in settings:
             settings[name] = _changed(settings[name], name, inner, value)
+        elif inner and name == "settings":
+            raise value.place.error(f"settings are set by their names alone, as in {inner[0]}=value")
         elif inner:
             raise value.place.error(f"there is no stream '{name}'{nearest(name, [*entries, *settings])}")
         elif name in entries:

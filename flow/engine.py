@@ -272,7 +272,7 @@ class Engine:
         def run(frame: _Frame) -> Any:
             value = node.actor(**{port: frame.values[stream] for port, stream in node.inputs.items()})
             if not isinstance(value, node.output):
-                raise TypeError(f"{node.use} returned a {type(value).__name__}, not a {node.output.__name__}")
+                raise TypeError(f"{node.use} returned {type(value).__name__}, not {node.output.__name__}")
             return value
 
         return _Work(node.name, tuple(node.inputs.values()), node.name, node.ordered, run)

@@ -43,7 +43,7 @@ class Sink(Protocol):
 
     A sink whose parameters name streams says which do, in `names_streams`, for pipeline files to be checked. With a
     method `discard` it gives up what `open` began, where another output of the run could not be opened, or no frame
-    got through.
+    got through; by an attribute `empty` it says that it was given nothing worth keeping, and is to give up then, too.
     """
 
     suffix: str

@@ -45,6 +45,8 @@ def replay(
             "pipeline": graph.text,
             "overrides": "\n".join(overrides),
             "log": log.name,
+            "start": "" if start is None else repr(start),
+            "end": "" if end is None else repr(end),
             **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
         }
         with tqdm(total=opened.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:

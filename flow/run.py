@@ -45,7 +45,8 @@ class Stop:
 
 @contextmanager
 def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
-    """Send SIGINT, SIGTERM and SIGHUP to `stop` instead of raising in the middle of something."""
+    """Send SIGINT, SIGTERM and SIGHUP to `stop` instead of raising in the middle of something; SIGHUP only where it is
+    not ignored, as under nohup."""
 
     def request(number: int, frame: FrameType | None) -> None:
         stop.request()
@@ -56,7 +57,9 @@ def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
             raise KeyboardInterrupt  # out of a source that does not answer
 
     in_main = threading.current_thread() is threading.main_thread()  # only there can signals be caught
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if in_main else ()
+    signals = [signal.SIGINT, signal.SIGTERM] if in_main else []
+    if in_main and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signals.append(signal.SIGHUP)
     before = {number: signal.signal(number, request) for number in signals}
     try:
         yield
@@ -72,6 +75,7 @@ class _Outputs:
     sinks: dict[str, tuple[Sink, list[str]]]
     paths: Mapping[str, Path]
     opened: list[str] = field(default_factory=list)
+    withheld: list[str] = field(default_factory=list)
     errors: list[tuple[str, BaseException]] = field(default_factory=list)
 
     def open(self, kinds: Mapping[str, type], about: Mapping[str, str]) -> bool:
@@ -86,12 +90,17 @@ class _Outputs:
             self.opened.append(use)
         return True
 
-    def discard(self) -> None:
-        """Give up what is open, so that an output of an earlier run stays; a sink that cannot is closed later."""
+    def discard(self, only_empty: bool = False) -> None:
+        """Give up what is open, so that an output of an earlier run stays; a sink that cannot is closed later.
+
+        only_empty: of sinks that can tell, those that were given nothing to keep.
+        """
         for use in tuple(self.opened):
-            discard = getattr(self.sinks[use][0], "discard", None)
-            if discard is not None:
+            sink = self.sinks[use][0]
+            discard = getattr(sink, "discard", None)
+            if discard is not None and (not only_empty or getattr(sink, "empty", False)):
                 self.opened.remove(use)
+                self.withheld.append(use)
                 with suppress(Exception):  # why it is given up is what to tell of
                     discard()
 
@@ -106,7 +115,9 @@ class _Outputs:
             use, cause = self.errors[0]
             if use not in self.paths:  # no output's fault
                 raise cause
-            sentence = f"{use.rpartition('.')[2]} could not write {self.paths[use]}: {cause}"
+            failed = {use for use, _ in self.errors}
+            kept = "".join(f"; {self.paths[use]} has what came before" for use in self.opened if use not in failed)
+            sentence = f"{use.rpartition('.')[2]} could not write {self.paths[use]}: {cause}{kept}"
             raise SinkError(sentence, summary | {"verdict": str(Verdict.INCOMPLETE), "failure": sentence}) from cause
 
 
@@ -125,15 +136,10 @@ def run(
     outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
     Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
     closed and readable by then. A run of which no frame gets through leaves no output, and those of an earlier run as
-    they are, as far as its sinks can `discard`. Of the summary's wall_seconds, start_seconds were over before the first
-    frame.
+    they are, as far as its sinks can `discard`; so it is with a sink that is `empty` at the end. Of the summary's
+    wall_seconds, start_seconds were over before the first frame.
     """
-    for why in log.refused.values():
-        raise UsageError(why)
-    try:
-        graph = graph.without(log.missing)
-    except PipelineError as error:
-        raise UsageError(str(error)) from None
+    graph = fitted(graph, log)
     stop, ledger = stop or Stop(), Ledger()
     wall, cpu = time.perf_counter(), time.process_time()
     surveys = dict[str, Finding]()
@@ -160,17 +166,27 @@ def run(
         times["cpu_seconds"] = time.process_time() - cpu
         kept = engine is not None and engine.whole == engine.admitted and not len(ledger)
         whole = finished and kept and not sinks.errors
-        if not (engine and engine.through):
-            sinks.discard()
+        sinks.discard(only_empty=bool(engine and engine.through))
         summary = _summary(graph, feeder, engine, ledger, times) | {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
             "surveys": surveys,
             "findings": _notes(log, graph) | findings(graph),
             "outputs": [str(outputs[use]) for use in sinks.opened],
+            "withheld": [str(outputs[use]) for use in sinks.withheld],
         }
         sinks.close(summary)
     return summary
+
+
+def fitted(graph: Graph, log: Log) -> Graph:
+    """The graph without the optional streams that the log lacks; raises UsageError where it lacks another."""
+    for why in log.refused.values():
+        raise UsageError(why)
+    try:
+        return graph.without(log.missing)
+    except PipelineError as error:
+        raise UsageError(str(error)) from None
 
 
 def _notes(log: Log, graph: Graph) -> dict[str, Finding]:

@@ -276,7 +276,7 @@ def draw_health(canvas: Canvas, path: str, health: TiltHealth) -> str:
     for name, angle in (("tilt off turn", health.turn), ("ground off level", health.ground)):
         if np.isfinite(angle):
             canvas.curve(path, name, np.degrees(angle), Place(Panel.HEALTH, path, path))
-    canvas.say(path, health.judgement, rr.TextLogLevel.ERROR if health.fault else rr.TextLogLevel.INFO)
+    canvas.say(path, health.judgement, rr.TextLogLevel.WARN if health.fault else rr.TextLogLevel.INFO)
     return f"{path}: {health.fault}" if health.fault else ""
 
 

@@ -61,7 +61,8 @@ def import_images(
     if not 0 < height < math.inf:
         raise LogError(f"the camera's height must be positive and finite, not {height} m")
     if not 0 < rate <= 1e9 or FIRST_STAMP + (len(left) + 1) * 1e9 / rate >= LAST_STAMP:
-        raise LogError(f"no log has {counted(len(left), 'pair')} at {rate} Hz: stamps are whole ns and end in 2038")
+        those = counted(len(left), "pair")
+        raise LogError(f"the rate of {those} must be above 0 and at most 1e9 Hz, not {rate:g}; stamps end in 2038")
     if not abs(pitch_down) <= 90 or not abs(roll) <= 180:
         raise LogError(f"no camera looks {pitch_down} degrees down, rolled by {roll}; give degrees up to 90 and 180")
     period = round(1e9 / rate)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -108,8 +108,8 @@ class McapLog:
     source: McapSource
     start: float | None = None
     end: float | None = None
-    missing: dict[str, str] = field(init=False)
-    refused: dict[str, str] = field(init=False)
+    missing: Mapping[str, str] = field(init=False)
+    refused: Mapping[str, str] = field(init=False)
     lacking: dict[str, str] = field(init=False)
     undecodable: str = field(init=False)
     topics: dict[str, str] = field(init=False)

@@ -68,6 +68,7 @@ class McapSink:
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
     _writer: Ros2Writer | None = field(default=None, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
+    empty: bool = field(default=True, init=False, repr=False)  # whether no result was written, only what is said of it
 
     def __post_init__(self) -> None:
         if self.compression not in COMPRESSIONS:
@@ -81,7 +82,8 @@ class McapSink:
             known = ", ".join(builder.__name__ for builder in _BUILDERS)
             setting = "results" if stream in self.results else "also"
             raise LogError(
-                f"McapSink cannot write '{stream}', a {kind.__name__} (it writes {known}); leave it out of {setting}"
+                f"McapSink cannot write '{stream}' of type {kind.__name__} (it writes {known}); leave it out of "
+                f"'{setting}'"
             )
         if stream == "diagnostics":
             raise LogError(
@@ -91,7 +93,7 @@ class McapSink:
 
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: what it was made from and with, kept as its metadata record "roverflow"."""
-        self._last_stamp = None
+        self._last_stamp, self.empty = None, True
         self._writer = Ros2Writer(Path(path), keep=True, compression=self.compression)
         self._writer.metadata("roverflow", about)
 
@@ -101,6 +103,7 @@ class McapSink:
         for stream in self._written:
             data = record.items.get(stream)
             if data is not None:
+                self.empty = False
                 writer.write(f"/nav/{stream}", _BUILDERS[type(data)](data), stamp)
             if type(data) in _BESIDE:
                 name, build = _BESIDE[type(data)]

@@ -81,7 +81,7 @@ class RerunSink:
     def _check_room(self) -> None:
         """Raise LogError before the disk is full: rerun's writer does not return from a full one."""
         if _room(self._partial) < RESERVE:
-            raise unwritable(self._path, f"less than {RESERVE >> 20} MB are free")
+            raise unwritable(self._path, f"less than {RESERVE >> 20} MB more can be written there")
 
     def _begin(self) -> None:
         self._check_room()

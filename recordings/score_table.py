@@ -47,6 +47,8 @@ def format_brief(found: Score) -> str:
 
 def _frame_lines(found: Score) -> list[str]:
     lines = [f"frames       {found.compared} of {found.frames} have results"]
+    if found.beyond:
+        lines.append(f"not counted  {counted(found.beyond, 'frame')} outside the part of the log that was run")
     for topic, stamps in found.missing.items():
         lines.append(f"missing      {topic}: {len(stamps)} of {counted(found.frames, 'frame')}, scored as all unknown")
     for topic, count in found.unmatched.items():

@@ -11,14 +11,19 @@ from __future__ import annotations
 import heapq
 import json
 import math
+import struct
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Metadata
+from mcap.stream_reader import StreamReader
 from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2, terrain_measures
@@ -44,7 +49,8 @@ class Score:
 
     frames: in the truth; compared: those with at least one result that was scored; missing: result topic -> stamps of
     true frames that it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without
-    truth; unscored: topic -> why -> frames that have it and cannot be scored;
+    truth; beyond: true frames outside the part of the log that was run (`run --start`, `--end`), which do not count;
+    unscored: topic -> why -> frames that have it and cannot be scored;
     lost: log -> why -> messages that could not be read; a true frame that lacks one is scored as far as it goes;
     disparity: `StereoErrors.measures`, cropped by the truth's max_disparity (the data set's range where it has one,
     else the frame's largest), rounded up to 16;
@@ -58,6 +64,7 @@ class Score:
     compared: int
     missing: dict[str, list[int]]
     unmatched: dict[str, int]
+    beyond: int = 0
     unscored: dict[str, dict[str, int]] = field(default_factory=dict)
     lost: dict[str, dict[str, int]] = field(default_factory=dict)
     disparity: dict[str, Any] | None = None
@@ -79,7 +86,10 @@ def score(result: Path, truth: Path) -> Score:
     """
     tally = _Tally(Path(result), Path(truth))
     for stamp, frame in _frames(Path(result), Path(truth), tally):
-        tally.add(stamp, frame)
+        if stamp in tally.outside and not frame.keys() & {*RESULTS}:
+            tally.beyond += 1
+        else:
+            tally.add(stamp, frame)
     return tally.score()
 
 
@@ -87,7 +97,7 @@ def _frames(result: Path, truth: Path, tally: _Tally) -> Iterator[tuple[int, dic
     """(stamp, {topic: message}) of all frames of both logs, each when it is complete."""
     streams = [
         _on_their_clock(iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)])),
-        _on_their_clock(iter_decoded(truth, [*TRUTHS, "/tf_static"], tally.lost[str(truth)])),
+        _on_their_clock(tally.noted(iter_decoded(truth, [*TRUTHS, "/tf_static"], tally.lost[str(truth)]))),
     ]
     waiting: dict[int, dict[str, Any]] = {}
     for topic, time, message in heapq.merge(*streams, key=lambda item: item[1]):
@@ -125,15 +135,18 @@ class _Tally:
     def __init__(self, result: Path, truth: Path) -> None:
         self.result, self.truth = result, truth
         self.mounts: dict[str, Any] = {}
-        self.frames = self.compared = 0
+        self.frames = self.compared = self.beyond = 0
         self.missing: dict[str, list[int]] = {topic: [] for topic in RESULTS}
         self.unmatched: dict[str, int] = {}
         self.unscored: dict[str, dict[str, int]] = {}
+        self.fitting = False  # whether a map of any frame could be scored
         self.left_out: set[str] = set()  # topics, of the frame that is being added
         self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
         with McapFile(truth) as log:  # recorders note topics of which no message came; of a damaged log, some may have
             channels = log.index.channels
             self.truths = {channels[number].topic for number in channels if log.count({number}) or log.index.lost}
+            self.part = _part(result, truth, log.start)
+        self.outside: set[int] = set()  # stamps of the truth there, in the log that was run
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
         self.terrain: terrain_measures.TerrainTally | None = None
@@ -141,6 +154,13 @@ class _Tally:
         self.untilted: dict[str, int] = {}
         self.pose = PoseTally()
         self.per_frame: list[dict[str, float]] = []
+
+    def noted(self, messages: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
+        """The truth's messages; takes note of the stamps of those outside the part of the log that was run."""
+        for topic, time, message in messages:
+            if topic in TRUTHS and not self.part[0] <= time < self.part[1]:
+                self.outside.add(ros2.stamp_of(message.header))
+            yield topic, time, message
 
     def add(self, stamp: int, frame: dict[str, Any]) -> None:
         results = [topic for topic in RESULTS if topic in frame]
@@ -231,6 +251,7 @@ class _Tally:
             for topic, why in (unfit | dict.fromkeys(fitting, "the frame's other map does not fit the truth")).items():
                 self._leave_out(topic, why)
             return {}
+        self.fitting |= bool(fitting)
         self.terrain = self.terrain or terrain_measures.TerrainTally()
         return self.terrain.add(ground, fitting.get("/nav/elevation_map", {}), fitting.get("/nav/navigation_map"))
 
@@ -260,24 +281,37 @@ class _Tally:
         if not self.seen_results:
             raise without_results(self.result, RESULTS)
         if not self.compared:
-            unfit = [f"of {topic}, {why}" for topic in RESULTS for why in self.unscored.get(topic, ())]
-            if unfit:
-                raise LogError(f"{self.result}: nothing in it fits the truth in {self.truth}: {unfit[0]}")
+            misfits = [f"of {topic}, {why}" for topic in RESULTS for why in self.unscored.get(topic, ())]
+            if misfits:
+                raise LogError(f"{self.result}: nothing in it fits the truth in {self.truth}: {misfits[0]}")
             raise LogError(f"no result of {self.result} has the stamp of a true frame of {self.truth}; is it its run?")
-        tilts = self.tilts
+        tilts, unfit = self.tilts, not self.fitting and bool(self.unscored.keys() & {*RESULTS[1:]})
         return Score(
             self.frames, self.compared,
             missing={topic: stamps for topic, stamps in self.missing.items() if stamps},
             unmatched=self.unmatched,
+            beyond=self.beyond,
             unscored=self.unscored,
             lost={log: dict(why) for log, why in self.lost.items() if why},
             disparity=self.disparity.measures() if self.disparity else None,
-            terrain=self.terrain.measures() if self.terrain else None,
+            terrain=self.terrain.measures() if self.terrain and not unfit else None,
             tilt={"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)} if tilts else None,
             untilted=self.untilted,
             pose=self.pose.measures(),
             per_frame=self.per_frame,
         )  # fmt: skip
+
+
+def _part(result: Path, truth: Path, start: int) -> tuple[float, float]:
+    """From which log time and to which, ns, the log `truth`, which starts at `start`, was run, where that is told."""
+    about: dict[str, str] = {}
+    with suppress(McapError, OSError, struct.error), result.open("rb") as file:
+        for record in islice(StreamReader(file).records, 2):  # a header, and what a run says of itself before all else
+            about = record.metadata if isinstance(record, Metadata) else {}
+    if about.get("log") != truth.name:
+        return -math.inf, math.inf
+    first, end = about.get("start"), about.get("end")
+    return start + float(first or -math.inf) * 1e9, start + float(end or math.inf) * 1e9
 
 
 def _layers(message: Any, onto: ElevationMap) -> dict[str, Array]:

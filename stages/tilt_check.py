@@ -23,7 +23,7 @@ GROUND_FROM, GROUND_TO = 0.5, 8.0  # m of depth, of the ground that a plane is l
 GROUND_POINTS = 4000
 GROUND_ROUNDS = 6
 GROUND_NOISE = 0.03  # m
-NOTHING_YET = Diagnosis("", "no frames to judge the tilt yet", False)
+NOTHING_YET = Diagnosis("", "no frames to judge the tilt by", False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -257,6 +257,27 @@ def test_a_damaged_image_costs_its_frame_and_nothing_else(traverse, tmp_path, ca
     assert counts["/nav/navigation_map"] == FRAMES - 1
 
 
+def test_the_score_of_a_part_counts_that_part_alone(traverse, tmp_path, capsys):
+    out, score_file = tmp_path / "part.mcap", tmp_path / "score.json"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--end", 1.1) == 0
+    assert roverflow("score", out, "--truth", traverse, "--json", score_file) == 0
+    assert f"{FRAMES - 2} frames outside the part of the log that was run" in capsys.readouterr().out
+    found = json.loads(score_file.read_text())
+    assert (found["frames"], found["compared"], found["beyond"], found["missing"]) == (2, 2, FRAMES - 2, {})
+    assert found["disparity"]["whole_image"]["nonocc"]["bad_1"] < 0.1
+
+
+def test_a_run_without_any_result_replaces_none(tmp_path, capsys):
+    log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
+    assert roverflow("simulate", log, "--frames", 1, "--size", "32x32") == 0
+    assert roverflow("run", log, "-p", "paper", "-o", out, "--no-rrd") == 0
+    before = out.read_bytes()
+    assert roverflow("run", log, "-o", out) == 3  # too small to be halved twice
+    assert out.read_bytes() == before
+    assert "out.mcap was not written or replaced: it would hold no result" in capsys.readouterr().out
+    assert out.with_suffix(".rrd").exists()  # which shows why
+
+
 def test_a_score_never_overwrites_what_it_reads(traverse, result, capsys):
     before = traverse.stat()
     assert roverflow("score", result, "--truth", traverse, "--json", traverse) == 2

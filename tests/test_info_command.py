@@ -19,6 +19,15 @@ def test_info_says_what_a_log_holds(traverse, capsys):
     said = capsys.readouterr().out
     assert "/stereo/left/image_rect_color" in said
     assert f"{FRAMES}" in said
+    assert said.splitlines()[-1] == "run -p rover: has all it needs"
+
+
+def test_info_says_why_a_run_would_be_refused(traverse, capsys):
+    assert roverflow("info", traverse, "-p", "paper", "--set", "source.left=/nix") == 0
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said.startswith("run -p paper: would be refused: the source's 'left' is set to /nix")
+    assert roverflow("run", traverse, "-p", "paper", "--set", "source.left=/nix") == 2
+    assert said.partition("refused: ")[2] in capsys.readouterr().err
 
 
 def test_info_of_a_log_that_is_cut_short_says_so_and_ends_incomplete(traverse, tmp_path, capsys):

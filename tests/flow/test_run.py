@@ -51,7 +51,7 @@ def test_a_stage_that_returns_something_else_fails_the_frame_not_the_run(tmp_pat
     text = PIPELINE.replace("tests.flow.toys.Add, a: sum, b: height", "tests.flow.toys.Liar, couple: sum")
     _, summary = replayed(graph(tmp_path, text=text), traverse(2))
     assert summary["drops"] == {"failed": 2}
-    assert "returned a Text, not a Couple" in summary["ledger"][0]["detail"]
+    assert "returned Text, not Couple" in summary["ledger"][0]["detail"]
 
 
 def test_a_failing_sink_stops_the_run_and_is_still_closed(tmp_path):
@@ -110,6 +110,17 @@ def test_what_was_lost_before_an_interrupt_is_told_to_the_sinks(tmp_path):
     assert summary["drops"] == {"unreadable": 1}
 
 
+def test_a_run_under_nohup_outlives_its_terminal():
+    stop, before = Stop(), signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interrupts(stop, print):
+            signal.raise_signal(signal.SIGHUP)
+        assert not stop.finishing()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_an_interrupt_that_comes_after_the_end_of_the_log_costs_nothing(tmp_path):
     stop, pipeline = Stop(), graph(tmp_path)
     ((_, sink),) = pipeline.sinks
@@ -157,7 +168,7 @@ def test_what_tells_of_an_interrupt_may_fail_and_the_run_still_ends_properly():
         raise OSError("Input/output error")  # as of a terminal that was closed
 
     with interrupts(stop, gone):
-        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGTERM)
         assert (stop.finishing(), stop.abandoning()) == (True, False)
         signal.raise_signal(signal.SIGINT)
         assert stop.abandoning()

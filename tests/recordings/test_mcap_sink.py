@@ -190,7 +190,7 @@ def test_only_what_was_asked_for_is_wanted() -> None:
     sink = McapSink(results=("disparity",))
     assert sink.wants("disparity", Disparity)
     assert not sink.wants("points", PointCloud)
-    with pytest.raises(LogError, match="cannot write 'disparity', a CameraImage"):
+    with pytest.raises(LogError, match="cannot write 'disparity' of type CameraImage"):
         sink.wants("disparity", CameraImage)
 
 

@@ -200,7 +200,7 @@ def test_a_full_disk_is_foreseen_and_the_recording_ends_in_what_room_is_left(tmp
     sink.open(tmp_path / "run.rrd", STREAMS, {})
     resource.setrlimit(resource.RLIMIT_FSIZE, (RESERVE // 2, limits[1]))
     try:
-        with pytest.raises(LogError, match=r"cannot write .* 64 MB are free"):
+        with pytest.raises(LogError, match=r"cannot write .* 64 MB more can be written"):
             sink.write(Record(START, scene(START)))
         sink.close({"verdict": "INCOMPLETE"})
     finally:

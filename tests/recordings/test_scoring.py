@@ -376,6 +376,12 @@ def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
         scoring.score(tmp_path / "other.mcap", truth)
 
 
+def test_where_no_map_fits_frames_without_one_make_no_table(tmp_path, truth, frames):
+    found = scored(tmp_path, truth, frames, resolution=0.1, skipped=(1,))
+    assert found.unscored["/nav/elevation_map"]
+    assert found.terrain is None
+
+
 def test_a_damaged_truth_costs_what_it_held_and_nothing_is_scored_against_it(tmp_path, truth, frames):
     run = Run().write(tmp_path / "run.mcap", frames)
     with truth.open("rb") as file:

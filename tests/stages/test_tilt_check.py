@@ -42,7 +42,7 @@ def ground(slope: float, rocks: int = 0) -> PointCloud:
 def test_a_sound_tilt_comes_to_be_called_sound():
     stage = CheckTilt()
     found = checked(DRIVE.ups(), stage)
-    assert found[0].judgement == "no frames to judge the tilt yet"
+    assert found[0].judgement == "no frames to judge the tilt by"
     assert np.isnan(found[0].turn)
     assert 0.05 < np.degrees(np.sqrt(np.nanmean(np.square([health.turn for health in found])))) < 0.4
     assert found[-1].frames == FRAMES
