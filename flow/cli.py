@@ -166,8 +166,8 @@ def _run(options: argparse.Namespace) -> int:
         with suppress(UnwritableError):  # the log's own fault is the one to tell
             _write(options.summary, json.dumps(as_json(error.summary), indent=2))
         raise
-    _write(options.summary, json.dumps(summary, indent=2))
     report(summary)
+    _write(options.summary, json.dumps(summary, indent=2))
     return _exit_code_of(summary)
 
 

@@ -16,6 +16,8 @@ import yaml
 from flow.errors import UsageError
 from flow.graph import Place
 
+MOST = 100_000  # values that a pipeline file may hold
+
 
 @dataclass(frozen=True)
 class Value:
@@ -43,6 +45,8 @@ def read(text: str, at: Callable[[int], Place]) -> Value:
     """YAML as values; at: the place of a line of it. Raises PipelineError where it is none."""
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
+        if root is not None and _size(root, {}) > MOST:
+            raise at(1).error(f"it holds more than {MOST} values, as where YAML aliases hold each other")
         return Value(None, at(1)) if root is None else _located(root, at, yaml.SafeLoader(""))
     except RecursionError:
         raise at(1).error("it is nested too deep, as where a YAML anchor holds itself") from None
@@ -74,6 +78,15 @@ def _located(node: yaml.Node, at: Callable[[int], Place], loader: yaml.SafeLoade
     except (AttributeError, LookupError, ValueError) as error:  # what YAML takes it for by its form, but it is none
         kind = node.tag.rpartition(":")[2]
         raise place.error(f"{reprlib.repr(node.value)} looks like a YAML {kind} but is none; quote it") from error
+
+
+def _size(node: Any, sizes: dict[int, int]) -> int:
+    """How many values a YAML node holds, those of an alias wherever it stands; sizes: of nodes that were seen."""
+    if id(node) not in sizes:
+        parts = node.value if isinstance(node, yaml.CollectionNode) else ()
+        inner = [part for part in parts for part in (part if isinstance(part, tuple) else (part,))]
+        sizes[id(node)] = 1 + sum(_size(part, sizes) for part in inner)
+    return sizes[id(node)]
 
 
 def settled(tree: Value, overrides: Iterable[str]) -> Value:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from flow.document import Value, nearest, read, settled
-from flow.errors import PipelineError, UsageError
+from flow.errors import UsageError
 from flow.graph import Graph, Node, Place, accepts, clock_of, hints_of, in_order, is_aligner, output_of, ports_of
 from flow.ledger import failure
 from flow.values import coerced
@@ -31,7 +31,7 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
 
     overrides: settings of the command line (see `flow.document.settled`), applied before anything is checked.
     """
-    path = find(name)
+    path = _find(name)
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -47,7 +47,7 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     return _Builder(path, text, settled(tree, overrides)).graph()
 
 
-def find(name: str) -> Path:
+def _find(name: str) -> Path:
     """The file of a pipeline."""
     if name in shipped():
         return SHIPPED / f"{name}.yaml"
@@ -263,6 +263,3 @@ def _shown(kind: Any) -> str:
     if isinstance(kind, type):
         return kind.__name__.replace("NoneType", "None")
     return " | ".join(map(_shown, get_args(kind))) or str(kind)
-
-
-__all__ = ["PipelineError", "find", "load"]

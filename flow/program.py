@@ -10,7 +10,13 @@ INTERRUPTED = 130
 def program() -> int:
     """`flow.cli.main` for a process of its own: while it begins and when it is through, too, an interrupt is no
     traceback, and the exit code is that of `main`."""
+    import os
+    import signal
+
     try:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, signal.default_int_handler)  # so that nothing half done is left behind
         _open_what_is_closed()
         from flow.allocator import keep_freed_memory
 
@@ -21,9 +27,6 @@ def program() -> int:
     except KeyboardInterrupt:
         print("roverflow: interrupted", file=sys.stderr)
         code = INTERRUPTED
-    import os
-    import signal
-
     signal.signal(signal.SIGINT, lambda *_: os._exit(code))
     # Python itself, asked to run a module, may end an interrupted process by the signal; and native code that the
     # interpreter is torn down under may abort it, where a stage of an abandoned frame still works.
@@ -41,6 +44,7 @@ def _open_what_is_closed() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115
+        getattr(sys, name).reconfigure(errors="backslashreplace")  # what its encoding lacks
 
 
 def _working() -> bool:

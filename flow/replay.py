@@ -49,6 +49,7 @@ def replay(
             "end": "" if end is None else repr(end),
             **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
         }
+        about = {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}  # odd names of files
         with tqdm(total=opened.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
             drops = 0
 

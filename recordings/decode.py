@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
 from recordings.ros2 import stamp_of
+from recordings.ros2_writer import LAST_STAMP
 from stages.data import Array, CameraModel, Pose, Tilt, Transform
 
 # Encoding -> (dtype, channels in the message, conversion to gray or RGB)
@@ -41,6 +42,7 @@ _BAYER = {
     "bayer_gbrg": cv2.COLOR_BayerGBRG2RGB,
     "bayer_grbg": cv2.COLOR_BayerGRBG2RGB,
 }
+FARTHEST = 1e9  # m, of a place in any frame
 _PADDING = 1024  # bytes that may follow the end of a compressed image
 _ENCODINGS = _PLAIN | {f"{name}{bits}": (f"u{bits // 8}", 1, code) for name, code in _BAYER.items() for bits in (8, 16)}
 
@@ -52,6 +54,10 @@ def stamp_or(header: Any, log_time: int) -> int:
         raise LogError(f"its stamp is negative ({stamp} ns)")
     if header.stamp.nanosec >= 1_000_000_000:
         raise LogError(f"its stamp is damaged ({header.stamp.nanosec} ns beyond the second)")
+    if not stamp and log_time >= LAST_STAMP:
+        raise LogError(
+            f"it has no stamp, and was logged at {log_time} ns, which no ROS 2 stamp can be: they end in 2038"
+        )
     return stamp or log_time
 
 
@@ -172,10 +178,16 @@ def transform_of(message: Any) -> Transform:
     name = f"the transform '{parent}' <- '{child}'"
     if not parent or not child:
         raise LogError(f"{name} lacks the name of a frame")
-    translation = np.array([moved.x, moved.y, moved.z])
-    if not np.isfinite(translation).all():
-        raise LogError(f"the translation of {name} is {translation.tolist()}")
+    translation = _place(moved, f"the translation of {name}")
     return Transform(parent, child, rotation_of(turned, name).as_matrix(), translation)
+
+
+def _place(vector: Any, what: str) -> Array:
+    """A geometry_msgs/Vector3 or Point (3,), m, where it is one of this world."""
+    place = np.array([vector.x, vector.y, vector.z])
+    if not (np.abs(place) < FARTHEST).all():  # or NaN
+        raise LogError(f"{what} is {place.tolist()}, which is no place")
+    return place
 
 
 def rotation_of(quaternion: Any, what: str) -> Rotation:
@@ -204,9 +216,7 @@ def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
     covariance = placed.covariance.reshape(6, 6) if placed is not None else None
     if covariance is not None and (not covariance.any() or covariance[0, 0] < 0):
         covariance = None  # all zero or -1: not known
-    position = np.array([pose.position.x, pose.position.y, pose.position.z])
-    if not np.isfinite(position).all():
-        raise LogError(f"the pose is at {position.tolist()}")
+    position = _place(pose.position, "the position of the pose")
     child = frame_name(getattr(message, "child_frame_id", "")) or base_frame
     return Pose(
         stamp_or(message.header, log_time), position, rotation_of(pose.orientation, "the pose").as_quat(),

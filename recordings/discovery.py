@@ -11,7 +11,10 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
-from typing import Protocol
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from recordings.mcap_source import McapSource
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -60,26 +63,9 @@ class Topics:
         self.missing[stream] = self.refused[setting] = why
 
 
-class Settings(Protocol):
-    """Topic names that the user gave, None where they are to be found."""
-
-    @property
-    def left(self) -> str | None: ...
-    @property
-    def right(self) -> str | None: ...
-    @property
-    def left_info(self) -> str | None: ...
-    @property
-    def right_info(self) -> str | None: ...
-    @property
-    def inclinometer(self) -> str | None: ...
-    @property
-    def odometry(self) -> str | None: ...
-
-
 def discover(
     topics: Sequence[Topic],
-    settings: Settings,
+    settings: McapSource,
     bare_angles: bool,
     frame_of: Callable[[str], str],
     untilted: Callable[[str], str | None],
@@ -87,7 +73,8 @@ def discover(
 ) -> Topics:
     """The topics of each role.
 
-    bare_angles: whether the settings say how bare pitch and roll are to be read; frame_of: topic -> the frame_id of its
+    settings: with the topics that the user named; bare_angles: whether they say how bare pitch and roll are to be
+    read; frame_of: topic -> the frame_id of its
     messages; untilted: Imu topic -> why it has no orientation, None where it has; unplaced: topic of transforms -> why
     they tell no pose of the rover, None where they do.
     """
@@ -117,7 +104,7 @@ def partners(name: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _find_images(topics: Sequence[Topic], settings: Settings, found: Topics) -> None:
+def _find_images(topics: Sequence[Topic], settings: McapSource, found: Topics) -> None:
     images = [topic for topic in topics if topic.schema in IMAGES]
     names = {topic.name for topic in images}
     for side, given in (("left", settings.left), ("right", settings.right)):
@@ -184,7 +171,7 @@ def looks_rectified(topic: str) -> bool:
 
 
 def _find_info(
-    topics: Sequence[Topic], settings: Settings, side: str, frame_of: Callable[[str], str], found: Topics
+    topics: Sequence[Topic], settings: McapSource, side: str, frame_of: Callable[[str], str], found: Topics
 ) -> None:
     infos = [topic for topic in topics if topic.schema == INFO and topic.messages]
     given = settings.left_info if side == "left" else settings.right_info
@@ -213,7 +200,7 @@ def _find_info(
 
 def _find_tilt(
     topics: Sequence[Topic],
-    settings: Settings,
+    settings: McapSource,
     bare_angles: bool,
     untilted: Callable[[str], str | None],
     found: Topics,
@@ -260,7 +247,7 @@ def _undefined(topic: Topic) -> str:
 
 
 def _find_pose(
-    topics: Sequence[Topic], settings: Settings, unplaced: Callable[[str], str | None], found: Topics
+    topics: Sequence[Topic], settings: McapSource, unplaced: Callable[[str], str | None], found: Topics
 ) -> None:
     poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
     if settings.odometry is not None:

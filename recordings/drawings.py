@@ -116,8 +116,7 @@ class Canvas:
             self.recording.log(f"{LEDGER}/{path}", rr.TextLog(text, level=level))
 
     def photograph(self, path: str, pixels: Array, place: Place) -> None:
-        """An image (H, W) gray or (H, W, 3) RGB, 8 or 16 bit, as JPEG."""
-        pixels = paint.eight_bit(pixels)
+        """An image (H, W) gray or (H, W, 3) RGB, 8 bit, as JPEG."""
         stored = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
         _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         self.log(path, rr.EncodedImage(contents=blob, media_type="image/jpeg"), place)
@@ -179,8 +178,9 @@ def draw_stereo(canvas: Canvas, path: str, frame: StereoFrame) -> None:
     canvas.camera = canvas.camera or frame.camera
     own = same_view(frame.camera, canvas.camera)
     left, right = (Panel.LEFT, Panel.RIGHT) if own else (Panel.LEFT_DERIVED, Panel.RIGHT_DERIVED)
-    canvas.photograph(f"{path}/left", frame.left, Place(left, f"{path}/left", f"{path}: left"))
-    canvas.photograph(f"{path}/right", frame.right, Place(right, f"{path}/right", f"{path}: right"))
+    pixels = paint.eight_bit(frame.left, frame.right)
+    canvas.photograph(f"{path}/left", pixels[0], Place(left, f"{path}/left", f"{path}: left"))
+    canvas.photograph(f"{path}/right", pixels[1], Place(right, f"{path}/right", f"{path}: right"))
 
 
 @draws(Disparity)
@@ -327,7 +327,9 @@ def draw_camera(canvas: Canvas, path: str, frame: StereoFrame, cloud: PointCloud
     camera, sensor = frame.camera, cloud.sensor
     if sensor is None:
         return
-    small = cv2.resize(frame.left, None, fx=THUMBNAIL, fy=THUMBNAIL, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        paint.eight_bit(frame.left, frame.right)[0], None, fx=THUMBNAIL, fy=THUMBNAIL, interpolation=cv2.INTER_AREA
+    )
     height, width = small.shape[:2]
     at, line = f"{path}/camera", f"{path}/plumb"
     canvas.photograph(f"{at}/image", small, Place(Panel.CAMERA, at, path, cloud.frame_id))

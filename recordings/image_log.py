@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from recordings.discovery import SIDES
 from recordings.errors import LogError, counted
-from recordings.rig import BODY_FROM_OPTICAL
+from recordings.rig import BODY_FROM_OPTICAL, pinhole
 from recordings.ros2 import Ros2Writer, camera_info, image, imu, transform_message
 from recordings.ros2_writer import LAST_STAMP
-from stages.data import Array, CameraModel, StereoCamera, StereoFrame, Transform
+from stages.data import Array, StereoCamera, StereoFrame, Transform
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
 FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
@@ -214,18 +214,9 @@ def _write_tilt(writer: Ros2Writer, stamp: int) -> None:
 
 def _write_images(writer: Ros2Writer, frame: StereoFrame) -> None:
     for side, pixels in (("left", frame.left), ("right", frame.right)):
-        model = _model(side, frame.camera)
-        writer.write(f"/stereo/{side}/camera_info", camera_info(frame.stamp, CAMERAS[side], model), frame.stamp)
+        info = camera_info(frame.stamp, CAMERAS[side], pinhole(frame.camera, side))
+        writer.write(f"/stereo/{side}/camera_info", info, frame.stamp)
         writer.write(f"/stereo/{side}/image_rect", image(frame.stamp, CAMERAS[side], pixels), frame.stamp)
-
-
-def _model(side: str, camera: StereoCamera) -> CameraModel:
-    cx = camera.cx if side == "left" else camera.cx_right
-    k = np.array([[camera.fx, 0.0, cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    p = np.hstack([k, np.zeros((3, 1))])
-    if side == "right":
-        p[0, 3] = -camera.fx * camera.baseline
-    return CameraModel(camera.width, camera.height, k, np.zeros(5), np.eye(3), p)
 
 
 def _pixels(path: Path) -> Array:

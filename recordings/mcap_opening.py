@@ -22,7 +22,7 @@ from recordings.mcap_index import Lost, said
 from recordings.mcap_reader import CONVERT, McapFile
 from recordings.rig import Camera, Frames, baseline_note, calibrated_pair, mounted
 from recordings.ros2_types import decoder_for, full_name
-from stages.data import Array, CameraModel, Mount, Pose
+from stages.data import LEVEL_FRAME, Array, CameraModel, Mount, Pose
 
 if TYPE_CHECKING:
     from recordings.mcap_source import McapSource
@@ -181,19 +181,25 @@ class Opening:
                 self.mount = mount
 
     def _check_pose(self) -> None:
-        """A pose of something of which nothing tells how the camera sits on it is missing."""
+        """A pose in a frame that moves along is missing, and so is that of something of which nothing tells how the
+        camera sits on it."""
         if self.cameras is None or "odometry" not in self.topics:
             return
         topic, camera = self.topics["odometry"], self.cameras[0].frame_id
-        moving = self._first(topic, lambda message: _pose_of(message, self.source.base_frame).child_frame_id)
-        if isinstance(moving, LogError) or moving in (camera, self.cameras[0].image_frame):
+        pose = self._first(topic, lambda message: _pose_of(message, self.source.base_frame))
+        if isinstance(pose, LogError):
             return
+        moving, resting = pose.child_frame_id, pose.frame_id
         base = self.mount.base_from_camera if self.mount is not None else self.static.between(moving, camera)
-        if base is None or base.parent != moving:
+        why = ""
+        if resting in (LEVEL_FRAME, camera, self.cameras[0].image_frame, moving):
+            why = f"{topic} is a pose in the frame '{resting}', which moves with the rover; record it in one that rests"
+        elif moving not in (camera, self.cameras[0].image_frame) and (base is None or base.parent != moving):
             why = (
                 f"{topic} is the pose of '{moving}', and nothing tells how the camera '{camera}' sits on it; record "
                 "that in /tf_static, or set 'base_frame' of the source where it has another name"
             )
+        if why:
             self.missing["odometry"] = why
             if self.source.odometry:
                 self.refused["odometry"] = why

@@ -15,7 +15,6 @@ from functools import cached_property
 from heapq import heapify, heappop, heappush
 from itertools import accumulate
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -63,6 +62,9 @@ class McapFile:
         try:
             self.size = self.path.stat().st_size
             self.index = from_summary(self._file, self.size) or walk(self._file, self.size)
+            for number in self.index.times.keys() - self.index.channels.keys():
+                unknown = counted(len(self.index.times[number]), "message")
+                self.index.lose(f"{unknown} of channel {number}, which the log does not define, cannot be read")
             self.start, self.end = self._time_range()
         except BaseException:
             self._file.close()
@@ -146,9 +148,7 @@ class McapFile:
     def __enter__(self) -> McapFile:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     def _queue(self, channels: set[int], ordered: set[int]) -> list[tuple[int, int, int, Any]]:
@@ -329,6 +329,8 @@ def _opened(path: Path) -> BinaryIO:
     """The file, open, if it begins like an MCAP file."""
     if path.is_dir():
         raise LogError(f"{path} is a folder; give the .mcap file in it")
+    if path.exists() and not path.is_file():
+        raise LogError(f"{path} is a pipe or a device, in which nothing can be looked up; give a .mcap file")
     try:
         file = path.open("rb")
     except OSError as error:

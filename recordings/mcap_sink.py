@@ -95,7 +95,11 @@ class McapSink:
         """Start the log. about: what it was made from and with, kept as its metadata record "roverflow"."""
         self._last_stamp, self.empty = None, True
         self._writer = Ros2Writer(Path(path), keep=True, compression=self.compression)
-        self._writer.metadata("roverflow", about)
+        try:
+            self._writer.metadata("roverflow", about)
+        except BaseException:
+            self._writer.abort()
+            raise
 
     def write(self, record: FrameRecord) -> None:
         """Write a frame that is through."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from recordings.decode import Angle, Angles
+from recordings.decode import Angle, Angles, frame_name
 from recordings.errors import LogError
 from recordings.mcap_log import McapLog
 from stages.data import CameraImage, Mount, Pose, Tilt
@@ -54,6 +54,7 @@ class McapSource:
     base_frame: str = "base_link"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "base_frame", frame_name(self.base_frame))
         self.angles()
         given = self.camera_from_inclinometer
         if given is not None and not _is_unit_quaternion(given):

@@ -67,12 +67,14 @@ def legend_colours(codes: Array, legend: Mapping[int, tuple[str, Rgb]]) -> Array
     return rgb
 
 
-def eight_bit(pixels: Array) -> Array:
-    """An 8 or 16 bit image as 8 bit: the image's top used bit becomes bit 7, so a 12 bit camera is not black."""
-    if pixels.dtype == np.uint8:
-        return pixels
-    shift = max(0, int(pixels.max(initial=0)).bit_length() - 8)
-    return (pixels >> shift).astype(np.uint8)
+def eight_bit(*images: Array) -> tuple[Array, ...]:
+    """8 or 16 bit images of one exposure as 8 bit: the top bit that they use becomes bit 7, so a 12 bit camera is not
+    black. What a thousandth of an image exceeds is not asked: a hot pixel makes no night."""
+    if all(pixels.dtype == np.uint8 for pixels in images):
+        return images
+    top = max(_percentiles(pixels[::4, ::4].ravel(), 99.9)[0] for pixels in images)
+    shift = max(0, int(top).bit_length() - 8)
+    return tuple(np.minimum(pixels >> shift, 255).astype(np.uint8) for pixels in images)
 
 
 def disparity_limit(disparity: Array) -> float:
@@ -186,15 +188,9 @@ def paint_elevation(terrain: ElevationMap, limits: tuple[float, float] | None = 
     known = np.isfinite(elevation)
     rgb_known = colours(elevation[known], low, high, cv2.COLORMAP_VIRIDIS)
     flat = _AMBIENT + (1.0 - _AMBIENT) * _LIGHT[2]  # level ground keeps the palette's colour
-    slope_x, slope_y = _slopes(elevation, known)
-    shade = _brightness(slope_x / terrain.resolution, slope_y / terrain.resolution, _LIGHT) / flat
+    shade = hillshade(elevation, terrain.resolution)[known] / flat
     rgb[known] = np.clip(rgb_known * shade[:, None], 0.0, 255.0).astype(np.uint8)
     return rgb
-
-
-def paint_navigation(navigation: NavigationMap) -> Array:
-    """Free, hazard and unknown cells as RGB (rows, cols, 3), in grid order (see `birds_eye`)."""
-    return legend_colours(navigation.cells, CELLS)
 
 
 def cell_centres(shape: tuple[int, int], resolution: float, origin: tuple[float, float]) -> tuple[Array, Array]:

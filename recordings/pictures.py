@@ -6,7 +6,7 @@ views: x (forward) up, y (left) to the left, with the coordinates of the map's f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ import numpy as np
 
 from recordings import paint
 from recordings.errors import LogError
-from recordings.ros2 import iter_messages, read_disparity, read_grid_map, read_occupancy_grid
+from recordings.mcap_reader import iter_decoded
+from recordings.ros2 import read_disparity, read_grid_map, read_occupancy_grid
 from stages.data import Array, ElevationMap, NavigationMap
 
 MAP_HEIGHT = 900  # px; maps are enlarged by a whole factor to about that
@@ -24,19 +25,17 @@ INK, PAPER = (38, 40, 46), (250, 250, 248)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
-def draw(result: Path, out: Path, frames: Sequence[int] | None = None) -> list[Path]:
-    """Write `frame-NNNN-{disparity,elevation,navigation}.png` into the folder `out`; returns the files, sorted.
-
-    result: a result log; frames: numbers of frames, negative from the end; None: the first, middle and last.
-    Raises LogError where the log holds nothing to draw, ValueError for a frame it does not hold.
+def draw(result: Path, out: Path) -> list[Path]:
+    """Write `frame-NNNN-{disparity,elevation,navigation}.png` of the first, middle and last frame of a result log into
+    the folder `out`; returns the files, sorted. Raises LogError where the log holds nothing to draw.
     """
-    stamps = sorted({stamp for _, stamp, _ in iter_messages(result, PAINTERS)})
+    stamps = sorted({stamp for _, stamp, _ in iter_decoded(result, PAINTERS)})
     if not stamps:
         raise LogError(f"{result} holds none of {', '.join(PAINTERS)}; draw pictures of a result log")
-    chosen = {stamps[number]: number for number in _numbers(len(stamps), frames)}
+    chosen = {stamps[number]: number for number in (0, len(stamps) // 2, len(stamps) - 1)}
     out.mkdir(parents=True, exist_ok=True)
     written = []
-    for topic, stamp, message in iter_messages(result, PAINTERS):
+    for topic, stamp, message in iter_decoded(result, PAINTERS):
         if stamp in chosen:
             name, paint_message = PAINTERS[topic]
             path = out / f"frame-{chosen[stamp]:04d}-{name}.png"
@@ -66,7 +65,7 @@ def elevation_picture(terrain: ElevationMap) -> Array:
 def navigation_picture(navigation: NavigationMap) -> Array:
     """A navigation map as an RGB picture with coordinates and a legend."""
     navigation = paint.navigation_ahead(navigation)
-    rgb = paint.paint_navigation(navigation)
+    rgb = paint.legend_colours(navigation.cells, paint.CELLS)
     title = f"navigation map ({navigation.frame_id})"
     page = _map_page(rgb, navigation.resolution, navigation.origin, title)
     _legend(page, paint.CELLS)
@@ -78,15 +77,6 @@ PAINTERS: Mapping[str, tuple[str, Callable[[Any], Array]]] = {
     "/nav/elevation_map": ("elevation", lambda message: elevation_picture(read_grid_map(message))),
     "/nav/navigation_map": ("navigation", lambda message: navigation_picture(read_occupancy_grid(message))),
 }
-
-
-def _numbers(count: int, frames: Sequence[int] | None) -> Iterable[int]:
-    if frames is None:
-        return {0, count // 2, count - 1}
-    for number in frames:
-        if not -count <= number < count:
-            raise ValueError(f"there is no frame {number}: the log holds frames 0 to {count - 1}")
-    return {number % count for number in frames}
 
 
 def _page(picture: Array, title: str) -> Array:

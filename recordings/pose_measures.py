@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings.errors import counted
 from stages.data import Array
 
 
@@ -72,22 +71,6 @@ class PoseTally:
             "largest": self.largest if self.frames else math.nan,
             "heading": self.heading if self.frames else math.nan,
         }  # fmt: skip
-
-
-def format_pose(found: dict[str, float]) -> list[str]:
-    """The measures as lines for a terminal."""
-    lines = []
-    if found["frames"]:
-        drift = "-" if math.isnan(found["drift"]) else f"{100 * found['drift']:.2f}%"
-        parts = f", in {found['parts']} parts that nothing joins" if found["parts"] > 1 else ""
-        lines.append(
-            f"pose         off by {drift} of {found['way']:.2f} m driven, {100 * found['largest']:.1f} cm and "
-            f"{math.degrees(found['heading']):.2f} deg at most{parts}"
-        )
-    for key, why in (("missing", "none is given"), ("of_another_body", "it is not base_link's, as the truth is")):
-        if found[key]:
-            lines.append(f"pose         not scored in {counted(int(found[key]), 'frame')}: {why}")
-    return lines
 
 
 def _placed(message: Any) -> tuple[Array, Rotation]:

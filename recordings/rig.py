@@ -28,6 +28,7 @@ _PARALLEL = 1e-3  # rad; cameras turned against each other by less need no recti
 _BESIDE = 0.01  # of the baseline; and so for cameras that are shifted against each other by less in y and z
 _ALIKE = 1e-3  # of a focal length or of cy; and so for lenses that differ by less: a pixel at 1000 px
 _AGREEING = 0.05  # of a baseline; what tells it twice tells the same where it differs by less
+SHORTEST, LONGEST = 1.0, 1e6  # px, focal lengths
 _SHRUNK = 0.1  # of the focal length; what rectification makes smaller than that is no image
 
 
@@ -42,7 +43,7 @@ class Frames:
         """Add a geometry_msgs/TransformStamped. Raises LogError, and keeps what is there, where it contradicts that."""
         transform = transform_of(message)
         parent, child = transform.parent, transform.child
-        known = self.between(parent, child)
+        known = self.edges.get(parent, {}).get(child) or self.between(parent, child)
         if known is None:
             if child in self.parents:
                 raise LogError(f"'{child}' has two parents, '{self.parents[child]}' and '{parent}'; the first is used")
@@ -57,15 +58,19 @@ class Frames:
         no name."""
         if not parent or not child:
             return None
-        reached = {parent: Transform(parent, parent, np.eye(3), np.zeros(3))}
-        queue = deque([parent])
-        while queue and child not in reached:
+        before, queue = {child: child}, deque([child] if parent in self.edges else [])
+        while queue and parent not in before:
             frame = queue.popleft()
-            for name, step in self.edges.get(frame, {}).items():
-                if name not in reached:
-                    reached[name] = reached[frame].after(step)
+            for name in self.edges.get(frame, {}):
+                if name not in before:
+                    before[name] = frame
                     queue.append(name)
-        return reached.get(child)
+        if parent not in before:
+            return None
+        whole, frame = Transform(parent, parent, np.eye(3), np.zeros(3)), parent
+        while frame != child:
+            whole, frame = whole.after(self.edges[frame][before[frame]]), before[frame]
+        return whole
 
     def listed(self) -> list[str]:
         """Each transform of the log as "parent <- child", sorted."""
@@ -73,9 +78,8 @@ class Frames:
 
 
 def _same(one: Transform, other: Transform) -> bool:
-    return np.allclose(one.rotation, other.rotation, rtol=0, atol=_SAME) and np.allclose(
-        one.translation, other.translation, rtol=0, atol=_SAME
-    )
+    off = max(np.abs(one.rotation - other.rotation).max(), np.abs(one.translation - other.translation).max())
+    return bool(off <= _SAME)
 
 
 @dataclass(frozen=True)
@@ -128,8 +132,6 @@ def calibrated_pair(
     if placed is not None:
         left, right = (_joined if rectified else _rectifying)(left, right, placed)
     baseline = float(left.p[0, 3]) / float(left.p[0, 0]) - float(right.p[0, 3]) / float(right.p[0, 0])
-    if not np.isfinite(baseline):
-        raise LogError(f"P of the CameraInfo of {topics[0]} or {topics[1]} tells no baseline; calibrate them again")
     if not baseline > 0:
         raise LogError(
             f"the baseline is {baseline:.4g} m, so {topics[0]} is the right camera: exchange 'left' and 'right' "
@@ -166,6 +168,13 @@ def baseline_note(
     )
 
 
+def pinhole(camera: StereoCamera, side: str) -> CameraModel:
+    """The calibration of the left or the right one of two rectified cameras, as `StereoCamera.from_models` takes it."""
+    cx, shift = (camera.cx, 0.0) if side == "left" else (camera.cx_right, -camera.fx * camera.baseline)
+    k = np.array([[camera.fx, 0.0, cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    return CameraModel(camera.width, camera.height, k, np.zeros(5), np.eye(3), np.column_stack([k, [shift, 0.0, 0.0]]))
+
+
 def is_ideal(model: CameraModel) -> bool:
     """Whether raw and rectified image are the same: no distortion, no rotation, K = P; or there is no K."""
     alike = not np.any(model.k) or np.allclose(model.k, model.p[:, :3])
@@ -185,6 +194,8 @@ def _checked(model: CameraModel, topic: str) -> CameraModel:
         model = replace(model, p=np.hstack([model.k, np.zeros((3, 1))]))
     if model.p[0, 0] <= 0 or model.p[1, 1] <= 0:
         raise LogError(f"the focal lengths in P of {whose} are not positive; calibrate the camera again")
+    if not all(SHORTEST <= focal <= LONGEST for focal in (model.p[0, 0], model.p[1, 1])):
+        raise LogError(f"the focal lengths in P of {whose} are those of no camera; calibrate the camera again")
     if model.width <= 0 or model.height <= 0:
         raise LogError(f"{whose} is for images of {model.width}x{model.height}; calibrate the camera again")
     cx, cy = model.p[0, 2], model.p[1, 2]

@@ -8,8 +8,7 @@ x and y, runs its first index along -x, and stores column-major.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from stages.data import (
 
 __all__ = [
     "TYPES", "Ros2Writer", "camera_info", "diagnostics", "disparity_image", "grid_map", "header", "image", "imu",
-    "iter_messages", "make", "occupancy_grid", "odometry", "point_cloud", "read_disparity", "read_grid_map",
+    "make", "occupancy_grid", "odometry", "point_cloud", "read_disparity", "read_grid_map",
     "read_occupancy_grid", "read_point_cloud", "reason_map", "source_image", "stamp_of",
     "transform_message",
 ]  # fmt: skip
@@ -307,16 +306,6 @@ def diagnostics(stamp: int, statuses: Iterable[tuple[int, str, str, dict[str, st
             for level, name, text, values in statuses
         ],
     )  # fmt: skip
-
-
-def iter_messages(path: Path, topics: Iterable[str] | None = None) -> Iterator[tuple[str, int, Any]]:
-    """(topic, log time in ns, decoded message) of the CDR channels of a log, in log-time order.
-
-    topics: which (None: all that can be decoded). Raises LogError for a damaged log.
-    """
-    from recordings.mcap_reader import iter_decoded  # the reader builds on this file's readers
-
-    yield from iter_decoded(path, topics)
 
 
 def _time(stamp: int) -> Any:

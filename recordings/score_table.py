@@ -7,10 +7,24 @@ from textwrap import wrap
 from typing import Any
 
 from recordings.errors import counted
-from recordings.pose_measures import format_pose
+from recordings.measures import share
 from recordings.scoring import Score
 from recordings.stereo_measures import CROP_STEP, REGIONS, THRESHOLDS
-from recordings.terrain_measures import format_terrain
+
+ROWS = (
+    "DEM RMSE 0-8 m, tilt and all, cm",
+    "levelled RMSE 0-4 m; 4-8 m, cm",
+    "seen cells known; of these within 5 cm, %",
+    "values where nothing could be seen, of values; of all cells, %",
+    "levelled errors within 1; 2 stated random sigmas, %",
+    "raw errors within 1; 2 stated sigmas in all, %",
+    "rocks in view found: 0.2 m; 0.3 m and higher",
+    "rocks of which anything shows found: the same",
+    "free cells on a rock; rock cells called free, %",
+    "false alarms; in the worst 5 degrees of slope to 15, %",
+    "hazard cells (rock or over 20 degrees) found; called free, %",
+    "seen cells left unknown; free cells where nothing could be seen, %",
+)
 
 
 def format_score(found: Score) -> str:
@@ -19,7 +33,7 @@ def format_score(found: Score) -> str:
     if found.disparity is not None:
         parts.append(_disparity_lines(found.disparity))
     if found.terrain is not None:
-        parts.append(format_terrain(found.terrain))
+        parts.append(terrain_lines(found.terrain))
     parts.append(_pose_lines(found))
     return "\n\n".join("\n".join(lines) for lines in parts if lines)
 
@@ -104,8 +118,51 @@ def _known_line(name: str, m: dict[str, float]) -> str:
     return f"               {f'{name}, of the known':<33} |{bad} |"
 
 
+def terrain_figures(found: dict[str, Any]) -> list[str]:
+    """What stands in each of the `ROWS`."""
+    heights, hazards, intervals, rocks = (found[name] for name in ("heights", "hazards", "intervals", "rocks"))
+    near, far, all_ = (heights[ring] for ring in ("0-4 m", "4-8 m", "0-8 m"))
+    worst = [value for name, value in hazards["by_slope"].items() if name != "15-20 deg" and not math.isnan(value)]
+    return [
+        _cm(all_["raw"]["rmse"]),
+        f"{_cm(near['levelled']['rmse'])}; {_cm(far['levelled']['rmse'])}",
+        _percents(all_["completeness"], all_["levelled"]["within_5cm"]),
+        _percents(found["made_up"]["of_values"], found["made_up"]["of_cells"]),
+        _percents(*intervals["random"].values()),
+        _percents(*intervals["total"].values()),
+        "; ".join(f"{rock['found']:.0f} of {rock['in_view']:.0f}" for rock in rocks.values()),
+        "; ".join(f"{rock['glimpsed_found']:.0f} of {rock['glimpsed']:.0f}" for rock in rocks.values()),
+        _percents(hazards["free_on_rock"], hazards["rock_false_safe"]),
+        _percents(hazards["false_alarm"], max(worst, default=math.nan)),
+        _percents(hazards["recall"], hazards["false_safe"]),
+        _percents(hazards["unknown"], hazards["free_unseen"]),
+    ]
+
+
+def terrain_lines(found: dict[str, Any]) -> list[str]:
+    """The measures of a `TerrainTally` as lines."""
+    lines = [
+        "terrain      in cells that a pixel of both cameras hits, by distance from base_link; errors in cm",
+        "               distance      cells    known |   RMSE    MAE   bias   NMAD  within 5 cm",
+    ]
+    levelled = ["               levelled: the same less the best plane of each frame's errors"]
+    for kind, title in (("raw", []), ("levelled", levelled)):
+        lines += title
+        for name, ring in found["heights"].items():
+            h = ring[kind]
+            errors = "".join(f"{_cm(h[key]):>7}" for key in ("rmse", "mae", "bias", "nmad"))
+            known, close = _percent(share(h["cells"], ring["seen"])), _percent(h["within_5cm"])
+            lines.append(f"               {name:<8} {ring['seen']:10d} {known:>8} |{errors} {close:>12}")
+    slopes = found["hazards"]["by_slope"].items()
+    return [
+        *lines,
+        *(f"             {label:66} {value:>17}" for label, value in zip(ROWS, terrain_figures(found), strict=True)),
+        "             false alarms by slope: " + ", ".join(f"{name} {_percent(value)}" for name, value in slopes),
+    ]
+
+
 def _pose_lines(found: Score) -> list[str]:
-    return [*_tilt_lines(found), *(format_pose(found.pose) if found.pose is not None else [])]
+    return [*_tilt_lines(found), *(place_lines(found.pose) if found.pose is not None else [])]
 
 
 def _tilt_lines(found: Score) -> list[str]:
@@ -117,9 +174,33 @@ def _tilt_lines(found: Score) -> list[str]:
     return lines
 
 
+def place_lines(found: dict[str, float]) -> list[str]:
+    """The measures of a `PoseTally` as lines."""
+    lines = []
+    if found["frames"]:
+        drift = "-" if math.isnan(found["drift"]) else f"{100 * found['drift']:.2f}%"
+        parts = f", in {found['parts']} parts that nothing joins" if found["parts"] > 1 else ""
+        lines.append(
+            f"pose         off by {drift} of {found['way']:.2f} m driven, {100 * found['largest']:.1f} cm and "
+            f"{math.degrees(found['heading']):.2f} deg at most{parts}"
+        )
+    for key, why in (("missing", "none is given"), ("of_another_body", "it is not base_link's, as the truth is")):
+        if found[key]:
+            lines.append(f"pose         not scored in {counted(int(found[key]), 'frame')}: {why}")
+    return lines
+
+
 def _percent(value: float) -> str:
     return "-" if math.isnan(value) else f"{100 * value:.2f}%"
 
 
 def _number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"  # never -0.00
+
+
+def _percents(*values: float) -> str:
+    return "; ".join("-" if math.isnan(value) else f"{100 * value:.2f}" for value in values)
+
+
+def _cm(value: float) -> str:
+    return "-" if math.isnan(value) else f"{round(100 * value, 2) + 0.0:.2f}"  # never -0.00

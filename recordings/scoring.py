@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2, terrain_measures
 from recordings.errors import LogError
+from recordings.mcap_index import said
 from recordings.mcap_reader import McapFile, iter_decoded, without_results
 from recordings.pose_measures import PoseTally
 from recordings.stereo_measures import StereoErrors, cropped_columns
@@ -88,8 +89,12 @@ def score(result: Path, truth: Path) -> Score:
     for stamp, frame in _frames(Path(result), Path(truth), tally):
         if stamp in tally.outside and not frame.keys() & {*RESULTS}:
             tally.beyond += 1
-        else:
+            continue
+        try:
             tally.add(stamp, frame)
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+            of = f"{result} or {truth}, with the stamp {stamp} ns"
+            raise LogError(f"what {of}, holds cannot be scored: {said(error)}; record it again") from error
     return tally.score()
 
 

@@ -100,9 +100,7 @@ def unwritable(path: Path, reason: str, kept: str = "") -> UnwritableError:
 
 def _settle(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk."""
-    if path.is_dir() and os.name == "nt":
-        return  # a folder cannot be opened there
-    number = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+    number = os.open(path, os.O_RDONLY)
     try:
         os.fsync(number)
     finally:

@@ -67,11 +67,15 @@ class Assess(Stage):
     """
 
     footprint: float = parameter(1.0, "width and length of the rover: the window of slope and roughness", unit="m",
-                                 low=0.05)  # fmt: skip
+                                 low=0.05, high=20.0)  # fmt: skip
     wheel_track: float = parameter(1.0, "distance between left and right wheels: the window of `ground`", unit="m",
-                                   low=0.05)  # fmt: skip
-    wheel: float = parameter(0.3, "diameter of a wheel: its reach, and the window of steepness", unit="m", low=0.05)
-    surroundings: float = parameter(2.5, "width of the window in which an obstacle stands out", unit="m", low=0.05)
+                                   low=0.05, high=20.0)  # fmt: skip
+    wheel: float = parameter(
+        0.3, "diameter of a wheel: its reach, and the window of steepness", unit="m", low=0.05, high=5.0
+    )
+    surroundings: float = parameter(
+        2.5, "width of the window in which an obstacle stands out", unit="m", low=0.05, high=50.0
+    )
     max_step: float = parameter(0.2, "height of a step that is a hazard; what reaches most of it is no ground",
                                 unit="m", low=0.01)  # fmt: skip
     skirt: float = parameter(

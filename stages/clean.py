@@ -33,7 +33,7 @@ class Clean(Stage):
     """
 
     method: str = parameter("organised", "outlier removal", choices=("organised", "knn"))
-    region: float = parameter(8.0, "horizontal range wanted in the map", unit="m", low=0.1)
+    region: float = parameter(8.0, "horizontal range wanted in the map", unit="m", low=0.1, high=200.0)
     margin: float = parameter(1.0, "added to region to crop by distance from the camera", unit="m", low=0.0)
     deviations: float = parameter(
         3.0, "organised: difference of neighbours that noise may explain, in standard deviations; knn: threshold above "

@@ -181,8 +181,6 @@ class CameraImage:
 
     def pair_with(self, right: CameraImage) -> StereoFrame:
         """The stereo frame of this (left) image and its right partner; it carries the left image's stamp."""
-        if self.pixels.shape != right.pixels.shape:
-            raise ValueError(f"left image is {self.pixels.shape}, right image is {right.pixels.shape}")
         camera = StereoCamera.from_models(self.model, right.model, self.frame_id, self.rectified and right.rectified)
         return StereoFrame(self.stamp, self.pixels, right.pixels, camera)
 

@@ -19,7 +19,7 @@ from stages.kernels.neighbours import lie_of_cells
 from stages.kernels.rigid import transform_points
 from stages.overlap import fit_plane
 from stages.stage import Finding, Severity, Stage, counted, parameter
-from stages.voxelise import Voxelise
+from stages.voxelise import Voxelise, check_cells
 
 # What is remembered of a cell, 29 bytes. weight: sum of 1 / variance over its frames; best: the smallest standard
 # deviation among them; below, above: from the height to the cell's extremes; first, last: ms since the first frame;
@@ -34,6 +34,7 @@ CELL = np.dtype(
 HIDDEN = -1.0
 MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that no map ends where they still change
 _MS = 1_000_000
+_TELLING = 100  # cells that a frame and the map must share for their heights to tell of a jump
 LARGEST_JUMP = 5.0  # standard deviations, from one frame to the next, of what joins them to the map
 PATIENCE = 3  # frames in succession that do not join the map begin a new one
 _STEEPEST = 3.0  # rise per run; a cell at the edge of a rock may be steeper, and what it is off by is bounded
@@ -90,8 +91,10 @@ class Fuse(Stage):
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
-    region: float = parameter(8.0, "horizontal range from the rover that a frame adds to the map", unit="m", low=0.1)
-    window: float = parameter(20.0, "width of the map that is given with each frame", unit="m", low=0.5)
+    region: float = parameter(
+        8.0, "horizontal range from the rover that a frame adds to the map", unit="m", low=0.1, high=200.0
+    )
+    window: float = parameter(20.0, "width of the map that is given with each frame", unit="m", low=0.5, high=400.0)
     tilt_sigma: float = parameter(0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0)
     height_sigma: float = parameter(0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0)
     position: float = parameter(
@@ -112,6 +115,7 @@ class Fuse(Stage):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_cells("Fuse.window", self.window, self.resolution)
         least = 2 * (self.region + MARGIN)
         if self.window < least:
             raise ValueError(
@@ -161,11 +165,6 @@ class Fuse(Stage):
             Severity.WARNING,
         )
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the map so far, bytes."""
-        return self._map.cells.nbytes
-
     def _check(self, cloud: PointCloud) -> None:
         if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
             raise ValueError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
@@ -189,6 +188,9 @@ class Fuse(Stage):
         expected = np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])
         # What joined the frame before tells what to expect: a pose whose height drifts is off by much, but by and by.
         before = np.array([self._map.plane[0], 0.0, 0.0])
+        jump = float(np.median(off)) - before[0] if len(off) >= _TELLING and self.height_sigma > 0 else 0.0
+        if abs(jump) > LARGEST_JUMP * self.height_sigma:
+            return np.array([before[0] + jump, 0.0, 0.0])  # far enough off, all is an outlier to a robust fit
         plane = before + fit_plane(x, y, off - before[0], variance, expected, self.resolution)
         return np.asarray(plane * (1 - np.array([self.follow_height, self.follow_tilt, self.follow_tilt])))
 

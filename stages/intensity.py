@@ -1,4 +1,4 @@
-"""Images as matching, segmentation and display want them: 8 bit, and gray.
+"""Images as matching and segmentation want them: 8 bit, and gray.
 
 A camera of 10 or 12 bit leaves the upper bits of its 16 unused. Its images are stretched by what they hold, not by what
 they could hold; the percentiles come from a histogram, which costs one pass where sorting would cost many.

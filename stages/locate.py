@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.level import level_transform
+from stages.motion import levered
 from stages.stage import Finding, Severity, Stage, counted, parameter
 
 VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once
@@ -103,7 +104,7 @@ class Locate(Stage):
         """The first frame of a segment: at its origin, upright by the tilt."""
         world = level_transform(tilt, mount, camera.child, camera_height=0.0)
         # About the origin, which is base_link where that is known, the tilt's error moves the camera as well.
-        covariance = _levered(np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0]), world.translation)
+        covariance = levered(np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0]), world.translation)
         return _State(motion.segment, camera, motion.covariance, world, covariance, 0.0)
 
     def _drawn(self, state: _State, tilt: Tilt, mount: Mount) -> _State:
@@ -120,7 +121,7 @@ class Locate(Stage):
         base = mount.base_from_camera
         placed = state.world if base is None else state.world.after(base.inverse())
         alike = self._alike(placed.translation, state.way)
-        covariance = _levered(state.covariance, placed.translation - state.world.translation) + alike.T @ alike
+        covariance = levered(state.covariance, placed.translation - state.world.translation) + alike.T @ alike
         np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # the origin's is zero but for rounding
         return Pose(
             stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),
@@ -146,22 +147,13 @@ def _carried(before: _State, motion: CameraMotion, camera: Transform) -> _State:
     world = before.world.after(before.camera.inverse().after(camera))
     way = world.translation - before.world.translation
     # What the motion's covariance, in the axes of its segment's first camera, has gained since the frame before.
-    step = motion.covariance - _levered(before.told, camera.translation - before.camera.translation)
+    step = motion.covariance - levered(before.told, camera.translation - before.camera.translation)
     values, axes = np.linalg.eigh(step)
     added = (axes * np.clip(values, 0, None)) @ axes.T  # two frames tracked from one keyframe may err the same way
     turned = np.kron(np.eye(2), world.rotation @ camera.rotation.T)
-    covariance = _levered(before.covariance, way) + turned @ added @ turned.T
+    covariance = levered(before.covariance, way) + turned @ added @ turned.T
     driven = before.way + float(np.linalg.norm(way))
     return _State(motion.segment, camera, motion.covariance, world, covariance, driven)
-
-
-def _levered(covariance: Array, way: Array) -> Array:
-    """The covariance (6, 6) of position and turn, after a way whose direction the turn decides."""
-    x, y, z = way
-    lever = np.eye(6)
-    lever[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
-    levered: Array = lever @ covariance @ lever.T
-    return levered
 
 
 def _frame_of(segment: int) -> str:

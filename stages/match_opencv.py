@@ -49,12 +49,6 @@ class MatchOpenCV(Stage):
         0.0, "mean horizontal gradient of a block, in gray levels, that a match must exceed", low=0, high=255
     )
     color: bool = parameter(False, "match on RGB instead of gray")
-    threads: int = parameter(
-        1,
-        "most cores for one frame; never changes the result. OpenCV's matcher divides only paths=3, over its own pool,"
-        " whose size belongs to the program (cv2.setNumThreads): with OpenCV nothing beyond 1 is used by this stage",
-        low=1,
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
+from stages.motion import cross_matrix, levered
 from stages.stage import Finding, Stage, check_joined, parameter
 from stages.tracking import Step, View, step_between, view
 
@@ -104,16 +105,10 @@ class VisualOdometry(Stage):
 def _grown(before: _Keyframe, step: Step, camera: Transform) -> Array:
     """The covariance (6, 6) of the camera in its segment, position then turn: the keyframe's, which the way to here
     levers, and the step's."""
-    lever, own = np.eye(6), np.zeros((6, 6))
-    lever[:3, 3:] = -_cross(camera.translation - before.camera.translation)
+    own = np.zeros((6, 6))
     # The camera is at -R' t of the keyframe; the step's turn and shift are in the camera's own axes.
-    own[:3, :3], own[:3, 3:], own[3:, :3] = -_cross(step.translation), -np.eye(3), -np.eye(3)
+    own[:3, :3], own[:3, 3:], own[3:, :3] = -cross_matrix(step.translation), -np.eye(3), -np.eye(3)
     own = np.kron(np.eye(2), camera.rotation) @ own
-    grown: Array = lever @ before.covariance @ lever.T + own @ step.covariance @ own.T
+    way = camera.translation - before.camera.translation
+    grown: Array = levered(before.covariance, way) + own @ step.covariance @ own.T
     return grown
-
-
-def _cross(vector: Array) -> Array:
-    """The matrix of the cross product with a vector."""
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 
-from stages.data import Disparity, StereoCamera, StereoFrame
+from stages.data import Disparity, StereoFrame
 from stages.kernels.scaling import doubled, halved
 from stages.match import SMALLEST_SIDE
 from stages.stage import Stage, check_rectified, check_same_time, parameter
@@ -72,7 +72,7 @@ class Swap(Stage):
 
     def __call__(self, frame: StereoFrame) -> StereoFrame:
         check_rectified(self, frame)
-        camera: StereoCamera = frame.camera
+        camera = frame.camera
         last = camera.width - 1
         mirrored = replace(camera, cx=last - camera.cx_right, cx_right=last - camera.cx)
         return StereoFrame(frame.stamp, cv2.flip(frame.right, 1), cv2.flip(frame.left, 1), mirrored)

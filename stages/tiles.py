@@ -25,11 +25,6 @@ class Tiles:
     dtype: np.dtype[np.void]
     tiles: dict[tuple[int, int], Array] = field(default_factory=dict)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the cells, bytes."""
-        return sum(tile.nbytes for tile in self.tiles.values())
-
     def read(self, row: int, col: int, rows: int, cols: int) -> Array:
         """A copy of the block of (rows, cols) cells whose first is (row, col)."""
         block = np.zeros((rows, cols), self.dtype)

@@ -20,6 +20,7 @@ from stages.kernels.spread import laid_along_sight
 from stages.stage import Stage, parameter
 
 Grid = tuple[float, tuple[float, float], int, float]  # resolution, origin, rows and columns, region
+WIDEST = 4000  # cells, of a map
 FINEST = 0.5  # of a cell, below which a point's reach is not worth following
 WITNESSES = 2  # places along lines of sight that a cell without a point of its own must have
 REACHED = 0.5  # the count of such a cell: less than a point
@@ -54,7 +55,9 @@ class Voxelise(Stage):
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
-    region: float = parameter(8.0, "horizontal range from the level frame's origin kept in the map", unit="m", low=0.1)
+    region: float = parameter(
+        8.0, "horizontal range from the level frame's origin kept in the map", unit="m", low=0.1, high=200.0
+    )
     tails: float = parameter(1.2, "variance of a point over the square of its sigma, within which 68 % are", low=0.0)
     correlated: float = parameter(12.0, "neighbouring points that share one matching error", low=1.0)
     systematic: float = parameter(0.06, "share of the points' variance that no averaging removes", low=0.0, high=1.0)
@@ -78,6 +81,7 @@ class Voxelise(Stage):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_cells("Voxelise.region", self.region, self.resolution, 2)
         if not all(0 <= value <= 100 for value in self.percentiles):
             raise ValueError(f"Voxelise.percentiles must be between 0 and 100, not {self.percentiles}")
 
@@ -156,6 +160,16 @@ class Voxelise(Stage):
             + self.scatter * uneven
             + self.bend * bend * bend
             + np.where(beside, self.rim * rise, 0.0)
+        )
+
+
+def check_cells(what: str, width: float, resolution: float, times: int = 1) -> None:
+    """Raise ValueError for a map of more cells than memory has room for, `times` the width, m, of a parameter."""
+    cells = times * width / resolution
+    if cells > WIDEST:
+        raise ValueError(
+            f"{what} = {width:g} m makes a map {cells:.0f} cells of {resolution:g} m wide, and {WIDEST} is the most; "
+            "take larger cells, or less"
         )
 
 

@@ -20,7 +20,7 @@ class Voxels(Stage):
     """Sorts the measured points of a levelled cloud into cubes; what refinement made up is left out."""
 
     resolution: float = parameter(0.05, "edge of a cube", unit="m", low=0.005, high=2.0)
-    region: float = parameter(8.0, "horizontal range from the level frame's origin", unit="m", low=0.1)
+    region: float = parameter(8.0, "horizontal range from the level frame's origin", unit="m", low=0.1, high=200.0)
     least: int = parameter(1, "points without which a cube is left out", low=1)
 
     def __call__(self, cloud: PointCloud) -> VoxelMap:

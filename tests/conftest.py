@@ -10,10 +10,13 @@ from hypothesis import settings
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from flow.cli import main
+
 settings.register_profile("untimed", deadline=None)  # the first example may compile a kernel
 settings.load_profile("untimed")
 
 FRAMES = 4
+SMALL = ("--set", "disparities=64")
 
 
 @pytest.fixture(scope="session")
@@ -24,6 +27,19 @@ def traverse(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("traverse") / "traverse.mcap"
     Simulation(frames=FRAMES, width=320, height=240).write(path)
     return path
+
+
+@pytest.fixture(scope="session")
+def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The traverse, run through the default pipeline; its recording and its summary are beside it."""
+    out = tmp_path_factory.mktemp("result") / "out.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--summary", out.with_suffix(".json")) == 0
+    return out
+
+
+def roverflow(*arguments: object) -> int:
+    """What the command line makes of these arguments."""
+    return main([str(argument) for argument in arguments])
 
 
 def rewrite(source: Path, out: Path, change: Callable[[str, int, bytes], bytes | None]) -> Path:

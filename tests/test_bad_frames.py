@@ -10,18 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flow.cli import main
 from recordings import ros2
+from recordings.mcap_reader import iter_decoded
 from recordings.ros2 import TYPES
-from tests.conftest import FRAMES, rewrite
+from tests.conftest import FRAMES, rewrite, roverflow
 
 BAD = 1  # the frame that is made bad
 MAPS = ("/nav/elevation_map", "/nav/navigation_map", "/nav/regional_map")
 Change = Callable[[str, int, bytes], bytes | None]
-
-
-def roverflow(*arguments: object) -> int:
-    return main([str(argument) for argument in arguments])
 
 
 def edited(schema: str, raw: bytes, /, **fields: Any) -> bytes:
@@ -33,7 +29,7 @@ def edited(schema: str, raw: bytes, /, **fields: Any) -> bytes:
 
 def tilts_about(stamp: int, log: Path) -> set[int]:
     """Numbers of the inclinometer's messages within 0.3 s of a stamp."""
-    stamps = [ros2.stamp_of(message.header) for _, _, message in ros2.iter_messages(log, ["/imu/inclinometer"])]
+    stamps = [ros2.stamp_of(message.header) for _, _, message in iter_decoded(log, ["/imu/inclinometer"])]
     return {number for number, at in enumerate(stamps) if abs(at - stamp) < 300_000_000}
 
 
@@ -86,7 +82,7 @@ CASES: dict[str, tuple[Callable[[int, Path], Change], tuple[str, ...]]] = {
 def maps_of(out: Path) -> dict[str, dict[int, Any]]:
     """Topic -> stamp -> map."""
     found: dict[str, dict[int, Any]] = {topic: {} for topic in MAPS}
-    for topic, stamp, message in ros2.iter_messages(out, MAPS):
+    for topic, stamp, message in iter_decoded(out, MAPS):
         grid = ros2.read_occupancy_grid(message) if "navigation" in topic else ros2.read_grid_map(message)
         found[topic][stamp] = grid
     return found
@@ -125,7 +121,7 @@ def test_a_bad_frame_is_named_and_skipped_and_the_map_stays_sound(
     both = np.isfinite(regional) & np.isfinite(whole)
     assert both.sum() > 5000
     assert np.median(np.abs(regional - whole)[both]) < 0.005
-    losses = [message for _, stamp, message in ros2.iter_messages(out, ["/nav/diagnostics"]) if stamp == stamps[BAD]]
+    losses = [message for _, stamp, message in iter_decoded(out, ["/nav/diagnostics"]) if stamp == stamps[BAD]]
     assert max(status.level for message in losses for status in message.status) >= 1
 
 
@@ -136,7 +132,7 @@ def test_a_run_whose_every_cloud_is_empty_leaves_no_map_and_says_so(traverse: Pa
     assert "INCOMPLETE: 0 of" in said.out
     assert f"{FRAMES} failed, first: points" in said.out
     assert "Traceback" not in said.out + said.err
-    counts = Counter(topic for topic, _, _ in ros2.iter_messages(out))
+    counts = Counter(topic for topic, _, _ in iter_decoded(out))
     assert counts["/nav/disparity"] == FRAMES
     assert not counts.keys() & set(MAPS)
 

@@ -21,35 +21,21 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from flow.cli import main
 from recordings.mcap_index import Raw
-from recordings.mcap_reader import McapFile
+from recordings.mcap_reader import McapFile, iter_decoded
 from recordings.mcap_sink import McapSink
-from recordings.ros2 import iter_messages, read_disparity, stamp_of
+from recordings.ros2 import read_disparity, stamp_of
 from recordings.simulator import Simulation
 from recordings.simulator.traverse import level_pose
 from stages.data import Source
-from tests.conftest import FRAMES, rewrite
+from tests.conftest import FRAMES, SMALL, rewrite, roverflow
 
 ROOT = Path(__file__).parent.parent
-SMALL = ("--set", "disparities=64")
 RESULTS = {
     "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/nav/pose", "/nav/regional_map",
     "/nav/regional_navigation_map", "/tf", "/nav/diagnostics", "/nav/navigation_map/reason",
     "/nav/regional_navigation_map/reason", "/nav/disparity/source",
 }  # fmt: skip
-
-
-def roverflow(*arguments: object) -> int:
-    return main([str(argument) for argument in arguments])
-
-
-@pytest.fixture(scope="module")
-def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The traverse, run through the default pipeline."""
-    out = tmp_path_factory.mktemp("result") / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", out, "--summary", out.with_suffix(".json")) == 0
-    return out
 
 
 def raw_messages(path: Path) -> list[tuple[str, int, str]]:
@@ -80,7 +66,7 @@ def test_a_run_notes_once_which_streams_go_by_the_time_of_the_log(traverse, tmp_
 
 def test_every_known_disparity_says_whether_it_was_measured_or_guessed(result):
     disparities, sources = (
-        [message for _, _, message in iter_messages(result, [topic])]
+        [message for _, _, message in iter_decoded(result, [topic])]
         for topic in ("/nav/disparity", "/nav/disparity/source")
     )
     assert len(disparities) == len(sources) == FRAMES
@@ -106,7 +92,7 @@ def test_a_log_without_a_pose_gets_one_that_says_it_is_visual(traverse, tmp_path
     log = rewrite(traverse, tmp_path / "log.mcap", lambda topic, _, data: None if topic in poses else data)
     out, summary = tmp_path / "out.mcap", tmp_path / "out.json"
     assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd", "--summary", summary) == 0
-    poses = [message for topic, _, message in iter_messages(out) if topic == "/nav/pose"]
+    poses = [message for topic, _, message in iter_decoded(out) if topic == "/nav/pose"]
     assert [(pose.header.frame_id, pose.child_frame_id) for pose in poses] == [("visual_odom", "base_link")] * FRAMES
     simulation = Simulation(frames=FRAMES, width=320, height=240)
     start = level_pose(simulation.base_at(simulation.stamp(0))).inverse()
@@ -121,7 +107,7 @@ def test_a_log_without_a_pose_gets_one_that_says_it_is_visual(traverse, tmp_path
 
 
 def test_the_logs_own_pose_is_kept_and_the_tilt_judged_all_the_same(result):
-    poses = [message for topic, _, message in iter_messages(result) if topic == "/nav/pose"]
+    poses = [message for topic, _, message in iter_decoded(result) if topic == "/nav/pose"]
     assert {pose.header.frame_id for pose in poses} == {"odom"}
     findings = json.loads(result.with_suffix(".json").read_text())["findings"]
     assert findings == {"health": {"severity": "note", "sentence": f"too few frames to judge the tilt ({FRAMES})"}}
@@ -223,14 +209,14 @@ def test_part_of_a_log(traverse, tmp_path):
 def test_the_pose_comes_from_tf_where_told(traverse, tmp_path):
     """The simulator's /odometry is left out; its pose is written as /tf among another transform."""
     from recordings.mcap_source import McapSource
-    from recordings.ros2 import Ros2Writer, iter_messages, transform_message
+    from recordings.ros2 import Ros2Writer, transform_message
     from stages.data import Pose, Transform
 
     log = tmp_path / "tf.mcap"
     with McapSource().open(traverse) as opened:
         poses = [item for _, stream, item in opened if stream == "odometry"]
     with Ros2Writer(log) as writer:
-        for topic, stamp, message in iter_messages(traverse):
+        for topic, stamp, message in iter_decoded(traverse):
             if not topic.startswith(("/truth", "/odometry", "/tf")) or topic == "/tf_static":
                 writer.write(topic, message, stamp)
         for pose in poses:

@@ -6,15 +6,8 @@ import json
 
 import pytest
 
-from flow.cli import main
+from tests.conftest import roverflow
 from tests.recordings.middlebury_scene import write_scene
-
-SMALL = ("--set", "disparities=64")
-
-
-def roverflow(*arguments: object) -> int:
-    return main([str(argument) for argument in arguments])
-
 
 MATCHING = """
 source: {use: recordings.McapSource}

@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import json
 
-from flow.cli import main
 from flow.pipeline import SHIPPED
-from tests.conftest import FRAMES
+from tests.conftest import FRAMES, roverflow
 from tests.recordings.sample_log import RIGHT, TILT, write_sample
-
-
-def roverflow(*arguments: object) -> int:
-    return main([str(argument) for argument in arguments])
 
 
 def test_info_says_what_a_log_holds(traverse, capsys):

@@ -13,28 +13,14 @@ import pytest
 import rerun
 
 from flow.arguments import check_demo
-from flow.cli import main
 from flow.errors import UsageError
 from recordings import McapSource, RerunSink
 from recordings.whole_file import is_ours
-from tests.conftest import rewrite
+from tests.conftest import SMALL, rewrite, roverflow
 from tests.recordings.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
 TAKEN = "is there already and no {} of roverflow; choose another name or remove it"
-SMALL = ("--set", "disparities=64")
-
-
-def roverflow(*arguments: object) -> int:
-    return main([str(argument) for argument in arguments])
-
-
-@pytest.fixture(scope="module")
-def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result log of the traverse, with recording and summary beside it."""
-    out = tmp_path_factory.mktemp("result") / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", out, "--summary", out.with_suffix(".json")) == 0
-    return out
 
 
 def drop(*parts: str):
@@ -409,3 +395,44 @@ def test_angles_of_a_field_that_is_not_there_are_refused_before_the_first_frame(
     assert f"bare angles of {imu}: " in said
     assert words in said
     assert not list(tmp_path.iterdir())
+
+
+def test_a_pipe_is_no_log(tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe")
+    for command in (("run", tmp_path / "pipe", "-o", tmp_path / "out.mcap"), ("info", tmp_path / "pipe")):
+        assert roverflow(*command) == 2
+        assert (
+            "pipe is a pipe or a device, in which nothing can be looked up; give a .mcap file"
+            in capsys.readouterr().err
+        )
+
+
+def test_a_pipeline_whose_aliases_hold_each_other_is_refused_at_once(tmp_path, capsys):
+    lines = [
+        "a0: &a0 [x, x, x, x, x, x, x, x, x]",
+        *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)),
+    ]
+    (tmp_path / "bomb.yaml").write_text("\n".join(lines))
+    assert roverflow("graph", "-p", tmp_path / "bomb.yaml") == 2
+    assert (
+        "bomb.yaml:1: it holds more than 100000 values, as where YAML aliases hold each other"
+        in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize(("settings", "said"), [
+    (["region=1km"], "stages.Clean.region: must be at most 200.0 m, not 1km"),
+    (["wheel=1km"], "stages.Assess.wheel: must be at most 5.0 m, not 1km"),
+    (["cells.region=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
+    (["regional_cells.window=400m"], "makes a map 8000 cells of 0.05 m wide, and 4000 is the most"),
+])  # fmt: skip
+def test_maps_that_no_memory_holds_are_refused_before_the_run(settings, said, capsys):
+    assert roverflow("graph", *(text for setting in settings for text in ("--set", setting))) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_log_whose_name_is_no_text_is_run(traverse, tmp_path):
+    log = os.fsencode(tmp_path / "Fahrt-") + b"\xfcd.mcap"
+    os.link(traverse, log)
+    assert roverflow("run", os.fsdecode(log), *SMALL, "--end", 0.6, "-o", tmp_path / "out.mcap") == 0
+    assert not list(tmp_path.glob("*.partial"))

@@ -3,38 +3,24 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import rasterio
 
-from flow.cli import main
 from recordings import ros2
+from recordings.mcap_reader import iter_decoded
 from stages.data import Cell, Reason
 from tests.bench.regional import RUNS, region, shares_within, traverse_of
-from tests.conftest import FRAMES, rewrite
+from tests.conftest import FRAMES, SMALL, rewrite, roverflow
 
-SMALL = ("--set", "disparities=64")
 REGIONAL = {"/nav/regional_map", "/nav/regional_navigation_map"}
-
-
-def roverflow(*arguments: object) -> int:
-    return main([str(argument) for argument in arguments])
-
-
-@pytest.fixture(scope="module")
-def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The traverse, run through the default pipeline."""
-    out = tmp_path_factory.mktemp("regional") / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd") == 0
-    return out
 
 
 def test_every_frame_gives_the_map_around_the_rover_in_the_pose_s_frame(result):
     maps = {topic: [] for topic in REGIONAL}
-    for topic, _, message in ros2.iter_messages(result, REGIONAL):
+    for topic, _, message in iter_decoded(result, REGIONAL):
         maps[topic].append(message)
     assert [len(messages) for messages in maps.values()] == [FRAMES, FRAMES]
     assert {message.header.frame_id for messages in maps.values() for message in messages} == {"odom"}
@@ -48,7 +34,7 @@ def test_every_frame_gives_the_map_around_the_rover_in_the_pose_s_frame(result):
 @pytest.mark.parametrize("stream", ["navigation_map", "regional_navigation_map"])
 def test_a_result_log_says_why_each_cell_is_a_hazard_or_unknown(result, stream):
     grids, reasons = (
-        [message for _, _, message in ros2.iter_messages(result, [topic])]
+        [message for _, _, message in iter_decoded(result, [topic])]
         for topic in (f"/nav/{stream}", f"/nav/{stream}/reason")
     )
     assert len(grids) == len(reasons) == FRAMES
@@ -66,7 +52,7 @@ def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tm
     log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
     rewrite(traverse, log, lambda topic, _, data: None if topic == "/odometry" else data)
     assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd") == 0
-    regional = [message for _, _, message in ros2.iter_messages(out, ["/nav/regional_map"])]
+    regional = [message for _, _, message in iter_decoded(out, ["/nav/regional_map"])]
     assert [message.header.frame_id for message in regional] == ["visual_odom"] * FRAMES
     assert ros2.read_grid_map(regional[-1]).layers["frames"].max() == FRAMES
 
@@ -74,7 +60,7 @@ def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tm
 def test_a_pipeline_that_fuses_nothing_has_its_frames_exported(traverse, tmp_path, capsys):
     out = tmp_path / "out.mcap"
     assert roverflow("run", traverse, "-p", "paper", *SMALL, "-o", out, "--no-rrd") == 0
-    counts = Counter(topic for topic, _, _ in ros2.iter_messages(out))
+    counts = Counter(topic for topic, _, _ in iter_decoded(out))
     assert not REGIONAL & set(counts)
     assert roverflow("export", out, tmp_path / "maps") == 2
     said = capsys.readouterr().err
@@ -97,7 +83,7 @@ def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, capsys):
         assert file.shape == cv2.imread(str(tmp_path / "maps" / "navigation_map.pgm"), cv2.IMREAD_UNCHANGED).shape
     own = [
         np.isfinite(ros2.read_grid_map(message).layers["elevation"]).sum()
-        for _, _, message in ros2.iter_messages(result, ["/nav/elevation_map"])
+        for _, _, message in iter_decoded(result, ["/nav/elevation_map"])
     ]
     assert max(own) < known < sum(own)
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from flow.cli import main
-from recordings.ros2 import iter_messages, stamp_of
+from recordings.mcap_reader import iter_decoded
+from recordings.ros2 import stamp_of
 from recordings.simulator import Simulation
 from recordings.simulator.traverse import level_pose
 from tests.tilt_faults import FAULTS, PIPELINE
@@ -71,7 +72,7 @@ def test_visual_poses_drift_by_less_than_a_hundredth_of_the_way(
 ) -> None:
     judged(log, tmp_path)
     start, way, before = level_pose(simulation.base_at(simulation.stamp(0))).inverse(), 0.0, np.zeros(3)
-    for _, _, pose in iter_messages(tmp_path / "out.mcap", ["/nav/pose"]):
+    for _, _, pose in iter_decoded(tmp_path / "out.mcap", ["/nav/pose"]):
         true = start.after(simulation.base_at(stamp_of(pose.header)))
         way, before = way + float(np.linalg.norm(true.translation - before)), true.translation
         place, turn = pose.pose.pose.position, pose.pose.pose.orientation

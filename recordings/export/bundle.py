@@ -6,10 +6,11 @@ frames gave, in memory that grows with the ground seen and not with the rectangl
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import chain, count, groupby
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM, Mosaic
 from recordings.export.ply import COLOURS, write_ply
+from recordings.mcap_index import said
 from recordings.mcap_reader import iter_decoded, without_results
 from recordings.paint import hillshade
 from recordings.whole_file import written
@@ -34,6 +36,7 @@ POINTS = "/nav/points"
 # As in other hillshades: the sun in the north-west, 45 degrees high, for a picture whose upper edge is north.
 _NORTH_WEST = np.array([-0.5, 0.5, np.sqrt(0.5)])
 _COLOUR = np.dtype([("sigma", "f4"), ("rgb", "u1", (3,)), ("seen", "u1")])
+_LONGEST = 100  # characters of the name of a file that a log chooses
 _CENTRES = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 _POINTS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 
@@ -104,7 +107,8 @@ def _export_region(result: Path, out: Path, lost: Counter[str] | None) -> list[P
         raise LogError(f"no cell of {REGION[0]} in {result} is known: there is nothing to export")
     if len(known) == 1:
         return next(iter(known.values())).write(out)
-    return [file for name, region in known.items() for file in region.write(out / name.replace("/", "-"))]
+    folders = file_names(known)
+    return [file for name, region in known.items() for file in region.write(out / folders[name])]
 
 
 def _export_frames(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
@@ -135,6 +139,17 @@ def _export_frames(result: Path, out: Path, lost: Counter[str] | None) -> list[P
     return files
 
 
+def file_names(names: Iterable[str]) -> dict[str, str]:
+    """For each of the names, which a log may have chosen badly, that of a file: in its folder, and of no other."""
+    chosen: dict[str, str] = {}
+    for name in names:
+        plain = re.sub(r"[^\w.-]", "-", name)[:_LONGEST].lstrip(".") or "unnamed"
+        others = {other.casefold() for other in chosen.values()}
+        numbered = (f"{plain}{number}" for number in chain([""], (f"-{number}" for number in count(2))))
+        chosen[name] = next(other for other in numbered if other.casefold() not in others)
+    return chosen
+
+
 def _check_damage(result: Path, lost: Counter[str] | None) -> None:
     """Raise LogError if it is damage that left nothing to export."""
     for why in lost or ():
@@ -144,8 +159,8 @@ def _check_damage(result: Path, lost: Counter[str] | None) -> None:
 def _read(reader: Callable[[Any], Any], message: Any, result: Path) -> Any:
     try:
         return reader(message)
-    except ValueError as error:
-        raise LogError(f"{result}: {error}") from error
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        raise LogError(f"{result}: a {message.__msgtype__} in it is not one: {said(error)}") from error
 
 
 def _terrain_mosaic(terrain: ElevationMap, rim: float) -> Mosaic:
@@ -176,7 +191,8 @@ def _write(path: Path, write: Callable[..., Any], *arguments: Any) -> Path:
 
 def _write_maps(folder: Path, terrain: Mosaic, navigation: Mosaic | None, about: str) -> list[Path]:
     """A GeoTIFF of each layer, the hillshade with its world file, and the navigation map with its YAML."""
-    files = [_write(folder / f"{layer}.tif", write_geotiff, terrain, layer, about) for layer in terrain.fills]
+    names = file_names(terrain.fills)
+    files = [_write(folder / f"{names[layer]}.tif", write_geotiff, terrain, layer, about) for layer in terrain.fills]
     files.append(_write(folder / "hillshade.png", _write_hillshade, terrain))
     files.append(_write(folder / "hillshade.pgw", _write_world_file, terrain))
     if navigation is not None:

@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings import ros2
+from recordings.rig import pinhole
 from recordings.simulator import ground_truth, raycast, traverse
 from stages.data import (
     LEVEL_FRAME,
     Array,
-    CameraModel,
     Cell,
     Disparity,
     ElevationMap,
@@ -71,13 +71,11 @@ def frame(simulation: Simulation, index: int, log_time: int) -> list[Logged]:
 
 
 def _camera_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> dict[str, Any]:
-    camera, messages = simulation.camera, {}
+    messages = {}
     name = "image_rect_color" if simulation.color else "image_rect"
-    k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-    sides = (("left", traverse.LEFT_FRAME, 0.0), ("right", traverse.RIGHT_FRAME, -camera.fx * camera.baseline))
-    for (side, frame_id, shift), picture in zip(sides, truth.images, strict=True):
-        p = np.column_stack([k, [shift, 0, 0]])
-        model = CameraModel(camera.width, camera.height, k, np.zeros(5), np.eye(3), p)
+    sides = (("left", traverse.LEFT_FRAME), ("right", traverse.RIGHT_FRAME))
+    for (side, frame_id), picture in zip(sides, truth.images, strict=True):
+        model = pinhole(simulation.camera, side)
         messages[f"/stereo/{side}/camera_info"] = ros2.camera_info(stamp, frame_id, model)
         messages[f"/stereo/{side}/{name}"] = ros2.image(stamp, frame_id, picture)
     return messages

@@ -29,11 +29,6 @@ def decay(abundance: float) -> float:
     return 1.79 + 0.152 / abundance
 
 
-def area_fraction(abundance: float, diameter: ArrayLike) -> Array:
-    """F_k(D): share of the ground covered by rocks of at least `diameter` metres."""
-    return np.asarray(abundance * np.exp(-decay(abundance) * np.asarray(diameter, dtype=np.float64)))
-
-
 def rocks_per_area(abundance: float, smallest: float, largest: float, steps: int = 4000) -> tuple[Array, Array]:
     """Diameters (steps,), m, and the number of rocks per m^2 from `smallest` up to each of them.
 

@@ -16,6 +16,8 @@ place.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
 
@@ -37,6 +39,9 @@ from stages.kernels.vectors import (
     spread,
     store,
 )  # fmt: skip
+
+if TYPE_CHECKING:
+    from stages.kernels.pair import Rule
 
 BLOCK = 64
 FAR = 255  # beyond either end of the search range
@@ -158,27 +163,30 @@ def _around(place, columns):  # type: ignore[no-untyped-def]
     return 0 if place == columns else columns - 1 if place < 0 else place
 
 
-def aggregate_reference(costs: Array, image: Array, table: Array, p1: int, paths: int) -> tuple[Array, Array]:
-    """The sums of the sweep down and of the sweep up in plain numpy.
+def aggregate_reference(
+    steps: Array, rule: Rule, costs: Array, searched: Array, sign: int, beside: bool = True
+) -> Array:
+    """The sums of the sweep down (sign 1) or up (-1) in plain numpy, (H, W, n) int64.
 
-    costs: (H, W, n) uint8; image: (H, W) uint8; table, p1: as above; paths: 4 or 8. Returns two (H, W, n) uint8.
+    steps: of `brightness_steps`; costs: (H, W, n); searched: (H, W, n) bool, where a pixel looks for disparities;
+    beside: whether what only the pixel before has counts where it is next to what is searched.
     """
     height, columns, n = costs.shape
-    sums = []
-    for sign in (1, -1):
-        total = np.zeros(costs.shape, np.int64)
-        for dy, dx in SIDES if paths == 8 else SIDES[::2]:
-            dy, dx = sign * dy, sign * dx
-            before = np.zeros((height + 2, columns + 2, n + 2), np.int64)  # of every pixel, a frame of paths that begin
-            before[..., 0] = before[..., -1] = FAR
-            for y in range(height)[::sign]:
-                for x in range(columns)[::sign]:
-                    q = before[y + dy + 1, x + dx + 1]
-                    inside = 0 <= y + dy < height and 0 <= x + dx < columns
-                    step = abs(int(image[y, x]) - int(image[y + dy, x + dx])) if inside else 0
-                    near = np.minimum(np.minimum(q[:-2], q[2:]) + p1, np.minimum(q[1:-1], table[step]))
-                    after = np.minimum(costs[y, x] + near, 255)
-                    before[y + 1, x + 1, 1:-1] = after - after.min()
-            total += before[1:-1, 1:-1, 1:-1]
-        sums.append(np.minimum(total, 255).astype(np.uint8))
-    return sums[0], sums[1]
+    total = np.zeros(costs.shape, np.int64)
+    for side, (dy, dx) in enumerate(SIDES):
+        if side % 2 and not rule.diagonals:
+            continue
+        dy, dx = sign * dy, sign * dx
+        before = np.zeros((height + 2, columns + 2, n + 2), np.int64)  # of every pixel, a frame of paths that begin
+        before[1:-1, 1:-1] = FAR
+        for y in range(height)[::sign]:
+            for x in range(columns)[::sign]:
+                q, own = before[y + dy + 1, x + dx + 1], searched[y, x]
+                q = q if beside else np.where(np.pad(own, 1), q, FAR)
+                up, left = (y, x) if sign > 0 else (y + dy, x + dx)
+                p2 = rule.table[steps[side, up, left + 1]]
+                near = np.minimum(np.minimum(q[:-2], q[2:]) + rule.p1, np.minimum(q[1:-1], p2))
+                after = np.minimum(costs[y, x] + near, 255)
+                before[y + 1, x + 1, 1:-1][own] = after[own] - after[own].min()
+        total += before[1:-1, 1:-1, 1:-1]
+    return np.minimum(total, 255)

@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.data import Array
-from stages.kernels.aggregation import FAR, SIDES, next_path
+from stages.kernels.aggregation import FAR, aggregate_reference, next_path
 from stages.kernels.census import PLANES, census_costs
 from stages.kernels.compiled import kernel, part
 from stages.kernels.gradient import LARGEST, raw_costs
 from stages.kernels.pair import Pair, Rule
-from stages.kernels.selection import find_winner, fit_row
+from stages.kernels.selection import find_winner, fit_row, select_reference
 from stages.kernels.sharing import AtOnce, by_bands, shared_by
 from stages.kernels.vectors import (
     Width,
@@ -283,11 +283,11 @@ def search_around_reference(pair: Pair, rule: Rule, windows: Windows) -> tuple[A
         costs = _smoothed_reference(costs, searched)
     pull = pair.prior_costs[pair.prior[..., np.newaxis] + np.arange(n)]
     np.put_along_axis(costs, lanes, np.minimum(np.take_along_axis(costs, lanes, axis=2) + pull, 255), axis=2)
-    sums = sum(np.minimum(paths_reference(pair, rule, costs, searched, sign), 255) for sign in (1, -1))
+    sums = sum(aggregate_reference(pair.steps, rule, costs, searched, sign) for sign in (1, -1))
     total = np.where(searched, np.minimum(sums, 255), 255)
-    pixels, evidence = np.full(first.shape, np.nan, np.float32), np.zeros(first.shape, np.uint8)
+    pixels, evidence = np.empty(first.shape, np.float32), np.empty(first.shape, np.uint8)
     for y in range(first.shape[0]):
-        _select_reference(total[y], first[y], int(first.min()), n, rule, pixels[y], evidence[y])
+        pixels[y], evidence[y] = select_reference(total[y], first[y], int(first.min()), n, rule)
     return pixels, evidence
 
 
@@ -320,52 +320,3 @@ def _smoothed_reference(raw: Array, searched: Array) -> Array:
     mean = ((up + down + 1) // 2 + three + 1) // 2
     smoothed: Array = np.where(searched, ((mean + 1) // 2 + 1) // 2, FAR)
     return smoothed
-
-
-def paths_reference(pair: Pair, rule: Rule, costs: Array, searched: Array, sign: int, beside: bool = True) -> Array:
-    """The sums of the paths of a sweep down (1) or up (-1), as of `aggregation.aggregate_reference`.
-
-    beside: whether what only the pixel before has counts where it is next to what is searched.
-    """
-    height, columns, n = costs.shape
-    total = np.zeros(costs.shape, np.int64)
-    for side, (dy, dx) in enumerate(SIDES):
-        if side % 2 and not rule.diagonals:
-            continue
-        dy, dx = sign * dy, sign * dx
-        before = np.zeros((height + 2, columns + 2, n + 2), np.int64)  # of every pixel, a frame of paths that begin
-        before[1:-1, 1:-1] = FAR
-        for y in range(height)[::sign]:
-            for x in range(columns)[::sign]:
-                q, own = before[y + dy + 1, x + dx + 1], searched[y, x]
-                q = q if beside else np.where(np.pad(own, 1), q, FAR)
-                up, left = (y, x) if sign > 0 else (y + dy, x + dx)
-                p2 = rule.table[pair.steps[side, up, left + 1]]
-                near = np.minimum(np.minimum(q[:-2], q[2:]) + rule.p1, np.minimum(q[1:-1], p2))
-                after = np.minimum(costs[y, x] + near, 255)
-                before[y + 1, x + 1, 1:-1][own] = after[own] - after[own].min()
-        total += before[1:-1, 1:-1, 1:-1]
-    return total
-
-
-def _select_reference(
-    total: Array, first: Array, lowest: int, n: int, rule: Rule, pixels: Array, evidence: Array
-) -> None:
-    """Fill in a row, as `selection.select_reference` does."""
-    columns, disparities = total.shape
-    disparity = np.arange(disparities) + lowest
-    right = np.zeros(columns, np.int64)
-    for r in range(columns):
-        seen = [(total[r + d, d - lowest], d) for d in disparity if 0 <= r + d < columns]
-        right[r] = min(seen)[1] if seen else lowest
-    for x in range(columns):
-        d = int(np.argmin(total[x]))
-        lane, partner = d + lowest - first[x], x - lowest - d
-        if not (0 < lane < n - 1 and 0 < partner < columns - 1):
-            continue
-        low, before, after = total[x, d], total[x, d - 1], total[x, d + 1]
-        lead = min([255, *total[x, : d - 1], *total[x, d + 2 :]]) - low
-        if abs(right[partner] - d - lowest) <= rule.consistency and lead > rule.uniqueness:
-            rise = max(max(before, after) - low, 1)
-            pixels[x] = np.float32(lowest + d) + np.float32(before - after) / np.float32(2 * rise)
-            evidence[x] = lead

@@ -10,6 +10,8 @@ lane from pixel to pixel, as the partners do.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stages.data import Array
@@ -29,6 +31,9 @@ from stages.kernels.vectors import (
     store,
     where_less,
 )  # fmt: skip
+
+if TYPE_CHECKING:
+    from stages.kernels.pair import Rule
 
 
 @part
@@ -110,27 +115,28 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):  # typ
         evidence[x] = np.uint8(lead) if sound else np.uint8(0)
 
 
-def select_reference(
-    total: Array, disparities: int, minimum: int, uniqueness: int, consistency: int
-) -> tuple[Array, Array]:
-    """Disparities and evidence of a row in plain numpy. total: (W, n) uint8, the sums of all paths."""
-    columns, _ = total.shape
-    sums = total[:, :disparities].astype(np.int64)
+def select_reference(total: Array, first: Array, lowest: int, n: int, rule: Rule) -> tuple[Array, Array]:
+    """Disparities and evidence of a row in plain numpy.
+
+    total: (W, m) the sums of all paths, from disparity `lowest` on, 255 where not searched; first: (W,) the disparity
+    of the first of the n that are searched.
+    """
+    columns, disparities = total.shape
+    sums, disparity = total.astype(np.int64), np.arange(disparities) + lowest
     right = np.zeros(columns, np.int64)
     for r in range(columns):
-        seen = [x for x in range(columns) if 0 <= x - minimum - r < disparities]
-        if seen:
-            right[r] = min((sums[x, x - minimum - r], x - minimum - r) for x in seen)[1]
+        seen = [(sums[r + d, d - lowest], d) for d in disparity if 0 <= r + d < columns]
+        right[r] = min(seen)[1] if seen else lowest
     pixels, evidence = np.full(columns, np.nan, np.float32), np.zeros(columns, np.uint8)
     for x in range(columns):
         d = int(np.argmin(sums[x]))
-        partner = x - minimum - d
-        if not (0 < d < disparities - 1 and 0 < partner < columns - 1):
+        lane, partner = d + lowest - first[x], x - lowest - d
+        if not (0 < lane < n - 1 and 0 < partner < columns - 1):
             continue
         low, before, after = sums[x, d], sums[x, d - 1], sums[x, d + 1]
         lead = min([255, *sums[x, : d - 1], *sums[x, d + 2 :]]) - low
-        if abs(right[partner] - d) <= consistency and lead > uniqueness:
+        if abs(right[partner] - d - lowest) <= rule.consistency and lead > rule.uniqueness:
             rise = max(max(before, after) - low, 1)
-            pixels[x] = np.float32(minimum + d) + np.float32(before - after) / np.float32(2 * rise)
+            pixels[x] = np.float32(lowest + d) + np.float32(before - after) / np.float32(2 * rise)
             evidence[x] = lead
     return pixels, evidence

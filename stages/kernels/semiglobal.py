@@ -82,7 +82,7 @@ def match(
             _search_rows(left, right, rule, prior, search, memory, pixels, evidence, space, both)
         blank, partner = both(lambda: blank_windows(left), lambda: blank_windows(right))
         if excluded is not None:
-            blank[:, : left.shape[1]] |= excluded
+            blank |= excluded
 
         def drop(first: int, end: int) -> None:
             drop_blank(*(layer[first:end] for layer in (blank, partner, pixels, evidence)))

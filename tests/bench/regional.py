@@ -22,6 +22,7 @@ import numpy as np
 
 from recordings import McapSource, ros2
 from recordings.decode import transform_of
+from recordings.mcap_reader import iter_decoded
 from recordings.measures import without_plane
 from recordings.simulator import Simulation, raycast, traverse
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Pose, Transform
@@ -101,7 +102,7 @@ def within(regions: list[Region]) -> str:
 def _frames(out: Path) -> dict[int, dict[str, object]]:
     """Stamp -> what a frame left: the points (N, 3), the map, and `level` in the map's frame."""
     frames: dict[int, dict[str, object]] = {}
-    for topic, stamp, message in ros2.iter_messages(out, ["/nav/points", "/nav/regional_map", "/tf"]):
+    for topic, stamp, message in iter_decoded(out, ["/nav/points", "/nav/regional_map", "/tf"]):
         frame = frames.setdefault(stamp, {})
         if topic == "/nav/points":
             fields = ros2.read_point_cloud(message)

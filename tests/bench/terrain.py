@@ -28,9 +28,10 @@ from flow import arguments
 from flow.align import Token
 from flow.allocator import keep_freed_memory
 from flow.pipeline import load
+from recordings.score_table import ROWS, terrain_figures, terrain_lines
 from recordings.simulator import log, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
-from recordings.terrain_measures import ROWS, TerrainTally, TrueGround, format_terrain, terrain_figures
+from recordings.terrain_measures import TerrainTally, TrueGround
 from stages.data import Array, Cell, Disparity, Mount, Source, StereoFrame, Tilt, Transform
 
 SLOPE, TILT_NOISE = np.radians(5.0), np.radians(0.3)
@@ -194,7 +195,7 @@ def main(given: Sequence[str] | None = None) -> None:
             print(f"{label:66}" + "".join(f"{cell:>26}" for cell in cells), flush=True)
         if options.rings:
             for name, run in found.items():
-                print("\n".join(["", name, *format_terrain(run.tally.measures())]))
+                print("\n".join(["", name, *terrain_lines(run.tally.measures())]))
         everything[str(rocks)] = {name: run.tally.measures() for name, run in found.items()}
     if options.json is not None:
         options.json.write_text(json.dumps(everything, indent=2))

@@ -339,3 +339,25 @@ def test_the_field_log_has_its_tilt_at_ten_hertz() -> None:
     tilts = [item for _, stream, item in items_of(path) if stream == "inclinometer"]
     assert len(tilts) == 161
     assert all(abs(np.linalg.norm(tilt.up) - 1) < 1e-9 for tilt in tilts)
+
+
+def test_messages_of_a_channel_that_is_nowhere_defined_are_told(tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    with log.open("wb") as file:
+        writer = Writer(file, use_chunking=False, use_statistics=False)
+        writer.start()
+        schema = writer.register_schema("a/A", "ros2msg", b"int8 a")
+        known = writer.register_channel("/a", "cdr", schema)
+        for time in range(1, 4):
+            writer.add_message(known, time, b"\0\1\0\0\0", time)
+        writer.finish()
+    content = bytearray(log.read_bytes())
+    place = content.index(struct.pack("<BQHIQ", 5, 27, known, 0, 2))
+    struct.pack_into("<H", content, place + 9, 999)
+    log.write_bytes(content)
+    with McapFile(log) as file:
+        found = list(file.messages({known}))
+    assert [item.log_time for item in found if not isinstance(item, Lost)] == [1, 3]
+    assert [item.reason for item in found if isinstance(item, Lost)] == [
+        "1 message of channel 999, which the log does not define, cannot be read"
+    ]

@@ -14,7 +14,7 @@ from PIL import Image
 
 from recordings import ros2
 from recordings.errors import LogError
-from recordings.export.bundle import export
+from recordings.export.bundle import export, file_names
 from recordings.ros2 import Ros2Writer
 from stages.data import Array, Cell, ElevationMap, NavigationMap, PointCloud, Transform
 
@@ -298,3 +298,16 @@ def test_a_file_that_cannot_be_written_is_named_and_nothing_half_is_left(result:
     with pytest.raises(LogError, match=r"cannot write .*variance\.tif: it is a folder"):
         export(result, tmp_path / "out")
     assert not list((tmp_path / "out").glob("*.partial"))
+
+
+def test_the_names_that_a_log_chooses_lead_nowhere_and_to_no_one_file_twice():
+    named = file_names(
+        ["elevation", "../../etc", "/abs", "..", "", ".", "a/b", "a-b", "A-B", "x" * 300, "nul\0", "höhe"]
+    )
+    assert named["elevation"] == "elevation"
+    assert named["höhe"] == "höhe"
+    assert len({name.casefold() for name in named.values()}) == len(named)
+    for name in named.values():
+        assert (Path("out") / name).resolve().parent == Path("out").resolve()
+        assert 0 < len(name) < 120
+        assert not name.startswith(".")

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from recordings import McapSource
 from recordings.errors import LogError
 from recordings.inventory import describe
-from recordings.ros2 import iter_messages
+from recordings.mcap_reader import iter_decoded
 from tests.recordings.sample_log import (
     FRAMES,
     LAYOUTS,
@@ -234,7 +234,7 @@ def test_a_ros_1_bag_is_refused_with_the_command_that_converts_it(tmp_path: Path
         McapSource().open(tmp_path / "IN.bag")
     command = str(caught.value).rpartition(": ")[2].split()
     subprocess.run([Path(sys.executable).parent / command[0], *command[1:]], cwd=tmp_path, check=True)
-    ((_, _, read),) = iter_messages(tmp_path / "OUT" / "OUT.mcap")
+    ((_, _, read),) = iter_decoded(tmp_path / "OUT" / "OUT.mcap")
     assert (read.point.x, read.point.y, read.point.z) == (1.0, 2.0, 3.0)
 
 

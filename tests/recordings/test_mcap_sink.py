@@ -13,7 +13,8 @@ from mcap.reader import make_reader
 
 from recordings import McapSink
 from recordings.errors import LogError
-from recordings.ros2 import iter_messages, read_disparity, read_grid_map, read_occupancy_grid, stamp_of
+from recordings.mcap_reader import iter_decoded
+from recordings.ros2 import read_disparity, read_grid_map, read_occupancy_grid, stamp_of
 from stages import Fuse
 from stages.data import (
     CameraImage,
@@ -89,7 +90,7 @@ def write(path: Path, seconds: float = 0.1, compression: str = "lz4") -> Path:
 
 
 def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path: Path) -> None:
-    read = list(iter_messages(write(tmp_path / "out.mcap")))
+    read = list(iter_decoded(write(tmp_path / "out.mcap")))
     topics = [(topic, stamp - START) for topic, stamp, _ in read]
     results = [f"/nav/{name}" for name in ("disparity", "points", "elevation_map", "navigation_map")]
     frame = [
@@ -124,7 +125,7 @@ def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path: Path) -> N
 
 def test_losses_are_in_the_diagnostics_of_their_frame_and_the_late_ones_at_the_end(tmp_path: Path) -> None:
     path = write(tmp_path / "out.mcap")
-    whole, lost, late = [message.status for topic, _, message in iter_messages(path) if topic == "/nav/diagnostics"]
+    whole, lost, late = [message.status for topic, _, message in iter_decoded(path) if topic == "/nav/diagnostics"]
     assert [(s.level, s.message) for s in whole] == [(0, "nothing lost")]
     assert [(s.level, s.name, s.message) for s in lost] == [(2, "match/elevation_map", "no texture")]
     assert {v.key: v.value for v in lost[0].values}["reason"] == "failed"
@@ -140,12 +141,12 @@ def test_the_stamps_in_a_regional_map_s_cells_can_be_told_from_the_diagnostics_b
         sink.write(Record(cloud.stamp, {"regional_map": fuse(cloud, pose, MOUNT)}))
     sink.close({})
     told = {}
-    for topic, stamp, message in iter_messages(tmp_path / "out.mcap"):
+    for topic, stamp, message in iter_decoded(tmp_path / "out.mcap"):
         if topic == "/nav/diagnostics":
             epochs = [v.value for s in message.status if s.name == "regional_map" for v in s.values if v.key == "epoch"]
             told[stamp] = int(epochs[0])
     assert list(told.values()) == [DRIVE, DRIVE + SECOND, DRIVE + SECOND]
-    for topic, stamp, message in iter_messages(tmp_path / "out.mcap"):
+    for topic, stamp, message in iter_decoded(tmp_path / "out.mcap"):
         if topic == "/nav/regional_map":
             assert told[stamp] + np.nanmax(read_grid_map(message).layers["last"]) * SECOND == stamp
 
@@ -170,8 +171,8 @@ def test_the_log_is_compressed_as_asked_for_and_holds_the_same(tmp_path: Path, c
     with log.open("rb") as file:
         used = {index.compression for index in make_reader(file).get_summary().chunk_indexes}
     assert used == {"" if compression == "none" else compression}
-    sent = [(topic, stamp, repr(message)) for topic, stamp, message in iter_messages(write(tmp_path / "usual.mcap"))]
-    assert [(topic, stamp, repr(message)) for topic, stamp, message in iter_messages(log)] == sent
+    sent = [(topic, stamp, repr(message)) for topic, stamp, message in iter_decoded(write(tmp_path / "usual.mcap"))]
+    assert [(topic, stamp, repr(message)) for topic, stamp, message in iter_decoded(log)] == sent
     with pytest.raises(ValueError, match=r"compression must be one of lz4, zstd, none, not 'gzip'"):
         McapSink(compression="gzip")
 
@@ -219,7 +220,7 @@ def test_a_regional_map_s_frame_is_joined_to_the_frame_level(tmp_path: Path) -> 
     sink.open(tmp_path / "out.mcap", {"regional_map": ElevationMap}, ABOUT)
     sink.write(Record(START, {**items(START), "regional_map": region}))
     sink.close({})
-    read = {topic: message for topic, _, message in iter_messages(tmp_path / "out.mcap")}
+    read = {topic: message for topic, _, message in iter_decoded(tmp_path / "out.mcap")}
     assert read["/nav/regional_map"].header.frame_id == "odom"
     frames = {(item.header.frame_id, item.child_frame_id): item.transform for item in read["/tf"].transforms}
     assert set(frames) == {("level", "left_optical"), ("odom", "level")}
@@ -237,7 +238,7 @@ def test_the_tilts_health_and_what_the_run_found_are_in_the_diagnostics(tmp_path
         "pose": {"severity": "note", "sentence": "visual"},
     }
     sink.close(SUMMARY | {"findings": found, "entries": []})
-    frame, end = [message.status for topic, _, message in iter_messages(path) if topic == "/nav/diagnostics"]
+    frame, end = [message.status for topic, _, message in iter_decoded(path) if topic == "/nav/diagnostics"]
     assert [(status.level, status.name) for status in frame] == [(0, "roverflow"), (1, "health")]
     assert frame[1].message == "turn it round"
     values = {value.key: value.value for value in frame[1].values}

@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from recordings import McapSource, ros2, scoring
 from recordings.errors import LogError
 from recordings.image_log import FIRST_STAMP
+from recordings.mcap_reader import iter_decoded
 from recordings.middlebury import import_scene, logs_of, read_pfm, read_scene
 from recordings.score_table import format_score
 from stages.data import Disparity, StereoFrame
@@ -35,7 +36,7 @@ def frame_of(log: Path) -> StereoFrame:
 
 
 def truth_of(log: Path) -> dict[str, object]:
-    return {topic: message for topic, _, message in ros2.iter_messages(log) if topic.startswith("/truth")}
+    return {topic: message for topic, _, message in iter_decoded(log) if topic.startswith("/truth")}
 
 
 def result(log: Path, frame: StereoFrame, pixels: np.ndarray) -> Path:

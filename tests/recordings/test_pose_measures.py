@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recordings.pose_measures import PoseTally, format_pose
+from recordings.pose_measures import PoseTally
 from recordings.ros2 import odometry
+from recordings.score_table import place_lines
 from stages.data import Pose
 
 
@@ -58,7 +59,7 @@ def test_each_part_begins_anew_and_adds_its_own_error_and_way():
     ])  # fmt: skip
     assert found["drift"] == pytest.approx((0.02 + 0.06) / (1 + 3))
     assert (found["parts"], found["frames"], found["missing"]) == (2, 4, 1)
-    first, second = format_pose(found)
+    first, second = place_lines(found)
     assert "off by 2.00% of 4.00 m driven, 6.0 cm and 0.00 deg at most, in 2 parts that nothing joins" in first
     assert "not scored in 1 frame: none is given" in second
 
@@ -67,4 +68,4 @@ def test_a_pose_of_something_else_is_not_scored():
     assert tallied([(pose([0, 0, 0]), None)]) is None
     found = tallied([(pose([0, 0, 0]), pose([0, 0, 0], child="camera"))])
     assert math.isnan(found["drift"])
-    assert format_pose(found) == ["pose         not scored in 1 frame: it is not base_link's, as the truth is"]
+    assert place_lines(found) == ["pose         not scored in 1 frame: it is not base_link's, as the truth is"]

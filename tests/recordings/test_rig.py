@@ -106,7 +106,7 @@ def test_exchanged_cameras_are_named_so(tmp_path: Path, names: tuple[str, str]) 
         ({"width": 11}, r"principal point \(11.5, 7.5\) in P of the CameraInfo of .* lies outside its 11x16 images"),
         ({"height": 7}, "lies outside its 24x7 images"),
         ({"width": 0}, "is for images of 0x16"),
-        ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "tells no baseline"),
+        ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "are those of no camera"),
     ],
 )
 def test_a_calibration_that_cannot_be_is_told_as_such(tmp_path: Path, values: dict[str, Any], said: str) -> None:
@@ -267,7 +267,23 @@ def test_a_translation_that_is_not_finite_is_told_and_not_used(tmp_path: Path) -
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert "no static transform joins the camera" in log.missing["mount"]
         told = [str(item) for _, _, item in log if isinstance(item, Exception)]
-    assert told == ["/tf_static: the translation of the transform 'base_link' <- 'left_optical' is [nan, 0.1, 0.9]"]
+    what = "the translation of the transform 'base_link' <- 'left_optical'"
+    assert told == [f"/tf_static: {what} is [nan, 0.1, 0.9], which is no place"]
+
+
+def test_a_long_chain_of_transforms_is_followed_and_told_in_few_steps():
+    frames, message = Frames(), TRANSFORMS[0]
+    links = [Transform(f"link{i}", f"link{i + 1}", np.eye(3), np.array([0.1, 0.0, 0.0])) for i in range(2000)]
+    for _ in range(3):
+        for link in links:
+            frames.add(transform_message([(link, 0)]).transforms[0])
+    whole = frames.between("link0", "link2000")
+    assert (whole.parent, whole.child) == ("link0", "link2000")
+    np.testing.assert_allclose(whole.translation, [200.0, 0.0, 0.0], atol=1e-6)
+    assert frames.between("link2000", "link0").translation[0] == pytest.approx(-200.0)
+    assert frames.between("link0", "elsewhere") is None
+    assert frames.between("elsewhere", "link0") is None
+    assert frames.between(message.parent, "link0") is None
 
 
 def test_a_transform_that_is_told_again_is_no_contradiction(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_typestore
 
 from recordings.errors import LogError
+from recordings.mcap_reader import iter_decoded
 from recordings.ros2 import (
     TYPES,
     Ros2Writer,
@@ -30,7 +31,6 @@ from recordings.ros2 import (
     grid_map,
     image,
     imu,
-    iter_messages,
     make,
     occupancy_grid,
     odometry,
@@ -140,11 +140,11 @@ def test_another_decoder_reads_the_same_numbers(written: Path) -> None:
 
 
 def test_our_reader_returns_every_message_with_its_topic_and_time(written: Path) -> None:
-    read = {topic: (stamp, message) for topic, stamp, message in iter_messages(written)}
+    read = {topic: (stamp, message) for topic, stamp, message in iter_decoded(written)}
     for topic, message in one_of_each().items():
         assert read[topic][0] == STAMP
         assert plain(read[topic][1]) == plain(through_rosbags(message)), topic
-    assert [topic for topic, _, _ in iter_messages(written, ["/grid"])] == ["/grid"]
+    assert [topic for topic, _, _ in iter_decoded(written, ["/grid"])] == ["/grid"]
 
 
 def test_a_grid_map_starts_at_the_corner_of_largest_x_and_y() -> None:
@@ -261,7 +261,7 @@ def test_two_writers_to_one_path_each_write_a_whole_log(tmp_path: Path) -> None:
             writer.write(f"/image{place}", image(number, "cam", np.zeros((200, 200), np.uint8)), number)
     for place, writer in enumerate(writers):
         writer.close()
-        assert [topic for topic, _, _ in iter_messages(path)] == [f"/image{place}"] * 49
+        assert [topic for topic, _, _ in iter_decoded(path)] == [f"/image{place}"] * 49
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -355,9 +355,9 @@ def test_a_schema_of_nonsense_is_a_log_error(text: bytes) -> None:
 def test_messages_of_real_recorders_decode() -> None:
     folder = data_folder("logs/rosbag2")
     talker = folder / "rosbag2_py__test__resources__mcap__talker__talker.mcap"
-    assert sum(1 for _ in iter_messages(talker)) == 20
+    assert sum(1 for _ in iter_decoded(talker)) == 20
     cdr = folder / "rosbag2_tests__resources__mcap__cdr_test__cdr_test_0.mcap"
-    assert sum(1 for _ in iter_messages(cdr)) == 7
+    assert sum(1 for _ in iter_decoded(cdr)) == 7
 
 
 def test_a_point_cloud_reads_back_as_it_was_whatever_its_padding_and_byte_order() -> None:

@@ -18,9 +18,8 @@ from flow.cli import main
 from recordings import ros2, scoring
 from recordings.errors import LogError
 from recordings.ros2 import Ros2Writer
-from recordings.score_table import format_brief, format_score
+from recordings.score_table import ROWS, format_brief, format_score, terrain_lines
 from recordings.simulator import Simulation, log
-from recordings.terrain_measures import ROWS, format_terrain
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
 from tests.recordings.sample_log import rewritten
 
@@ -271,7 +270,7 @@ def test_leaving_out_a_bad_frame_scores_as_saying_unknown(tmp_path, truth, frame
     silent = scored(tmp_path, truth, frames, skipped=(1,))
     honest = scored(tmp_path, truth, frames, blind=(1,))
     assert silent.disparity == honest.disparity
-    assert format_terrain(silent.terrain) == format_terrain(honest.terrain)
+    assert terrain_lines(silent.terrain) == terrain_lines(honest.terrain)
     known, seen = np.sum(frames[0].seen == 255), sum(np.sum(frame.seen == 255) for frame in frames)
     assert silent.disparity["density"] == known / seen
     assert silent.disparity["bad_2"] == pytest.approx(1 - known / seen)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
+from recordings.score_table import terrain_lines
 from recordings.simulator import log
 from recordings.simulator.ground_truth import in_sight, rocks_in_view
 from recordings.simulator.simulation import Simulation
-from recordings.terrain_measures import TerrainTally, TrueGround, format_terrain
+from recordings.terrain_measures import TerrainTally, TrueGround
 from stages.data import Array, Cell, ElevationMap
 
 SMALL = Simulation(frames=1, width=320, height=240, abundance=0.15, relief_cells=512, seed=5, threads=1)
@@ -137,7 +138,7 @@ def test_frames_add_up_and_the_table_prints() -> None:
     found = tally.measures()
     assert found["heights"]["0-8 m"]["raw"]["bias"] == pytest.approx(0.05)
     assert found["intervals"]["total"] == {"1": 0.5, "2": 0.5}
-    text = "\n".join(format_terrain(found))
+    text = "\n".join(terrain_lines(found))
     assert text.count("2 of 2; 0 of 0") == 2  # rocks of 0.2 m, in view and glimpsed; none of 0.3 m
     assert all(len(line) <= 100 for line in text.splitlines())
 

@@ -64,13 +64,11 @@ def as_disparity(pixels: Array, camera: StereoCamera = CAMERA, stamp: int = 7) -
 
 @dataclass(frozen=True)
 class Terrain:
-    """A terrain grid with what is true of it: base (ground), above (mean and highest of the rock over it), rock (index
-    of the rock in each cell, 0 for none)."""
+    """A terrain grid with what is true of it: above_mean, height of the rock over the ground, m; rock, its index in a
+    cell, 0 for none."""
 
     elevation: ElevationMap
-    base: Array
     above_mean: Array
-    above_top: Array
     rock: Array
 
 
@@ -115,7 +113,7 @@ def rolling_terrain(
     published = {name: (layer + error).astype(np.float32) for name, layer in layers.items()}
     published["count"] = np.full((cells, cells), 16, np.float32)
     grid = ElevationMap(7, published, resolution, (-extent, -extent), "level")
-    return Terrain(grid, blocks(base).mean(-1), blocks(above).mean(-1), blocks(above).max(-1), blocks(index).max(-1))
+    return Terrain(grid, blocks(above).mean(-1), blocks(index).max(-1))
 
 
 def map_of(elevation: Array, resolution: float = 0.05, **layers: Array) -> ElevationMap:

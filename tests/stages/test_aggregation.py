@@ -36,17 +36,18 @@ def test_sums_are_those_of_the_reference(lanes, paths, height, columns, pull):
         near[rng.random(image.shape) < 0.3] = np.nan
         prior = prior_costs(near, 0, lanes, *pull)
         expected = np.minimum(costs.astype(int) + prior_costs_reference(near, 0, lanes, *pull), 255).astype(np.uint8)
-    down, up = aggregate_reference(expected, image, table, 9, paths)
     planes = np.zeros((height, 3, columns), np.uint8)
     pair = Pair(planes, planes, brightness_steps(image), np.zeros(1, np.uint8), 0, columns, *prior)
-    rule = rule_of(True, lanes, 0)._replace(diagonals=paths == 8, table=table)
+    rule = rule_of(True, lanes, 0)._replace(p1=9, diagonals=paths == 8, table=table)
+    everything = np.ones(costs.shape, bool)
+    down, up = (aggregate_reference(pair.steps, rule, expected, everything, sign) for sign in (1, -1))
     size, width = columns * lanes, Width(lanes)
     flat = costs.reshape(height, size)
     sums, total = np.full(height * size, 3, np.uint8), np.zeros((height, size), np.uint8)
     sweep(flat, pair, rule, np.zeros(3 * size, np.uint8), 1, sums, total, False, width)
     assert np.array_equal(sums.reshape(costs.shape), down)
     sweep(flat, pair, rule, np.zeros(3 * size, np.uint8), -1, sums, total, True, width)
-    assert np.array_equal(total.reshape(costs.shape), np.minimum(down.astype(int) + up, 255))
+    assert np.array_equal(total.reshape(costs.shape), np.minimum(down + up, 255))
 
 
 def test_census_costs_made_on_the_way_are_those_handed_in():

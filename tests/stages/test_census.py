@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numba import njit
 
-from stages.kernels.blank import blank_windows, blank_windows_reference
 from stages.kernels.census import census, census_costs, census_costs_reference, census_reference
 from stages.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
 from stages.kernels.pair import Rule, describe
@@ -85,13 +84,3 @@ def test_costs_are_those_of_the_references_at_every_pixel_and_disparity(images, 
             expected = census_costs_reference(*bits, lanes, minimum, rule.unseen)
             rows_of_census(pair, rule.unseen, costs, width)
             assert np.array_equal(costs.reshape(expected.shape), expected)
-
-
-@pytest.mark.parametrize(("height", "columns"), [(1, 1), (3, 200), (21, 77), (40, 128)])
-def test_blank_windows_are_those_of_one_gray_value(height, columns):
-    random = np.random.default_rng(height)
-    image = np.full((height, columns), 90, np.uint8)
-    speckled = random.random(image.shape) < 0.02
-    image[speckled] = random.integers(0, 256, image.shape, np.uint8)[speckled]
-    assert np.array_equal(blank_windows(image)[:, :columns], blank_windows_reference(image))
-    assert blank_windows(np.full_like(image, 7))[:, :columns].all()

@@ -260,10 +260,11 @@ for frame in range(int(sys.argv[1]) // 8):
     cloud = PointCloud(frame + 1, points, np.zeros((n, 3), np.uint8), np.full(n, 0.02, np.float32),
                        np.arange(n, dtype=np.int32), "level", sensor=sensor)
     fuse(cloud, pose)
-cells = sum(int((tile["frames"] > 0).sum()) for tile in fuse._map.cells.tiles.values())
+tiles = fuse._map.cells.tiles.values()
+cells = sum(int((tile["frames"] > 0).sum()) for tile in tiles)
 with open("/proc/self/status") as status:
     peak = next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
-print(cells, fuse.nbytes / 1e6, peak / 1024)
+print(cells, sum(tile.nbytes for tile in tiles) / 1e6, peak / 1024)
 """
 
 

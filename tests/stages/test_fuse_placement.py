@@ -94,7 +94,7 @@ def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(c
     np.testing.assert_array_equal(fuse._map.cells.read(-300, -300, 600, 600), before)
 
 
-@pytest.mark.parametrize("jump", [np.array([0, 0, 0.6]), np.array([0, 0, -0.4])])
+@pytest.mark.parametrize("jump", [np.array([0, 0, up]) for up in (0.6, -0.4, 30.0, -1e3, 1e6)])
 def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jump):
     fuse = Fuse()
     for frame in range(5):

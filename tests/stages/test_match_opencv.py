@@ -111,7 +111,7 @@ def test_any_size_gives_disparities_within_range_and_within_the_right_image(h, w
 
 
 @pytest.mark.parametrize("paths", [3, 5, 8])
-def test_the_bits_depend_neither_on_threads_nor_on_the_pool(paths):
+def test_the_bits_depend_neither_on_company_nor_on_the_pool(paths):
     frame, _ = slanted_pair()
     pool = cv2.getNumThreads()
     try:
@@ -119,7 +119,7 @@ def test_the_bits_depend_neither_on_threads_nor_on_the_pool(paths):
         alone = MatchOpenCV(disparities=48, paths=paths)(frame)
         cv2.setNumThreads(4)
         with ThreadPoolExecutor(3) as workers:
-            others = list(workers.map(MatchOpenCV(disparities=48, paths=paths, threads=4), [frame] * 4))
+            others = list(workers.map(MatchOpenCV(disparities=48, paths=paths), [frame] * 4))
     finally:
         cv2.setNumThreads(pool)
     for other in others:

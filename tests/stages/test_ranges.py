@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.data import Disparity, Source
-from stages.kernels.around import paths_reference
-from stages.kernels.blank import blank_windows_reference, drop_blank
+from stages.kernels.aggregation import aggregate_reference
+from stages.kernels.blank import blank_windows, drop_blank
 from stages.kernels.census import census_costs_reference
 from stages.kernels.gradient import smoothed_costs_reference
 from stages.kernels.pair import describe
@@ -117,16 +117,14 @@ def test_disparities_are_those_of_a_search_that_lacks_the_rest_of_the_range(
     searched = np.zeros(costs.shape, bool)
     for each in ranges:
         searched[each.top : each.end, :, each.first : each.first + each.width.lanes] = True
-    down, up = (np.minimum(paths_reference(pair, rule, costs, searched, sign, beside=False), 255) for sign in (1, -1))
+    down, up = (aggregate_reference(pair.steps, rule, costs, searched, sign, beside=False) for sign in (1, -1))
     pixels, evidence = np.empty(truth.shape, np.float32), np.empty(truth.shape, np.uint8)
     for each in ranges:
-        lanes = slice(each.first, each.first + each.width.lanes)
+        n, least = min(each.width.lanes, disparities), minimum + each.first
+        total = np.minimum(down + up, 255)[:, :, each.first : each.first + n]
         for y in range(each.top, each.end):
-            pixels[y], evidence[y] = select_reference(
-                np.minimum(down + up, 255)[y, :, lanes], min(each.width.lanes, disparities), minimum + each.first,
-                rule.uniqueness, rule.consistency,
-            )  # fmt: skip
-    drop_blank(*(blank_windows_reference(image) for image in (left, right)), pixels, evidence)
+            pixels[y], evidence[y] = select_reference(total[y], np.full(columns, least), least, n, rule)
+    drop_blank(*(blank_windows(image) for image in (left, right)), pixels, evidence)
     np.testing.assert_array_equal(found.pixels, pixels)
     np.testing.assert_array_equal(found.confidence, rule.calibration[evidence])
     for threads, memory in ((2, 1 << 30), (1, 1), (2, 1)):

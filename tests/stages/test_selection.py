@@ -35,7 +35,7 @@ def test_a_row_is_selected_as_by_the_reference_in_either_direction(disparities, 
     guard = np.where(np.abs(np.arange(2 * lanes) - lanes) <= 1, 255, 0).astype(np.uint8)
     beyond = np.where(np.arange(lanes) < disparities, 0, 255).astype(np.uint8)
     rule = rule_of(True, disparities, minimum)._replace(uniqueness=1, consistency=1)
-    expected = select_reference(total, disparities, minimum, 1, 1)
+    expected = select_reference(total[:, :disparities], np.full(columns, minimum), minimum, disparities, rule)
     index = np.uint8 if lanes <= 256 else np.uint16
     for step in (1, -1):
         rows = np.empty(columns, np.int16), np.empty((4, columns), np.uint16), np.empty(columns + lanes, index)
