@@ -91,7 +91,7 @@ def _export_region(result: Path, out: Path, lost: Counter[str] | None) -> list[P
             region.last = stamp
             _lay_terrain(region.terrain, given)
             if POINTS in frame and "level" in frame:
-                points = _read(ros2.read_point_cloud, frame[POINTS], result)
+                points = _read(_fields_of, frame[POINTS], result)
                 _colour(region.colours, points, frame["level"], given.resolution)
             if REGION[1] in frame:
                 cells = _read(ros2.read_occupancy_grid, frame[REGION[1]], result)
@@ -130,7 +130,7 @@ def _export_frames(result: Path, out: Path, lost: Counter[str] | None) -> list[P
             if mosaic.close():
                 files += _write_maps(folder, mosaic, cells, about)
         if POINTS in frame:
-            points = _read(ros2.read_point_cloud, frame[POINTS], result)
+            points = _read(_fields_of, frame[POINTS], result)
             files.append(_write(folder / "points.ply", _write_points, points, about))
         number += len(files) > written_before
     if not files:
@@ -154,6 +154,14 @@ def _check_damage(result: Path, lost: Counter[str] | None) -> None:
     """Raise LogError if it is damage that left nothing to export."""
     for why in lost or ():
         raise LogError(f"{result}: {why}; nothing that is left of it can be exported, run the traverse again")
+
+
+def _fields_of(cloud: Any) -> dict[str, Array]:
+    """The fields of a PointCloud2 that says where its points are. Raises ValueError for another."""
+    fields = ros2.read_point_cloud(cloud)
+    if lacking := {"x", "y", "z"} - fields.keys():
+        raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+    return fields
 
 
 def _read(reader: Callable[[Any], Any], message: Any, result: Path) -> Any:
