@@ -1,4 +1,4 @@
-"""Finds where the messages of an MCAP file are from its summary, where that is whole (else `mcap_walk` does).
+"""What lies where in an MCAP file, and from when: found from its summary, where that is whole (else `mcap_walk` does).
 
 Both ways give the same `Index`, so reading knows one way only.
 """
@@ -239,11 +239,6 @@ def in_order(message: T, clocks: Iterable[Clock]) -> T | Lost:
         return message
     back = f"by {fall / 1e9:.3g} s or more, and was not yet 1 s beyond where it had been"
     return Lost(message.channel, message.log_time, f"the log's clock was set back {back}")
-
-
-def said(error: BaseException) -> str:
-    """The first line of what an exception says."""
-    return str(error).split("\n")[0] or type(error).__name__
 
 
 def _stream(content: bytes | memoryview) -> ReadDataStream:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from recordings.decode import camera_model, frame_of, pixels_of, pose_of, stamp_or, tilt_of
 from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
-from recordings.errors import LogError
-from recordings.mcap_index import Lost, Raw, said
+from recordings.errors import LogError, said
+from recordings.mcap_index import Lost, Raw
 from recordings.mcap_opening import CAMERAS, Decoder, Opening, peek_stamp
 from recordings.mcap_reader import McapFile
 from recordings.rig import Camera, Frames

@@ -17,8 +17,8 @@ from mcap.records import Channel
 
 from recordings.decode import camera_model, frame_name, frame_of, pixels_of, pose_of, tilt_of, unread_encoding
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
-from recordings.errors import LogError, counted
-from recordings.mcap_index import Lost, said
+from recordings.errors import LogError, counted, said
+from recordings.mcap_index import Lost
 from recordings.mcap_reader import CONVERT, McapFile
 from recordings.rig import Camera, Frames, baseline_note, calibrated_pair, mounted
 from recordings.ros2_types import decoder_for, full_name

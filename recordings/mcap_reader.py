@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
-from recordings.errors import LogError, counted
+from recordings.errors import LogError, counted, said
 from recordings.mcap_chunk import LARGEST, unpacked
 from recordings.mcap_index import (
     BROKEN,
@@ -40,7 +40,6 @@ from recordings.mcap_index import (
     raw,
     read,
     records,
-    said,
 )
 from recordings.mcap_walk import walk
 from recordings.ros2_types import decoder_for

@@ -15,7 +15,7 @@ from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
-from recordings.errors import counted
+from recordings.errors import counted, said
 from recordings.mcap_chunk import HEAD, LARGEST, is_chunk, next_chunk, start_time, unpacked, unpacked_start
 from recordings.mcap_index import (
     BROKEN,
@@ -28,7 +28,6 @@ from recordings.mcap_index import (
     raw,
     read,
     records,
-    said,
     summary,
 )
 

@@ -27,8 +27,7 @@ from mcap.stream_reader import StreamReader
 from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2, terrain_measures
-from recordings.errors import LogError
-from recordings.mcap_index import said
+from recordings.errors import LogError, said
 from recordings.mcap_reader import McapFile, iter_decoded, without_results
 from recordings.pose_measures import PoseTally
 from recordings.stereo_measures import StereoErrors, cropped_columns

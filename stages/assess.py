@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from stages.data import Array, ElevationMap
-from stages.kernels.footprint import fit_planes
+from stages.kernels.footprint import window_planes
 from stages.kernels.relief import lowest_around
 from stages.stage import Stage, parameter
 
@@ -116,8 +116,8 @@ class Assess(Stage):
         ground = self._ground(height, observed, elevation.resolution)
         step, support = self._step(elevation, height, observed, ground)
         passable = observed & ~(step >= self.obstacle)
-        steepness = fit_planes(height, passable, _cells(self.wheel, elevation.resolution), _WHEEL_LEVERAGE)
-        roughness = fit_planes(height, passable, _cells(self.footprint, elevation.resolution), _LEVERAGE)[3]
+        steepness = window_planes(height, passable, _cells(self.wheel, elevation.resolution), _WHEEL_LEVERAGE)
+        roughness = window_planes(height, passable, _cells(self.footprint, elevation.resolution), _LEVERAGE)[3]
         layers = {
             "ground": ground.height,
             "step": step,
@@ -141,16 +141,16 @@ class Assess(Stage):
         narrow = _cells(self.wheel_track, resolution)
         ground = observed
         for above, below in _WITHIN:
-            around = fit_planes(height, ground, wide, _LEVERAGE)
+            around = window_planes(height, ground, wide, _LEVERAGE)
             off = height - around[0]
             ground = observed & ~((off > above * self.obstacle) | (off < -below * self.obstacle))
         for share in _ABOUT:
-            local = fit_planes(height, ground, narrow, _LEVERAGE)
+            local = window_planes(height, ground, narrow, _LEVERAGE)
             level = np.where(np.isfinite(local[0]), local[0], around[0])
             ground = observed & (np.abs(height - level) <= share * self.obstacle)
-        local = fit_planes(height, ground, narrow, _LEVERAGE)
+        local = window_planes(height, ground, narrow, _LEVERAGE)
         footprint = _cells(self.footprint, resolution)
-        under = local if footprint == narrow else fit_planes(height, ground, footprint, _LEVERAGE)
+        under = local if footprint == narrow else window_planes(height, ground, footprint, _LEVERAGE)
         level = np.where(np.isfinite(local[0]), local[0], around[0])
         trend, planes = self._trend(around[1:3], resolution), np.where(ground, local[:3], np.nan)
         return _Ground(level, around[0], trend, _slope(under, resolution), planes)
@@ -196,7 +196,7 @@ def _as_whole_obstacles(step: Array, raised: Array) -> Array:
 
 
 def _slope(plane: Array, resolution: float) -> Array:
-    """Slope, rad, of planes (4, rows, cols) as `fit_planes` gives them."""
+    """Slope, rad, of planes (4, rows, cols) as `window_planes` gives them."""
     return np.asarray(np.arctan(np.hypot(plane[1], plane[2]) / resolution))
 
 

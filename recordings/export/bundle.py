@@ -19,12 +19,11 @@ import numpy as np
 
 from recordings import ros2
 from recordings.decode import transform_of
-from recordings.errors import LogError
+from recordings.errors import LogError, said
 from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM, Mosaic
 from recordings.export.ply import COLOURS, write_ply
-from recordings.mcap_index import said
 from recordings.mcap_reader import iter_decoded, without_results
 from recordings.paint import hillshade
 from recordings.whole_file import written

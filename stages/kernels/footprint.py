@@ -18,7 +18,7 @@ from stages.kernels.compiled import kernel
 _NARROWEST = 0.2929
 
 
-def fit_planes(heights: Array, use: Array, radius: int, leverage: float) -> Array:
+def window_planes(heights: Array, use: Array, radius: int, leverage: float) -> Array:
     """The plane fitted to the window of (2 * radius + 1)^2 cells about each cell.
 
     heights: (rows, cols) float64, finite where `use`; use: (rows, cols) bool, the cells that count; leverage: the
@@ -29,7 +29,7 @@ def fit_planes(heights: Array, use: Array, radius: int, leverage: float) -> Arra
     and the root mean square of the window's residuals. NaN where the cells used are too few, or too nearly in a line.
     """
     planes = np.empty((4, *heights.shape))
-    _fit_planes(np.ascontiguousarray(heights), np.ascontiguousarray(use), int(radius), float(leverage), planes)
+    _window_planes(np.ascontiguousarray(heights), np.ascontiguousarray(use), int(radius), float(leverage), planes)
     return planes
 
 
@@ -49,7 +49,7 @@ def _add_row(sums, heights, use, row, sign):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fit_planes(heights, use, radius, leverage, planes):  # type: ignore[no-untyped-def]
+def _window_planes(heights, use, radius, leverage, planes):  # type: ignore[no-untyped-def]
     rows, cols = heights.shape
     sums = np.zeros((cols, 6))
     windows = np.empty((10, cols))
@@ -118,8 +118,8 @@ def _solve(windows, row, leverage, height, along, across, rough):  # type: ignor
         rough[col] = np.sqrt(residual if residual > 0.0 else 0.0) if known else np.nan
 
 
-def fit_planes_reference(heights: Array, use: Array, radius: int, leverage: float) -> Array:
-    """The same as `fit_planes`: numpy's least squares, one window at a time."""
+def window_planes_reference(heights: Array, use: Array, radius: int, leverage: float) -> Array:
+    """The same as `window_planes`: numpy's least squares, one window at a time."""
     planes = np.full((4, *heights.shape), np.nan)
     for row, col in np.ndindex(*heights.shape):
         top, left = max(0, row - radius), max(0, col - radius)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from stages.assess import Assess
 from stages.binarise import Binarise
 from stages.data import Array, Cell
-from stages.kernels.footprint import fit_planes, fit_planes_reference
+from stages.kernels.footprint import window_planes, window_planes_reference
 from stages.kernels.relief import lowest_around, lowest_around_reference
 from tests.stages.terrain_scene import map_of, rolling_terrain
 
@@ -33,7 +33,7 @@ def test_plane_kernel_equals_the_plain_reference(seed: int, radius: int, share: 
     random = np.random.default_rng(seed)
     heights = random.normal(0, 1, (12, 15))
     use = random.random(heights.shape) < share
-    got, want = fit_planes(heights, use, radius, 0.2503), fit_planes_reference(heights, use, radius, 0.2503)
+    got, want = window_planes(heights, use, radius, 0.2503), window_planes_reference(heights, use, radius, 0.2503)
     np.testing.assert_array_equal(np.isnan(got), np.isnan(want))
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)
 
