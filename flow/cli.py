@@ -195,7 +195,8 @@ def _info(options: argparse.Namespace) -> int:
     description = describe(options.log, graph.source, *_tolerances(graph))
     with graph.source.open(options.log) as log:
         try:
-            description["refused"] = fitted(graph, log) and ""
+            fitted(graph, log)
+            description["refused"] = ""
         except UsageError as error:
             description["refused"] = str(error)
     say(json.dumps(description, indent=2) if options.json else format_description(description))

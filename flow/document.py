@@ -37,7 +37,7 @@ class Value:
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """The end of a sentence about a `name` that is none of the valid: which of them may be meant, if any."""
-    close = get_close_matches(name, list(valid), n=1, cutoff=0.6)
+    close = get_close_matches(name, list(valid), n=1)
     return f"; did you mean '{close[0]}'?" if close else ""
 
 

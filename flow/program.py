@@ -27,7 +27,9 @@ def program() -> int:
     except KeyboardInterrupt:
         print("roverflow: interrupted", file=sys.stderr)
         code = INTERRUPTED
-    signal.signal(signal.SIGINT, lambda *_: os._exit(code))
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda *_: os._exit(code))
     # Python itself, asked to run a module, may end an interrupted process by the signal; and native code that the
     # interpreter is torn down under may abort it, where a stage of an abandoned frame still works.
     if code == INTERRUPTED or _working():

@@ -45,8 +45,8 @@ def replay(
             "pipeline": graph.text,
             "overrides": "\n".join(overrides),
             "log": log.name,
-            "start": "" if start is None else repr(start),
-            "end": "" if end is None else repr(end),
+            "start": "" if start is None else repr(float(start)),
+            "end": "" if end is None else repr(float(end)),
             **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
         }
         about = {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}  # odd names of files

@@ -53,7 +53,7 @@ def report(summary: dict[str, Any]) -> None:
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
         say(f"  {number} {reason}, first: {first['stream']} at {first['stamp']}: {first['detail']}")
     for path in summary["withheld"]:
-        say(f"  {path} was not written or replaced: it would hold no result; --summary has every loss")
+        say(f"  {path} was not written or replaced: it would hold no result; --summary has what was lost")
     for path in map(Path, summary["outputs"]):
         say(f"  {path} ({path.stat().st_size / 1e6:.1f} MB)")
     for line in [line for part in found for line in lines(part, WARNING)]:

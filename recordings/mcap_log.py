@@ -93,6 +93,20 @@ class Reading:
             return LogError(f"{self.topic} at {raw.log_time} ns: {said(error)}")
 
 
+def part_of(first: int, start: float | None, end: float | None) -> tuple[int | None, int | None]:
+    """The part of a log from `start` to before `end`, s after its first message, which is of `first`, in log time, ns;
+    None where it does not end."""
+    low, high = (None if after is None else first + round(after * 1e9) for after in (start, end))
+    return low, high
+
+
+def is_within(stamp: int, log_time: int, low: int | None, high: int | None) -> bool:
+    """Whether a message belongs to a part of a log. By its stamp, where it has one of the log's clock: then both images
+    of a frame are in or out, though they were logged one after the other."""
+    when = stamp if stamp and abs(stamp - log_time) < LEAD else log_time
+    return (low is None or when >= low) and (high is None or when < high)
+
+
 @dataclass
 class McapLog:
     """An opened log; iterating gives (log time in ns, stream, item), an exception as item standing for a loss.
@@ -180,7 +194,7 @@ class McapLog:
             reading = (infos if raw.channel in infos else items)[raw.channel]
             if isinstance(raw, Lost):
                 yield raw.log_time, reading.stream, LogError(f"{reading.topic}: {raw.reason}")
-            elif reading.stream not in CAMERAS or self._is_within(raw.data, raw.log_time, low, high):
+            elif reading.stream not in CAMERAS or is_within(peek_stamp(raw.data), raw.log_time, low, high):
                 item = noted if raw.channel in infos else reading(raw)
                 if item is not None:
                     yield raw.log_time, reading.stream, item
@@ -237,7 +251,7 @@ class McapLog:
         if "left" not in self.topics or (low is None and high is None):
             return
         raws = self.file.messages(self.channels("left"), *_widened(low, high))
-        if not any(isinstance(raw, Lost) or self._is_within(raw.data, raw.log_time, low, high) for raw in raws):
+        if not any(isinstance(raw, Lost) or is_within(peek_stamp(raw.data), raw.log_time, low, high) for raw in raws):
             length = (self.file.end - self.file.start) / 1e9
             until = "its end" if self.end is None else f"{self.end:g} s"
             raise LogError(
@@ -247,18 +261,7 @@ class McapLog:
 
     def _range(self) -> tuple[int | None, int | None]:
         """The range in log time, ns."""
-        low = None if self.start is None else self.file.start + round(self.start * 1e9)
-        high = None if self.end is None else self.file.start + round(self.end * 1e9)
-        return low, high
-
-    def _is_within(self, data: memoryview, log_time: int, low: int | None, high: int | None) -> bool:
-        """Whether an image belongs to the range. By its stamp, where that is of the log's clock: then both images of a
-        frame are in or out, though they were logged one after the other."""
-        if low is None and high is None:
-            return True
-        stamp = peek_stamp(data) or log_time
-        when = stamp if abs(stamp - log_time) < LEAD else log_time
-        return (low is None or when >= low) and (high is None or when < high)
+        return part_of(self.file.start, self.start, self.end)
 
     def _info_readings(self, calibrations: dict[str, Calibrations], streams: Sequence[str]) -> list[Reading]:
         return [

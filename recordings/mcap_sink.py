@@ -68,7 +68,7 @@ class McapSink:
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
     _writer: Ros2Writer | None = field(default=None, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
-    empty: bool = field(default=True, init=False, repr=False)  # whether no result was written, only what is said of it
+    empty: bool = field(default=False, init=False, repr=False)  # whether it lacks all results that it is to hold
 
     def __post_init__(self) -> None:
         if self.compression not in COMPRESSIONS:
@@ -93,7 +93,7 @@ class McapSink:
 
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: what it was made from and with, kept as its metadata record "roverflow"."""
-        self._last_stamp, self.empty = None, True
+        self._last_stamp, self.empty = None, any(stream in streams for stream in self._written)
         self._writer = Ros2Writer(Path(path), keep=True, compression=self.compression)
         try:
             self._writer.metadata("roverflow", about)

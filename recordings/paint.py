@@ -69,12 +69,13 @@ def legend_colours(codes: Array, legend: Mapping[int, tuple[str, Rgb]]) -> Array
 
 def eight_bit(*images: Array) -> tuple[Array, ...]:
     """8 or 16 bit images of one exposure as 8 bit: the top bit that they use becomes bit 7, so a 12 bit camera is not
-    black. What a thousandth of an image exceeds is not asked: a hot pixel makes no night."""
-    if all(pixels.dtype == np.uint8 for pixels in images):
-        return images
-    top = max(_percentiles(pixels[::4, ::4].ravel(), 99.9)[0] for pixels in images)
+    black. The brightest thousandth does not count, so that a hot pixel does not darken the rest."""
+    deep = [pixels for pixels in images if pixels.dtype != np.uint8]
+    top = max((_percentiles(pixels[::4, ::4].ravel(), 99.9)[0] for pixels in deep), default=0.0)
     shift = max(0, int(top).bit_length() - 8)
-    return tuple(np.minimum(pixels >> shift, 255).astype(np.uint8) for pixels in images)
+    return tuple(
+        pixels if pixels.dtype == np.uint8 else np.minimum(pixels >> shift, 255).astype(np.uint8) for pixels in images
+    )
 
 
 def disparity_limit(disparity: Array) -> float:

@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2, terrain_measures
 from recordings.errors import LogError, said
+from recordings.mcap_log import is_within, part_of
 from recordings.mcap_reader import McapFile, iter_decoded, without_results
 from recordings.pose_measures import PoseTally
 from recordings.stereo_measures import StereoErrors, cropped_columns
@@ -47,9 +48,9 @@ FIRST = 9  # stamps that tell how far the clock of the logging is from theirs
 class Score:
     """Errors of a run. Shares 0 to 1, lengths m, disparities px, angles rad; NaN where there was nothing to measure.
 
-    frames: in the truth; compared: those with at least one result that was scored; missing: result topic -> stamps of
-    true frames that it lacks, which are scored as all unknown; unmatched: result topic -> messages at stamps without
-    truth; beyond: true frames outside the part of the log that was run (`run --start`, `--end`), which do not count;
+    frames: in the truth of the part that was run; compared: those with a result that was scored; missing: result topic
+    -> stamps of true frames that it lacks, which are scored as all unknown; unmatched: result topic -> messages at
+    stamps without truth; beyond: true frames outside that part (`run --start`, `--end`), which do not count;
     unscored: topic -> why -> frames that have it and cannot be scored;
     lost: log -> why -> messages that could not be read; a true frame that lacks one is scored as far as it goes;
     disparity: `StereoErrors.measures`, cropped by the truth's max_disparity (the data set's range where it has one,
@@ -92,8 +93,8 @@ def score(result: Path, truth: Path) -> Score:
         try:
             tally.add(stamp, frame)
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            of = f"{result} or {truth}, with the stamp {stamp} ns"
-            raise LogError(f"what {of}, holds cannot be scored: {said(error)}; record it again") from error
+            where = f"{result} or {truth} holds something at {stamp} ns"
+            raise LogError(f"{where} that cannot be scored: {said(error)}; record it again") from error
     return tally.score()
 
 
@@ -149,7 +150,8 @@ class _Tally:
         with McapFile(truth) as log:  # recorders note topics of which no message came; of a damaged log, some may have
             channels = log.index.channels
             self.truths = {channels[number].topic for number in channels if log.count({number}) or log.index.lost}
-            self.part = _part(result, truth, log.start)
+            with McapFile(result):  # or why that is none
+                self.part = part_of(log.start, *_part(result, truth))
         self.outside: set[int] = set()  # stamps of the truth there, in the log that was run
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
@@ -162,7 +164,7 @@ class _Tally:
     def noted(self, messages: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
         """The truth's messages; takes note of the stamps of those outside the part of the log that was run."""
         for topic, time, message in messages:
-            if topic in TRUTHS and not self.part[0] <= time < self.part[1]:
+            if topic in TRUTHS and not is_within(ros2.stamp_of(message.header), time, *self.part):
                 self.outside.add(ros2.stamp_of(message.header))
             yield topic, time, message
 
@@ -306,16 +308,18 @@ class _Tally:
         )  # fmt: skip
 
 
-def _part(result: Path, truth: Path, start: int) -> tuple[float, float]:
-    """From which log time and to which, ns, the log `truth`, which starts at `start`, was run, where that is told."""
+def _part(result: Path, truth: Path) -> tuple[float | None, float | None]:
+    """From where and to where the log `truth` was run, s after its first message; None where all of it was, or the
+    result does not tell."""
     about: dict[str, str] = {}
-    with suppress(McapError, OSError, struct.error), result.open("rb") as file:
-        for record in islice(StreamReader(file).records, 2):  # a header, and what a run says of itself before all else
+    with suppress(McapError, OSError, ValueError, struct.error), result.open("rb") as file:
+        # A header, and what a run says of itself before all else.
+        for record in islice(StreamReader(file, emit_chunks=True).records, 2):
             about = record.metadata if isinstance(record, Metadata) else {}
-    if about.get("log") != truth.name:
-        return -math.inf, math.inf
-    first, end = about.get("start"), about.get("end")
-    return start + float(first or -math.inf) * 1e9, start + float(end or math.inf) * 1e9
+        if about.get("log") == truth.name.encode("utf-8", "replace").decode():
+            first, end = (about.get(name) for name in ("start", "end"))
+            return float(first) if first else None, float(end) if end else None
+    return None, None
 
 
 def _layers(message: Any, onto: ElevationMap) -> dict[str, Array]:

@@ -188,10 +188,12 @@ class Fuse(Stage):
         expected = np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])
         # What joined the frame before tells what to expect: a pose whose height drifts is off by much, but by and by.
         before = np.array([self._map.plane[0], 0.0, 0.0])
-        jump = float(np.median(off)) - before[0] if len(off) >= _TELLING and self.height_sigma > 0 else 0.0
-        if abs(jump) > LARGEST_JUMP * self.height_sigma:
-            return np.array([before[0] + jump, 0.0, 0.0])  # far enough off, all is an outlier to a robust fit
         plane = before + fit_plane(x, y, off - before[0], variance, expected, self.resolution)
+        # Far enough off, all is an outlier to a robust fit.
+        left = np.abs(off - plane @ [np.ones_like(x), x, y])
+        explained = self.height_sigma + self.tilt_sigma * (np.abs(x) + np.abs(y)) + np.sqrt(variance)
+        if len(off) >= _TELLING and self.height_sigma > 0 and np.median(left - LARGEST_JUMP * explained) > 0:
+            return np.array([np.median(off), 0.0, 0.0])
         return np.asarray(plane * (1 - np.array([self.follow_height, self.follow_tilt, self.follow_tilt])))
 
     def _jumped(self, plane: Array) -> bool:

@@ -14,9 +14,9 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stages.covariance import levered
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.level import level_transform
-from stages.motion import levered
 from stages.stage import Finding, Severity, Stage, counted, parameter
 
 VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once

@@ -173,19 +173,6 @@ class TiltHealth:
         publish_stamp(self)
 
 
-def levered(covariance: Array, way: Array) -> Array:
-    """A covariance (6, 6) of position and turn, after a way (3,), m, whose direction the turn decides."""
-    lever = np.eye(6)
-    lever[:3, 3:] = -cross_matrix(way)
-    return lever @ covariance @ lever.T
-
-
-def cross_matrix(vector: Array) -> Array:
-    """The matrix (3, 3) of the cross product with a vector (3,)."""
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
 def _share(first: int, last: int, stamp: int) -> float:
     """How far `stamp` is on the way from one stamp to the other, 0 to 1."""
     if not first <= stamp <= last:

@@ -169,7 +169,7 @@ def check_cells(what: str, width: float, resolution: float, times: int = 1) -> N
     if cells > WIDEST:
         raise ValueError(
             f"{what} = {width:g} m makes a map {cells:.0f} cells of {resolution:g} m wide, and {WIDEST} is the most; "
-            "take larger cells, or less"
+            "take larger cells or a smaller map"
         )
 
 

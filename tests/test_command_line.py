@@ -251,6 +251,11 @@ def test_the_score_of_a_part_counts_that_part_alone(traverse, tmp_path, capsys):
     found = json.loads(score_file.read_text())
     assert (found["frames"], found["compared"], found["beyond"], found["missing"]) == (2, 2, FRAMES - 2, {})
     assert found["disparity"]["whole_image"]["nonocc"]["bad_1"] < 0.1
+    # The first frame's stamp is before that time, and its messages were logged after it.
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--start", 0.52) == 0
+    assert roverflow("score", out, "--truth", traverse, "--json", score_file) == 0
+    found = json.loads(score_file.read_text())
+    assert (found["compared"], found["beyond"], found["missing"]) == (FRAMES - 1, 1, {})
 
 
 def test_a_run_without_any_result_replaces_none(tmp_path, capsys):

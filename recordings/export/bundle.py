@@ -35,7 +35,7 @@ POINTS = "/nav/points"
 # As in other hillshades: the sun in the north-west, 45 degrees high, for a picture whose upper edge is north.
 _NORTH_WEST = np.array([-0.5, 0.5, np.sqrt(0.5)])
 _COLOUR = np.dtype([("sigma", "f4"), ("rgb", "u1", (3,)), ("seen", "u1")])
-_LONGEST = 100  # characters of the name of a file that a log chooses
+_LONGEST = 100  # bytes of the name of a file that a log chooses
 _CENTRES = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 _POINTS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 
@@ -142,7 +142,8 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
     """For each of the names, which a log may have chosen badly, that of a file: in its folder, and of no other."""
     chosen: dict[str, str] = {}
     for name in names:
-        plain = re.sub(r"[^\w.-]", "-", name)[:_LONGEST].lstrip(".") or "unnamed"
+        short = re.sub(r"[^\w.-]", "-", name).encode()[:_LONGEST].decode(errors="ignore")
+        plain = short.lstrip(".") or "unnamed"
         others = {other.casefold() for other in chosen.values()}
         numbered = (f"{plain}{number}" for number in chain([""], (f"-{number}" for number in count(2))))
         chosen[name] = next(other for other in numbered if other.casefold() not in others)

@@ -107,6 +107,7 @@ class Simulation:
     def __post_init__(self) -> None:
         for name, (low, high, unit) in LIMITS.items():
             value = getattr(self, name) * UNITS.get(unit, 1)
+            value = min(value, 1e300) if value > high else value  # no float holds every whole number
             if not low <= value <= high:
                 shown = f"{low:.9g} to {high:.9g} {unit}".rstrip()
                 raise ValueError(f"Simulation.{name} must be {shown}, not {value:.9g}{f' {unit}' if unit else ''}")

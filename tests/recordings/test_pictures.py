@@ -159,11 +159,12 @@ def test_every_triangle_of_a_surface_joins_three_known_neighbours(rows: int, col
 def test_sixteen_bit_images_keep_their_contrast() -> None:
     """A 12 bit camera fills a quarter of a 16 bit range's bits, and must not come out black."""
     twelve = np.linspace(0, 4095, 256).astype(np.uint16).reshape(16, 16)
-    dark = twelve // 2
-    dark[0, 1] = 65535  # a hot pixel
-    eight, other = paint.eight_bit(np.tile(twelve, (4, 4)), np.tile(dark, (4, 4)))
+    bright, dark = np.tile(twelve, (16, 16)), np.tile(twelve // 2, (16, 16))
+    dark[0, 0] = 65535  # a hot pixel
+    eight, other = paint.eight_bit(bright, dark)
     assert (eight.min(), eight.max()) == (0, 255)
     assert other[-1, -1] == eight[-1, -1] // 2  # of one exposure
+    assert paint.eight_bit(eight, bright)[0] is eight
 
 
 def test_a_picture_leaves_out_what_lies_behind_the_rover_unless_something_is_known_there():

@@ -271,7 +271,7 @@ def test_a_translation_that_is_not_finite_is_told_and_not_used(tmp_path: Path) -
     assert told == [f"/tf_static: {what} is [nan, 0.1, 0.9], which is no place"]
 
 
-def test_a_long_chain_of_transforms_is_followed_and_told_in_few_steps():
+def test_a_long_chain_of_transforms_is_followed_either_way():
     frames, message = Frames(), TRANSFORMS[0]
     links = [Transform(f"link{i}", f"link{i + 1}", np.eye(3), np.array([0.1, 0.0, 0.0])) for i in range(2000)]
     for _ in range(3):

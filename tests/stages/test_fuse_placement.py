@@ -119,6 +119,31 @@ def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jum
     assert "began anew in the same frame, odom, 1 time:" in found.sentence
 
 
+def leaning(frame, degrees, up=0.0):
+    cloud, pose = drive(frame)
+    turned = Rotation.from_euler("y", degrees, degrees=True).apply(cloud.points).astype(np.float32)
+    return replace(cloud, points=turned), replace(pose, position=np.add(pose.position, (0, 0, up)))
+
+
+@pytest.mark.parametrize(("sigmas", "degrees"), [
+    ({"tilt_sigma": 0.05}, (0, 3, -4, 5, -3, 4)), ({"height_sigma": 0.002}, (0.0, 0.4, -0.3, 0.5, -0.4, 0.3)),
+])  # fmt: skip
+def test_what_the_stated_errors_of_height_and_tilt_explain_together_is_no_jump(sigmas, degrees):
+    fuse = Fuse(**sigmas)
+    for frame, angle in enumerate(degrees):
+        terrain = fuse(*leaning(frame, angle), MOUNT)
+    assert terrain.layers["frames"].max() == len(degrees)
+    assert fuse.finding() is None
+
+
+def test_a_tilt_that_jumps_is_told_in_degrees():
+    fuse = Fuse()
+    for frame in range(3):
+        fuse(*drive(frame), MOUNT)
+    with pytest.raises(ValueError, match=r"and [3-6]\.\d degrees off the map"):
+        fuse(*leaning(3, 6), MOUNT)
+
+
 def test_a_pose_in_another_frame_begins_the_map_anew():
     fuse, fresh = Fuse(), Fuse()
     fuse(*drive(0), MOUNT)
