@@ -73,7 +73,7 @@ def as_written(value: float, unit: str) -> str:
     """
     kind, base = UNITS.get(unit, (unit, 1.0))
     if kind not in _WRITTEN or not value:
-        return str(value)
+        return f"{value:.9g}"
     numbers = {name: value * base / UNITS[name][1] for name in _WRITTEN[kind]}
     texts = [(abs(number) < 1, f"{number:.9g} {name}") for name, number in numbers.items()]
     return min(texts, key=lambda text: (text[0], len(text[1])))[1]

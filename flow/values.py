@@ -7,7 +7,7 @@ from dataclasses import Field
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
-from flow.units import check_bare, quantity
+from flow.units import as_written, check_bare, quantity
 
 
 def coerced(value: Any, kind: Any, parameter: Field[Any]) -> Any:
@@ -46,9 +46,14 @@ def _number(value: Any, kind: type, parameter: Field[Any]) -> float | int:
     low, high = parameter.metadata.get("low"), parameter.metadata.get("high")
     for wrong, wanted in (
         (not math.isfinite(value), "finite"),
-        (low is not None and value < low, f"at least {low}"),
-        (high is not None and value > high, f"at most {high}"),
+        (low is not None and value < low, f"at least {_limit(low, unit)}"),
+        (high is not None and value > high, f"at most {_limit(high, unit)}"),
     ):
         if wrong:
-            raise ValueError(f"must be {wanted}{f' {unit}' if unit else ''}, not {given}")
+            raise ValueError(f"must be {wanted}, not {given}")
     return kind(value)  # type: ignore[no-any-return]
+
+
+def _limit(value: float | None, unit: str) -> str:
+    text = as_written(value or 0, unit)
+    return text if text[-1].isalpha() else f"{text} {unit}".rstrip()

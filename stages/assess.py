@@ -9,6 +9,7 @@ a rock stands out of the ground instead of bending it. None of it changes when t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -82,8 +83,9 @@ class Assess(Stage):
         0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.01
     )
     max_slope: float = parameter(
-        0.349, "slope of the surroundings up to which it is no step (20 degrees)", unit="rad", low=0.0, high=1.5
-    )
+        0.349, "slope of the surroundings up to which it is no step (20 degrees)", unit="rad", low=0.0,
+        high=float(np.deg2rad(89)),
+    )  # fmt: skip
 
     @property
     def obstacle(self) -> float:
@@ -169,7 +171,7 @@ class Assess(Stage):
         below = np.minimum(ground.height - bottom, 4 * (ground.height - height))
         explained = np.abs(ground.trend).sum(axis=0)  # from one corner of a cell to the opposite one
         within = np.minimum(top - bottom - explained, 4 * np.minimum(height - bottom, top - height))
-        step = np.fmax.reduce([rise, above, below, within, np.zeros_like(height)])
+        step = reduce(np.fmax, [rise, above, below, within, np.zeros_like(height)])
         raised = observed & ((np.abs(height - ground.height) >= self.skirt) | (step >= self.obstacle))
         return np.where(observed, _as_whole_obstacles(step, raised), np.nan), support
 

@@ -57,7 +57,9 @@ class Binarise(Stage):
     method: str = parameter("rover", "hazard rule", choices=("rover", "absolute"))
     max_step: float = parameter(0.2, "height of a step, or elevation, that is a hazard", unit="m", low=0.01)
     ground_clearance: float = parameter(0.25, "height that reaches the rover's belly", unit="m", low=0.01)
-    max_slope: float = parameter(0.349, "steepest slope that is free (20 degrees)", unit="rad", low=0.0, high=1.5)
+    max_slope: float = parameter(
+        0.349, "steepest slope that is free (20 degrees)", unit="rad", low=0.0, high=float(np.deg2rad(89))
+    )
     max_roughness: float = parameter(0.06, "root mean square of heights off their plane", unit="m", low=0.0)
     margin: float = parameter(
         0.03, "a height this close to its limit counts as reaching it: cells blunt a peak", unit="m", low=0.0

@@ -19,6 +19,7 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.hamming import clear_partners
+from stages.robust import NORMAL, tukey_weights
 
 FEATURES = 4000  # per image
 SMALLEST = 32  # px, side of an image that has any
@@ -38,7 +39,6 @@ NEGLIGIBLE = 0.1  # px, root mean square: less is not worth an interpolation; ex
 BEYOND = 1.0  # px; features of the far horizon lie about infinity
 ROUNDS = 20  # of reweighting
 THREADS = 2  # the frames wait for the survey, so that nothing else keeps the cores busy
-TUKEY = 4.685  # standard deviations, beyond which an outlier has no weight
 MODELS = (5, 3, 1)  # terms of the models tried, richest first: all; shift, x and y; shift
 
 
@@ -253,8 +253,8 @@ def _robust_fit(place: Array, values: Array, count: int) -> tuple[Array, float, 
         roots = np.sqrt(weights)
         terms = np.linalg.lstsq(columns * roots[:, None], values * roots, rcond=None)[0]
         residuals = values - columns @ terms
-        scale = max(1.4826 * float(np.median(np.abs(residuals))), 0.02)
-        weights = np.square(np.clip(1 - np.square(residuals / (TUKEY * scale)), 0, None))
+        scale = max(NORMAL * float(np.median(np.abs(residuals))), 0.02)
+        weights = tukey_weights(residuals, scale)
     repeated = len(place) / len(np.unique(np.floor(place / CELL), axis=0))
     covariance = np.linalg.pinv(columns.T @ (columns * weights[:, None])) * scale**2 * repeated
     grid = _grid_columns(count)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, PointCloud, Tilt, TiltHealth, Transform
+from stages.robust import NORMAL, tukey_weights
 from stages.stage import Finding, Severity, Stage, parameter
 from stages.tilt_diagnosis import INCONSISTENT, Diagnosis, Evidence, diagnose, off_level
 
@@ -175,8 +176,8 @@ def _ground_normal(cloud: PointCloud) -> Array:
         values, axes = np.linalg.eigh(spread.T @ spread / weights.sum())
         normal = axes[:, 0]
         distance = (some - centre) @ normal
-        scale = max(1.4826 * float(np.median(np.abs(distance))), GROUND_NOISE)
-        weights = np.square(np.clip(1 - np.square(distance / (4.685 * scale)), 0, None)) + 1e-9
+        scale = max(NORMAL * float(np.median(np.abs(distance))), GROUND_NOISE)
+        weights = tukey_weights(distance, scale) + 1e-9
     if values[1] < 4 * values[0]:  # a heap of points rather than a plane
         return np.full(3, np.nan)
     towards: Array = normal * (-np.sign(normal @ centre) or 1.0)

@@ -329,7 +329,7 @@ def _mount(fit: _Fit, least: float) -> _Cause:
     ups = fit.ups @ turn.T
     error = Rotation.from_matrix(turn).as_rotvec()
     angle = float(np.linalg.norm(error))
-    spread = float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(normal)).max()))
+    spread = float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(normal))[-1]))
     along = mount.T @ error / max(angle, 1e-12)
     x, y, z, w = Rotation.from_matrix(turn @ mount).as_quat(canonical=True)
     fault = f"the mount of the inclinometer is wrong by {_deg(angle)}"

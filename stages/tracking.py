@@ -15,6 +15,7 @@ import numpy as np
 from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.hamming import clear_partners
+from stages.robust import tukey_weights
 
 DETECTION_WIDTH = 640  # px; features are looked for in an image of at most about this width
 FEATURES = 1500
@@ -24,7 +25,6 @@ COARSE = 3.0  # px of the detection image, reprojection error of an inlier of RA
 TRIALS = 300
 PATCH = 21  # px, side of the tracked patch
 STRAY = 6.0  # px, by how much a patch may lie beside the place that RANSAC's pose gives it
-TUKEY = 4.685  # standard deviations, beyond which an outlier has no weight
 SHARPEST = 0.05  # px, least standard deviation that tracked patches are taken to have
 ROUNDS = 8
 DEPENDENT = 4.0  # how much larger errors are, held against exact truth, than if patches erred independently
@@ -164,7 +164,7 @@ def _fitted(
         slopes = slopes[:, :6]
         sizes = np.linalg.norm(errors.reshape(-1, 2), axis=1)
         scale = max(float(np.median(sizes)) / 1.1774, SHARPEST)  # the median of a Rayleigh distribution
-        weights = np.square(np.clip(1 - np.square(sizes / (TUKEY * scale)), 0, None))
+        weights = tukey_weights(sizes, scale)
         both = np.repeat(weights, 2)
         normal = slopes.T @ (slopes * both[:, None])
         if not np.all(np.isfinite(normal)) or np.linalg.cond(normal) > 1e12:

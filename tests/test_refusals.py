@@ -70,7 +70,7 @@ def test_what_a_stage_cannot_do_without_is_asked_for_before_anything_runs(traver
     ("change", "words"),
     [
         ("disparity=96", "disparity.param=value; did you mean 'disparities'?"),
-        ("max_slope=95deg", "must be at most 1.5 rad, not 95deg"),
+        ("max_slope=95deg", "must be at most 89 deg, not 95deg"),
     ],
 )
 def test_a_setting_that_cannot_be_is_told_as_it_was_written(traverse, tmp_path, capsys, change, words):
@@ -421,8 +421,8 @@ def test_a_pipeline_whose_aliases_hold_each_other_is_refused_at_once(tmp_path, c
 
 
 @pytest.mark.parametrize(("settings", "said"), [
-    (["region=1km"], "stages.Clean.region: must be at most 200.0 m, not 1km"),
-    (["wheel=1km"], "stages.Assess.wheel: must be at most 5.0 m, not 1km"),
+    (["region=1km"], "stages.Clean.region: must be at most 200 m, not 1km"),
+    (["wheel=1km"], "stages.Assess.wheel: must be at most 5 m, not 1km"),
     (["cells.region=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
     (["regional_cells.window=400m"], "makes a map 8000 cells of 0.05 m wide, and 4000 is the most"),
 ])  # fmt: skip

@@ -248,7 +248,7 @@ def fit_planes_reference(
             if abs(np.linalg.det(points[corners])) < LEAST_TRIANGLE:
                 continue
             candidate = np.linalg.solve(points[corners], d[corners])
-            cost = np.minimum((points @ candidate - d) ** 2, threshold**2).sum()
+            cost = float(np.minimum((points @ candidate - d) ** 2, threshold**2).sum())
             if cost < best:
                 best, plane = cost, candidate
         if plane is None:

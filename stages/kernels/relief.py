@@ -6,6 +6,8 @@ given slope of the surroundings explains is taken off, so that a plane has no st
 
 from __future__ import annotations
 
+from functools import reduce
+
 import numpy as np
 
 from stages.data import Array
@@ -77,6 +79,6 @@ def lowest_around_reference(heights: Array, use: Array, trend: Array, radius: in
         around[radius + dr : radius + dr + rows, radius + dc : radius + dc + cols] - trend[0] * dc - trend[1] * dr
         for dr, dc in _disc(radius)
     ]
-    lowest = np.fmin.reduce(moved)
+    lowest = reduce(np.fmin, moved)
     share = np.isfinite(moved).mean(axis=0)
     return np.where(use, lowest, np.nan), np.where(use, share, 0.0)

@@ -122,10 +122,10 @@ def select_reference(total: Array, first: Array, lowest: int, n: int, rule: Rule
     of the first of the n that are searched.
     """
     columns, disparities = total.shape
-    sums, disparity = total.astype(np.int64), np.arange(disparities) + lowest
+    sums = total.astype(np.int64)
     right = np.zeros(columns, np.int64)
     for r in range(columns):
-        seen = [(sums[r + d, d - lowest], d) for d in disparity if 0 <= r + d < columns]
+        seen = [(sums[r + d, d - lowest], d) for d in range(lowest, lowest + disparities) if 0 <= r + d < columns]
         right[r] = min(seen)[1] if seen else lowest
     pixels, evidence = np.full(columns, np.nan, np.float32), np.zeros(columns, np.uint8)
     for x in range(columns):

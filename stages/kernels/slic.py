@@ -298,7 +298,7 @@ def connect_reference(labels: Array, smallest: int) -> tuple[Array, int]:
     component = np.zeros((height, width), np.int64)
     for label in np.unique(labels):
         found, _ = ndimage.label(labels == label)
-        component = np.where(found > 0, found + component.max(), component)
+        component = np.where(found > 0, found + np.max(component), component)
     numbers, total = np.full((height, width), -1, np.int32), 0
     for y, x in np.ndindex(height, width):
         if numbers[y, x] >= 0:
