@@ -192,8 +192,8 @@ def _info(options: argparse.Namespace) -> int:
     graph = load(options.pipeline, options.set)
     if not isinstance(graph.source, McapSource):
         raise UsageError(f"{graph.source_use} is no recordings.McapSource, through which alone info can look at a log")
-    description = describe(options.log, graph.source, *_tolerances(graph))
     with graph.source.open(options.log) as log:
+        description = describe(log, *_tolerances(graph))
         try:
             fitted(graph, log)
             description["refused"] = ""

@@ -54,12 +54,12 @@ def _shown(value: Any, metadata: Mapping[str, Any]) -> str:
 
 
 def _mermaid(graph: Graph) -> str:
+    boxes = {"source": "source"} | {node.name: f"s{i}" for i, node in enumerate(graph.nodes)}  # `end` is a keyword
     lines = ["flowchart LR", f"  source[({graph.source_use})]"]
-    lines += [f"  {node.name}[{node.name}<br/>{node.use}]" for node in graph.nodes]
-    lines += [f"  {start} -- {stream}: {kind} --> {end}" for start, end, stream, kind in _edges(graph)]
-    lines += [
-        f"  {graph.nodes[-1].name} -- {_TO_SINKS} --> frames{i}[/{use}/]" for i, (use, _) in enumerate(graph.sinks)
-    ]
+    lines += [f"  {boxes[node.name]}[{node.name}<br/>{node.use}]" for node in graph.nodes]
+    lines += [f"  {boxes[start]} -- {stream}: {kind} --> {boxes[end]}" for start, end, stream, kind in _edges(graph)]
+    last = boxes[graph.nodes[-1].name]
+    lines += [f"  {last} -- {_TO_SINKS} --> frames{i}[/{use}/]" for i, (use, _) in enumerate(graph.sinks)]
     return "\n".join(lines)
 
 

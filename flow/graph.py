@@ -7,7 +7,8 @@ graph share one clock; joining others is the aligners' work.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
 from types import UnionType
@@ -18,23 +19,38 @@ from flow.errors import PipelineError
 Event = tuple[int, str, Any]  # of a log: log time in ns, stream, item; an exception stands for an item that was lost
 
 
+class Source(Protocol):
+    """Where a log comes from. streams: stream -> the type of its items, of all that a log may provide."""
+
+    @property
+    def streams(self) -> Mapping[str, type]:
+        """See above."""
+
+    def open(self, path: Any, *, start: float | None, end: float | None) -> AbstractContextManager[Log]:
+        """The log at `path`, from `start` to before `end`, s after its first message."""
+
+
 class Log(Protocol):
     """What a source opens: its events in the order of log time, and what it says of itself before any is read.
 
     missing: stream -> why the log cannot provide it; refused: setting of the source -> why the log cannot be read so,
-    whatever the graph needs.
+    whatever the graph needs; frames: how many are to come, where that is known.
     """
 
     missing: Mapping[str, str]
     refused: Mapping[str, str]
 
-    def __iter__(self) -> Iterator[Event]:
-        """The events, from the first one on."""
+    @property
+    def frames(self) -> int | None:
+        """See above."""
+
+    def events(self, streams: Collection[str]) -> Iterator[Event]:
+        """The events of these streams, from the first one on, and losses of which it is not known of which stream."""
 
     def notes(self) -> Mapping[str, str]:
         """What there is to say of a stream, as a note of the run; asked at its end."""
 
-    def excerpts(self, count: int, streams: set[str]) -> Iterable[Iterable[Event]]:
+    def excerpts(self, count: int, streams: Collection[str]) -> Iterable[Iterable[Event]]:
         """So many stretches of these streams, spread over the whole log; asked for where a stage surveys it."""
 
 
@@ -143,15 +159,18 @@ class Graph:
         """The graph without the optional nodes that need a stream in `missing` (stream -> why it is missing).
 
         A port that may stay unconnected is left so. Raises PipelineError with that sentence where a node that is not
-        optional needs the stream, or no stage is left.
+        optional needs the stream, or cannot work without it, or no stage is left.
         """
         gone = dict(missing)
         kept = []
         for node in self.nodes:
             lost = {port: gone[stream] for port, stream in node.inputs.items() if stream in gone}
+            left = {port: stream for port, stream in node.inputs.items() if port not in lost}
             needed = [why for port, why in lost.items() if port not in ports_of(type(node.actor))[1]]
+            if not needed and lost and (why := unfit(node.name, node.actor, left)):
+                needed = [f"{why}, and {next(iter(lost.values()))}"]
             if not needed:
-                kept.append(replace(node, inputs={p: s for p, s in node.inputs.items() if p not in lost}))
+                kept.append(replace(node, inputs=left))
             elif node.optional:
                 gone[node.name] = needed[0]
             else:
@@ -160,6 +179,15 @@ class Graph:
             raise PipelineError(f"nothing of the pipeline {self.name} is left to do: {next(iter(gone.values()))}")
         made = {node.name for node in self.nodes}
         return replace(self, nodes=tuple(kept), left_out={name: why for name, why in gone.items() if name in made})
+
+
+def unfit(name: str, actor: Any, inputs: Collection[str]) -> str:
+    """Why the stage of stream `name` cannot work with these of its ports connected; empty where it can."""
+    try:
+        getattr(actor, "check_inputs", lambda inputs: None)(set(inputs))
+    except ValueError as error:
+        return f"stream '{name}': {error}"
+    return ""
 
 
 def is_aligner(kind: type) -> bool:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_args
 
 from flow.document import Value, nearest, read, settled
 from flow.errors import UsageError
-from flow.graph import Graph, Node, Place, accepts, clock_of, hints_of, in_order, is_aligner, output_of, ports_of
+from flow.graph import Graph, Node, Place, accepts, clock_of, hints_of, in_order, is_aligner, output_of, ports_of, unfit
 from flow.ledger import failure
 from flow.values import coerced
 
@@ -23,7 +23,7 @@ SHIPPED = Path(__file__).parent / "pipelines"
 _BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"
 _RESERVED = ("use", "optional")
 # what a class needs to have to be one
-_NEEDED = {"the source": ("streams",), "a sink": ("suffix", "wants", "open", "write", "close")}
+_NEEDED = {"the source": ("streams", "open"), "a sink": ("suffix", "wants", "open", "write", "close")}
 
 
 def load(name: str, overrides: Iterable[str] = ()) -> Graph:
@@ -97,6 +97,8 @@ class _Builder:
                 raise item.place.error(
                     f"'{name}' is no name of a stream; letters, digits and underscores make one, no digit first"
                 )
+            if name == "source":
+                raise item.place.error("'source' is no name of a stream: settings of the source go by it")
             if name in kinds:
                 raise item.place.error(f"'{name}' is already a stream of the source; choose another name")
         wiring = {name: self._inputs(name, item, [*kinds, *streams]) for name, item in streams.items()}
@@ -107,10 +109,11 @@ class _Builder:
             kinds[name], clocks[name] = node.output, node.clock
             nodes.append(node)
         self._check_clock(nodes)
-        for (_, sink), entry in zip(sinks, top["sinks"].value, strict=True):
-            self._check_streams(sink, entry, kinds)
         source_use = self._use(top["source"], "the source")
-        return Graph(self.path.stem, self.text, source, source_use, tuple(nodes), sinks, kinds)
+        graph = Graph(self.path.stem, self.text, source, source_use, tuple(nodes), sinks, kinds)
+        for (_, sink), entry in zip(sinks, top["sinks"].value, strict=True):
+            self._check_streams(sink, entry, graph)
+        return graph
 
     def _node(
         self, name: str, item: Value, inputs: dict[str, str], kinds: dict[str, type], clocks: dict[str, str]
@@ -126,21 +129,24 @@ class _Builder:
         optional = item.value.get("optional", Value(False, item.place))
         if not isinstance(optional.value, bool):
             raise optional.place.error(f"'optional' must be true or false, not {optional.plain()}")
-        try:
-            getattr(actor, "check_inputs", lambda inputs: None)(set(inputs))
-        except ValueError as error:
-            raise item.place.error(f"stream '{name}': {error}") from error
+        if why := unfit(name, actor, inputs):
+            raise item.place.error(why)
         output = output_of(actor, {port: kinds[stream] for port, stream in inputs.items()}, item.place)
         clock = clock_of(name, actor, {port: clocks[stream] for port, stream in inputs.items()}, item.place)
         return Node(name, self._use(item, name), actor, inputs, output, clock, optional.value, item.place)
 
     @staticmethod
-    def _check_streams(sink: Any, entry: Value, streams: Mapping[str, type]) -> None:
-        """Whether the streams that a sink's entry names are there."""
+    def _check_streams(sink: Any, entry: Value, graph: Graph) -> None:
+        """Whether the streams that a sink's entry names are there, and of the frames."""
         for key in set(getattr(sink, "names_streams", ())) & entry.value.keys():
             for name in entry.value[key].plain():
-                if name not in streams:
-                    raise entry.value[key].place.error(f"there is no stream '{name}'{nearest(str(name), streams)}")
+                if name not in graph.kinds:
+                    raise entry.value[key].place.error(f"there is no stream '{name}'{nearest(str(name), graph.kinds)}")
+                if name not in graph.frame_streams:
+                    raise entry.value[key].place.error(
+                        f"'{name}' is not of the frames, which run on the clock of '{graph.clock}'; align it first "
+                        "(flow.align)"
+                    )
 
     def _check_clock(self, nodes: list[Node]) -> None:
         stages = [node for node in nodes if not node.aligns]

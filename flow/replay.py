@@ -6,10 +6,13 @@ The rest of the runtime knows no paths of pipelines, no terminal and no librarie
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+from flow.errors import UsageError
+from flow.graph import Graph
 
 
 def replay(
@@ -32,11 +35,7 @@ def replay(
     from flow.run import Stop, interrupts, run
 
     graph = pipelines.load(pipeline, overrides)
-    outputs = {}
-    for use, sink in graph.sinks:
-        path = {".mcap": out, ".rrd": rrd}.get(sink.suffix)
-        if path is not None:
-            outputs[use] = path
+    outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     cv2.setNumThreads(1)  # frames in flight fill the cores, not threads inside one call
     stop = Stop()
     with graph.source.open(log, start=start, end=end) as opened, threadpool_limits(1):
@@ -62,6 +61,17 @@ def replay(
             with interrupts(stop, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)):
                 summary = run(graph, opened, outputs, workers=workers, about=about, stop=stop, on_frame=on_frame)
     return as_json(summary | {"overrides": list(overrides)})
+
+
+def _outputs(graph: Graph, paths: Mapping[str, Path | None]) -> dict[str, Path]:
+    """Sink -> the path that it writes to, by what its files end in; those without one stay unused."""
+    endings = [sink.suffix for _, sink in graph.sinks]
+    for use, sink in graph.sinks:
+        if sink.suffix not in paths:
+            raise UsageError(f"{use} writes {sink.suffix} files, and a run has outputs for {' and '.join(paths)} only")
+        if endings.count(sink.suffix) > 1:
+            raise UsageError(f"several sinks write {sink.suffix} files, and a run has one output for them; leave one")
+    return {use: path for use, sink in graph.sinks if (path := paths[sink.suffix]) is not None}
 
 
 def as_json(summary: dict[str, Any]) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from typing import Any
 from flow.engine import Engine
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.feeder import Feeder
-from flow.findings import NOTE, Finding, finding, findings
+from flow.findings import NOTE, WARNING, Finding, finding, findings
 from flow.graph import Event, Graph, Log, Sink
-from flow.ledger import Ledger, Verdict
+from flow.ledger import Ledger, Verdict, failure
 from flow.survey import surveyed
 
 
@@ -144,7 +144,7 @@ def run(
     wall, cpu = time.perf_counter(), time.process_time()
     surveys = dict[str, Finding]()
     with suppress(_StoppedError):
-        graph, surveys = surveyed(graph, lambda *which: (_events(part, stop) for part in log.excerpts(*which)))
+        graph, surveys = surveyed(graph, lambda *which: (_read(part, stop) for part in log.excerpts(*which)))
     streams = graph.frame_streams
     used = {use: sink for use, sink in graph.sinks if use in outputs}
     wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
@@ -157,7 +157,7 @@ def run(
             engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
             try:
                 started = time.perf_counter() - wall
-                finished = _feed(feeder, log, engine, stop)
+                finished = _feed(feeder, _read(log.events(graph.source_streams), stop), engine, stop)
             finally:
                 engine.finish(stop.abandoning)
             sinks.errors += [engine.failure] if engine.failure else []
@@ -191,17 +191,20 @@ def fitted(graph: Graph, log: Log) -> Graph:
 
 def _notes(log: Log, graph: Graph) -> dict[str, Finding]:
     """What the log says of the streams that the graph reads."""
-    return {name: finding(NOTE, why) for name, why in log.notes().items() if name in graph.source_streams}
+    try:
+        return {name: finding(NOTE, why) for name, why in log.notes().items() if name in graph.source_streams}
+    except Exception as error:  # no reason to leave the outputs open
+        return {"log": finding(WARNING, failure(error))}
 
 
 class _StoppedError(Exception):
     """Leaves the log in the middle; the aligners then draw no conclusion from its end."""
 
 
-def _feed(feeder: Feeder, log: Log, engine: Engine, stop: Stop) -> bool:
+def _feed(feeder: Feeder, events: Iterable[Event], engine: Engine, stop: Stop) -> bool:
     """Admit the frames of the log; False if it was stopped, or an output failed, before the log's end."""
     with suppress(_StoppedError):
-        for frame in feeder.frames(_events(log, stop)):
+        for frame in feeder.frames(events):
             if not engine.admit(frame.stamp, frame.values, frame.entries, stop.finishing):
                 feeder.give_back(frame)
                 return False
@@ -209,9 +212,9 @@ def _feed(feeder: Feeder, log: Log, engine: Engine, stop: Stop) -> bool:
     return False
 
 
-def _events(log: Iterable[Event], stop: Stop) -> Iterator[Event]:
-    """The events of `log`; a source that breaks down ends the log with its exception, and a stop in the middle."""
-    log_time, source = 0, iter(log)
+def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
+    """The events of a log; a source that breaks down ends the log with its exception, and a stop in the middle."""
+    log_time, source = 0, iter(events)
     while True:
         try:
             stop.reading = True

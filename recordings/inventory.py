@@ -4,7 +4,6 @@ up, how much of the traverse has a tilt, what is missing and what is damaged."""
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,52 +13,48 @@ from recordings.errors import counted
 from recordings.mcap_index import Lost
 from recordings.mcap_log import McapLog
 from recordings.mcap_opening import CAMERAS, peek_stamp
-from recordings.mcap_source import McapSource
 from stages.data import StereoCamera, Tilt
 
 Stamps = NDArray[np.int64]
 
 
-def describe(
-    path: Path, source: McapSource, slop: int = 5_000_000, max_gap: int | None = 200_000_000
-) -> dict[str, Any]:
-    """The inventory of a log, as plain JSON values. Raises LogError where the file is no log that can be read.
+def describe(log: McapLog, slop: int = 5_000_000, max_gap: int | None = 200_000_000) -> dict[str, Any]:
+    """The inventory of a log, as plain JSON values.
 
-    source: how the log's streams are found, as in a pipeline file; slop: largest difference between the stamps of the
-    two images of a frame, ns; max_gap: largest distance between the tilts around a frame, ns, None: they are not
-    counted. Only stamps count here: a run waits for none that is logged too late.
+    slop: largest difference between the stamps of the two images of a frame, ns; max_gap: largest distance between the
+    tilts around a frame, ns, None: they are not counted. Only stamps count here: a run waits for none that is logged
+    too late.
     """
-    with source.open(Path(path)) as log:
-        damage = sorted({lost.reason for lost in log.file.index.lost} | {str(problem) for _, problem in log.problems})
-        stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
-        stamps["inclinometer"] = _tilts(log, damage)
-        left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
-        return {
-            "path": str(path),
-            "size_bytes": log.file.size,
-            "profile": log.file.index.profile,
-            "indexed": not log.file.index.walked,
-            "start": log.file.start,
-            "end": log.file.end,
-            "duration_s": (log.file.end - log.file.start) / 1e9,
-            "topics": _topics(log),
-            "notes": log.notes(),
-            "streams": dict(log.topics),
-            "calibration": _calibration(log),
-            "frames": {
-                "left": len(stamps["left"]),
-                "right": len(stamps["right"]),
-                "pairs": _pairs(left, right, slop),
-                "slop_s": slop / 1e9,
-                "with_tilt": None if max_gap is None else _tilted(left, tilts, max_gap),
-                "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
-            },
-            "transforms": log.static.listed(),
-            "mount": _mount(log),
-            "missing": dict(log.lacking),
-            "undecodable": log.undecodable,
-            "damage": list(dict.fromkeys(damage)),
-        }
+    damage = sorted({lost.reason for lost in log.file.index.lost} | {str(problem) for _, problem in log.problems})
+    stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
+    stamps["inclinometer"] = _tilts(log, damage)
+    left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
+    return {
+        "path": str(log.path),
+        "size_bytes": log.file.size,
+        "profile": log.file.index.profile,
+        "indexed": not log.file.index.walked,
+        "start": log.file.start,
+        "end": log.file.end,
+        "duration_s": (log.file.end - log.file.start) / 1e9,
+        "topics": _topics(log),
+        "notes": log.notes(),
+        "streams": dict(log.topics),
+        "calibration": _calibration(log),
+        "frames": {
+            "left": len(stamps["left"]),
+            "right": len(stamps["right"]),
+            "pairs": _pairs(left, right, slop),
+            "slop_s": slop / 1e9,
+            "with_tilt": None if max_gap is None else _tilted(left, tilts, max_gap),
+            "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
+        },
+        "transforms": log.static.listed(),
+        "mount": _mount(log),
+        "missing": dict(log.lacking),
+        "undecodable": log.undecodable,
+        "damage": list(dict.fromkeys(damage)),
+    }
 
 
 def format_description(description: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,7 +109,7 @@ def is_within(stamp: int, log_time: int, low: int | None, high: int | None) -> b
 
 @dataclass
 class McapLog:
-    """An opened log; iterating gives (log time in ns, stream, item), an exception as item standing for a loss.
+    """An opened log.
 
     missing: stream -> why the log does not provide it, and what to do; refused: setting of the source that the log does
     not bear out -> why; lacking: as `missing`, without the topics that cannot be decoded, which `undecodable` lists;
@@ -156,23 +156,20 @@ class McapLog:
         times = self.file.times(self.channels("left"))
         return int(np.sum((times >= (low or 0)) & (times < (high or 1 << 62))))
 
-    def __iter__(self) -> Iterator[tuple[int, str, Any]]:
-        return self.events(STREAMS)
-
-    def events(self, streams: Sequence[str]) -> Iterator[tuple[int, str, Any]]:
-        """Iterates as the log does, over some of its streams."""
+    def events(self, streams: Collection[str] = STREAMS) -> Iterator[tuple[int, str, Any]]:
+        """(Log time in ns, stream, item) for each message of some streams; an exception as item stands for a loss."""
         return self._between(*self._range(), streams)
 
-    def excerpts(self, count: int, streams: set[str]) -> Iterator[Iterator[tuple[int, str, Any]]]:
-        """Iterates as the log does, over some of its streams, `count` times a few frames, spread over all of it."""
+    def excerpts(self, count: int, streams: Collection[str]) -> Iterator[Iterator[tuple[int, str, Any]]]:
+        """As `events`, `count` times those of a few frames, spread over all of the log, whatever part of it is read."""
         times = self.file.times(self.channels("left")).tolist() if "left" in self.topics else []
         for first in sorted({int((part + 0.5) * len(times) / count) for part in range(count)}) if times else ():
             last = min(first + EXCERPT, len(times)) - 1
             # Stamps are before log times: from behind the image before.
             low = times[first - 1] + 1 if first else self.file.start
-            yield self._between(low, times[last] + LEAD, [name for name in STREAMS if name in streams])
+            yield self._between(low, times[last] + LEAD, streams)
 
-    def _between(self, low: int | None, high: int | None, streams: Sequence[str]) -> Iterator[tuple[int, str, Any]]:
+    def _between(self, low: int | None, high: int | None, streams: Collection[str]) -> Iterator[tuple[int, str, Any]]:
         wide_low, wide_high = _widened(low, high)
         log_start = self.file.start if wide_low is None else max(wide_low, self.file.start)
         for stream, problem in self.problems:
@@ -263,14 +260,14 @@ class McapLog:
         """The range in log time, ns."""
         return part_of(self.file.start, self.start, self.end)
 
-    def _info_readings(self, calibrations: dict[str, Calibrations], streams: Sequence[str]) -> list[Reading]:
+    def _info_readings(self, calibrations: dict[str, Calibrations], streams: Collection[str]) -> list[Reading]:
         return [
             self._reading(side, topic, calibrations[side].note)
             for side, (topic, _) in self._opening.infos.items()
             if side in self.topics and side in streams
         ]
 
-    def _item_readings(self, calibrations: dict[str, Calibrations], streams: Sequence[str]) -> list[Reading]:
+    def _item_readings(self, calibrations: dict[str, Calibrations], streams: Collection[str]) -> list[Reading]:
         tilt, base_frame = self.source.angles() or tilt_of, self.source.base_frame
         made: dict[str, Callable[[Any, int], Any]] = {
             "inclinometer": lambda message, log_time: self._of_the_mount(tilt(message, log_time)),

@@ -214,7 +214,7 @@ def test_the_pose_comes_from_tf_where_told(traverse, tmp_path):
 
     log = tmp_path / "tf.mcap"
     with McapSource().open(traverse) as opened:
-        poses = [item for _, stream, item in opened if stream == "odometry"]
+        poses = [item for _, stream, item in opened.events() if stream == "odometry"]
     with Ros2Writer(log) as writer:
         for topic, stamp, message in iter_decoded(traverse):
             if not topic.startswith(("/truth", "/odometry", "/tf")) or topic == "/tf_static":
@@ -224,7 +224,7 @@ def test_the_pose_comes_from_tf_where_told(traverse, tmp_path):
             at = Transform(pose.frame_id, "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
             writer.write("/tf", transform_message([(wheel, pose.stamp), (at, pose.stamp)]), pose.stamp)
     with McapSource(odometry="/tf").open(log) as opened:
-        read = [item for _, stream, item in opened if stream == "odometry"]
+        read = [item for _, stream, item in opened.events() if stream == "odometry"]
     assert all(isinstance(pose, Pose) for pose in read)
     assert [pose.stamp for pose in read] == [pose.stamp for pose in poses]
     np.testing.assert_allclose([p.position for p in read], [p.position for p in poses], atol=1e-12)
@@ -409,6 +409,13 @@ def test_graph_draws_every_stream(form, capsys):
     for stream in ("stereo", "tilt", "matched", "disparity", "points", "elevation_map", "navigation_map"):
         assert stream in drawn
     assert drawn.count("every stream of the frame") == (0 if form == "text" else 2)  # to the two sinks
+
+
+def test_a_stream_may_have_the_name_of_a_keyword_of_mermaid(tmp_path, capsys):
+    text = (ROOT / "flow" / "pipelines" / "paper.yaml").read_text()
+    (tmp_path / "own.yaml").write_text(re.sub(r"\bstereo\b", "end", text))
+    assert roverflow("graph", "-p", tmp_path / "own.yaml", "--format", "mermaid") == 0
+    assert "  s0[end<br/>flow.align.pair]" in capsys.readouterr().out
 
 
 def test_graph_shows_what_is_set(capsys):

@@ -431,6 +431,20 @@ def test_maps_that_no_memory_holds_are_refused_before_the_run(settings, said, ca
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("sinks", "said"), [
+    (["tests.flow.toys.Keep"], "tests.flow.toys.Keep writes .txt files, and a run has outputs for .mcap and .rrd only"),
+    (["recordings.McapSink", "another.Another"], "several sinks write .mcap files, and a run has one output for them"),
+])  # fmt: skip
+def test_a_sink_that_a_run_has_no_output_for_is_refused(traverse, tmp_path, capsys, sinks, said):
+    (tmp_path / "another.py").write_text("from recordings import McapSink\nclass Another(McapSink):\n    pass\n")
+    listed = ", ".join(f"{{use: {use}}}" for use in sinks)
+    shipped = (ROOT / "flow" / "pipelines" / "paper.yaml").read_text()
+    (tmp_path / "own.yaml").write_text(f"{shipped.partition('sinks:')[0]}sinks: [{listed}]\n")
+    assert roverflow("run", traverse, "-p", tmp_path / "own.yaml", "-o", tmp_path / "out.mcap") == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out.mcap").exists()
+
+
 def test_a_log_whose_name_is_no_text_is_run(traverse, tmp_path):
     log = os.fsencode(tmp_path / "Fahrt-") + b"\xfcd.mcap"
     os.link(traverse, log)

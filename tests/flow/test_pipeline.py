@@ -137,6 +137,8 @@ def test_a_key_of_a_setting_is_replaced_wherever_it_is_named_or_in_one_place_alo
         ("toys.Scale", "toys.Keep", 5, ["Keep is no stage"]),
         ("gain: 2.5", "gian: 2.5", 1, ["no parameter 'gian'", "did you mean 'gain'"]),
         ("toys.Keep}", "toys.Keep, only: [sum, twise]}", 8, ["there is no stream 'twise'", "did you mean 'twice'"]),
+        ("toys.Keep}", "toys.Keep, only: [sum, level]}", 8, ["'level' is not of the frames", "clock of 'both'; align"]),
+        ("  twice:", "  source:", 5, ["'source' is no name of a stream"]),
         ("sinks:", "sinkz:", 7, ["no 'sinkz'", "did you mean 'sinks'"]),
         ("  both:", "  left:", 3, ["'left' is already a stream of the source"]),
         ("  sum: ", "  both:", 6, ["'both' stands here twice"]),

@@ -14,7 +14,7 @@ from flow.errors import SinkError, UsageError
 from flow.feeder import Feeder
 from flow.ledger import Ledger
 from flow.run import Stop, interrupts, run
-from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, Text, graph, replayed, traverse
+from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, Text, graph, replayed, replayed_log, traverse
 
 
 def test_a_failing_frame_is_recorded_and_skipped_and_the_others_go_on(tmp_path):
@@ -65,8 +65,8 @@ def test_a_failing_sink_stops_the_run_and_is_still_closed(tmp_path):
 
 def test_a_log_that_breaks_off_keeps_what_was_read(tmp_path):
     class Broken(Log):
-        def __iter__(self):
-            yield from self.events
+        def events(self, streams):
+            yield from super().events(streams)
             raise OSError("input/output error")
 
     pipeline = graph(tmp_path)
@@ -97,8 +97,8 @@ def test_what_was_lost_before_an_interrupt_is_told_to_the_sinks(tmp_path):
     stop, pipeline = Stop(), graph(tmp_path, nap=0.001)
 
     class Damaged(Log):
-        def __iter__(self):
-            yield from self.events
+        def events(self, streams):
+            yield from super().events(streams)
             stop.request()
             yield 1000 * MS, "left", OSError("chunk 7 is damaged")
             yield 1100 * MS, "left", OSError("chunk 8 is damaged")
@@ -238,8 +238,8 @@ def test_samplers_of_samplers_are_whole_to_the_end_of_the_log(tmp_path):
 
 def test_a_run_that_is_torn_down_is_never_sealed_as_complete(tmp_path):
     class Torn(Log):
-        def __iter__(self):
-            yield from self.events
+        def events(self, streams):
+            yield from super().events(streams)
             raise SystemExit
 
     pipeline = graph(tmp_path)
@@ -381,6 +381,38 @@ def test_a_port_that_may_stay_open_is_left_open_where_the_log_lacks_its_stream(t
     ((use, sink),) = pipeline.sinks
     run(pipeline, Log(traverse(3), missing={"level": "no level"}), {use: Path("unused")})
     assert sink.values("raised") == sink.values("sum")
+
+
+@pytest.mark.parametrize("optional", [False, True])
+def test_a_stage_that_cannot_do_without_what_the_log_lacks_is_refused_or_left_out(tmp_path, optional):
+    text = PIPELINE.replace("at: both}", "at: both, optional: true}")
+    either = f"toys.Either, both: true, optional: {str(optional).lower()}, a: sum, b: h"
+    text = text.replace("toys.Add, a: sum, b: h", either)
+    pipeline, log = graph(tmp_path, text=text), Log(traverse(3), missing={"level": "no level"})
+    why = "stream 'raised': Either.both needs a `b`, and no level"
+    if optional:
+        assert replayed_log(pipeline, log)[1]["findings"]["raised"]["sentence"] == f"left out: {why}"
+    else:
+        with pytest.raises(UsageError, match=why):
+            replayed_log(pipeline, log)
+
+
+def test_a_message_that_no_stage_would_have_got_is_no_loss(tmp_path):
+    text = "\n".join(line for line in PIPELINE.splitlines() if not re.search("height|raised", line))
+    broken = [(50 * MS, "level", OSError("damaged")), (60 * MS, "words", OSError("damaged"))]
+    _, summary = replayed(graph(tmp_path, text=text), [*traverse(1), *broken])
+    assert (summary["verdict"], summary["ledger"]) == ("COMPLETE", [])
+
+
+def test_a_log_that_fails_at_its_notes_costs_no_output(tmp_path):
+    class Mute(Log):
+        def notes(self):
+            raise OSError("input/output error")
+
+    sink, summary = replayed_log(graph(tmp_path), Mute(traverse(3)))
+    assert (sink.summary["verdict"], len(sink.records)) == ("COMPLETE", 3)
+    assert summary["findings"]["log"]["severity"] == "warning"
+    assert "input/output error" in summary["findings"]["log"]["sentence"]
 
 
 def test_a_pipeline_of_which_nothing_is_left_is_refused(tmp_path):

@@ -57,7 +57,7 @@ class Excerpted(Log):
     def excerpts(self, count, streams):
         self.asked.append((count, streams))
         for first, last in self.stretches:
-            yield iter(self.events[first:last])
+            yield iter(self.given[first:last])
 
 
 def both(stamp, value):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import random
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -46,6 +47,9 @@ class Text:
 class Source:
     streams: ClassVar[Mapping[str, type]] = {"left": Number, "right": Number, "level": Number, "words": Text}
     gain: float = 1.0
+
+    def open(self, path: Path, *, start: float | None, end: float | None) -> AbstractContextManager[Log]:
+        return nullcontext(Log(traverse(3)))
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,13 @@ class Total:
 @dataclass(frozen=True)
 class Either:
     """Adds what may be missing."""
+
+    both: bool = False
+
+    def check_inputs(self, connected: set[str]) -> None:
+        """Wants both, where it is told to."""
+        if self.both and "b" not in connected:
+            raise ValueError("Either.both needs a `b`")
 
     def __call__(self, a: Couple, b: Number | None = None) -> Couple:
         return Couple(a.stamp, a.value + (b.value if b else 0.0))
@@ -165,11 +176,12 @@ class Log:
     """A log of given events."""
 
     def __init__(self, events: list[tuple[int, str, Any]], missing: dict[str, str] | None = None) -> None:
-        self.events, self.missing = events, missing or {}
+        self.given, self.missing = events, missing or {}
         self.refused: dict[str, str] = {}
+        self.frames = None
 
-    def __iter__(self) -> Iterator[tuple[int, str, Any]]:
-        yield from self.events
+    def events(self, streams: Collection[str]) -> Iterator[tuple[int, str, Any]]:
+        yield from (event for event in self.given if event[1] in {*streams, "log"})
 
     def notes(self) -> dict[str, str]:
         return {}
@@ -209,5 +221,10 @@ def traverse(frames, start=0):
 
 def replayed(graph, events, **options):
     """(sink, summary) of a run; the sink is kept by the graph."""
+    return replayed_log(graph, Log(events), **options)
+
+
+def replayed_log(graph, log, **options):
+    """(sink, summary) of a run of a log."""
     ((use, sink),) = graph.sinks
-    return sink, run(graph, Log(events), {use: Path("unused")}, **options)
+    return sink, run(graph, log, {use: Path("unused")}, **options)

@@ -14,6 +14,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
+from recordings.inventory import describe
 from recordings.ros2 import Ros2Writer, camera_info, image, imu, odometry, transform_message
 from stages.data import CameraImage, CameraModel, Pose, Tilt, Transform
 
@@ -120,7 +121,13 @@ def rewritten(
 
 def items_of(path: Path, source: McapSource | None = None, **bounds: float) -> list[tuple[int, str, Any]]:
     with (source or McapSource()).open(path, **bounds) as log:
-        return list(log)
+        return list(log.events())
+
+
+def inventory_of(path: Path, **tolerances: int) -> dict[str, Any]:
+    """What `roverflow info` finds in a log."""
+    with McapSource().open(path) as log:
+        return describe(log, **tolerances)
 
 
 def essence(item: Any) -> Any:

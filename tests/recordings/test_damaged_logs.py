@@ -24,11 +24,11 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.inventory import describe, format_description
+from recordings.inventory import format_description
 from recordings.mcap_chunk import unpacked
 from recordings.mcap_index import MAGIC, Index, Lost
 from recordings.mcap_reader import McapFile
-from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, items_of, rewritten
+from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, inventory_of, items_of, rewritten
 
 
 def record(opcode: int, content: bytes) -> bytes:
@@ -55,7 +55,7 @@ def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]]
     try:
         with McapSource().open(path) as log:
             told = set(log.missing)
-            events = list(log)
+            events = list(log.events())
     except LogError as error:
         events = [(0, "log", error)]
     known = {(time, stream, essence(item)) for time, stream, item in whole if stream != "mount"}
@@ -135,7 +135,7 @@ def test_a_broken_chunk_costs_its_own_messages_each_with_its_time(
     assert any(str(item).startswith(f"{LEFT}: the chunk at byte") for _, _, item in events)
     kept = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
     assert kept == [essence(item) for time, stream, item in whole if (time, stream) not in lost]
-    assert describe(damaged, McapSource())["damage"]
+    assert inventory_of(damaged)["damage"]
 
 
 def test_damage_that_took_all_images_is_told_as_that(sample: Path, tmp_path: Path) -> None:
@@ -226,7 +226,7 @@ def test_a_log_time_that_no_clock_can_show_costs_its_message(
     ]
     assert (time, stream) == (whole[-1][0], "left")
     assert "log time is damaged" in str(error)
-    assert describe(path, McapSource())["end"] == whole[-1][0]
+    assert inventory_of(path)["end"] == whole[-1][0]
 
 
 def test_many_losses_take_their_time_from_the_last_message_before_them() -> None:
@@ -260,7 +260,7 @@ def test_what_is_behind_the_end_of_a_log_is_told(
     size = len(first) if second == "log" else 5000
     said = f"the log ends at byte {len(first)}, and {size} bytes behind that are not read; give each log by itself"
     assert (stream, str(lost)) == ("log", f"log.mcap: {said}")
-    assert describe(path, McapSource())["damage"] == [said]
+    assert inventory_of(path)["damage"] == [said]
 
 
 def test_an_index_that_points_behind_the_end_loses_its_chunk_alone(sample: Path, tmp_path: Path) -> None:
@@ -324,7 +324,7 @@ def test_every_real_log_is_described_or_refused_in_a_sentence() -> None:
     paths = [path for path in sorted(data_folder("logs").rglob("*")) if path.suffix in (".mcap", ".bag")]
     for path in paths:
         try:
-            text = format_description(json.loads(json.dumps(describe(path, McapSource()))))
+            text = format_description(json.loads(json.dumps(inventory_of(path))))
         except LogError as error:
             refused.append(str(error))
             continue

@@ -177,7 +177,7 @@ def test_an_imu_that_begins_with_nonsense_is_still_an_inclinometer(tmp_path: Pat
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
-        losses = [(stream, str(item)) for _, stream, item in log if isinstance(item, Exception)]
+        losses = [(stream, str(item)) for _, stream, item in log.events() if isinstance(item, Exception)]
     assert [stream for stream, _ in losses] == ["inclinometer"]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recordings import McapSource
-from recordings.inventory import describe, format_description
+from recordings.inventory import format_description
 from recordings.ros2 import transform_message
 from stages.data import Transform
 from tests.recordings.sample_log import (
@@ -22,6 +22,7 @@ from tests.recordings.sample_log import (
     START,
     TILT,
     TRANSFORMS,
+    inventory_of,
     rewritten,
     write_sample,
 )
@@ -31,7 +32,7 @@ from tests.recordings.test_mcap_log import copied
 @pytest.fixture(scope="module")
 def description(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     path = write_sample(tmp_path_factory.mktemp("log") / "sample.mcap")
-    described: dict[str, Any] = json.loads(json.dumps(describe(path, McapSource())))
+    described: dict[str, Any] = json.loads(json.dumps(inventory_of(path)))
     return described
 
 
@@ -56,7 +57,7 @@ def test_calibration_transforms_and_pairs_are_told(description: dict[str, Any]) 
 
 def test_the_text_names_every_topic_its_stream_and_what_is_missing(tmp_path: Path) -> None:
     path = write_sample(tmp_path / "log.mcap", lambda topic, number, m: None if topic == "/odom" else m)
-    text = format_description(describe(path, McapSource()))
+    text = format_description(inventory_of(path))
     line = next(line for line in text.splitlines() if line.startswith(LEFT))
     assert line.split() == [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100", "s", "left"]
     assert "missing: odometry: the log has no nav_msgs/Odometry" in text
@@ -73,10 +74,10 @@ def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: P
         return message
 
     path = write_sample(tmp_path / "log.mcap", edit)
-    frames = describe(path, McapSource())["frames"]
+    frames = inventory_of(path)["frames"]
     assert frames["pairs"] == FRAMES - 1
     assert frames["with_tilt"] == 2  # the first and the last frame, which have a tilt of their own
-    wider = describe(path, McapSource(), slop=6_000_000, max_gap=400_000_000)
+    wider = inventory_of(path, slop=6_000_000, max_gap=400_000_000)
     assert (wider["frames"]["pairs"], wider["frames"]["with_tilt"]) == (FRAMES, FRAMES)
     assert "5 pairs within 6 ms of 5 left and 5 right images; tilts around 5 of the left" in format_description(wider)
     assert "of the left ones, at most 400 ms apart" in format_description(wider)
@@ -88,7 +89,7 @@ def test_repeated_stamps_count_once_and_are_told(tmp_path: Path) -> None:
             message.header.stamp.nanosec -= PERIOD
         return message
 
-    described = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())
+    described = inventory_of(write_sample(tmp_path / "log.mcap", edit))
     frames = described["frames"]
     assert (frames["left"], frames["right"]) == (FRAMES, FRAMES)
     assert (frames["pairs"], frames["with_tilt"]) == (FRAMES - 1, FRAMES - 1)
@@ -98,7 +99,7 @@ def test_repeated_stamps_count_once_and_are_told(tmp_path: Path) -> None:
 
 def test_of_cameras_that_are_missing_no_pairs_are_told(tmp_path: Path) -> None:
     edit = lambda topic, _, message: None if topic.endswith("camera_info") else message  # noqa: E731
-    text = format_description(describe(write_sample(tmp_path / "log.mcap", edit), McapSource()))
+    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
     assert "missing: left: no CameraInfo belongs to" in text
     assert "frames:" not in text
 
@@ -110,7 +111,7 @@ def test_tilts_that_cannot_be_read_are_told_in_a_line_with_the_first_of_them(tmp
             message.orientation.w = 0.0 if number < 3 else 0.25
         return message
 
-    described = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())
+    described = inventory_of(write_sample(tmp_path / "log.mcap", edit))
     assert len(described["damage"]) == FRAMES - 1
     (line,) = (line for line in format_description(described).splitlines() if line.startswith("damaged"))
     assert line.startswith(
@@ -124,7 +125,7 @@ def test_streams_whose_headers_have_no_stamp_are_told_to_go_by_the_time_of_the_l
             message.header.stamp.sec = message.header.stamp.nanosec = 0
         return message
 
-    described = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())
+    described = inventory_of(write_sample(tmp_path / "log.mcap", edit))
     assert list(described["notes"]) == ["left", "odometry"]
     assert [line for line in format_description(described).splitlines() if line.startswith("note: ")] == [
         "note: left: header stamps are 0: log times are used",
@@ -141,7 +142,7 @@ def test_a_calibration_that_may_be_of_another_image_size_is_doubted(tmp_path: Pa
     path = write_sample(tmp_path / "log.mcap", edit)
     assert (
         "doubtful: cx of 11.5 px lies in the outer fifth of 60x32 images: check that the calibration is for this size"
-        in (format_description(describe(path, McapSource())))
+        in (format_description(inventory_of(path)))
     )
 
 
@@ -180,7 +181,7 @@ def test_a_baseline_that_is_told_twice_or_by_the_transform_alone_is_noted(
         return message
 
     path = write_sample(tmp_path / "log.mcap", edit)
-    described = describe(path, McapSource())
+    described = inventory_of(path)
     assert described["calibration"]["baseline"] == pytest.approx(told or told_by_transform)
     unstamped = "header stamps are 0: log times are used"
     assert described["notes"] == {"right": f"{unstamped}; {note}" if note else unstamped}
@@ -189,7 +190,7 @@ def test_a_baseline_that_is_told_twice_or_by_the_transform_alone_is_noted(
 
 def test_a_missing_right_calibration_is_said_in_whole_sentences(tmp_path: Path) -> None:
     edit = lambda topic, _, message: None if topic == "/stereo/right/camera_info" else message  # noqa: E731
-    text = format_description(describe(write_sample(tmp_path / "log.mcap", edit), McapSource()))
+    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
     listed = "the log's CameraInfo topics are /stereo/left/camera_info"
     why = f"no CameraInfo belongs to {RIGHT} ({listed}); set 'right_info'"
     assert [line.partition(" of the source")[0] for line in text.splitlines() if line.startswith("missing")] == [
@@ -200,7 +201,7 @@ def test_a_missing_right_calibration_is_said_in_whole_sentences(tmp_path: Path) 
 
 def test_topics_that_cannot_be_decoded_are_listed_once(tmp_path: Path) -> None:
     path = copied(write_sample(tmp_path / "log.mcap"), tmp_path / "odd.mcap", lambda *of: ("protobuf", of[2]))
-    text = format_description(describe(path, McapSource()))
+    text = format_description(inventory_of(path))
     assert text.count("cannot be decoded") == text.count(f"{LEFT}: its messages are in 'protobuf'") == 1
     assert "missing: left, right: the log has no camera image" in text
     with McapSource().open(path) as log:  # a refusal stands alone
@@ -209,14 +210,14 @@ def test_topics_that_cannot_be_decoded_are_listed_once(tmp_path: Path) -> None:
 
 def test_one_is_not_many(tmp_path: Path) -> None:
     edit = lambda topic, number, message: None if number else message  # noqa: E731
-    text = format_description(describe(write_sample(tmp_path / "log.mcap", edit), McapSource()))
+    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
     assert "1 pair within 5 ms of 1 left and 1 right image; tilts around 1 of the left" in text
 
 
 def test_damage_is_told(tmp_path: Path) -> None:
     path = rewritten(write_sample(tmp_path / "sample.mcap"), tmp_path / "log.mcap", chunk_size=500)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    description = describe(path, McapSource())
+    description = inventory_of(path)
     assert not description["indexed"]
     assert "the log is cut or damaged at byte" in description["damage"][0]
     assert "damaged: the log is cut" in format_description(description)
@@ -228,6 +229,6 @@ def test_an_imu_without_orientation_is_not_taken_for_an_inclinometer(tmp_path: P
             message.orientation_covariance = np.full(9, -1.0)
         return message
 
-    description = describe(write_sample(tmp_path / "log.mcap", edit), McapSource())
+    description = inventory_of(write_sample(tmp_path / "log.mcap", edit))
     assert "holds no orientation" in description["missing"]["inclinometer"]
     assert description["frames"]["with_tilt"] == 0

@@ -16,7 +16,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.inventory import describe
 from recordings.mcap_reader import iter_decoded
 from tests.recordings.sample_log import (
     FRAMES,
@@ -26,6 +25,7 @@ from tests.recordings.sample_log import (
     RIGHT,
     START,
     TILT,
+    inventory_of,
     items_of,
     rewritten,
     write_sample,
@@ -109,13 +109,13 @@ def left_of(log: Any) -> tuple[list[int], list[str]]:
 def test_a_calibration_that_changed_before_the_range_or_excerpt_is_known(tmp_path: Path, layout: str) -> None:
     path = calibrated_once_more(tmp_path / "log.mcap", layout)
     with McapSource().open(path, start=7) as log:
-        read, lost = left_of(log)
+        read, lost = left_of(log.events())
         assert (read, len(lost)) == ([], 1)
         assert f"where it changes (at or before {START + 2 * PERIOD} ns)" in lost[0]
         excerpts = [left_of(events)[0] for events in log.excerpts(FRAMES, {"left", "right"})]
     assert excerpts == [[0, 1], [1], [], [], []]
     with McapSource().open(path, start=3) as log:
-        assert f"where it changes ({START + 2 * PERIOD} ns)" in left_of(log)[1][0]
+        assert f"where it changes ({START + 2 * PERIOD} ns)" in left_of(log.events())[1][0]
 
 
 def test_a_damaged_calibration_before_the_range_leaves_the_one_before_it_in_force(tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_damaged_calibration_before_the_range_leaves_the_one_before_it_in_forc
     path.write_bytes(content)
     assert broken.message_start_time >= START + 60 * PERIOD
     with McapSource().open(path, start=8.0) as log:
-        read, lost = left_of(log)
+        read, lost = left_of(log.events())
         assert (read, lost[-1].rpartition("(")[2]) == ([], f"at or before {START + 2 * PERIOD} ns)")
 
 
@@ -159,11 +159,11 @@ def test_messages_of_a_topic_in_another_encoding_are_told_with_their_number(
     with McapSource().open(path) as log:
         assert log.missing == {}
         assert log.frames == (3 if topic == LEFT else FRAMES)
-        losses = [(name, str(item)) for _, name, item in log if isinstance(item, Exception)]
+        losses = [(name, str(item)) for _, name, item in log.events() if isinstance(item, Exception)]
     assert [name for name, _ in losses] == [stream]
     assert f"{topic}: 2 messages of its channel" in losses[0][1]
     assert "in 'json', not in 'cdr'" in losses[0][1]
-    described = describe(path, McapSource())
+    described = inventory_of(path)
     counts = [(item["encoding"], item["messages"]) for item in described["topics"] if item["topic"] == topic]
     assert sorted(counts) == [("cdr", 3), ("json", 2)]
     assert described["damage"] == [losses[0][1]]
@@ -197,8 +197,8 @@ def test_a_type_with_other_fields_than_its_names_is_said_and_no_failure(
     path = copied(sample, tmp_path / "log.mcap", encode)
     with McapSource().open(path) as log:
         assert stream in log.missing
-        list(log)
-    describe(path, McapSource())
+        list(log.events())
+    inventory_of(path)
 
 
 @pytest.mark.parametrize("start", [None, 0.35])

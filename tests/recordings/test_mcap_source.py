@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.inventory import describe
 from recordings.ros2 import header, make, transform_message
 from stages.data import CameraImage, Mount, Transform
 from tests.recordings.sample_log import (
@@ -30,6 +29,7 @@ from tests.recordings.sample_log import (
     TRANSFORMS,
     WIDTH,
     essence,
+    inventory_of,
     items_of,
     model,
     picture,
@@ -50,7 +50,7 @@ def test_what_was_written_is_read_bit_for_bit(sample: Path) -> None:
     with McapSource().open(sample) as log:
         assert (log.missing, log.frames) == ({}, FRAMES)
         assert log.topics == {"left": LEFT, "right": RIGHT, "inclinometer": TILT, "odometry": "/odom"}
-        events = list(log)
+        events = list(log.events())
     assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
     by_stream = {stream: [item for _, name, item in events if name == stream] for stream in McapSource.streams}
     assert [len(by_stream[name]) for name in ("left", "right", "inclinometer", "mount", "odometry")] == [5, 5, 5, 1, 5]
@@ -98,7 +98,7 @@ def test_every_layout_of_file_gives_the_same_items(
 ) -> None:
     other = rewritten(sample, tmp_path / "other.mcap", **LAYOUTS[layout])
     assert [(t, s, essence(i)) for t, s, i in items_of(other)] == [(t, s, essence(i)) for t, s, i in whole]
-    assert describe(other, McapSource())["frames"]["pairs"] == FRAMES
+    assert inventory_of(other)["frames"]["pairs"] == FRAMES
 
 
 def test_messages_come_in_log_time_order_whatever_their_order_in_the_file(sample: Path, tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_messages_come_in_log_time_order_whatever_their_order_in_the_file(sample
 def test_a_range_holds_whole_frames_and_the_tilts_around_them(sample: Path) -> None:
     with McapSource().open(sample, start=0.1, end=0.3) as log:
         assert log.frames == 2
-        events = list(log)
+        events = list(log.events())
     stamps = {s: [i.stamp - START for _, stream, i in events if stream == s] for s in ("left", "right", "inclinometer")}
     assert stamps["left"] == stamps["right"] == [PERIOD, 2 * PERIOD]
     assert stamps["inclinometer"] == [number * PERIOD for number in range(FRAMES)]
@@ -182,7 +182,7 @@ def test_what_is_missing_is_said_with_the_remedy(tmp_path: Path, edit: Any, stre
 def test_pairs_are_found_by_the_names_cameras_go_by(tmp_path: Path, names: tuple[str, str]) -> None:
     with McapSource().open(write_sample(tmp_path / "log.mcap", names=names)) as log:
         assert (log.topics["left"], log.topics["right"]) == names
-        assert {item.stamp for _, stream, item in log if stream == "left"} == {
+        assert {item.stamp for _, stream, item in log.events() if stream == "left"} == {
             START + n * PERIOD for n in range(FRAMES)
         }
 
@@ -223,7 +223,7 @@ def test_baseline_and_rectification_of_two_single_calibrations_come_from_their_t
 
     path = write_sample(tmp_path / "log.mcap", edit, names=("/left/image_raw", "/right/image_raw"))
     with McapSource().open(path) as log:
-        events = list(log)
+        events = list(log.events())
     left, right = (next(i for _, s, i in events if s == side) for side in ("left", "right"))
     camera = left.pair_with(right).camera
     assert camera.baseline == pytest.approx(np.hypot(0.3, 0.01))
@@ -271,7 +271,7 @@ def test_a_camera_whose_images_nobody_can_read_is_missing_before_the_run(tmp_pat
         assert list(log.missing) == ["right"]
         assert log.missing["right"].startswith(f"{RIGHT}: image encoding 'yuv422_yuy2' is not one of those that can be")
         assert "(mono8, 8UC1, " in log.missing["right"]
-    described = describe(path, McapSource())
+    described = inventory_of(path)
     assert (described["frames"]["pairs"], described["missing"]) == (0, log.missing)
 
 

@@ -31,7 +31,7 @@ def imported(folder: Path) -> tuple[Path, str]:
 def frame_of(log: Path) -> StereoFrame:
     with McapSource().open(log) as opened:
         assert set(opened.missing) == {"odometry"}
-        images = {stream: item for _, stream, item in opened if stream in ("left", "right")}
+        images = {stream: item for _, stream, item in opened.events() if stream in ("left", "right")}
     return images["left"].pair_with(images["right"])
 
 

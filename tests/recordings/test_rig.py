@@ -192,7 +192,7 @@ def test_a_rectified_image_has_a_frame_of_its_own_where_r_turns_the_camera(tmp_p
         return message
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=RECTIFIED)) as log:
-        found = {stream: item for _, stream, item in log if stream in ("left", "mount", "odometry")}
+        found = {stream: item for _, stream, item in log.events() if stream in ("left", "mount", "odometry")}
         camera, mount, pose = found["left"], found["mount"].base_from_camera, found["odometry"]
     assert camera.frame_id == mount.child == pose.child_frame_id == "left_optical_rectified"
     own = TRANSFORMS[0].rotation  # of the camera on the rover
@@ -252,7 +252,7 @@ def test_a_transform_that_cannot_be_is_told_and_the_others_hold(tmp_path: Path, 
         np.testing.assert_allclose(
             log.mount.camera_from_inclinometer, TRANSFORMS[0].rotation.T @ TRANSFORMS[1].rotation, atol=1e-12
         )
-        told = [(stream, item) for _, stream, item in log if isinstance(item, Exception)]
+        told = [(stream, item) for _, stream, item in log.events() if isinstance(item, Exception)]
     assert [stream for stream, _ in told] == ["log"]
     with pytest.raises(LogError, match=said):
         raise told[0][1]
@@ -266,7 +266,7 @@ def test_a_translation_that_is_not_finite_is_told_and_not_used(tmp_path: Path) -
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert "no static transform joins the camera" in log.missing["mount"]
-        told = [str(item) for _, _, item in log if isinstance(item, Exception)]
+        told = [str(item) for _, _, item in log.events() if isinstance(item, Exception)]
     what = "the translation of the transform 'base_link' <- 'left_optical'"
     assert told == [f"/tf_static: {what} is [nan, 0.1, 0.9], which is no place"]
 
@@ -288,7 +288,7 @@ def test_a_long_chain_of_transforms_is_followed_either_way():
 
 def test_a_transform_that_is_told_again_is_no_contradiction(tmp_path: Path) -> None:
     with McapSource().open(with_transforms(tmp_path / "log.mcap", *TRANSFORMS, TRANSFORMS[0].inverse())) as log:
-        assert not [item for _, _, item in log if isinstance(item, Exception)]
+        assert not [item for _, _, item in log.events() if isinstance(item, Exception)]
         assert log.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]
 
 

@@ -13,9 +13,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from recordings import McapSource, mcap_opening
-from recordings.inventory import describe
 from recordings.mcap_index import JITTER
-from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, items_of
+from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, inventory_of, items_of
 
 BACK = 2 * PERIOD + PERIOD // 2
 FIRST = 3  # the first frame after the clock was set back
@@ -65,7 +64,7 @@ def test_what_follows_a_clock_set_back_is_lost_until_that_time_has_come(
     assert {item.stamp for item in surveyed if not isinstance(item, Exception)} == {
         START + number * PERIOD for number in range(FIRST)
     }
-    description = describe(path, McapSource())
+    description = inventory_of(path)
     assert description["frames"]["pairs"] == FIRST
     assert f"{LEFT} at {images[0][0]} ns: {said}" in description["damage"]
 
@@ -133,7 +132,9 @@ def test_a_clock_set_back_by_all_that_was_recorded_takes_no_sensor(
 
     with McapSource().open(reordered(sample, tmp_path / "log.mcap", far_back)) as log:
         assert log.missing == {}
-        stamps = [item.stamp for _, stream, item in log if stream == "left" and not isinstance(item, Exception)]
+        stamps = [
+            item.stamp for _, stream, item in log.events() if stream == "left" and not isinstance(item, Exception)
+        ]
     assert stamps == [START + number * PERIOD for number in range(FIRST)]
 
 
