@@ -167,9 +167,11 @@ def run(
         kept = engine is not None and engine.whole == engine.admitted and not len(ledger)
         whole = finished and kept and not sinks.errors
         sinks.discard(only_empty=bool(engine and engine.through))
-        summary = _summary(graph, feeder, engine, ledger, times) | {
+        summary = {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
+            "pipeline": graph.name,
+            **_counted(feeder, engine, ledger, times),
             "surveys": surveys,
             "findings": _notes(log, graph) | findings(graph),
             "outputs": [str(outputs[use]) for use in sinks.opened],
@@ -240,14 +242,10 @@ def _peak_memory_mb() -> float:
     return round(peak * (1 if sys.platform == "darwin" else 1024) / 1e6, 1)
 
 
-def _summary(
-    graph: Graph, feeder: Feeder, engine: Engine | None, ledger: Ledger, times: dict[str, float]
-) -> dict[str, Any]:
+def _counted(feeder: Feeder, engine: Engine | None, ledger: Ledger, times: dict[str, float]) -> dict[str, Any]:
+    """Of the summary, what is counted and timed."""
     frames_out = engine.whole if engine else 0
     return {
-        "verdict": "",
-        "interrupted": False,
-        "pipeline": graph.name,
         "frames_in": engine.admitted if engine else 0,
         "frames_out": frames_out,
         "frames_through": engine.through if engine else 0,  # whole or not
