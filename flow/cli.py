@@ -26,8 +26,9 @@ from flow.graph import Graph
 from flow.program import INTERRUPTED
 from flow.replay import as_json, product_version, replay
 from flow.report import counted, headline, report, say
+from recordings.earlier_output import is_ours
 from recordings.errors import LogError, UnwritableError
-from recordings.whole_file import is_ours, writing, written
+from recordings.whole_file import writing, written
 
 BEGINNING = 0.6  # s of the demo's traverse, one frame
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE = 0, 1, 2, 3

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
 from recordings.ros2 import stamp_of
-from recordings.ros2_writer import LAST_STAMP
+from recordings.ros2_types import LAST_STAMP
 from stages.data import Array, CameraModel, Pose, Tilt, Transform
 
 # Encoding -> (dtype, channels in the message, conversion to gray or RGB)
@@ -118,20 +118,29 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
 def _compressed_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     data = np.ascontiguousarray(message.data, np.uint8)
     content = data.tobytes()
-    # OpenCV fills the missing part of a cut picture with gray and says nothing. Padding may follow the end, and the
-    # rest of a camera's buffer, which is zero.
+    # Of a JPEG that lacks a little of its end, OpenCV may say nothing and make a picture that is wrong there, if zeros
+    # follow: the rest of a camera's buffer. Behind a whole picture these, or other padding, do no harm.
     end = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(content[:2], b"")
     if end not in content.rstrip(b"\0")[-_PADDING:]:
         raise LogError(f"the compressed image is cut after {data.size} bytes")
     stated = _stated_size(content)
     if stated is not None:
         _check_size(*stated, size)
-    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if stated else None
-    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
-        raise LogError(f"the compressed image (format '{message.format}') cannot be decoded; it should be JPEG or PNG")
     encoding = message.format.split(";")[0].strip()
+    pixels = unpacked_pixels(data, _BAYER.get(encoding.rstrip("0123456789"))) if stated else None
+    if pixels is None:
+        raise LogError(f"the compressed image (format '{message.format}') cannot be decoded; it should be JPEG or PNG")
+    return pixels
+
+
+def unpacked_pixels(data: Array, mosaic: int | None = None) -> Array | None:
+    """Gray (H, W) or RGB (H, W, 3) pixels, uint8 or uint16, of an image file's bytes (n,); None where OpenCV makes none
+    such of them. mosaic: its conversion of a Bayer pattern, where a single channel is one."""
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        return None
     if pixels.ndim == 2:
-        return _converted(pixels, _BAYER.get(encoding.rstrip("0123456789")))
+        return _converted(pixels, mosaic)
     return _converted(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
 
 

@@ -78,6 +78,7 @@ class Canvas:
     camera: StereoCamera | None = None
     _curves: dict[Panel, list[str]] = field(default_factory=dict)
     _said: dict[str, str] = field(default_factory=dict)
+    _legends: dict[str, Mapping[int, tuple[str, paint.Rgb]]] = field(default_factory=dict)
     _kept: dict[str, Hashable] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
@@ -123,8 +124,8 @@ class Canvas:
 
     def labels(self, path: str, codes: Array, legend: Mapping[int, tuple[str, paint.Rgb]], place: Place) -> None:
         """A label image (H, W); its names stand above it and appear on hover."""
-        if self._said.get(path) != str(legend):
-            self._said[path] = str(legend)
+        if self._legends.get(path) != legend:
+            self._legends[path] = legend
             names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
             self.recording.log(path, rr.AnnotationContext(names), static=True)
         self.log(f"{path}/labels", rr.SegmentationImage(codes.astype(np.uint8)), place)
@@ -178,7 +179,7 @@ def draw_stereo(canvas: Canvas, path: str, frame: StereoFrame) -> None:
     canvas.camera = canvas.camera or frame.camera
     own = same_view(frame.camera, canvas.camera)
     left, right = (Panel.LEFT, Panel.RIGHT) if own else (Panel.LEFT_DERIVED, Panel.RIGHT_DERIVED)
-    pixels = paint.eight_bit(frame.left, frame.right)
+    pixels = paint.top_eight_bits(frame.left, frame.right)
     canvas.photograph(f"{path}/left", pixels[0], Place(left, f"{path}/left", f"{path}: left"))
     canvas.photograph(f"{path}/right", pixels[1], Place(right, f"{path}/right", f"{path}: right"))
 
@@ -328,7 +329,7 @@ def draw_camera(canvas: Canvas, path: str, frame: StereoFrame, cloud: PointCloud
     if sensor is None:
         return
     small = cv2.resize(
-        paint.eight_bit(frame.left, frame.right)[0], None, fx=THUMBNAIL, fy=THUMBNAIL, interpolation=cv2.INTER_AREA
+        paint.top_eight_bits(frame.left, frame.right)[0], None, fx=THUMBNAIL, fy=THUMBNAIL, interpolation=cv2.INTER_AREA
     )
     height, width = small.shape[:2]
     at, line = f"{path}/camera", f"{path}/plumb"

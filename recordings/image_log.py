@@ -13,23 +13,24 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from recordings.decode import unpacked_pixels
 from recordings.discovery import SIDES
 from recordings.errors import LogError, counted
 from recordings.rig import BODY_FROM_OPTICAL, pinhole
-from recordings.ros2 import Ros2Writer, camera_info, image, imu, transform_message
-from recordings.ros2_writer import LAST_STAMP
+from recordings.ros2 import camera_info, image, imu, transform_message
+from recordings.ros2_types import LAST_STAMP
+from recordings.ros2_writer import Ros2Writer
 from stages.data import Array, StereoCamera, StereoFrame, Transform
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
 FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
-CAMERAS = {"left": "left_camera_optical", "right": "right_camera_optical"}
+CAMERA_FRAMES = {"left": "left_camera_optical", "right": "right_camera_optical"}
 # Ground truth that data sets put beside their images, as Middlebury's mask0nocc.png.
-_NOT_CAMERAS = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
+_NOT_CAMERA_FRAMES = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
 _LISTED = 5  # files in a sentence
 _LARGEST = 1e9  # px or m
 _REQUIRED, _OPTIONAL = ("fx", "cx", "cy", "baseline"), ("fy", "cx_right", "width", "height")
@@ -110,7 +111,7 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
     near = (f for pattern in ("*", "*/*") for f in folder.glob(pattern) if not f.parent.name.startswith("."))
     files = sorted((f for f in near if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
     named = {file.relative_to(folder).as_posix(): file for file in files}
-    names = {name: file for name, file in named.items() if not _NOT_CAMERAS.search(name)}
+    names = {name: file for name, file in named.items() if not _NOT_CAMERA_FRAMES.search(name)}
     for word, other in SIDES:
         partners = {name: word.sub(other, name) for name in names if word.search(name)}
         pairs = [(one, two) for one, two in partners.items() if two in names and not _counted(one, word, names)]
@@ -194,7 +195,7 @@ def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) ->
     if (values.setdefault("width", width), values.setdefault("height", height)) != (width, height):
         expected = f"{values['width']:g}x{values['height']:g}"
         raise LogError(f"{pair[0]} is {width}x{height}, the calibration or the first pair is {expected}")
-    camera = StereoCamera(**{**values, "width": width, "height": height}, frame_id=CAMERAS["left"])
+    camera = StereoCamera(**{**values, "width": width, "height": height}, frame_id=CAMERA_FRAMES["left"])
     return StereoFrame(stamp, images[0], images[1], camera)
 
 
@@ -202,8 +203,8 @@ def _mounts(baseline: float, pitch_down: float, roll: float, height: float) -> t
     """The left camera on the rover, the right one beside it, and the inclinometer."""
     rotation = Rotation.from_euler("YX", [pitch_down, roll], degrees=True).as_matrix() @ BODY_FROM_OPTICAL
     return (
-        Transform("base_link", CAMERAS["left"], rotation, np.array([0.0, 0.0, height])),
-        Transform(CAMERAS["left"], CAMERAS["right"], np.eye(3), np.array([baseline, 0.0, 0.0])),
+        Transform("base_link", CAMERA_FRAMES["left"], rotation, np.array([0.0, 0.0, height])),
+        Transform(CAMERA_FRAMES["left"], CAMERA_FRAMES["right"], np.eye(3), np.array([baseline, 0.0, 0.0])),
         Transform("base_link", "imu_link", np.eye(3), np.zeros(3)),
     )
 
@@ -214,9 +215,9 @@ def _write_tilt(writer: Ros2Writer, stamp: int) -> None:
 
 def _write_images(writer: Ros2Writer, frame: StereoFrame) -> None:
     for side, pixels in (("left", frame.left), ("right", frame.right)):
-        info = camera_info(frame.stamp, CAMERAS[side], pinhole(frame.camera, side))
+        info = camera_info(frame.stamp, CAMERA_FRAMES[side], pinhole(frame.camera, side))
         writer.write(f"/stereo/{side}/camera_info", info, frame.stamp)
-        writer.write(f"/stereo/{side}/image_rect", image(frame.stamp, CAMERAS[side], pixels), frame.stamp)
+        writer.write(f"/stereo/{side}/image_rect", image(frame.stamp, CAMERA_FRAMES[side], pixels), frame.stamp)
 
 
 def _pixels(path: Path) -> Array:
@@ -225,9 +226,7 @@ def _pixels(path: Path) -> Array:
         data = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
         raise LogError(f"cannot read {path}: {error.strerror or error}") from error
-    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+    pixels = unpacked_pixels(data)
+    if pixels is None:
         raise LogError(f"{path} is not an image of 8 or 16 bit that can be read")
-    if pixels.ndim == 2:
-        return np.asarray(pixels)
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB))
+    return pixels

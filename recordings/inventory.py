@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import counted
+from recordings.mcap_cameras import CAMERAS
 from recordings.mcap_index import Lost
 from recordings.mcap_log import McapLog
-from recordings.mcap_opening import CAMERAS, peek_stamp
+from recordings.mcap_messages import peek_stamp
 from stages.data import StereoCamera, Tilt
 
 Stamps = NDArray[np.int64]
@@ -25,7 +26,8 @@ def describe(log: McapLog, slop: int = 5_000_000, max_gap: int | None = 200_000_
     tilts around a frame, ns, None: they are not counted. Only stamps count here: a run waits for none that is logged
     too late.
     """
-    damage = sorted({lost.reason for lost in log.file.index.lost} | {str(problem) for _, problem in log.problems})
+    opening, lost = log.opening, log.file.index.lost
+    damage = sorted({item.reason for item in lost} | {str(problem) for _, problem in opening.problems})
     stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
     stamps["inclinometer"] = _tilts(log, damage)
     left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
@@ -49,10 +51,10 @@ def describe(log: McapLog, slop: int = 5_000_000, max_gap: int | None = 200_000_
             "with_tilt": None if max_gap is None else _tilted(left, tilts, max_gap),
             "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
         },
-        "transforms": log.static.listed(),
+        "transforms": opening.static.listed(),
         "mount": _mount(log),
-        "missing": dict(log.lacking),
-        "undecodable": log.undecodable,
+        "missing": dict(opening.lacking),
+        "undecodable": opening.undecodable,
         "damage": list(dict.fromkeys(damage)),
     }
 
@@ -190,9 +192,9 @@ def _tilted(left: Stamps, tilt: Stamps, max_gap: int) -> int:
 
 
 def _calibration(log: McapLog) -> dict[str, Any] | None:
-    if log.cameras is None:
+    if log.opening.cameras is None:
         return None
-    left, right = log.cameras
+    left, right = log.opening.cameras
     camera = StereoCamera.from_models(left.model, right.model, left.image_frame, left.rectified)
     names = ("width", "height", "fx", "fy", "cx", "cy", "cx_right", "baseline", "frame_id")
     values = {name: getattr(camera, name) for name in names}
@@ -200,11 +202,12 @@ def _calibration(log: McapLog) -> dict[str, Any] | None:
 
 
 def _mount(log: McapLog) -> dict[str, Any] | None:
-    if log.mount is None:
+    mount = log.opening.mount
+    if mount is None:
         return None
-    base = log.mount.base_from_camera
+    base = mount.base_from_camera
     return {
-        "camera_from_inclinometer": log.mount.camera_from_inclinometer.tolist(),
+        "camera_from_inclinometer": mount.camera_from_inclinometer.tolist(),
         "base": None if base is None else base.parent,
         "position": None if base is None else base.translation.tolist(),
     }

@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 from recordings.decode import camera_model, frame_of, pixels_of, pose_of, stamp_or, tilt_of
 from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import LogError, said
+from recordings.mcap_cameras import CAMERAS
 from recordings.mcap_index import Lost, Raw
-from recordings.mcap_opening import CAMERAS, Decoder, Opening, peek_stamp
+from recordings.mcap_messages import Decoder, peek_stamp
+from recordings.mcap_opening import Opening
 from recordings.mcap_reader import McapFile
-from recordings.rig import Camera, Frames
-from stages.data import CameraImage, CameraModel, Mount, Pose, Tilt
+from recordings.rig import Camera
+from stages.data import CameraImage, CameraModel, Pose, Tilt
 
 if TYPE_CHECKING:
     from recordings.mcap_source import McapSource
@@ -111,35 +113,26 @@ def is_within(stamp: int, log_time: int, low: int | None, high: int | None) -> b
 class McapLog:
     """An opened log.
 
-    missing: stream -> why the log does not provide it, and what to do; refused: setting of the source that the log does
-    not bear out -> why; lacking: as `missing`, without the topics that cannot be decoded, which `undecodable` lists;
-    topics: stream -> topic; frames: left images to come; cameras: the calibrated pair, where both are there; static:
-    the log's static transforms; problems: (stream, loss) that opening it came upon.
+    opening: what it offers, and of that, as the runtime asks for it: missing: stream -> why the log does not provide
+    it, and what to do; refused: setting of the source that the log does not bear out -> why; topics: stream -> topic.
     """
 
     path: Path
     source: McapSource
     start: float | None = None
     end: float | None = None
+    opening: Opening = field(init=False)
     missing: Mapping[str, str] = field(init=False)
     refused: Mapping[str, str] = field(init=False)
-    lacking: dict[str, str] = field(init=False)
-    undecodable: str = field(init=False)
-    topics: dict[str, str] = field(init=False)
-    cameras: tuple[Camera, Camera] | None = field(init=False)
-    static: Frames = field(init=False)
-    mount: Mount | None = field(init=False)
-    problems: list[tuple[str, LogError]] = field(init=False)
+    topics: Mapping[str, str] = field(init=False)
     _info_times: dict[str, NDArray[np.int64]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.file = McapFile(self.path)
         try:
             self._check_range()
-            self._opening = opening = Opening(self.file, self.source)
-            self.missing, self.refused, self.undecodable = opening.refusals(), opening.refused, opening.undecodable
-            self.lacking, self.topics, self.problems = opening.missing, opening.topics, opening.problems
-            self.cameras, self.static, self.mount = opening.cameras, opening.static, opening.mount
+            self.opening = opening = Opening(self.file, self.source)
+            self.missing, self.refused, self.topics = opening.missing, opening.refused, opening.topics
             self._check_images()
         except BaseException:
             self.file.close()
@@ -172,12 +165,12 @@ class McapLog:
     def _between(self, low: int | None, high: int | None, streams: Collection[str]) -> Iterator[tuple[int, str, Any]]:
         wide_low, wide_high = _widened(low, high)
         log_start = self.file.start if wide_low is None else max(wide_low, self.file.start)
-        for stream, problem in self.problems:
+        for stream, problem in self.opening.problems:
             if stream in (*streams, "log"):
                 yield log_start, stream, problem
-        if self.mount is not None and "mount" in streams:
-            yield log_start, "mount", self.mount
-        calibrations = {side: Calibrations(model) for side, (_, model) in self._opening.infos.items()}
+        if self.opening.mount is not None and "mount" in streams:
+            yield log_start, "mount", self.opening.mount
+        calibrations = {side: Calibrations(info.model) for side, info in self.opening.infos.items()}
         readings = self._info_readings(calibrations, streams)
         for reading in readings if log_start > self.file.start else ():
             self._note_last_before(log_start, reading)
@@ -211,18 +204,18 @@ class McapLog:
         """Stream -> what there is to say of it: that its messages, going by the first, have no stamps of their own; of
         the right camera, where the baseline is from if not from its CameraInfo alone."""
         notes = {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
-        if "right" in self.topics and (said := self._opening.baseline_note):
+        if "right" in self.topics and (said := self.opening.baseline_note):
             notes["right"] = "; ".join((*filter(None, [notes.get("right")]), said))
         return notes
 
     def _is_unstamped(self, stream: str, topic: str) -> bool:
         raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, Lost))
-        first = next(raws, None) if self._opening.schemas[topic] in STAMPED else None
+        first = next(raws, None) if self.opening.messages.schemas[topic] in STAMPED else None
         return first is not None and len(first.data) >= 12 and not peek_stamp(first.data)
 
     def channels(self, stream: str) -> set[int]:
         """The channels that a stream is read from."""
-        return self._opening.channels_of(self.topics[stream])
+        return self.opening.messages.channels_of(self.topics[stream])
 
     def close(self) -> None:
         """Close the file."""
@@ -262,8 +255,8 @@ class McapLog:
 
     def _info_readings(self, calibrations: dict[str, Calibrations], streams: Collection[str]) -> list[Reading]:
         return [
-            self._reading(side, topic, calibrations[side].note)
-            for side, (topic, _) in self._opening.infos.items()
+            self._reading(side, info.topic, calibrations[side].note)
+            for side, info in self.opening.infos.items()
             if side in self.topics and side in streams
         ]
 
@@ -273,23 +266,25 @@ class McapLog:
             "inclinometer": lambda message, log_time: self._of_the_mount(tilt(message, log_time)),
             "odometry": lambda message, log_time: self._of_the_image(pose_of(message, log_time, base_frame)),
         }
-        for side, camera in zip(CAMERAS, self.cameras or (), strict=False):
+        for side, camera in zip(CAMERAS, self.opening.cameras or (), strict=False):
             made[side] = _Images(camera, calibrations[side])
         chosen = [(stream, topic) for stream, topic in self.topics.items() if stream in made and stream in streams]
         return [self._reading(stream, topic, made[stream]) for stream, topic in chosen]
 
     def _of_the_mount(self, tilt: Tilt) -> Tilt:
         """The tilt, if its sensor is the one that the mount speaks of."""
-        known = self._opening.tilt_frame
+        known = self.opening.tilt_frame
         if known and tilt.frame_id != known:
             raise LogError(f"its frame is '{tilt.frame_id}', but the mount was found for '{known}'")
         return tilt
 
     def _of_the_image(self, pose: Pose | None) -> Pose | None:
-        return pose if pose is None or self.cameras is None else self.cameras[0].of_image(pose)
+        cameras = self.opening.cameras
+        return pose if pose is None or cameras is None else cameras[0].of_image(pose)
 
     def _reading(self, stream: str, topic: str, item: Callable[[Any, int], Any]) -> Reading:
-        decoders = {number: self._opening.decoders[number] for number in self._opening.channels_of(topic)}
+        messages = self.opening.messages
+        decoders = {number: messages.decoders[number] for number in messages.channels_of(topic)}
         return Reading(stream, topic, decoders, item)
 
     @staticmethod

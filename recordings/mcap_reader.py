@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from itertools import accumulate
@@ -308,20 +308,6 @@ def iter_decoded(
                 lose(f"{topic} at {item.log_time} ns cannot be decoded ({said(error)})")
                 continue
             yield topic, item.log_time, message
-
-
-def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:
-    """What to say of a log that holds none of the topics `wanted` of a run's results; and the `remedy` if it holds any
-    that would do `instead`."""
-    with McapFile(Path(path)) as log:
-        topics = sorted({log.channel(n).topic for n in log.index.channels if log.count({n})})
-    results = [topic for topic in topics if topic.startswith("/nav/")]
-    if not results:
-        return LogError(f"{path} is not a result log: it has no /nav topics; give the log that roverflow run wrote")
-    holds = f"no {wanted[0]}" if len(wanted) == 1 else f"none of {', '.join(wanted)}"
-    why = "the run made none, or its McapSink's 'results' leave it out"
-    more = f"; {remedy}" if set(instead) & set(results) else ""
-    return LogError(f"{path} holds {holds}, only {', '.join(results)}: {why}{more}")
 
 
 def _opened(path: Path) -> BinaryIO:

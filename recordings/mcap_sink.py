@@ -15,7 +15,6 @@ from typing import Any, ClassVar
 from recordings.errors import LogError
 from recordings.frame_record import FrameRecord, LossEntry
 from recordings.ros2 import (
-    Ros2Writer,
     diagnostics,
     disparity_image,
     grid_map,
@@ -26,7 +25,7 @@ from recordings.ros2 import (
     source_image,
     transform_message,
 )
-from recordings.ros2_writer import COMPRESSIONS
+from recordings.ros2_writer import COMPRESSIONS, Ros2Writer
 from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
 
 _BUILDERS: dict[type, Callable[[Any], Any]] = {

@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.image_log import CAMERAS, FIRST_STAMP, read_frame, write_frames
-from recordings.ros2 import Ros2Writer, disparity_image, image
+from recordings.image_log import CAMERA_FRAMES, FIRST_STAMP, read_frame, write_frames
+from recordings.ros2 import disparity_image, image
+from recordings.ros2_writer import Ros2Writer
 from recordings.stereo_measures import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns
 from stages.data import Array, Disparity, Source, StereoFrame
 
@@ -185,4 +186,4 @@ def _write_truth(writer: Ros2Writer, scene: Scene) -> None:
         message = replace(disparity_image(disparity), min_disparity=0.0, max_disparity=float(scene.ndisp))
         writer.write("/truth/disparity", message, stamp)
     if scene.occlusion is not None:
-        writer.write("/truth/occlusion", image(stamp, CAMERAS["left"], scene.occlusion), stamp)
+        writer.write("/truth/occlusion", image(stamp, CAMERA_FRAMES["left"], scene.occlusion), stamp)

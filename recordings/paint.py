@@ -67,9 +67,13 @@ def legend_colours(codes: Array, legend: Mapping[int, tuple[str, Rgb]]) -> Array
     return rgb
 
 
-def eight_bit(*images: Array) -> tuple[Array, ...]:
+def top_eight_bits(*images: Array) -> tuple[Array, ...]:
     """8 or 16 bit images of one exposure as 8 bit: the top bit that they use becomes bit 7, so a 12 bit camera is not
-    black. The brightest thousandth does not count, so that a hot pixel does not darken the rest."""
+    black. The brightest thousandth does not count, so that a hot pixel does not darken the rest.
+
+    Matching stretches its images by what each pair holds; here black stays black and most frames are shifted alike, so
+    that the pictures of a traverse do not flicker.
+    """
     deep = [pixels for pixels in images if pixels.dtype != np.uint8]
     top = max((_percentiles(pixels[::4, ::4].ravel(), 99.9)[0] for pixels in deep), default=0.0)
     shift = max(0, int(top).bit_length() - 8)

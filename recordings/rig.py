@@ -23,6 +23,7 @@ from stages.data import Array, CameraModel, Mount, Pose, StereoCamera, Transform
 # A camera's axes (x right, y down, z forward) in the rover's (x forward, y left, z up), when it looks straight ahead.
 BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
+EVER = 0  # ns, the stamp of what holds throughout: frames may be before the log's first message, or of another clock
 _SAME = 1e-6  # m and matrix elements; two transforms of the same frames that differ by more contradict each other
 _PARALLEL = 1e-3  # rad; cameras turned against each other by less need no rectification: a pixel at 1000 px
 _BESIDE = 0.01  # of the baseline; and so for cameras that are shifted against each other by less in y and z
@@ -271,9 +272,7 @@ def _rectifying(left: CameraModel, right: CameraModel, placed: Transform) -> tup
     return replace(left, r=made[0], p=made[2]), replace(right, r=made[1], p=made[3])
 
 
-def mounted(
-    stamp: int, camera: Camera, inclinometer: str, base: str, frames: Frames, given: Iterable[float] | None
-) -> Mount:
+def mounted(camera: Camera, inclinometer: str, base: str, frames: Frames, given: Iterable[float] | None) -> Mount:
     """How the left camera sits on the rover.
 
     inclinometer, base: their frames; given: quaternion xyzw that turns inclinometer into left rectified camera
@@ -282,7 +281,7 @@ def mounted(
     based = frames.between(base, camera.frame_id)
     rectified = Transform(camera.frame_id, camera.image_frame, camera.model.r.T, np.zeros(3))
     base_from_camera = based.after(rectified) if based is not None else None
-    return Mount(stamp, _camera_from_inclinometer(camera, inclinometer, frames, given), base_from_camera)
+    return Mount(EVER, _camera_from_inclinometer(camera, inclinometer, frames, given), base_from_camera)
 
 
 def _camera_from_inclinometer(

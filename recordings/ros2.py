@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recordings.ros2_types import TYPES, make
-from recordings.ros2_writer import Ros2Writer
+from recordings.ros2_types import make
 from stages.data import (
     Array,
     CameraModel,
@@ -29,13 +28,6 @@ from stages.data import (
     Reason,
     Transform,
 )
-
-__all__ = [
-    "TYPES", "Ros2Writer", "camera_info", "diagnostics", "disparity_image", "grid_map", "header", "image", "imu",
-    "make", "occupancy_grid", "odometry", "point_cloud", "read_disparity", "read_grid_map",
-    "read_occupancy_grid", "read_point_cloud", "reason_map", "source_image", "stamp_of",
-    "transform_message",
-]  # fmt: skip
 
 REASON_UNTOLD = 255  # in a map read back: a hazard, of which an OccupancyGrid alone cannot say why
 FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32

@@ -36,6 +36,8 @@ float64 length_y
 geometry_msgs/Pose pose
 """
 
+LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are 32 bits, with a sign
+
 _SAID = 100  # characters of what the parser says, which may hold the whole schema
 _registering = RLock()  # rosbags builds classes and codecs in module-wide state
 

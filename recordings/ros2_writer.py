@@ -15,12 +15,11 @@ from mcap.writer import CompressionType, Writer
 
 from recordings.errors import LogError, counted
 from recordings.mcap_reader import McapFile
-from recordings.ros2_types import TYPES
+from recordings.ros2_types import LAST_STAMP, TYPES
 from recordings.whole_file import give_name, temporary_name, unwritable
 
 LARGE = 64 * 1024  # bytes; from here a message gets a chunk of its own
 COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
-LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are 32 bits, with a sign
 
 
 class Ros2Writer:

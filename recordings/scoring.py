@@ -11,26 +11,22 @@ from __future__ import annotations
 import heapq
 import json
 import math
-import struct
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.records import Metadata
-from mcap.stream_reader import StreamReader
 from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2, terrain_measures
 from recordings.errors import LogError, said
 from recordings.mcap_log import is_within, part_of
-from recordings.mcap_reader import McapFile, iter_decoded, without_results
+from recordings.mcap_reader import McapFile, iter_decoded
 from recordings.pose_measures import PoseTally
+from recordings.result_log import part_run, without_results
 from recordings.stereo_measures import StereoErrors, cropped_columns
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
 
@@ -151,7 +147,7 @@ class _Tally:
             channels = log.index.channels
             self.truths = {channels[number].topic for number in channels if log.count({number}) or log.index.lost}
             with McapFile(result):  # or why that is none
-                self.part = part_of(log.start, *_part(result, truth))
+                self.part = part_of(log.start, *part_run(result, truth))
         self.outside: set[int] = set()  # stamps of the truth there, in the log that was run
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
@@ -306,20 +302,6 @@ class _Tally:
             pose=self.pose.measures(),
             per_frame=self.per_frame,
         )  # fmt: skip
-
-
-def _part(result: Path, truth: Path) -> tuple[float | None, float | None]:
-    """From where and to where the log `truth` was run, s after its first message; None where all of it was, or the
-    result does not tell."""
-    about: dict[str, str] = {}
-    with suppress(McapError, OSError, ValueError, struct.error), result.open("rb") as file:
-        # A header, and what a run says of itself before all else.
-        for record in islice(StreamReader(file, emit_chunks=True).records, 2):
-            about = record.metadata if isinstance(record, Metadata) else {}
-        if about.get("log") == truth.name.encode("utf-8", "replace").decode():
-            first, end = (about.get(name) for name in ("start", "end"))
-            return float(first) if first else None, float(end) if end else None
-    return None, None
 
 
 def _layers(message: Any, onto: ElevationMap) -> dict[str, Array]:

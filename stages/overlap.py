@@ -39,3 +39,8 @@ def fit_plane(x: Array, y: Array, off: Array, variance: Array, expected: Array, 
         weighted = design * (weight * trust)
         plane[known] = np.linalg.solve(weighted @ design.T + prior, weighted @ off)
     return plane
+
+
+def rise(plane: Array, x: Array, y: Array) -> Array:
+    """The height, m, of a plane of `fit_plane` at the places (x, y), (n,) m each: (n,)."""
+    return np.asarray(plane @ [np.ones_like(x), x, y])

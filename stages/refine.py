@@ -129,7 +129,7 @@ class Refine(Stage):
     ) -> tuple[Array, Array]:
         """Matches near their planes drawn towards them, holes filled from them, (H, W) float32; where, (H, W) bool."""
         margin = self.fill_margin if self.plane_fill else -1
-        planes = fit_planes(pixels, labels, count, self.inlier_distance, self.hypotheses, seed, weights, self.threads)
+        planes = fit_planes(pixels, labels, count, weights, self.hypotheses, self.inlier_distance, seed, self.threads)
         accepted = self._accepted(planes, self.valid_share)
         pixels, agreed = pull_to_planes(
             pixels, accepted, labels, within, self.near, self.plane_weight, margin, self.threads
@@ -142,8 +142,8 @@ class Refine(Stage):
         sparse, regions = (layer[few].copy() for layer in (pixels, labels))
         sparse[weights[few] == 0] = np.nan  # what the first planes filled is no evidence for the second
         planes = fit_planes(
-            sparse, group.take(regions), groups, self.inlier_distance, self.hypotheses, seed + 1,
-            np.ascontiguousarray(weights[few]), self.threads,
+            sparse, group.take(regions), groups, np.ascontiguousarray(weights[few]), self.hypotheses,
+            self.inlier_distance, seed + 1, self.threads,
         )  # fmt: skip
         accepted = (self._accepted(planes, self.valid_share / 2, 2) * [0.5, 0.5, 1])[group]
         pixels, again = pull_to_planes(
@@ -169,17 +169,14 @@ class Refine(Stage):
         if self.fill == "none":
             return pixels, kinds
         weights = np.where(hole, F32(0), np.maximum(confidence, F32(LEAST_WEIGHT)))
-        smoothed, _ = smooth(pixels, weights, guide, SMOOTHING, EDGE)
+        smoothed = smooth(pixels, weights, guide, SMOOTHING, EDGE)
         smoothed[~within_reach(pixels, within, self.fill_reach, self.fill_margin)] = np.nan
         return np.where(hole, smoothed, pixels), kinds
 
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
         if self.bilateral_radius == 0:
             return pixels
-        return joint_bilateral(
-            pixels, guide, self.bilateral_radius, self.bilateral_radius, BILATERAL_GRAY, BILATERAL_DISPARITY,
-            self.threads,
-        )  # fmt: skip
+        return joint_bilateral(pixels, guide, self.bilateral_radius, BILATERAL_GRAY, BILATERAL_DISPARITY, self.threads)
 
     def _borne_out(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> Array:
         """Where the images vary alike, so shifted, (H, W) bool."""

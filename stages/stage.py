@@ -12,6 +12,8 @@ from typing import Any
 
 from stages.data import Disparity, StereoFrame
 
+WIDEST = 4000  # cells, of a map
+
 
 def parameter(
     default: Any,
@@ -85,6 +87,16 @@ class Finding:
 def counted(number: int, what: str) -> str:
     """A number of things in words: "1 frame", "2 frames"."""
     return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def check_cells(what: str, width: float, resolution: float, times: int = 1) -> None:
+    """Raise ValueError for a map of more cells than memory has room for, `times` the width, m, of a parameter."""
+    cells = times * width / resolution
+    if cells > WIDEST:
+        raise ValueError(
+            f"{what} = {width:g} m makes a map {cells:.0f} cells of {resolution:g} m wide, and {WIDEST} is the most; "
+            "take larger cells or a smaller map"
+        )
 
 
 def check_rectified(stage: Stage, frame: StereoFrame) -> None:

@@ -17,10 +17,9 @@ from stages.kernels.grid import FIGURES, cell_percentile, cell_statistics
 from stages.kernels.neighbours import lie_of_cells
 from stages.kernels.occlusion import lowest_sight
 from stages.kernels.spread import laid_along_sight
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_cells, parameter
 
 Grid = tuple[float, tuple[float, float], int, float]  # resolution, origin, rows and columns, region
-WIDEST = 4000  # cells, of a map
 FINEST = 0.5  # of a cell, below which a point's reach is not worth following
 WITNESSES = 2  # places along lines of sight that a cell without a point of its own must have
 REACHED = 0.5  # the count of such a cell: less than a point
@@ -160,16 +159,6 @@ class Voxelise(Stage):
             + self.scatter * uneven
             + self.bend * bend * bend
             + np.where(beside, self.rim * rise, 0.0)
-        )
-
-
-def check_cells(what: str, width: float, resolution: float, times: int = 1) -> None:
-    """Raise ValueError for a map of more cells than memory has room for, `times` the width, m, of a parameter."""
-    cells = times * width / resolution
-    if cells > WIDEST:
-        raise ValueError(
-            f"{what} = {width:g} m makes a map {cells:.0f} cells of {resolution:g} m wide, and {WIDEST} is the most; "
-            "take larger cells or a smaller map"
         )
 
 

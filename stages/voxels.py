@@ -12,7 +12,7 @@ import numpy as np
 
 from stages.data import LEVEL_FRAME, PointCloud, VoxelMap
 from stages.kernels.voxels import voxel_means
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_cells, parameter
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,10 @@ class Voxels(Stage):
     resolution: float = parameter(0.05, "edge of a cube", unit="m", low=0.005, high=2.0)
     region: float = parameter(8.0, "horizontal range from the level frame's origin", unit="m", low=0.1, high=200.0)
     least: int = parameter(1, "points without which a cube is left out", low=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_cells("Voxels.region", self.region, self.resolution, 2)
 
     def __call__(self, cloud: PointCloud) -> VoxelMap:
         """The cubes of a cloud in frame `level`; there may be none."""

@@ -12,7 +12,7 @@ import pytest
 
 from recordings import ros2
 from recordings.mcap_reader import iter_decoded
-from recordings.ros2 import TYPES
+from recordings.ros2_types import TYPES
 from tests.conftest import FRAMES, rewrite, roverflow
 
 BAD = 1  # the frame that is made bad

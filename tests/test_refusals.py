@@ -15,7 +15,7 @@ import rerun
 from flow.arguments import check_demo
 from flow.errors import UsageError
 from recordings import McapSource, RerunSink
-from recordings.whole_file import is_ours
+from recordings.earlier_output import is_ours
 from tests.conftest import SMALL, rewrite, roverflow
 from tests.recordings.middlebury_scene import write_scene
 

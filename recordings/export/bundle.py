@@ -22,10 +22,11 @@ from recordings.decode import transform_of
 from recordings.errors import LogError, said
 from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
-from recordings.export.mosaic import RIM, Mosaic
+from recordings.export.mosaic import RIM, STRIP, Mosaic
 from recordings.export.ply import COLOURS, write_ply
-from recordings.mcap_reader import iter_decoded, without_results
+from recordings.mcap_reader import iter_decoded
 from recordings.paint import hillshade
+from recordings.result_log import without_results
 from recordings.whole_file import written
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Source, Tiles, Transform
 
@@ -123,9 +124,9 @@ def _export_frames(result: Path, out: Path, lost: Counter[str] | None) -> list[P
             _lay_terrain(mosaic, terrain)
             cells = None
             if FRAME[1] in frame:
-                map = _read(ros2.read_occupancy_grid, frame[FRAME[1]], result)
-                cells = _navigation_mosaic(map, 0.0)
-                _lay_navigation(cells, map)
+                navigation = _read(ros2.read_occupancy_grid, frame[FRAME[1]], result)
+                cells = _navigation_mosaic(navigation, 0.0)
+                _lay_navigation(cells, navigation)
             if mosaic.close():
                 files += _write_maps(folder, mosaic, cells, about)
         if POINTS in frame:
@@ -214,8 +215,8 @@ def _write_hillshade(path: Path, terrain: Mosaic) -> None:
     """1 to 255, bright where the sun falls in steeply, and 0 where nothing is known."""
     shades = np.zeros(terrain.shape, np.uint8)
     rows = terrain.shape[0]
-    for low in range(0, rows, 256):
-        high = min(rows, low + 256)
+    for low in range(0, rows, STRIP):
+        high = min(rows, low + STRIP)
         # With a row on either side, so that slopes are those of the whole map.
         block = terrain.block("elevation", low - 1, 0, high - low + 2, terrain.shape[1])
         lit = np.where(np.isfinite(block), 1 + 254 * hillshade(block, terrain.resolution, _NORTH_WEST), 0)
@@ -279,8 +280,8 @@ def _write_cells(path: Path, terrain: Mosaic, colours: Tiles, about: str) -> Non
     def parts() -> Iterator[Array]:
         rows, cols = terrain.shape
         first_col, first_row = (round(corner / terrain.resolution) for corner in terrain.origin)
-        for low in range(0, rows, 256):
-            count = min(256, rows - low)
+        for low in range(0, rows, STRIP):
+            count = min(STRIP, rows - low)
             elevation = terrain.block("elevation", low, 0, count, cols)
             known = np.isfinite(elevation)
             row, col = np.nonzero(known)

@@ -16,6 +16,7 @@ from stages.data import Array, Tiles
 
 LARGEST = 1 << 31  # cells of a rectangle; pictures of more are beyond what their readers take
 RIM = 1.5  # m; slopes and steps are measured over less than that; what a frame changes lies farther inside
+STRIP = 256  # rows that are read at a time, so that no map is in memory as a whole
 _ON_GRID = 1e-3  # of a cell; how far from its place a grid's corner may be by rounding
 
 
@@ -102,8 +103,8 @@ class Mosaic:
         inside[max(0, -row) : max(0, self.shape[0] - row), max(0, -col) : max(0, self.shape[1] - col)] = True
         return np.where(inside & (cells["laid"] > 0), cells[layer], self.fills[layer])
 
-    def strips(self, layer: str, rows: int = 256) -> Iterator[Array]:
-        """The layer from its largest y downwards, as blocks (up to `rows`, cols) whose first row is the uppermost."""
-        for top in range(self.shape[0], 0, -rows):
-            low = max(0, top - rows)
+    def strips(self, layer: str) -> Iterator[Array]:
+        """The layer from its largest y downwards, as blocks (up to `STRIP`, cols) whose first row is the uppermost."""
+        for top in range(self.shape[0], 0, -STRIP):
+            low = max(0, top - STRIP)
             yield self.block(layer, low, 0, top - low, self.shape[1])[::-1]

@@ -14,8 +14,8 @@ COLOURS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 _NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
 
-def write_ply(path: Path, dtype: np.dtype[np.void], parts: Iterable[Array], comment: str) -> int:
-    """Write vertices, and return how many.
+def write_ply(path: Path, dtype: np.dtype[np.void], parts: Iterable[Array], comment: str) -> None:
+    """Write vertices.
 
     dtype: a property each field; parts: structured arrays (n,) of it; comment: one line, ASCII. The number of points
     stands in the header, before the points, so it is filled in at the end.
@@ -27,7 +27,6 @@ def write_ply(path: Path, dtype: np.dtype[np.void], parts: Iterable[Array], comm
             count += len(part)
         file.seek(place)
         file.write(f"{count:>10d}".encode())
-    return count
 
 
 def _begin(file: BinaryIO, dtype: np.dtype[np.void], comment: str) -> int:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import ros2
 from recordings.rig import pinhole
+from recordings.ros2_types import make
 from recordings.simulator import ground_truth, raycast, traverse
 from stages.data import (
     LEVEL_FRAME,
@@ -165,10 +166,10 @@ def rocks_in_level(simulation: Simulation, truth: FrameTruth) -> Array:
 def _rocks_message(simulation: Simulation, stamp: int, truth: FrameTruth) -> Any:
     table = rocks_in_level(simulation, truth)
     fields = [
-        ros2.make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=ros2.FLOAT32, count=1)
+        make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=ros2.FLOAT32, count=1)
         for place, name in enumerate(ROCK_FIELDS)
     ]
-    return ros2.make(
+    return make(
         "sensor_msgs/msg/PointCloud2", header=ros2.header(stamp, LEVEL_FRAME), height=1, width=len(table),
         fields=fields, is_bigendian=False, point_step=4 * len(ROCK_FIELDS), row_step=4 * table.size,
         data=table.view(np.uint8).reshape(-1), is_dense=True,
@@ -184,5 +185,5 @@ def _tilt_message(stamp: int, truth: FrameTruth) -> Any:
     """geometry_msgs/QuaternionStamped: level <- base_link, in the header of base_link."""
     rotation = Rotation.from_matrix(truth.level.rotation.T @ truth.base.rotation)
     x, y, z, w = (float(value) for value in rotation.as_quat(canonical=True))
-    turn = ros2.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-    return ros2.make("geometry_msgs/msg/QuaternionStamped", header=ros2.header(stamp, "base_link"), quaternion=turn)
+    turn = make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    return make("geometry_msgs/msg/QuaternionStamped", header=ros2.header(stamp, "base_link"), quaternion=turn)

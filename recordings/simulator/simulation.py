@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recordings import ros2
+from recordings.ros2_writer import Ros2Writer
 from recordings.simulator import log, raycast, shading, sunlight, traverse
 from recordings.simulator.odometry import dead_reckoning
 from recordings.simulator.terrain import Terrain, make_terrain
@@ -219,7 +219,7 @@ class Simulation:
 
     def write(self, out: Path, progress: Callable[[int, int], None] | None = None) -> None:
         """Write the log. progress: called with (frames written, frames) after each frame."""
-        with ros2.Ros2Writer(Path(out)) as writer:
+        with Ros2Writer(Path(out)) as writer:
             for _, make_messages, index in sorted(self._events(), key=lambda event: event[0]):
                 for log_time, topic, message in make_messages():
                     writer.write(topic, message, log_time)

@@ -22,6 +22,8 @@ HURST = 0.7
 SHORTEST_WAVE = 0.35
 SHAPES = 32
 FACETS = 12
+DIAMETERS = 4000  # at which the size-frequency law is integrated
+DESCENTS = 150  # steps in which the bounds of the rocks' tops come close
 
 
 def decay(abundance: float) -> float:
@@ -29,12 +31,12 @@ def decay(abundance: float) -> float:
     return 1.79 + 0.152 / abundance
 
 
-def rocks_per_area(abundance: float, smallest: float, largest: float, steps: int = 4000) -> tuple[Array, Array]:
-    """Diameters (steps,), m, and the number of rocks per m^2 from `smallest` up to each of them.
+def rocks_per_area(abundance: float, smallest: float, largest: float) -> tuple[Array, Array]:
+    """Diameters (DIAMETERS,), m, and the number of rocks per m^2 from `smallest` up to each of them.
 
     The density that goes with F_k is n(D) = k q exp(-q D) / (pi D^2 / 4); it is integrated by the trapezoid rule.
     """
-    diameter = np.geomspace(smallest, largest, steps)
+    diameter = np.geomspace(smallest, largest, DIAMETERS)
     density = abundance * decay(abundance) * np.exp(-decay(abundance) * diameter) / (np.pi / 4 * diameter**2)
     number = np.concatenate([[0.0], np.cumsum(np.diff(diameter) * (density[1:] + density[:-1]) / 2)])
     return diameter, number
@@ -218,14 +220,14 @@ def _scene(ground: Array, resolution: float, rocks: Rocks, facets: Array) -> Sce
     )  # fmt: skip
 
 
-def _tops(facets: Array, steps: int = 150) -> Array:
+def _tops(facets: Array) -> Array:
     """Upper bounds, close ones, of how far the cut spheres `facets` (S, F, 4) reach upwards: (S,).
 
     With weights w >= 0 of the planes n . p <= d, every point has z <= w . d + |up - sum w n|; the weights go downhill.
     """
     normals, distance = facets[..., :3], facets[..., 3]
     weights, least = np.zeros(distance.shape), np.ones(len(facets))
-    for step in range(steps):
+    for step in range(DESCENTS):
         rest = np.array([0.0, 0.0, 1.0]) - np.einsum("sf,sfk->sk", weights, normals)
         length = np.linalg.norm(rest, axis=1)
         np.minimum(least, np.einsum("sf,sf->s", weights, distance) + length, out=least)

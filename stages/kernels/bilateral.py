@@ -18,12 +18,12 @@ FAR = F32(1e15)  # in scales of the difference in disparity; its square is still
 
 
 def joint_bilateral(
-    disparity: Array, guide: Array, radius: int, space: float, gray: float, range_scale: float, threads: int = 1
+    disparity: Array, guide: Array, radius: int, gray: float, range_scale: float, threads: int = 1
 ) -> Array:
     """Average each known disparity with its known neighbours; an unknown one (NaN) stays unknown.
 
-    disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: px; space: standard deviation of the
-    spatial Gaussian, px; gray: scale of the difference in the guide, levels; range_scale: scale of the difference in
+    disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: px, > 0, the standard deviation of the
+    spatial Gaussian, too; gray: scale of the difference in the guide, levels; range_scale: scale of the difference in
     disparity, px; threads: 2 share the work. Returns (H, W) float32.
     """
     height, filtered = disparity.shape[0], np.empty(disparity.shape, np.float32)
@@ -31,14 +31,14 @@ def joint_bilateral(
     scales = F32(1 / range_scale), F32(1 / gray)
     both = shared_by(threads)
     by_bands(both, height, lambda first, end: _prepare(disparity, guide, *scales, first, end, values, levels))
-    given = values, levels, _spatial(radius, space)
+    given = values, levels, _spatial(radius)
     by_bands(both, height, lambda first, end: _filter(*given, first, end, filtered))
     by_bands(both, height, lambda first, end: _finish(disparity, F32(range_scale), first, end, filtered))
     return filtered
 
 
-def _spatial(radius: int, space: float) -> Array:
-    offsets = np.arange(-radius, radius + 1) / space
+def _spatial(radius: int) -> Array:
+    offsets = np.arange(-radius, radius + 1) / radius
     return np.exp(-(offsets[:, None] ** 2 + offsets**2) / 2).astype(np.float32)
 
 
@@ -82,14 +82,12 @@ def _filter(values, levels, spatial, first, end, filtered):  # type: ignore[no-u
             filtered[y, x] = sums[x] / weights[x]  # a pixel's own weight is 1
 
 
-def joint_bilateral_reference(
-    disparity: Array, guide: Array, radius: int, space: float, gray: float, range_scale: float
-) -> Array:
+def joint_bilateral_reference(disparity: Array, guide: Array, radius: int, gray: float, range_scale: float) -> Array:
     """`joint_bilateral` in plain numpy and float64."""
     height, width = disparity.shape
     values = np.pad(disparity.astype(np.float64), radius, constant_values=np.nan)
     levels = np.pad(guide.astype(np.float64), radius)
-    spatial = _spatial(radius, space)
+    spatial = _spatial(radius)
     sums, weights = np.zeros((height, width)), np.zeros((height, width))
     for down in range(2 * radius + 1):
         for across in range(2 * radius + 1):

@@ -38,36 +38,35 @@ def fit_planes(
     disparity: Array,
     labels: Array,
     count: int,
+    weights: Array,
+    hypotheses: int,
     threshold: float = 0.5,
-    hypotheses: int = 64,
     seed: int = 0,
-    weights: Array | None = None,
     threads: int = 1,
 ) -> Planes:
     """Fit one plane to the known disparities of each segment.
 
-    disparity: (H, W) float32, px, NaN = unknown; labels: (H, W) int32 in 0..count-1; threshold: px, beyond which a
-    pixel is an outlier; weights: (H, W) float32 > 0, what each pixel counts in the least squares, None = the same;
-    threads: 2 share the work, to the same result. The same seed gives the same planes.
+    disparity: (H, W) float32, px, NaN = unknown; labels: (H, W) int32 in 0..count-1; weights: (H, W) float32 > 0, what
+    each pixel counts in the least squares; hypotheses: planes tried per segment; threshold: px, beyond which a pixel is
+    an outlier; threads: 2 share the work, to the same result. The same seed gives the same planes.
     """
-    assert weights is None or weights.shape == labels.shape, "a weight for each pixel"
+    assert weights.shape == labels.shape, "a weight for each pixel"
     planes = Planes(np.empty((count, 3)), np.empty(count, np.float32), np.empty(count, np.float32))
-    weights = np.ones((1, 1), np.float32) if weights is None else weights
     both = shared_by(threads)
-    points, start, sizes = known_points(disparity, labels, weights, count, both)
+    points, start, sizes = known_points(disparity, labels, count, weights, both)
     given = points, start, sizes, F32(threshold), hypotheses, U64(seed % 2**64)
     by_bands(both, count, lambda first, end: _fit(*given, first, end, *planes))
     return planes
 
 
 def known_points(
-    disparity: Array, labels: Array, weights: Array, count: int, both: AtOnce = in_turn
+    disparity: Array, labels: Array, count: int, weights: Array, both: AtOnce = in_turn
 ) -> tuple[Array, Array, Array]:
     """The known pixels, segment by segment, in scan order each.
 
-    disparity, labels, count: of `fit_planes`; weights: (H, W) float32, or of any other size for none. Returns (4, n)
-    float32, column, row, disparity and weight; (count + 1,) int64, those of segment s are start[s] to start[s + 1];
-    and (count,) int64, how many pixels a segment has, known or not.
+    The parameters are those of `fit_planes`. Returns (4, n) float32, column, row, disparity and weight; (count + 1,)
+    int64, those of segment s are start[s] to start[s + 1]; and (count,) int64, how many pixels a segment has, known or
+    not.
     """
     middle = labels.shape[0] // 2
     parts = slice(middle), slice(middle, labels.shape[0])
@@ -102,7 +101,7 @@ def _count_points(disparity, labels, known, sizes):  # type: ignore[no-untyped-d
 
 @kernel
 def _gather(disparity, labels, weights, first, end, place, points):  # type: ignore[no-untyped-def]
-    width, weighted = labels.shape[1], weights.shape == labels.shape
+    width = labels.shape[1]
     for y in range(first, end):
         x = 0
         while x < width:
@@ -111,8 +110,7 @@ def _gather(disparity, labels, weights, first, end, place, points):  # type: ign
             while x < width and labels[y, x] == segment:
                 d = disparity[y, x]
                 if d == d:
-                    points[0, n], points[1, n], points[2, n] = x, y, d
-                    points[3, n] = weights[y, x] if weighted else F32(1)
+                    points[0, n], points[1, n], points[2, n], points[3, n] = x, y, d, weights[y, x]
                     n += 1
                 x += 1
             place[segment] = n
@@ -226,10 +224,10 @@ def fit_planes_reference(
     disparity: Array,
     labels: Array,
     count: int,
+    weights: Array,
+    hypotheses: int,
     threshold: float = 0.5,
-    hypotheses: int = 64,
     seed: int = 0,
-    weights: Array | None = None,
 ) -> Planes:
     """`fit_planes` in plain numpy and float64, one segment after the other, drawing the same hypotheses."""
     planes = Planes(np.full((count, 3), np.nan), np.zeros(count, np.float32), np.zeros(count, np.float32))
@@ -241,7 +239,7 @@ def fit_planes_reference(
             continue
         points = np.stack([x[known], y[known], np.ones(known.sum())], axis=1).astype(np.float64)
         d = disparity[y, x][known].astype(np.float64)
-        root = np.sqrt(np.ones(len(d)) if weights is None else weights[y, x][known].astype(np.float64))
+        root = np.sqrt(weights[y, x][known].astype(np.float64))
         best, plane = np.inf, None
         for h in range(hypotheses):
             corners = [_draw_reference(seed, s, 3 * h + i, len(d)) for i in range(3)]

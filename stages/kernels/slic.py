@@ -24,17 +24,15 @@ F32 = np.float32
 _workspaces = Workspaces()
 LIGHTNESS = F32(100 / 255)  # of L in 0..100, to what 8 bits hold of it
 FAR = F32(1e30)
+MOVES = 2  # of the centres, before the last assignment
 LEAST_CELL = 8  # px; where grid cells are smaller, the centres settle at full resolution
 
 
-def superpixels(
-    image: Array, count: int, compactness: float = 10.0, iterations: int = 3, threads: int = 1
-) -> tuple[Array, int]:
+def superpixels(image: Array, count: int, compactness: float = 10.0, threads: int = 1) -> tuple[Array, int]:
     """Segment an image into about `count` connected superpixels.
 
     image: (H, W) gray or (H, W, 3) RGB, uint8; compactness: weight of position against colour, in CIELAB units at one
-    grid step; iterations: all but the last at half resolution, where the image is large enough; threads: 2 share the
-    work, to the same result. Returns the labels, (H, W) int32 in 0..n-1, and n.
+    grid step; threads: 2 share the work, to the same result. Returns the labels, (H, W) int32 in 0..n-1, and n.
     """
     height, width = image.shape[:2]
     count = min(count, height * width)
@@ -48,12 +46,11 @@ def superpixels(
         scale = 2 if min(height // grid[0], width // grid[1]) >= LEAST_CELL and min(height, width) > 1 else 1
         small = colour if scale == 1 else _colours(halved(image[: height // 2 * 2, : width // 2 * 2]), both)
         centres = _grid_centres(small, *grid)
-        for _ in range(iterations - 1):
+        for _ in range(MOVES):
             _move(small, centres, grid, compactness / step * scale, both)
         if scale == 2:
             centres[:, 3:] = centres[:, 3:] * 2 + F32(0.5)
-        labels = np.empty((height, width), np.int32)
-        _label(colour, centres, grid, compactness / step, labels, both)
+        labels = _assigned(colour, centres, grid, compactness / step, both)
         total = connect(labels, smallest, space.array((3, height * width), np.int32), both)
     return labels, total
 
@@ -84,32 +81,33 @@ def _grid_centres(colour: Array, rows: int, cols: int) -> Array:
 
 def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: AtOnce) -> None:
     """One k-means step: `centres` becomes the means of what is nearest to each."""
-    sums = _label(colour, centres, grid, weight, np.empty((0, 0), np.int32), both)
+    labels = _assigned(colour, centres, grid, weight, both)
+    upper, lower = np.zeros((2, len(centres), 6))
+    middle = len(colour) // 2
+    both(
+        lambda: _add_up(colour, labels, 0, middle, upper),
+        lambda: _add_up(colour, labels, middle, len(colour), lower),
+    )
+    sums = upper + lower
     seen = sums[:, 5] > 0
     centres[seen] = sums[seen, :5] / sums[seen, 5:]
 
 
-def _label(
-    colour: Array, centres: Array, grid: tuple[int, int], weight: float, labels: Array, both: AtOnce = in_turn
-) -> Array:
-    """Fill in `labels`, (H, W) int32, by `_assign`; or, where they are empty, return its sums, (n, 6) float64."""
+def _assigned(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: AtOnce = in_turn) -> Array:
+    """The nearest centre of each pixel, (H, W) int32."""
     rows, cols = grid
-    upper, lower = np.zeros((2, rows * cols, 6))
+    labels = np.empty(colour.shape[:2], np.int32)
     square, middle = F32(weight**2), rows // 2
     both(
-        lambda: _assign(colour, centres, rows, cols, square, 0, middle, labels, upper),
-        lambda: _assign(colour, centres, rows, cols, square, middle, rows, labels, lower),
+        lambda: _assign(colour, centres, rows, cols, square, 0, middle, labels),
+        lambda: _assign(colour, centres, rows, cols, square, middle, rows, labels),
     )
-    return upper + lower
+    return labels
 
 
 @fast_kernel
-def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, labels, sums):  # type: ignore[no-untyped-def]
-    """Find the nearest of nine centres for the pixels of grid rows first_row to end_row.
-
-    They become the `labels`, (H, W) int32; or, where those are empty, colour, y, x and count of each centre's pixels
-    are added to `sums`, (rows * cols, 6) float64.
-    """
+def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, labels):  # type: ignore[no-untyped-def]
+    """Find the nearest of nine centres for the pixels of grid rows first_row to end_row."""
     height, width, channels = colour.shape
     # Arrays of their own, not rows of one: so the compiler sees that they do not overlap.
     first, second, third = np.zeros(width, np.float32), np.zeros(width, np.float32), np.zeros(width, np.float32)
@@ -138,18 +136,23 @@ def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, la
                     least[x] = d if closer else least[x]
                     nearest[x] = beside if closer else nearest[x]
             for x in range(width):
-                nearest[x] += row * cols + col[x]
-            if labels.size:
-                labels[y] = nearest
-                continue
-            for x in range(width):
-                k = nearest[x]
-                sums[k, 0] += first[x]
-                sums[k, 1] += second[x]
-                sums[k, 2] += third[x]
-                sums[k, 3] += y
-                sums[k, 4] += x
-                sums[k, 5] += 1
+                labels[y, x] = nearest[x] + row * cols + col[x]
+
+
+@kernel
+def _add_up(colour, labels, first, end, sums):  # type: ignore[no-untyped-def]
+    """Add colour, y, x and 1 of the pixels of rows first to end to the `sums` of their labels, (n, 6) float64."""
+    channels = colour.shape[2]
+    for y in range(first, end):
+        for x in range(colour.shape[1]):
+            total = sums[labels[y, x]]
+            total[0] += F32(colour[y, x, 0]) * LIGHTNESS
+            if channels == 3:
+                total[1] += colour[y, x, 1]
+                total[2] += colour[y, x, 2]
+            total[3] += y
+            total[4] += x
+            total[5] += 1
 
 
 @fast_part
@@ -267,7 +270,7 @@ def _write(labels, first, end, rows, ends, parent, number):  # type: ignore[no-u
 
 
 def assign_reference(colour: Array, centres: Array, rows: int, cols: int, position_weight: float) -> Array:
-    """What `_assign` labels, in plain numpy: the nearest of the nine centres around each pixel's grid cell."""
+    """What `_assign` finds, in plain numpy: the nearest of the nine centres around each pixel's grid cell."""
     height, width, channels = colour.shape
     values = np.zeros((height, width, 3))
     values[..., :channels] = colour

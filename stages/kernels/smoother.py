@@ -16,15 +16,16 @@ from stages.kernels.compiled import fast_kernel, kernel
 F32 = np.float32
 BLOCK = 320  # columns solved together: their working set stays in the second-level cache
 PASSES = 3
+LEAST = F32(1e-6)  # smoothed weight, below which nothing is known
 
 
-def smooth(values: Array, weights: Array, guide: Array, strength: float, sigma: float) -> tuple[Array, Array]:
+def smooth(values: Array, weights: Array, guide: Array, strength: float, sigma: float) -> Array:
     """Smooth values along the image, across edges of the guide as little as possible.
 
     values: (H, W) float32, finite where weights > 0; weights: (H, W) float32 >= 0, 0 = unknown; guide: (H, W) uint8;
     strength: the lambda of the first pass (each later one has a quarter); sigma: gray levels of the guide over which
-    the coupling of two pixels falls to 1/e. Returns the smoothed values, NaN where no weight reaches, and the smoothed
-    weights: how much evidence arrived.
+    the coupling of two pixels falls to 1/e. Returns the smoothed values, (H, W) float32, NaN where less than `LEAST` of
+    weight arrives.
     """
     coupling = np.exp(-np.arange(256) / sigma).astype(np.float32)
     height, width = values.shape
@@ -39,8 +40,7 @@ def smooth(values: Array, weights: Array, guide: Array, strength: float, sigma: 
         _solve_in_blocks(moment, mass, across, step)
         moment, mass = cv2.transpose(moment), cv2.transpose(mass)
         _solve_in_blocks(moment, mass, down, step)
-    reached = mass > F32(1e-6)
-    return np.where(reached, moment / np.maximum(mass, F32(1e-6)), F32(np.nan)), mass
+    return np.where(mass > LEAST, moment / np.maximum(mass, LEAST), F32(np.nan))
 
 
 def _solve_in_blocks(moment: Array, mass: Array, coupling: Array, strength: np.float32) -> None:
@@ -93,7 +93,7 @@ def _solve(moment, mass, coupling, strength, upper, start, stop):  # type: ignor
 
 
 def smooth_reference(values: Array, weights: Array, guide: Array, strength: float, sigma: float) -> tuple[Array, Array]:
-    """`smooth` in float64, every line a sparse system handed to scipy."""
+    """`smooth` in float64, every line a sparse system handed to scipy; and the smoothed weights."""
     mass = weights.astype(np.float64)
     moment = np.where(mass > 0, values, 0.0) * mass
     for index in range(PASSES):
@@ -102,7 +102,7 @@ def smooth_reference(values: Array, weights: Array, guide: Array, strength: floa
             for array in (moment, mass):
                 turn(array)[:] = _solve_reference(turn(array), lines, strength * 0.25**index, sigma)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(mass > 1e-6, moment / mass, np.nan), mass
+        return np.where(mass > LEAST, moment / mass, np.nan), mass
 
 
 def _solve_reference(right_side: Array, guide: Array, strength: float, sigma: float) -> Array:

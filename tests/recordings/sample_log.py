@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.inventory import describe
-from recordings.ros2 import Ros2Writer, camera_info, image, imu, odometry, transform_message
+from recordings.ros2 import camera_info, image, imu, odometry, transform_message
+from recordings.ros2_writer import Ros2Writer
 from stages.data import CameraImage, CameraModel, Pose, Tilt, Transform
 
 WIDTH, HEIGHT = 24, 16

@@ -155,7 +155,7 @@ def test_damage_that_took_all_images_is_told_as_that(sample: Path, tmp_path: Pat
             f"no message of {LEFT}, {RIGHT} can be read; give one that has "
             f"(messages were lost: the chunk at byte {broken[0]} is broken and its messages are lost"
         )
-        assert log.lacking["left"].endswith("give one that has")
+        assert log.opening.lacking["left"].endswith("give one that has")
 
 
 def test_a_record_with_a_broken_length_costs_what_it_held(

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from recordings.decode import camera_model, pixels_of, pose_of, up_of
 from recordings.errors import LogError
-from recordings.ros2 import camera_info, header, image, make
+from recordings.ros2 import camera_info, header, image
+from recordings.ros2_types import make
 from stages.data import CameraModel
 from tests.recordings.sample_log import HEIGHT, WIDTH, picture
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from recordings import McapSource
-from recordings.ros2 import Ros2Writer, camera_info, image, transform_message
+from recordings.ros2 import camera_info, image, transform_message
+from recordings.ros2_writer import Ros2Writer
 from stages.data import Transform
 from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, items_of, model, picture, write_sample
 
@@ -64,8 +65,8 @@ def test_the_calibration_under_the_image_itself_comes_first(tmp_path: Path) -> N
     topics = {f"/cam/{side}": side for side in ("left", "right")}
     infos = {f"/cam/{side}/camera_info": side for side in topics.values()} | {"/cam/camera_info": "other"}
     with McapSource().open(images(tmp_path / "log.mcap", topics, infos)) as log:
-        assert log.cameras is not None
-        assert [camera.frame_id for camera in log.cameras] == ["left", "right"]
+        assert log.opening.cameras is not None
+        assert [camera.frame_id for camera in log.opening.cameras] == ["left", "right"]
 
 
 def test_a_navigation_camera_is_a_camera(tmp_path: Path) -> None:
@@ -187,7 +188,7 @@ def test_an_imu_that_is_nonsense_for_long_is_still_an_inclinometer(tmp_path: Pat
             message.orientation_covariance = np.full(9, -1.0)
         return message
 
-    monkeypatch.setattr("recordings.mcap_opening._LOOKED_AT", 1)
+    monkeypatch.setattr("recordings.mcap_messages._LOOKED_AT", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
 

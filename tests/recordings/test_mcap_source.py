@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.ros2 import header, make, transform_message
+from recordings.ros2 import header, transform_message
+from recordings.ros2_types import make
 from stages.data import CameraImage, Mount, Transform
 from tests.recordings.sample_log import (
     BASELINE,
@@ -284,7 +285,7 @@ def test_a_camera_whose_images_are_all_broken_is_missing_before_the_run(
             message.data = message.data[:-5]
         return message
 
-    monkeypatch.setattr("recordings.mcap_opening._LOOKED_AT", 1)
+    monkeypatch.setattr("recordings.mcap_messages._LOOKED_AT", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert list(log.missing) == (["right"] if whole is None else [])
         if whole is None:

@@ -16,6 +16,7 @@ from recordings.errors import LogError
 from recordings.image_log import FIRST_STAMP
 from recordings.mcap_reader import iter_decoded
 from recordings.middlebury import import_scene, logs_of, read_pfm, read_scene
+from recordings.ros2_writer import Ros2Writer
 from recordings.score_table import format_score
 from stages.data import Disparity, StereoFrame
 from tests.recordings import middlebury_scene as scenes
@@ -44,7 +45,7 @@ def result(log: Path, frame: StereoFrame, pixels: np.ndarray) -> Path:
     nothing = np.zeros(pixels.shape, np.uint8)
     disparity = Disparity(frame.stamp, pixels, nothing, nothing.astype(np.float32), camera=frame.camera)
     out = log.with_name(f"{log.stem}-nav.mcap")
-    with ros2.Ros2Writer(out) as writer:
+    with Ros2Writer(out) as writer:
         writer.write("/nav/disparity", ros2.disparity_image(disparity), frame.stamp)
     return out
 

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from recordings import paint
 from recordings.errors import LogError
 from recordings.pictures import MARGIN, disparity_picture, draw, elevation_picture, navigation_picture
-from recordings.ros2 import Ros2Writer, disparity_image, grid_map, occupancy_grid
+from recordings.ros2 import disparity_image, grid_map, occupancy_grid
+from recordings.ros2_writer import Ros2Writer
 from stages.data import LEVEL_FRAME, Array, Cell, Disparity, ElevationMap, NavigationMap
 
 START, STEP = 1_000_000_000, 500_000_000
@@ -161,10 +162,10 @@ def test_sixteen_bit_images_keep_their_contrast() -> None:
     twelve = np.linspace(0, 4095, 256).astype(np.uint16).reshape(16, 16)
     bright, dark = np.tile(twelve, (16, 16)), np.tile(twelve // 2, (16, 16))
     dark[0, 0] = 65535  # a hot pixel
-    eight, other = paint.eight_bit(bright, dark)
+    eight, other = paint.top_eight_bits(bright, dark)
     assert (eight.min(), eight.max()) == (0, 255)
     assert other[-1, -1] == eight[-1, -1] // 2  # of one exposure
-    assert paint.eight_bit(eight, bright)[0] is eight
+    assert paint.top_eight_bits(eight, bright)[0] is eight
 
 
 def test_a_picture_leaves_out_what_lies_behind_the_rover_unless_something_is_known_there():

@@ -44,9 +44,9 @@ def turned(axis: str, degrees: float) -> np.ndarray:
 def test_parallel_cameras_beside_each_other_are_rectified_as_they_are(tmp_path: Path, names: tuple[str, str]) -> None:
     beside = Transform("left_optical", "right_optical", np.eye(3), [0.25, 0.001, 0])
     with McapSource().open(single_calibrations(tmp_path / "log.mcap", names, beside)) as log:
-        assert log.cameras is not None
-        assert [camera.rectified for camera in log.cameras] == [True, True]
-        assert log.cameras[1].model.p[0, 3] == pytest.approx(-20 * 0.25)
+        assert log.opening.cameras is not None
+        assert [camera.rectified for camera in log.opening.cameras] == [True, True]
+        assert log.opening.cameras[1].model.p[0, 3] == pytest.approx(-20 * 0.25)
 
 
 @pytest.mark.parametrize(
@@ -64,8 +64,8 @@ def test_cameras_that_are_not_parallel_are_rectified_or_refused_where_called_rec
 ) -> None:
     beside = Transform("left_optical", "right_optical", rotation, place)
     with McapSource().open(single_calibrations(tmp_path / "raw.mcap", RAW, beside, fx)) as log:
-        assert log.cameras is not None
-        left, right = log.cameras
+        assert log.opening.cameras is not None
+        left, right = log.opening.cameras
     assert not left.rectified
     assert -right.model.p[0, 3] / right.model.p[0, 0] == pytest.approx(np.linalg.norm(place))
     point = np.array([0.3, -0.2, 4.0])
@@ -149,8 +149,8 @@ def test_a_calibration_of_the_projection_alone_is_that_of_rectified_images(tmp_p
         if distorted:
             assert "no focal length in K" in log.missing["left"]
         else:
-            assert log.cameras is not None
-            assert all(camera.rectified for camera in log.cameras)
+            assert log.opening.cameras is not None
+            assert all(camera.rectified for camera in log.opening.cameras)
 
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
@@ -210,7 +210,7 @@ def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:
 
     assert Frames().between("", "") is None
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        assert log.mount is None
+        assert log.opening.mount is None
         assert "joins the camera (whose frame_id is empty) and the inclinometer (whose frame_id" in log.missing["mount"]
 
 
@@ -222,7 +222,7 @@ def test_a_calibration_without_a_frame_is_of_its_images_frame(tmp_path: Path) ->
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
-        assert [camera.frame_id for camera in log.cameras or ()] == ["left_optical", "right_optical"]
+        assert [camera.frame_id for camera in log.opening.cameras or ()] == ["left_optical", "right_optical"]
 
 
 def with_transforms(path: Path, *more: Transform) -> Path:
@@ -248,9 +248,9 @@ def with_transforms(path: Path, *more: Transform) -> Path:
 def test_a_transform_that_cannot_be_is_told_and_the_others_hold(tmp_path: Path, more: Transform, said: str) -> None:
     with McapSource().open(with_transforms(tmp_path / "log.mcap", more)) as log:
         assert log.missing == {}
-        assert log.mount is not None
+        assert log.opening.mount is not None
         np.testing.assert_allclose(
-            log.mount.camera_from_inclinometer, TRANSFORMS[0].rotation.T @ TRANSFORMS[1].rotation, atol=1e-12
+            log.opening.mount.camera_from_inclinometer, TRANSFORMS[0].rotation.T @ TRANSFORMS[1].rotation, atol=1e-12
         )
         told = [(stream, item) for _, stream, item in log.events() if isinstance(item, Exception)]
     assert [stream for stream, _ in told] == ["log"]
@@ -289,10 +289,10 @@ def test_a_long_chain_of_transforms_is_followed_either_way():
 def test_a_transform_that_is_told_again_is_no_contradiction(tmp_path: Path) -> None:
     with McapSource().open(with_transforms(tmp_path / "log.mcap", *TRANSFORMS, TRANSFORMS[0].inverse())) as log:
         assert not [item for _, _, item in log.events() if isinstance(item, Exception)]
-        assert log.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]
+        assert log.opening.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]
 
 
 def test_the_pair_of_the_sample_is_rectified(sample: Path) -> None:
     with McapSource(left=LEFT).open(sample) as log:
-        assert log.cameras is not None
-        np.testing.assert_array_equal(log.cameras[1].model.p, model("right").p)
+        assert log.opening.cameras is not None
+        np.testing.assert_array_equal(log.opening.cameras[1].model.p, model("right").p)

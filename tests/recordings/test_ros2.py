@@ -23,15 +23,12 @@ from rosbags.typesys import Stores, get_typestore
 from recordings.errors import LogError
 from recordings.mcap_reader import iter_decoded
 from recordings.ros2 import (
-    TYPES,
-    Ros2Writer,
     camera_info,
     diagnostics,
     disparity_image,
     grid_map,
     image,
     imu,
-    make,
     occupancy_grid,
     odometry,
     point_cloud,
@@ -42,7 +39,8 @@ from recordings.ros2 import (
     stamp_of,
     transform_message,
 )  # fmt: skip
-from recordings.ros2_types import decoder_for
+from recordings.ros2_types import TYPES, decoder_for, make
+from recordings.ros2_writer import Ros2Writer
 from stages.data import (
     Disparity,
     ElevationMap,

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from flow.cli import main
 from recordings import ros2, scoring
 from recordings.errors import LogError
-from recordings.ros2 import Ros2Writer
+from recordings.ros2_writer import Ros2Writer
 from recordings.score_table import ROWS, format_brief, format_score, terrain_lines
 from recordings.simulator import Simulation, log
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
@@ -59,7 +59,7 @@ class Run:
     blind: tuple[int, ...] = ()  # frames that say unknown everywhere
 
     def write(self, path: Path, frames) -> Path:
-        with ros2.Ros2Writer(path) as writer:
+        with Ros2Writer(path) as writer:
             for index, frame in enumerate(frames):
                 if index in self.skipped:
                     continue

@@ -12,7 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from recordings import McapSource, mcap_opening
+from recordings import McapSource, mcap_messages
 from recordings.mcap_index import JITTER
 from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, inventory_of, items_of
 
@@ -122,7 +122,7 @@ def test_a_log_written_topic_by_topic_or_with_jitter_loses_nothing(
 def test_a_clock_set_back_by_all_that_was_recorded_takes_no_sensor(
     sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mcap_opening, "_LOOKED_AT", 1)  # what is lost comes first, and may be more than is looked at
+    monkeypatch.setattr(mcap_messages, "_LOOKED_AT", 1)  # what is lost comes first, and may be more than is looked at
 
     def far_back(messages: list[Any]) -> list[Any]:
         for _, _, message in messages:
@@ -160,4 +160,4 @@ def test_static_transforms_hold_whenever_they_were_logged(sample: Path, tmp_path
         return [(schema, channel, nothing), (schema, channel, message), *others]
 
     with McapSource().open(reordered(sample, tmp_path / "log.mcap", late_before)) as log:
-        assert (log.missing, log.problems) == ({}, [])
+        assert (log.missing, log.opening.problems) == ({}, [])

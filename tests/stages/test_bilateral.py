@@ -19,8 +19,8 @@ def random_disparity(height, width, seed):
 @given(st.integers(1, 30), st.integers(1, 30), st.integers(1, 5), st.integers(0, 2**31))
 def test_the_filter_equals_its_reference(height, width, radius, seed):
     disparity, guide = random_disparity(height, width, seed)
-    ours = joint_bilateral(disparity, guide, radius, 2.0, 15.0, 4.0)
-    plain = joint_bilateral_reference(disparity, guide, radius, 2.0, 15.0, 4.0)
+    ours = joint_bilateral(disparity, guide, radius, 15.0, 4.0)
+    plain = joint_bilateral_reference(disparity, guide, radius, 15.0, 4.0)
     assert ours == pytest.approx(plain, abs=1e-4, nan_ok=True)
 
 
@@ -29,6 +29,6 @@ def test_noise_falls_and_the_step_stays():
     truth = np.where(np.arange(80) < 40, 10, 30) * np.ones((60, 1))
     noisy = (truth + rng.normal(0, 0.3, truth.shape)).astype(np.float32)
     guide = np.where(truth == 10, 80, 160).astype(np.uint8)
-    filtered = joint_bilateral(noisy, guide, 4, 3.0, 10.0, 1.0)
+    filtered = joint_bilateral(noisy, guide, 4, 10.0, 1.0)
     assert (filtered - truth).std() < 0.08
     assert np.abs(filtered - truth).max() < 0.5

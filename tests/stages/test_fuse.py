@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages import Assess, Binarise, Cell, Fuse
-from stages.fuse import local_cells, placement
+from stages import Assess, Binarise, Cell, Fuse, Source
+from stages.placement import placement, sight_of
 from stages.tiles import Tiles
 from tests.stages.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
 
@@ -45,15 +45,14 @@ def test_a_rock_seen_from_two_headings_stands_where_it_is():
 
 def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(monkeypatch):
     def hiding(*arguments):
-        local, row, col = local_cells(*arguments)
-        x, y = centres(local)
+        sight = sight_of(*arguments)
+        x, y = centres(sight.terrain)
         looked = np.hypot(x, y) < 3
-        known = np.isfinite(local.layers["elevation"])
-        ceiling = np.where(~known & looked, next(heights), np.nan).astype(np.float32)
-        return replace(local, layers={**local.layers, "ceiling": ceiling}), row, col
+        ceiling = np.where(~sight.known & looked, next(heights), np.nan).astype(np.float32)
+        return replace(sight, terrain=replace(sight.terrain, layers={**sight.terrain.layers, "ceiling": ceiling}))
 
     heights = iter((-0.2, -0.1))
-    monkeypatch.setattr("stages.fuse.local_cells", hiding)
+    monkeypatch.setattr("stages.fuse.sight_of", hiding)
     fuse = Fuse()
     fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
     terrain = fuse(*drive(1, flat, at=(0.0, 0.0, 1.2)), MOUNT)
@@ -72,7 +71,7 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance():
     ]
     clouds[1] = (clouds[1][0], replace(clouds[1][1], position=[0, 0, 0]))
     clouds[1] = (replace(clouds[1][0], points=clouds[1][0].points + np.float32([0, 0, 0.01])), clouds[1][1])
-    local = [local_cells(cloud, placement(cloud, pose, MOUNT), 0.05, 8.0)[0].layers for cloud, pose in clouds]
+    local = [sight_of(cloud, placement(cloud, pose, MOUNT), 0.05, 8.0).terrain.layers for cloud, pose in clouds]
     for cloud, pose in clouds:
         terrain = fuse(cloud, pose, MOUNT)
     one, other = (layers["variance"].astype(float) + fuse.alignment**2 for layers in local)
@@ -239,6 +238,16 @@ def test_points_whose_error_is_not_known_do_not_enter_the_map():
     terrain = fuse(*drive(1), MOUNT)
     known = np.isfinite(terrain.layers["elevation"])
     assert np.abs(terrain.layers["elevation"] - rolling(*centres(terrain)))[known].max() < 0.03
+
+
+def test_what_refinement_made_up_is_no_evidence_for_the_map():
+    cloud, pose = drive(0)
+    guessed = cloud.points[:, 1] > 0
+    made_up = replace(cloud, source=np.where(guessed, Source.FILLED, Source.MEASURED).astype(np.uint8))
+    terrain, expected = Fuse()(made_up, pose, MOUNT), Fuse()(part(cloud, ~guessed), pose, MOUNT)
+    assert np.isfinite(terrain.layers["elevation"]).any()
+    for name, layer in expected.layers.items():
+        np.testing.assert_array_equal(terrain.layers[name], layer)
 
 
 def test_a_window_that_cannot_hold_what_a_frame_changes_is_refused():

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stages import Fuse, Pose, Transform
-from stages.fuse import placement
+from stages.placement import placement
 from stages.stage import Severity
 from tests.stages.region_scene import MOUNT, START, drive, flat, part
 

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from stages.kernels.planes import fit_planes, fit_planes_reference, known_points
 
 SHAPE = (48, 60)
+ALIKE = np.ones(SHAPE, np.float32)  # weights
 
 
 def render_planes(coefficients, labels):
@@ -34,7 +35,7 @@ def tiles():
 
 def test_outliers_and_holes_do_not_move_the_planes(tiles):
     disparity, labels, truth = tiles
-    planes = fit_planes(disparity, labels, 6)
+    planes = fit_planes(disparity, labels, 6, ALIKE, 64)
     clean = render_planes(truth, labels)
     assert np.abs(render_planes(planes.coefficients, labels) - clean).max() < 0.05
     assert planes.inlier_share == pytest.approx(0.8, abs=0.06)
@@ -43,8 +44,8 @@ def test_outliers_and_holes_do_not_move_the_planes(tiles):
 
 def test_equals_the_plain_reference_with_the_same_draws(tiles):
     disparity, labels, _ = tiles
-    ours = fit_planes(disparity, labels, 6, hypotheses=16, seed=11)
-    plain = fit_planes_reference(disparity, labels, 6, hypotheses=16, seed=11)
+    ours = fit_planes(disparity, labels, 6, ALIKE, 16, seed=11)
+    plain = fit_planes_reference(disparity, labels, 6, ALIKE, 16, seed=11)
     assert ours.coefficients[:, :2] == pytest.approx(plain.coefficients[:, :2], abs=2e-5)
     images = [render_planes(planes.coefficients, labels) for planes in (ours, plain)]
     assert images[0] == pytest.approx(images[1], abs=1e-4)
@@ -55,17 +56,17 @@ def test_equals_the_plain_reference_with_the_same_draws(tiles):
 def test_weights_count_in_the_least_squares_as_in_the_reference(tiles):
     disparity, labels, _ = tiles
     weights = np.random.default_rng(8).uniform(0.05, 1, SHAPE).astype(np.float32)
-    ours = fit_planes(disparity, labels, 6, hypotheses=16, weights=weights)
-    plain = fit_planes_reference(disparity, labels, 6, hypotheses=16, weights=weights)
+    ours = fit_planes(disparity, labels, 6, weights, 16)
+    plain = fit_planes_reference(disparity, labels, 6, weights, 16)
     images = [render_planes(planes.coefficients, labels) for planes in (ours, plain)]
     assert images[0] == pytest.approx(images[1], abs=1e-4)
-    unweighted = render_planes(fit_planes(disparity, labels, 6, hypotheses=16).coefficients, labels)
+    unweighted = render_planes(fit_planes(disparity, labels, 6, ALIKE, 16).coefficients, labels)
     assert np.abs(images[0] - unweighted).max() > 1e-3
 
 
 def test_two_threads_give_the_same_planes(tiles):
     disparity, labels, _ = tiles
-    one, two = (fit_planes(disparity, labels, 6, threads=n) for n in (1, 2))
+    one, two = (fit_planes(disparity, labels, 6, ALIKE, 64, threads=n) for n in (1, 2))
     for ours, theirs in zip(one, two, strict=True):
         assert np.array_equal(ours, theirs)
 
@@ -73,14 +74,13 @@ def test_two_threads_give_the_same_planes(tiles):
 def test_a_segment_is_fitted_alike_whatever_the_others_hold(tiles):
     disparity, labels, _ = tiles
     alone = np.where(labels == 4, disparity, np.float32(np.nan))
-    assert np.array_equal(
-        fit_planes(disparity, labels, 6, seed=9).coefficients[4], fit_planes(alone, labels, 6, seed=9).coefficients[4]
-    )
+    among, single = (fit_planes(given, labels, 6, ALIKE, 64, seed=9).coefficients for given in (disparity, alone))
+    assert np.array_equal(among[4], single[4])
 
 
 def test_the_seed_decides_the_draws(tiles):
     disparity, labels, _ = tiles
-    runs = [fit_planes(disparity, labels, 6, hypotheses=1, seed=seed).coefficients for seed in (1, 1, 2, -1)]
+    runs = [fit_planes(disparity, labels, 6, ALIKE, 1, seed=seed).coefficients for seed in (1, 1, 2, -1)]
     assert np.array_equal(runs[0], runs[1], equal_nan=True)
     assert not np.array_equal(runs[0], runs[2], equal_nan=True)
 
@@ -91,7 +91,7 @@ def test_too_few_or_collinear_pixels_give_no_plane():
     disparity = np.full((10, 30), np.nan, np.float32)
     disparity[0, :5] = 7
     disparity[3, 15:] = 7
-    planes = fit_planes(disparity, labels, 2)
+    planes = fit_planes(disparity, labels, 2, np.ones_like(disparity), 64)
     assert np.isnan(planes.coefficients).all()
     assert (planes.inlier_share == 0).all()
     assert np.isnan(render_planes(planes.coefficients, labels)).all()
@@ -104,7 +104,7 @@ def test_known_points_are_listed_once_each_under_their_label(height, width, coun
     labels = rng.integers(0, count, (height, width), dtype=np.int32)
     disparity, weights = rng.random((2, height, width)).astype(np.float32)
     disparity[rng.random(labels.shape) < 0.3] = np.nan
-    points, start, sizes = known_points(disparity, labels, weights, count)
+    points, start, sizes = known_points(disparity, labels, count, weights)
     assert np.array_equal(sizes, np.bincount(labels.ravel(), minlength=count))
     for segment in range(count):
         y, x = np.nonzero((labels == segment) & np.isfinite(disparity))

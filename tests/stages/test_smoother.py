@@ -5,22 +5,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.smoother import smooth, smooth_reference
+from stages.kernels.smoother import LEAST, smooth, smooth_reference
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(1, 24), st.integers(1, 24), st.sampled_from([0.5, 30.0, 8000.0]), st.integers(0, 2**31))
-def test_equals_a_sparse_solve_of_every_line(height, width, strength, seed):
+@given(
+    st.integers(1, 24), st.integers(1, 24), st.sampled_from([0.5, 30.0, 8000.0]), st.sampled_from([1.0, 3e-6]),
+    st.integers(0, 2**31),
+)  # fmt: skip
+def test_equals_a_sparse_solve_of_every_line(height, width, strength, heaviest, seed):
     rng = np.random.default_rng(seed)
     values = rng.uniform(0, 100, (height, width)).astype(np.float32)
     weights = np.where(rng.random((height, width)) < 0.3, 0, rng.random((height, width))).astype(np.float32)
     weights[0, 0] = 1
+    weights *= np.float32(heaviest)  # the lighter ones arrive as about the least that tells anything
     guide = rng.integers(100, 110, (height, width), dtype=np.uint8)
-    smoothed, mass = smooth(values, weights, guide, strength, 3.0)
-    expected, expected_mass = smooth_reference(values, weights, guide, strength, 3.0)
-    assert mass == pytest.approx(expected_mass, rel=1e-3, abs=1e-6)
-    reached = expected_mass > 1e-3
+    smoothed = smooth(values, weights, guide, strength, 3.0)
+    expected, mass = smooth_reference(values, weights, guide, strength, 3.0)
+    reached = mass > 1.001 * LEAST
     assert smoothed[reached] == pytest.approx(expected[reached], rel=1e-4, abs=1e-4)
+    assert np.isnan(smoothed[mass < 0.999 * LEAST]).all()
 
 
 def test_wide_images_are_solved_in_blocks_without_seams():
@@ -28,7 +32,7 @@ def test_wide_images_are_solved_in_blocks_without_seams():
     values = rng.uniform(0, 100, (12, 700)).astype(np.float32)
     guide = rng.integers(100, 110, values.shape, dtype=np.uint8)
     weights = np.ones_like(values)
-    assert smooth(values, weights, guide, 100, 3)[0] == pytest.approx(
+    assert smooth(values, weights, guide, 100, 3) == pytest.approx(
         smooth_reference(values, weights, guide, 100, 3)[0], abs=1e-3
     )
 
@@ -40,9 +44,8 @@ def test_a_hole_takes_the_value_on_its_side_of_the_edge():
     weights = np.ones_like(values)
     weights[10:20, 20:40] = 0
     values[10:20, 20:40] = np.nan
-    smoothed, mass = smooth(values, weights, guide, 8000, 1)
+    smoothed = smooth(values, weights, guide, 8000, 1)
     assert np.allclose(smoothed, np.where(guide == 50, 10, 90), atol=0.01)
-    assert mass[10:20, 20:40].min() > 0.3
 
 
 def test_where_no_weight_reaches_the_value_is_unknown():
@@ -50,6 +53,6 @@ def test_where_no_weight_reaches_the_value_is_unknown():
     guide[:, 10:] = 255
     weights = np.zeros((20, 20), np.float32)
     weights[:, :10] = 1
-    smoothed, _ = smooth(np.ones((20, 20), np.float32), weights, guide, 10, 1)
+    smoothed = smooth(np.ones((20, 20), np.float32), weights, guide, 10, 1)
     assert np.isnan(smoothed[:, 10:]).all()
     assert np.allclose(smoothed[:, :10], 1)

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stages.data import Array
-from stages.tilt_diagnosis import Evidence, diagnose
+from stages.tilt_causes import Evidence
+from stages.tilt_diagnosis import diagnose
 from tests.stages.drive import Drive
 from tests.tilt_faults import degrees_as_radians, exchanged, flipped, radians_as_degrees
 

@@ -57,6 +57,14 @@ def test_a_wall_and_what_hangs_over_it_are_cubes_of_their_own_colour() -> None:
     assert Voxels(least=2)(cloud_of(points, colors)).count.tolist() == [2]
 
 
+def test_a_map_of_more_cubes_than_memory_has_room_for_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"Voxels\.region = 100 m makes a map 40000 cells of 0\.005 m wide, and 4000"):
+        Voxels(resolution=0.005, region=100.0)
+    corners = cloud_of(np.array([[9.902, 0, 0], [0, 9.902, 0], [0, -9.902, 0]]), np.zeros((3, 3), np.uint8))
+    widest = Voxels(resolution=0.005, region=10.0)(corners)
+    assert widest.index.tolist() == [[0, -1981, 0], [1980, 0, 0], [0, 1980, 0]]
+
+
 def test_no_points_make_no_cubes_and_a_cloud_that_is_not_level_is_refused() -> None:
     empty = cloud_of(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert Voxels()(empty).index.shape == (0, 3)
