@@ -24,9 +24,9 @@ def surveyed(graph: Graph, excerpts: Excerpts) -> tuple[Graph, dict[str, Finding
     """The graph with its surveying stages fixed, and what each found (stream -> finding).
 
     A stage surveys if its `surveys` is true; its `survey` takes what `__call__` takes, of several frames each, and
-    returns the stage to run and what it found. `excerpts(count, streams)` gives that many stretches of the log, spread
-    over all of it; the first whole frame of each is taken. Raises PipelineError where a stage that remembers frames is
-    needed for it.
+    returns the stage to run and what it found, None if nothing. `excerpts(count, streams)` gives that many stretches
+    of the log, spread over all of it; the first whole frame of each is taken. Raises PipelineError where a stage that
+    remembers frames is needed for it.
     """
     nodes, findings = list(graph.nodes), dict[str, Finding]()
     if not any(_surveys(node) for node in nodes):
@@ -43,7 +43,8 @@ def surveyed(graph: Graph, excerpts: Excerpts) -> tuple[Graph, dict[str, Finding
             given = {port: [sample[stream] for sample in samples] for port, stream in node.inputs.items()}
             try:
                 actor, said = node.actor.survey(**given)
-                findings[node.name] = plain(said)
+                if said is not None:
+                    findings[node.name] = plain(said)
             except Exception as error:  # the stage then has no more to go by than each frame
                 actor = node.actor
                 findings[node.name] = finding(WARNING, f"could not survey the log: {failure(error)}")

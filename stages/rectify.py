@@ -3,10 +3,14 @@
 Each camera's undistortion and rectifying rotation are folded into one table of source positions (Bouguet's method, as
 in image_pipeline), computed once per camera and then only looked up. What the calibration leaves of a row offset is
 measured (stages.row_offset) and folded into the right camera's table.
+
+A right camera whose principal point lies farther right than the left one's has disparities below 0 for all that is far
+off, which no matcher searches by itself: then its image is moved to the left by whole columns.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,7 +21,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from stages.data import Array, CameraModel, StereoFrame
+from stages.data import Array, CameraModel, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
 from stages.stage import Finding, Severity, Stage, counted, parameter
@@ -25,13 +29,14 @@ from stages.stage import Finding, Severity, Stage, counted, parameter
 LARGEST_OFFSET = 64.0  # px
 UNUSUAL = 8.0  # px, more than a calibration leaves
 MOST_CROSSED = 0.5  # of the features
+LEAST_NEGATIVE = 0.05  # of them, where chance makes less than 0.01
 
 
 @dataclass(frozen=True)
 class Rectify(Stage):
-    """A stereo frame with row-aligned images; rectified input passes through but for the row correction.
+    """A stereo frame with row-aligned images; rectified input passes through but for these corrections.
 
-    Pixels that no raw pixel maps to are 0. A run measures the row offset once, on frames from all over the log
+    Pixels that no raw pixel maps to are 0. A run measures row offset and columns once, on frames from all over the log
     (`survey`), and corrects all frames alike; called on a single frame the stage measures that frame's own.
     """
 
@@ -42,6 +47,12 @@ class Rectify(Stage):
         " widths and heights); by default measured, and corrected where the evidence is clear",
         unit="px",
     )
+    columns: int | None = parameter(
+        None,
+        "columns by which the right image is moved to the left; by default as many as its principal point lies farther"
+        " right, where the images show that this much is needed for disparities not to be below 0",
+        unit="px", low=0, high=1024,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,31 +68,44 @@ class Rectify(Stage):
             )
 
     def __call__(self, frame: StereoFrame) -> StereoFrame:
-        if self._terms is not None:
-            return _rectified(frame, self._terms)
-        plain = _rectified(frame, ())
+        if self._terms is not None and not self._may_move(frame.camera):
+            return _rectified(frame, self._terms, self.columns or 0)
+        plain = _rectified(frame)
         offset = _measured([plain])
-        return _rectified(frame, offset.terms) if offset is not None and offset.clear else plain
+        clear = offset.terms if offset is not None and offset.clear else ()
+        terms = clear if self._terms is None else self._terms
+        columns = _columns_needed(frame.camera, offset) if self.columns is None else self.columns
+        return _rectified(frame, terms, columns) if terms or columns else plain
 
     @property
     def surveys(self) -> bool:
-        """Whether the stage wants to see frames of the whole log before it is called: unless told the row offset."""
-        return self.row_offset is None
+        """Whether the stage wants to see frames of the whole log before it is called: unless it is told all."""
+        return self.row_offset is None or self.columns is None
 
-    def survey(self, frame: Sequence[StereoFrame]) -> tuple[Rectify, Finding]:
-        """The stage with the row offset that frames have in common, and what there is to say about it."""
+    def survey(self, frame: Sequence[StereoFrame]) -> tuple[Rectify, Finding | None]:
+        """The stage with the row offset and the columns that suit all frames, and what there is to say about it."""
         plain = []
         for each in frame:
             with suppress(ValueError):  # the run will meet the frame again, and say what is the matter with it
-                plain.append(_rectified(each, ()))
-        stage, found = self._fitted(plain)
-        if plain and (doubts := plain[0].camera.doubts):
-            found = Finding("; ".join((*doubts, found.sentence)), Severity.WARNING)
-        return stage, found
+                plain.append(_rectified(each))
+        camera = plain[0].camera if plain else None
+        moves = camera is not None and self._may_move(camera)
+        offset = _measured(plain) if self.row_offset is None or moves else None
+        stage, of_rows = self._fitted(plain, offset) if self.row_offset is None else (self, None)
+        found = [Finding("; ".join(camera.doubts), Severity.WARNING)] if camera and camera.doubts else []
+        found += [of_rows] if of_rows else []
+        columns = self.columns or 0
+        if camera is not None and moves and (columns := _columns_needed(camera, offset)):
+            farther = f"the right image is moved to the left by {columns} px, as its principal point lies farther right"
+            found.append(Finding(farther))
+        return replace(stage, columns=columns), _joined(found)
 
-    def _fitted(self, plain: Sequence[StereoFrame]) -> tuple[Rectify, Finding]:
+    def _may_move(self, camera: StereoCamera) -> bool:
+        """Whether the images have to tell if the right one is moved."""
+        return self.columns is None and _infinity(camera) < 0
+
+    def _fitted(self, plain: Sequence[StereoFrame], offset: RowOffset | None) -> tuple[Rectify, Finding]:
         """The stage with the row offset of frames that are rectified but for it, and what there is to say of that."""
-        offset = _measured(plain)
         if offset is None:
             unclear = "the row offset is not clear from the images; none is corrected"
             return replace(self, row_offset=0.0), Finding(unclear)
@@ -114,22 +138,43 @@ class Rectify(Stage):
         return (float(self.row_offset),)
 
 
+def _joined(found: Sequence[Finding]) -> Finding | None:
+    """Several findings as one, None for none."""
+    worst = Severity.WARNING if any(each.severity == Severity.WARNING for each in found) else Severity.NOTE
+    return Finding("; ".join(each.sentence for each in found), worst) if found else None
+
+
+def _infinity(camera: StereoCamera) -> float:
+    """The disparity of what is infinitely far, px."""
+    return camera.cx - camera.cx_right
+
+
 def _measured(frames: Sequence[StereoFrame]) -> RowOffset | None:
     pairs = [tuple(gray(image) for image in eight_bit(frame.left, frame.right)) for frame in frames]
-    infinity = frames[0].camera.cx - frames[0].camera.cx_right if frames else 0.0
+    infinity = _infinity(frames[0].camera) if frames else 0.0
     return measure(cast(list[tuple[Array, Array]], pairs), infinity)
 
 
-def _rectified(frame: StereoFrame, row_terms: tuple[float, ...]) -> StereoFrame:
-    """The frame rectified, its right image moved down by the offset of these terms."""
+def _columns_needed(camera: StereoCamera, offset: RowOffset | None) -> int:
+    """By how much to move the right image to the left, as far as the features of `offset` tell. Near scenes that were
+    taken by such cameras may well lack disparities below 0."""
+    shown = offset is not None and offset.negative >= LEAST_NEGATIVE and offset.crossed <= MOST_CROSSED
+    return math.ceil(max(-_infinity(camera), 0.0)) if shown else 0
+
+
+def _rectified(frame: StereoFrame, row_terms: tuple[float, ...] = (), columns: int = 0) -> StereoFrame:
+    """The frame rectified, its right image moved down by the offset of these terms, and to the left."""
     camera, terms = frame.camera, row_terms if any(row_terms) else ()
-    if camera.raw is None:
-        return replace(frame, right=moved_down(frame.right, terms) if terms else frame.right)
-    left_maps = _rectifying_maps(*_frozen(camera.raw[0]), ())
-    right_maps = _rectifying_maps(*_frozen(camera.raw[1]), terms)
-    left = cv2.remap(frame.left, *left_maps, cv2.INTER_CUBIC)
-    right = cv2.remap(frame.right, *right_maps, cv2.INTER_CUBIC)
-    return StereoFrame(frame.stamp, left, right, replace(camera, raw=None))
+    left, right = frame.left, frame.right
+    if camera.raw is not None:
+        left = cv2.remap(left, *_rectifying_maps(*_frozen(camera.raw[0]), ()), cv2.INTER_CUBIC)
+        right = cv2.remap(right, *_rectifying_maps(*_frozen(camera.raw[1]), terms), cv2.INTER_CUBIC)
+    elif terms:
+        right = moved_down(right, terms)
+    if columns:
+        right = np.pad(right[:, columns:], [(0, 0), (0, min(columns, camera.width))] + [(0, 0)] * (right.ndim - 2))
+    camera = replace(camera, raw=None, cx_right=camera.cx_right - columns)
+    return StereoFrame(frame.stamp, left, right, camera)
 
 
 def _frozen(model: CameraModel) -> tuple[str, int, int, bytes]:

@@ -48,14 +48,15 @@ class RowOffset:
 
     terms: weights, px, of 1, x, y, xy, y^2, where x and y are the place in the right image from its centre, in widths
     and heights; features: pairs that agree on it; error: the largest standard deviation in the image that the terms
-    have by the scatter of the features, px: what a model of few terms cannot express is not in it; crossed: the share
-    of features that lie farther right in the right image than what is infinitely far, by more than `BEYOND`.
+    have by the scatter of the features, px: what a model of few terms cannot express is not in it; crossed, negative:
+    the shares of features whose disparity is below that of what is infinitely far, or below 0, by more than `BEYOND`.
     """
 
     terms: tuple[float, ...]
     features: int
     error: float
-    crossed: float
+    crossed: float = math.nan
+    negative: float = math.nan
 
     @property
     def clear(self) -> bool:
@@ -119,9 +120,10 @@ def measure(pairs: Sequence[tuple[Array, Array]], infinity: float = 0.0) -> RowO
             again = list(threads.map(_offsets_after, repeat(first), seen))
             rest = _fit(again, count)
             if rest is not None and rest.error <= CLEAR:
-                return replace(
-                    rest, terms=tuple(np.add(first.terms, rest.terms).tolist()), crossed=_crossed(seen, infinity)
-                )
+                disparity = np.concatenate([here[:, 0] - there[:, 0] for _, _, here, there in seen]) + BEYOND
+                crossed, negative = (float(np.mean(disparity < limit)) for limit in (infinity, 0.0))
+                terms = tuple(np.add(first.terms, rest.terms).tolist())
+                return replace(rest, terms=terms, crossed=crossed, negative=negative)
     return None
 
 
@@ -129,11 +131,6 @@ def _view(pair: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
     """Left and right image, alike in brightness, and the places (N, 2) of their features in either."""
     left, right = pair[0], _as_bright(pair[1], pair[0])
     return left, right, *_near_the_most_common(*_paired_features(left, right))
-
-
-def _crossed(seen: Sequence[tuple[Array, Array, Array, Array]], infinity: float) -> float:
-    """`RowOffset.crossed`, of the views with their features."""
-    return float(np.mean(np.concatenate([here[:, 0] - there[:, 0] < infinity - BEYOND for _, _, here, there in seen])))
 
 
 def _as_bright(image: Array, model: Array) -> Array:
@@ -164,7 +161,7 @@ def _fit(found: Sequence[tuple[Array, Array]], count: int) -> RowOffset | None:
         return None
     place, rows = (np.concatenate(parts) for parts in zip(*found, strict=True))
     terms, error, agreeing = _robust_fit(place, rows, count)
-    return RowOffset(tuple(terms.tolist()), agreeing, error, math.nan) if agreeing >= LEAST_FEATURES else None
+    return RowOffset(tuple(terms.tolist()), agreeing, error) if agreeing >= LEAST_FEATURES else None
 
 
 def _near_the_most_common(here: Array, there: Array) -> tuple[Array, Array]:

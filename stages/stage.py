@@ -37,13 +37,15 @@ class Stage:
     def __post_init__(self) -> None:
         for item in fields(self):
             value, meta = getattr(self, item.name), item.metadata
+            if value is None and item.default is None:
+                continue
             where = f"{type(self).__name__}.{item.name}"
             choices, low, high, unit = (meta.get(key) for key in ("choices", "low", "high", "unit"))
             if choices is not None and value not in choices:
                 raise ValueError(f"{where} must be one of {', '.join(map(str, choices))}, not {value}")
             if isinstance(value, numbers.Real) and not math.isfinite(value):
                 raise ValueError(f"{where} must be a finite number{f' of {unit}' if unit else ''}, not {value}")
-            if item.type in ("int", int) and not isinstance(value, numbers.Integral):
+            if item.type in ("int", "int | None", int) and not isinstance(value, numbers.Integral):
                 raise ValueError(f"{where} must be a whole number{f' of {unit}' if unit else ''}, not {value}")
             if (low is not None and not value >= low) or (high is not None and not value <= high):
                 bounds = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"

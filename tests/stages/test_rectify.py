@@ -248,6 +248,25 @@ def test_images_that_are_infinitely_far_at_another_disparity_are_not_called_swap
     assert "swapped" not in found.sentence
 
 
+@pytest.mark.parametrize("row_offset", [None, 0.0])
+def test_a_pair_whose_far_field_lies_below_disparity_0_is_moved_until_it_does_not(row_offset):
+    left, right = a_pair((0.0,), size=LARGE)
+    moved = np.roll(right, 60, axis=1)
+    camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE)
+    shifted = StereoFrame(1, left, moved, replace(camera, cx_right=380.0))
+    alone = Rectify(row_offset=row_offset)(shifted)
+    stage, found = Rectify(row_offset=row_offset).survey([shifted])
+    assert (stage.columns, found.severity) == (60, "note")
+    assert "the right image is moved to the left by 60 px" in found.sentence
+    for frame in (alone, stage(shifted)):
+        assert frame.camera.cx_right == frame.camera.cx == camera.cx
+        assert np.array_equal(frame.right[:, :-60], right[:, :-60])
+        assert not frame.right[:, -60:].any()
+    # Near scenes may be taken by such a camera as well, and lose nothing.
+    near, _ = Rectify(row_offset=row_offset).survey([StereoFrame(1, left, right, shifted.camera)])
+    assert near.columns == 0
+
+
 @pytest.mark.parametrize(("changes", "words"), [
     ({"cx": 120.0, "cx_right": 320.0}, "cx of 120 px lies in the outer fifth of 640x480 images: check that"),
     ({"cy": 400.0}, "cy of 400 px lies in the outer fifth of 640x480 images: check that"),
