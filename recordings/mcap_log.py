@@ -24,7 +24,7 @@ from recordings.mcap_index import Lost, Raw
 from recordings.mcap_messages import Decoder, peek_stamp
 from recordings.mcap_opening import Opening
 from recordings.mcap_reader import McapFile
-from recordings.rig import Camera
+from recordings.rig import Camera, rovers
 from stages.data import CameraImage, CameraModel, Pose, Tilt
 
 if TYPE_CHECKING:
@@ -202,10 +202,16 @@ class McapLog:
 
     def notes(self) -> dict[str, str]:
         """Stream -> what there is to say of it: that its messages, going by the first, have no stamps of their own; of
-        the right camera, where the baseline is from if not from its CameraInfo alone."""
+        the right camera, where the baseline is from if not from its CameraInfo alone; of the mount, that the rover's
+        frame is not known."""
         notes = {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
         if "right" in self.topics and (said := self.opening.baseline_note):
             notes["right"] = "; ".join((*filter(None, [notes.get("right")]), said))
+        if self.opening.mount is not None and self.opening.mount.base_from_camera is None:
+            notes["mount"] = (
+                f"no static transform joins '{self.source.base_frame}' and the camera: heights count from as far below "
+                "the camera as the pipeline says (points.camera_height, 1 m unless set), headings from its axis"
+            )
         return notes
 
     def _is_unstamped(self, stream: str, topic: str) -> bool:
@@ -264,7 +270,7 @@ class McapLog:
         tilt, base_frame = self.source.angles() or tilt_of, self.source.base_frame
         made: dict[str, Callable[[Any, int], Any]] = {
             "inclinometer": lambda message, log_time: self._of_the_mount(tilt(message, log_time)),
-            "odometry": lambda message, log_time: self._of_the_image(pose_of(message, log_time, base_frame)),
+            "odometry": lambda message, log_time: self._of_the_rover(pose_of(message, log_time, base_frame)),
         }
         for side, camera in zip(CAMERAS, self.opening.cameras or (), strict=False):
             made[side] = _Images(camera, calibrations[side])
@@ -278,9 +284,11 @@ class McapLog:
             raise LogError(f"its frame is '{tilt.frame_id}', but the mount was found for '{known}'")
         return tilt
 
-    def _of_the_image(self, pose: Pose | None) -> Pose | None:
+    def _of_the_rover(self, pose: Pose | None) -> Pose | None:
         cameras = self.opening.cameras
-        return pose if pose is None or cameras is None else cameras[0].of_image(pose)
+        if pose is None or cameras is None:
+            return pose
+        return rovers(pose, cameras[0], self.source.base_frame, self.opening.static)
 
     def _reading(self, stream: str, topic: str, item: Callable[[Any, int], Any]) -> Reading:
         messages = self.opening.messages

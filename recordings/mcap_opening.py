@@ -12,7 +12,7 @@ from recordings.errors import LogError, counted
 from recordings.mcap_cameras import CAMERAS, first_infos, unfit_images, unread_images
 from recordings.mcap_messages import Messages, attempt
 from recordings.mcap_reader import McapFile
-from recordings.rig import Camera, Frames, baseline_note, calibrated_pair, mounted
+from recordings.rig import Camera, Frames, baseline_note, calibrated_pair, mounted, rovers
 from stages.data import LEVEL_FRAME, Mount, Pose
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Opening:
         lacking = found.missing | unread | unpaired
         self.tilt_frame, self.mount, unmounted = self._mounted(found.chosen, lacking)
         moving = self._moving_pose(found.chosen)
-        self.refused = found.refused | (moving if self.source.odometry else {})
+        self.refused = found.refused | (moving if self.source.odometry else {}) | self._unjoined_base()
         lacking |= unmounted | moving
         there = [side for side in CAMERAS if side in found.chosen and side not in lacking]
         lacking |= unread_images(self.messages, found.chosen, there)
@@ -122,23 +122,35 @@ class Opening:
             return frame, None, {"mount": str(mount)}
         return frame, mount, {}
 
+    def _unjoined_base(self) -> dict[str, str]:
+        """Why the source's 'base_frame' cannot be as it is set, where the camera does not sit on such a frame."""
+        base = self.source.base_frame
+        if base == type(self.source).base_frame or self.mount is None or self.mount.base_from_camera is not None:
+            return {}
+        known = ", ".join(f"'{name}'" for name in sorted(self.static.edges)) or "nothing"
+        return {
+            "base_frame": f"the source's 'base_frame' is set to '{base}', which /tf_static does not join to the camera "
+            f"(it joins {known}); set the rover's"
+        }
+
     def _moving_pose(self, chosen: Mapping[str, str]) -> dict[str, str]:
         """Why the poses are of no use, where they are told in a frame that moves along, or are those of something of
         which nothing tells how the camera sits on it."""
         if self.cameras is None or "odometry" not in chosen:
             return {}
-        topic, camera = chosen["odometry"], self.cameras[0].frame_id
+        topic, camera, image = chosen["odometry"], self.cameras[0].frame_id, self.cameras[0].image_frame
         pose = self.messages.first(topic, lambda message: _pose_of(message, self.source.base_frame))
         if isinstance(pose, LogError):
             return {}
-        moving, resting = pose.child_frame_id, pose.frame_id
+        told, resting = pose.child_frame_id, pose.frame_id
+        moving = rovers(pose, self.cameras[0], self.source.base_frame, self.static).child_frame_id
         base = self.mount.base_from_camera if self.mount is not None else self.static.between(moving, camera)
         why = ""
-        if resting in (LEVEL_FRAME, camera, self.cameras[0].image_frame, moving):
+        if resting in (LEVEL_FRAME, camera, image, told, moving):
             why = f"{topic} is a pose in the frame '{resting}', which moves with the rover; record it in one that rests"
-        elif moving not in (camera, self.cameras[0].image_frame) and (base is None or base.parent != moving):
+        elif moving not in (camera, image) and (base is None or base.parent != moving):
             why = (
-                f"{topic} is the pose of '{moving}', and nothing tells how the camera '{camera}' sits on it; record "
+                f"{topic} is the pose of '{told}', and nothing tells how the camera '{camera}' sits on it; record "
                 "that in /tf_static, or set 'base_frame' of the source where it has another name"
             )
         return {"odometry": why} if why else {}

@@ -97,12 +97,10 @@ class Camera:
         turned = not np.allclose(self.model.r, np.eye(3), rtol=0, atol=_SAME)
         return f"{self.frame_id}_rectified" if turned and self.frame_id else self.frame_id
 
-    def of_image(self, pose: Pose) -> Pose:
-        """A pose of the camera's own frame as that of its rectified image; any other as it is."""
-        if pose.child_frame_id != self.frame_id or self.image_frame == self.frame_id:
-            return pose
-        turned = Rotation.from_quat(pose.quaternion) * Rotation.from_matrix(self.model.r.T)
-        return replace(pose, quaternion=turned.as_quat(), child_frame_id=self.image_frame)
+    @property
+    def image(self) -> Transform:
+        """Its rectified image in its own frame."""
+        return Transform(self.frame_id, self.image_frame, self.model.r.T, np.zeros(3))
 
 
 def calibrated_pair(
@@ -279,9 +277,22 @@ def mounted(camera: Camera, inclinometer: str, base: str, frames: Frames, given:
     coordinates, where the user gave it. Raises LogError where nothing tells that rotation.
     """
     based = frames.between(base, camera.frame_id)
-    rectified = Transform(camera.frame_id, camera.image_frame, camera.model.r.T, np.zeros(3))
-    base_from_camera = based.after(rectified) if based is not None else None
+    base_from_camera = based.after(camera.image) if based is not None else None
     return Mount(EVER, _camera_from_inclinometer(camera, inclinometer, frames, given), base_from_camera)
+
+
+def rovers(pose: Pose, camera: Camera, base: str, frames: Frames) -> Pose:
+    """A pose as that of the frame `base`, or where the camera does not sit on that, of the camera's rectified image; as
+    it is where no static transform tells how they sit on the frame whose pose it is."""
+    told = pose.child_frame_id
+    if told in (base, camera.image_frame):
+        return pose
+    if told != camera.frame_id and frames.between(base, camera.frame_id) is not None:
+        part = frames.between(told, base)
+    else:
+        on_camera = frames.between(told, camera.frame_id)
+        part = None if on_camera is None else on_camera.after(camera.image)
+    return pose if part is None else pose.of(part)
 
 
 def _camera_from_inclinometer(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.data import Array
+from stages.publish import Array
 
 
 def levered(covariance: Array, way: Array) -> Array:

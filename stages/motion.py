@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
+from stages.covariance import levered
 from stages.publish import Array, check_rotation, publish_stamp, publish_vector
 
 
@@ -110,6 +112,14 @@ class Pose:
         position = (1 - share) * self.position + share * later.position
         near = later.quaternion if self.quaternion @ later.quaternion >= 0 else -later.quaternion
         return replace(self, stamp=stamp, position=position, quaternion=_slerp(self.quaternion, near, share))
+
+    def of(self, part: Transform) -> Pose:
+        """The pose of another frame, `part.child`, that sits on this one, `part.parent`, as `part` tells."""
+        turn = Rotation.from_quat(self.quaternion)
+        way = turn.as_matrix() @ part.translation
+        covariance = None if self.covariance is None else levered(self.covariance, way)
+        quaternion = (turn * Rotation.from_matrix(part.rotation)).as_quat()
+        return Pose(self.stamp, self.position + way, quaternion, self.frame_id, part.child, covariance)
 
 
 @dataclass(frozen=True, eq=False)

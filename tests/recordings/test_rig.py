@@ -202,6 +202,45 @@ def test_a_rectified_image_has_a_frame_of_its_own_where_r_turns_the_camera(tmp_p
     np.testing.assert_allclose(Rotation.from_quat(pose.quaternion).as_matrix() @ by, given, atol=1e-9)
 
 
+@pytest.mark.parametrize("with_base", [True, False])
+def test_a_pose_of_a_part_of_the_rover_is_made_that_of_the_rover_or_of_its_camera(
+    tmp_path: Path, with_base: bool
+) -> None:
+    camera, inclinometer = TRANSFORMS
+    on_camera = camera.inverse().after(inclinometer)
+
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic == "/odom":
+            message.child_frame_id = "imu_link"
+        if topic == "/tf_static" and not with_base:
+            return transform_message([(on_camera, START)])
+        return message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert log.missing == {}
+        assert ("mount" in log.notes()) == (not with_base)
+        poses = [item for _, _, item in log.events(["odometry"])]
+    sits = inclinometer if with_base else on_camera  # the inclinometer, whose pose is logged
+    assert [pose.child_frame_id for pose in poses] == [sits.parent] * FRAMES
+    for number, pose in enumerate(poses):
+        placed = Transform("odom", sits.parent, Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
+        logged = placed.after(sits)
+        np.testing.assert_allclose(logged.translation, [number, 2.0, 3.0], atol=1e-9)
+        given = Rotation.from_quat(tilt_quaternion(number)).as_matrix()
+        np.testing.assert_allclose(logged.rotation, given, atol=1e-9)
+        # What the turn is off by, the lever makes of the place.
+        lever = float(np.linalg.norm(sits.translation))
+        assert np.trace(pose.covariance[:3, :3]) == pytest.approx(0.01 * (3 + 2 * lever**2))
+
+
+def test_a_frame_of_the_rover_that_is_set_must_be_one_that_the_camera_sits_on(tmp_path: Path) -> None:
+    with McapSource(base_frame="rover").open(write_sample(tmp_path / "log.mcap")) as log:
+        assert log.refused["base_frame"].startswith("the source's 'base_frame' is set to 'rover', which /tf_static")
+        assert "(it joins 'base_link', 'imu_link', 'left_optical')" in log.refused["base_frame"]
+    with McapSource(base_frame="imu_link").open(write_sample(tmp_path / "log.mcap")) as log:
+        assert log.refused == {}
+
+
 def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if hasattr(message, "header"):
