@@ -24,6 +24,7 @@ MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that n
 _TELLING = 100  # cells that a frame and the map must share for their heights to tell of a jump
 LARGEST_JUMP = 5.0  # standard deviations, from one frame to the next, of what joins them to the map
 PATIENCE = 3  # frames in succession that do not join the map begin a new one
+_LEANING = 5.0  # degrees; an odometry that knows no tilt is off by slopes, but hardly by one mean slope of so much
 _STEEPEST = 3.0  # rise per run; a cell at the edge of a rock may be steeper, and what it is off by is bounded
 
 
@@ -94,9 +95,11 @@ class Fuse(Stage):
         mount: how the camera sits on the frame whose pose is given; may be left out where that is the camera itself.
         """
         self._check(cloud)
-        sight = sight_of(cloud, placement(cloud, pose, mount), self.resolution, self.region)
+        placed, up = placement(cloud, pose, mount)
+        sight = sight_of(cloud, placed, self.resolution, self.region)
         if pose.frame_id != self._map.frame_id:
             self._map.begin(pose.frame_id, cloud.stamp)
+        self._map.ups += up
         known, seen = sight.known, self._seen(sight)
         cells, plane = self._joined(sight, seen)
         now = self._map.age(cloud.stamp)
@@ -108,14 +111,20 @@ class Fuse(Stage):
         return self._window(cloud.stamp, raised(sight.placed, plane))
 
     def finding(self) -> Finding | None:
-        """That the map began anew amid a run, a warning."""
-        if not self._map.anew:
-            return None
-        return Finding(
-            f"height or tilt jumped against the map, which began anew in the same frame, {self._map.frame_id}, "
-            f"{counted(self._map.anew, 'time')}: maps from before and after that do not join",
-            Severity.WARNING,
-        )
+        """That the map began anew amid a run, and that its frame leans, a warning."""
+        found = []
+        if self._map.anew:
+            found.append(
+                f"height or tilt jumped against the map, which began anew in the same frame, {self._map.frame_id}, "
+                f"{counted(self._map.anew, 'time')}: maps from before and after that do not join"
+            )
+        lean = float(np.degrees(np.arctan2(np.linalg.norm(self._map.ups[:2]), self._map.ups[2])))
+        if lean > _LEANING:
+            found.append(
+                f"z of the pose's frame '{self._map.frame_id}' is {lean:.0f} degrees off the vertical of the tilt: the "
+                "map is upright and its way is foreshortened; record the pose in a frame whose z points up"
+            )
+        return Finding("; ".join(found), Severity.WARNING) if found else None
 
     def _check(self, cloud: PointCloud) -> None:
         if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:

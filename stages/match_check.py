@@ -14,12 +14,18 @@ import numpy as np
 from stages.data import Disparity, MatchHealth, Source
 from stages.stage import Finding, Severity, Stage, counted, parameter
 
+_EVERY = 8  # px; enough to tell
+_HANGING = 1.5  # how much larger the disparities of the upper half are where that is nearer; ground in view makes it 2
+
 
 @dataclass(frozen=True)
 class CheckMatches(Stage):
     """Counts matches, and warns at the end if in most frames the ground before the rover had few; it remembers."""
 
-    lowest: float = parameter(0.125, "share of the rows that show that ground: the lowest", low=0.01, high=1.0)
+    lowest: float = parameter(
+        0.125, "share of the rows that show that ground: the lowest, of a camera that hangs the highest",
+        low=0.01, high=1.0,
+    )  # fmt: skip
     least: float = parameter(0.7, "share of it that must be matched", low=0.0, high=1.0)
     _near: list[float] = field(default_factory=list, init=False, repr=False, compare=False)
 
@@ -30,7 +36,8 @@ class CheckMatches(Stage):
         height, width = disparity.pixels.shape
         source = disparity.source[:, width // 2 :]
         matched = (source == Source.MEASURED) | (source == Source.PLANE)
-        near = float(matched[height - max(1, round(self.lowest * height)) :].mean())
+        rows = max(1, round(self.lowest * height))
+        near = float(matched[_towards_the_ground(disparity)][-rows:].mean())
         self._near.append(near)
         return MatchHealth(disparity.stamp, float(matched.mean()), near)
 
@@ -45,3 +52,13 @@ class CheckMatches(Stage):
             "right",
             Severity.WARNING,
         )
+
+
+def _towards_the_ground(disparity: Disparity) -> slice:
+    """The rows in the order in which disparities grow: downwards, but where the camera hangs upside down."""
+    some = slice(None, None, _EVERY), slice(None, None, _EVERY)
+    measured, pixels = disparity.source[some] == Source.MEASURED, disparity.pixels[some]
+    middle = len(pixels) // 2
+    upper, lower = pixels[:middle][measured[:middle]], pixels[middle:][measured[middle:]]
+    hangs = len(upper) and len(lower) and np.median(upper) > _HANGING * np.median(lower)
+    return slice(None, None, -1) if hangs else slice(None)

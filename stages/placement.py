@@ -51,8 +51,9 @@ class Sight:
         return x - self.placed.translation[0], y - self.placed.translation[1]
 
 
-def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> Transform:
-    """Frame `level` of a levelled cloud in the pose's frame: upright, turned by the pose's heading.
+def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tuple[Transform, Array]:
+    """Frame `level` of a levelled cloud in the pose's frame: upright, turned by the pose's heading; and up (3,), as the
+    tilt tells, in the frame as it is.
 
     Pitch and roll of the pose are not used: which way is up, the inclinometer knows. Raises ValueError where nothing
     tells how the frame whose pose it is sits to the camera, or where the pose's frame does not have z up.
@@ -70,7 +71,7 @@ def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> Tran
     yaw = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
     rotation = Rotation.from_euler("z", yaw).as_matrix()
     origin = cloud.sensor(child.inverse().translation)  # of the frame whose pose it is, in level
-    return Transform(pose.frame_id, LEVEL_FRAME, rotation, pose.position - rotation @ origin)
+    return Transform(pose.frame_id, LEVEL_FRAME, rotation, pose.position - rotation @ origin), turned[:, 2]
 
 
 def _child_from_camera(pose: Pose, sensor: Transform, mount: Mount | None) -> Transform:

@@ -28,8 +28,8 @@ _MS = 1_000_000
 @dataclass(eq=False)
 class Region:
     """The map so far: its frame, the stamps of its first and last frame, ns, whether those tell what was hidden from
-    them, its cells, the plane that joined the last frame, how many in succession did not join, and how often the map
-    began anew for that."""
+    them, its cells, the plane that joined the last frame, the sum of up as the tilts tell it in the map's frame, how
+    many frames in succession did not join, and how often the map began anew for that."""
 
     frame_id: str | None = None  # a pose may be in a frame without a name
     epoch: int = 0
@@ -37,12 +37,14 @@ class Region:
     hides: bool = False
     cells: Tiles = field(default_factory=lambda: Tiles(CELL))
     plane: Array = field(default_factory=lambda: np.zeros(3))
+    ups: Array = field(default_factory=lambda: np.zeros(3))
     refused: int = 0
     anew: int = 0
 
     def begin(self, frame_id: str, stamp: int) -> None:
         """Start anew: nothing joins the two."""
-        self.frame_id, self.epoch, self.cells, self.plane = frame_id, stamp, Tiles(CELL), np.zeros(3)
+        self.frame_id, self.epoch, self.cells = frame_id, stamp, Tiles(CELL)
+        self.plane, self.ups = np.zeros(3), np.zeros(3)
 
     def age(self, stamp: int) -> int:
         """The time since the first frame, ms."""

@@ -71,7 +71,7 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance():
     ]
     clouds[1] = (clouds[1][0], replace(clouds[1][1], position=[0, 0, 0]))
     clouds[1] = (replace(clouds[1][0], points=clouds[1][0].points + np.float32([0, 0, 0.01])), clouds[1][1])
-    local = [sight_of(cloud, placement(cloud, pose, MOUNT), 0.05, 8.0).terrain.layers for cloud, pose in clouds]
+    local = [sight_of(cloud, placement(cloud, pose, MOUNT)[0], 0.05, 8.0).terrain.layers for cloud, pose in clouds]
     for cloud, pose in clouds:
         terrain = fuse(cloud, pose, MOUNT)
     one, other = (layers["variance"].astype(float) + fuse.alignment**2 for layers in local)
@@ -272,8 +272,8 @@ for frame in range(int(sys.argv[1]) // 8):
 tiles = fuse._map.cells.tiles.values()
 cells = sum(int((tile["frames"] > 0).sum()) for tile in tiles)
 with open("/proc/self/status") as status:
-    peak = next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
-print(cells, sum(tile.nbytes for tile in tiles) / 1e6, peak / 1024)
+    size = {line.split(":")[0]: int(line.split()[1]) / 1024 for line in status if line.startswith(("VmHWM", "RssFile"))}
+print(cells, sum(tile.nbytes for tile in tiles) / 1e6, size["VmHWM"] - size["RssFile"])
 """
 
 
@@ -284,4 +284,5 @@ def test_a_kilometre_of_20_metres_width_fits_into_500_megabytes(metres):
     cells, map_size, process_size = (float(value) for value in done.stdout.split())
     assert cells == pytest.approx(metres * 20 / 0.05**2, rel=0.01)
     assert map_size < 0.26 * metres + 2
-    assert process_size < 500 - 0.26 * (1000 - metres)
+    # Of the 500 MB 80 are for the libraries' files, of whose pages systems map more or fewer at a time.
+    assert process_size < 500 - 80 - 0.26 * (1000 - metres)

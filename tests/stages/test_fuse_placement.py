@@ -26,7 +26,7 @@ def test_frames_with_errors_of_their_tilt_join_without_a_seam():
     rng, fuse, seams, before = np.random.default_rng(3), Fuse(), [], None
     for frame in range(12):
         cloud, pose = drive(frame, tilt=tuple(rng.normal(0, np.radians(0.4), 2)), noise=0.01)
-        now = [heights(cloud, placed) for placed in (placement(cloud, pose, MOUNT), fuse(cloud, pose, MOUNT).level)]
+        now = [heights(cloud, placed) for placed in (placement(cloud, pose, MOUNT)[0], fuse(cloud, pose, MOUNT).level)]
         if before is not None:
             off = [one - other for one, other in zip(before, now, strict=True)]
             seams.append([1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) for values in off])
@@ -65,7 +65,7 @@ def test_roll_and_pitch_of_the_pose_do_not_tilt_the_map():
     tilted = Rotation.from_quat(pose.quaternion) * Rotation.from_euler("yx", [8, -5], degrees=True)
     level = Transform("level", "base_link", Rotation.from_euler("yx", [8, -5], degrees=True).as_matrix(), np.zeros(3))
     cloud = replace(cloud, sensor=level.after(MOUNT.base_from_camera))
-    placed = placement(cloud, replace(pose, quaternion=tilted.as_quat()), MOUNT)
+    placed, _ = placement(cloud, replace(pose, quaternion=tilted.as_quat()), MOUNT)
     np.testing.assert_allclose(placed.rotation, Rotation.from_quat(pose.quaternion).as_matrix(), atol=1e-9)
     np.testing.assert_allclose(placed.translation, pose.position, atol=1e-9)
 
@@ -92,6 +92,20 @@ def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(c
     with pytest.raises(ValueError, match=sentence):
         fuse(*change(*drive(1)), MOUNT)
     np.testing.assert_array_equal(fuse._map.cells.read(-300, -300, 600, 600), before)
+
+
+@pytest.mark.parametrize(("degrees", "told"), [(0, False), (3, False), (12, True)])
+def test_a_pose_in_a_frame_that_leans_is_told(degrees, told):
+    fuse, lean = Fuse(), Rotation.from_euler("x", degrees, degrees=True)
+    for frame in range(4):
+        cloud, pose = drive(frame)
+        quaternion = (lean * Rotation.from_quat(pose.quaternion)).as_quat()
+        fuse(cloud, replace(pose, position=lean.as_matrix() @ pose.position, quaternion=quaternion), MOUNT)
+    found = fuse.finding()
+    assert (found is not None) == told
+    if found:
+        assert "'odom' is 12 degrees off the vertical" in found.sentence
+        assert found.severity == "warning"
 
 
 @pytest.mark.parametrize("jump", [np.array([0, 0, up]) for up in (0.6, -0.4, 30.0, -1e3, 1e6)])

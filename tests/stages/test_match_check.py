@@ -30,6 +30,18 @@ def test_the_warning_asks_for_the_lowest_rows_and_for_most_frames():
     assert "0 % is matched (median of 5 frames)" in found.sentence
 
 
+@pytest.mark.parametrize("hangs", [False, True])
+def test_of_a_camera_that_hangs_upside_down_the_nearest_ground_is_above(hangs):
+    away = np.linspace(10, 60, 80, dtype=np.float32)[:, None] + np.zeros((1, 100), np.float32)
+    matched = np.ones(away.shape, bool)
+    matched[:10] = False  # sky
+    shown = disparity_with(matched)
+    shown = Disparity(0, away, shown.source, shown.confidence)
+    if hangs:
+        shown = Disparity(0, shown.pixels[::-1], shown.source[::-1], shown.confidence)
+    assert CheckMatches()(shown).near == 1
+
+
 @pytest.mark.parametrize("pipeline", ["rover", "fast"])
 def test_a_search_range_that_ends_short_of_the_ground_is_a_warning_and_one_that_does_not_is_none(pipeline):
     simulation = Simulation(frames=1, width=320, height=240, seed=1, abundance=0.1)
