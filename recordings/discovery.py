@@ -125,7 +125,6 @@ def _find_images(topics: Sequence[Topic], settings: McapSource, found: Topics) -
         if name in by_name
         and settings.left in (None, left.name)
         and settings.right in (None, name)
-        and by_name[name].schema == left.schema
     ]
     if not pairs:
         listed = _listed(candidates)

@@ -8,7 +8,7 @@ tells up from down, and a right angle, where the rover hardly moved.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,6 +36,8 @@ SAME = 0.3  # difference of two rotations, as a matrix, below which they are one
 HIDDEN = 0.33  # standard deviation of a fault, over the least that counts, beyond which a fault could go unseen
 INCONSISTENT = "inconsistent"  # the fault of a tilt that no single fault explains
 OFF_GROUND = "up is off the ground"  # of one that the ground contradicts, where the motion cannot tell why
+_UNJUDGED = "its stamps are late or early"
+_NOT_YET = "these frames are too few, or too far apart in time, to tell the two apart: check the clocks first"
 WILD = 4.0  # how many times more than the camera the tilt must turn to have a wrong unit
 WILD_ANGLE = float(np.deg2rad(4))
 
@@ -88,6 +90,8 @@ def _judged(
     if gain > MARGIN and best.size > 1:
         near = best.score(variance) + RIVAL
         rivals = [cause for cause in causes if cause is not best and cause.size > 1 and cause.score(variance) < near]
+        if best is mount and offset is None:
+            best = replace(best, fault=f"{best.fault} or {_UNJUDGED}", remedy=f"{_NOT_YET}; {best.remedy}")
         return _named(best, rivals, n, float(before), float(after)), seems
     return _passed(sound, axes, mount, offset, variance, n, float(before)), seems
 

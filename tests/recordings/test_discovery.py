@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from recordings import McapSource
 from recordings.ros2 import camera_info, image, transform_message
+from recordings.ros2_types import make
 from recordings.ros2_writer import Ros2Writer
 from stages.data import Transform
 from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, items_of, model, picture, write_sample
@@ -39,6 +41,19 @@ def test_cameras_of_two_places_are_not_better_or_worse_than_each_other(tmp_path:
         assert "/rear/left/image_rect with /rear/right/image_rect" in log.missing["left"]
     with McapSource(right="/front/right/image_raw").open(path) as log:
         assert log.topics["left"] == "/front/left/image_raw"
+
+
+def test_one_camera_may_send_its_images_compressed(tmp_path: Path) -> None:
+    packed = cv2.imencode(".png", picture(0))[1].ravel()
+
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic != LEFT:
+            return message
+        return make("sensor_msgs/msg/CompressedImage", header=message.header, format="png", data=packed)
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert (log.topics["left"], log.topics["right"]) == (LEFT, RIGHT)
+        assert [item.pixels.shape for _, _, item in log.events(["left"])] == [picture(0).shape] * FRAMES
 
 
 @pytest.mark.parametrize("raw", ["/cam/left/image_raw", "/cam/left_raw/image_raw"])

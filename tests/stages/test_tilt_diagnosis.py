@@ -88,6 +88,13 @@ def test_a_time_offset_is_named_with_its_size(drive, late):
     assert abs(int(size[1]) - 200) < 50
 
 
+@pytest.mark.parametrize("late", [0.2, 0.1, -0.2])
+def test_few_frames_that_tell_a_wrong_mount_do_not_hide_that_it_may_be_the_time(late):
+    found = diagnose(Drive(3, 5.0, 0.1).evidence(frames=8, late=late))
+    assert re.match(r"the mount .* is wrong by .* degrees or its stamps are late or early$", found.fault)
+    assert "check the clocks first" in found.sentence
+
+
 @settings(max_examples=40, deadline=None)
 @example(seed=31, slope=2.0, noise=0.03, frames=22, odometry=0.05)  # the camera's drift is more than the tilt's noise
 @given(
