@@ -23,8 +23,10 @@ def finding(severity: str, sentence: str) -> Finding:
 
 
 def plain(said: Any) -> Finding:
-    """A finding out of what a stage returns: an object with `severity` and `sentence`; one whose severity is none is a
-    warning that says so."""
+    """A finding out of what a stage returns: an object with `severity` and `sentence`; what is none, or has a severity
+    that is none, is a warning that says so."""
+    if not (hasattr(said, "severity") and hasattr(said, "sentence")):
+        return finding(WARNING, f"its finding must have a severity and a sentence, or be None, not {said!r:.80}")
     severity, sentence = str(said.severity), str(said.sentence)
     if severity not in (NOTE, WARNING):
         wrong = f"a {type(said).__name__}'s severity must be {NOTE} or {WARNING}, not '{severity}'"

@@ -14,7 +14,7 @@ from typing import Any, get_args
 from flow.document import Value, nearest, read, settled
 from flow.entry import Entry, mapping
 from flow.errors import UsageError
-from flow.graph import Graph, Node, Place, accepts, clock_of, in_order, output_of, ports_of, unfit
+from flow.graph import Graph, Node, Place, accepts, clock_of, in_order, is_aligner, output_of, ports_of, unfit
 
 SHIPPED = Path(__file__).parent / "pipelines"
 _BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"
@@ -130,6 +130,8 @@ def _inputs(name: str, entry: Entry, streams: list[str]) -> dict[str, str]:
     for port in ports:
         if port not in inputs and port not in unneeded:
             raise entry.place.error(f"'{name}' lacks its input '{port}' ({entry.use} needs it)")
+    if is_aligner(entry.kind) and len(set(inputs.values())) < len(inputs):
+        raise entry.place.error(f"'{name}' aligns '{next(iter(inputs.values()))}' with itself; name two streams")
     if not inputs:
         raise entry.place.error(f"'{name}' has no input: give it a stream, for it works once for each item of one")
     return inputs

@@ -202,8 +202,11 @@ def _place(vector: Any, what: str) -> Array:
 def rotation_of(quaternion: Any, what: str) -> Rotation:
     """The rotation of a geometry_msgs/Quaternion that is a unit quaternion, or nearly."""
     values = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
-    if not abs(float(np.linalg.norm(values)) - 1) < 1e-2:
-        raise LogError(f"the quaternion of {what} is not a rotation: {values.tolist()}")
+    length = float(np.linalg.norm(values))
+    if not abs(length - 1) < 1e-2:
+        raise LogError(
+            f"the quaternion of {what} is not a rotation: {values.tolist()} has the length {length:.3g}, not 1"
+        )
     return Rotation.from_quat(values)
 
 

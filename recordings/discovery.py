@@ -122,9 +122,7 @@ def _find_images(topics: Sequence[Topic], settings: McapSource, found: Topics) -
         (left, by_name[name])
         for left in candidates
         for name in partners(left.name)
-        if name in by_name
-        and settings.left in (None, left.name)
-        and settings.right in (None, name)
+        if name in by_name and settings.left in (None, left.name) and settings.right in (None, name)
     ]
     if not pairs:
         listed = _listed(candidates)

@@ -238,7 +238,8 @@ def in_order(message: T, clocks: Iterable[Clock]) -> T | Lost:
     if not fall:
         return message
     back = f"by {fall / 1e9:.3g} s or more, and was not yet 1 s beyond where it had been"
-    return Lost(message.channel, message.log_time, f"the log's clock was set back {back}")
+    remedy = "if no clock was set and the log is only written in another order, `mcap sort` mends it"
+    return Lost(message.channel, message.log_time, f"the log's clock was set back {back}; {remedy}")
 
 
 def _stream(content: bytes | memoryview) -> ReadDataStream:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
@@ -41,7 +41,8 @@ def written(path: Path) -> Iterator[Path]:
             yield temporary
             give_name(temporary, path)
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # where nothing can be written, there is nothing to clear away
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -61,6 +61,11 @@ def test_info_counts_pairs_and_tilts_by_the_tolerances_of_the_pipeline(tmp_path,
     assert frames() == (0, 0.005, 4, 0.2)
     assert frames("--set", "stereo.slop=10 ms") == (5, 0.01, 4, 0.2)
     assert frames("--set", "tilt.max_gap=1 ms", "--set", "logged.max_gap=2 s") == (0, 0.005, 0, 0.001)
+    for wide, said in (("5 ms", "its right one (see frames)"), ("10 ms", "its tilt (see frames)")):
+        assert roverflow("info", log, "--set", f"stereo.slop={wide}", "--set", "tilt.max_gap=1 ms") == 0
+        last = capsys.readouterr().out.splitlines()[-1]
+        assert last.startswith("run -p rover: has all it needs, but no")
+        assert last.endswith(f"would find {said}")
     pipeline.write_text("""
 source: {use: recordings.McapSource}
 streams:

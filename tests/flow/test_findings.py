@@ -65,6 +65,12 @@ def test_a_finding_that_breaks_down_costs_the_run_nothing(tmp_path):
     assert found["sentence"].startswith("RuntimeError: unlucky (toys.py, line ")
 
 
+def test_a_finding_that_is_none_is_a_warning_that_says_so():
+    said = plain("the mount is loose")
+    assert said["severity"] == "warning"
+    assert said["sentence"] == "its finding must have a severity and a sentence, or be None, not 'the mount is loose'"
+
+
 @pytest.mark.parametrize("said", [Finding("warning", "the mount is loose"), Finding("the mount is loose", "warn")])
 def test_a_finding_of_no_severity_that_there_is_is_a_warning_that_says_what_is_wrong(said):
     wrong = f"a Finding's severity must be note or warning, not '{said.severity}'"

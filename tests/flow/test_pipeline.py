@@ -130,6 +130,7 @@ def test_a_key_of_a_setting_is_replaced_wherever_it_is_named_or_in_one_place_alo
         ("couple: both", "couple: sum", 5, ["circle", "twice -> sum -> twice"]),
         ("right: right", "right: words", 3, ["a Number cannot be paired with a Text"]),
         ("stream: level", "stream: words", 4, ["a Text cannot be interpolated"]),
+        ("right: right", "right: left", 3, ["'both' aligns 'left' with itself"]),
         ("stream: level, at: both", "stream: level, at: right", 6, ["different clocks", "align them first"]),
         ("toys.Scale", "toys.Scael", 5, ["no 'Scael'", "did you mean 'Scale'"]),
         ("flow.toys.Scale", "flaw.toys.Scale", 5, ["cannot import 'tests.flaw.toys'"]),
