@@ -11,10 +11,8 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from recordings.mcap_source import McapSource
+from recordings.log_settings import LogSettings
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -65,7 +63,7 @@ class Topics:
 
 def discover(
     topics: Sequence[Topic],
-    settings: McapSource,
+    settings: LogSettings,
     bare_angles: bool,
     frame_of: Callable[[str], str],
     untilted: Callable[[str], str | None],
@@ -104,7 +102,7 @@ def partners(name: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _find_images(topics: Sequence[Topic], settings: McapSource, found: Topics) -> None:
+def _find_images(topics: Sequence[Topic], settings: LogSettings, found: Topics) -> None:
     images = [topic for topic in topics if topic.schema in IMAGES]
     names = {topic.name for topic in images}
     for side, given in (("left", settings.left), ("right", settings.right)):
@@ -168,7 +166,7 @@ def looks_rectified(topic: str) -> bool:
 
 
 def _find_info(
-    topics: Sequence[Topic], settings: McapSource, side: str, frame_of: Callable[[str], str], found: Topics
+    topics: Sequence[Topic], settings: LogSettings, side: str, frame_of: Callable[[str], str], found: Topics
 ) -> None:
     infos = [topic for topic in topics if topic.schema == INFO and topic.messages]
     given = settings.left_info if side == "left" else settings.right_info
@@ -197,7 +195,7 @@ def _find_info(
 
 def _find_tilt(
     topics: Sequence[Topic],
-    settings: McapSource,
+    settings: LogSettings,
     bare_angles: bool,
     untilted: Callable[[str], str | None],
     found: Topics,
@@ -244,7 +242,7 @@ def _undefined(topic: Topic) -> str:
 
 
 def _find_pose(
-    topics: Sequence[Topic], settings: McapSource, unplaced: Callable[[str], str | None], found: Topics
+    topics: Sequence[Topic], settings: LogSettings, unplaced: Callable[[str], str | None], found: Topics
 ) -> None:
     poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
     if settings.odometry is not None:

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from recordings.decode import camera_model, frame_of, pixels_of, pose_of, stamp_or, tilt_of
 from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import LogError, said
+from recordings.log_settings import LogSettings
 from recordings.mcap_cameras import CAMERAS
 from recordings.mcap_index import Lost, Raw
 from recordings.mcap_messages import Decoder, peek_stamp
@@ -26,9 +27,6 @@ from recordings.mcap_opening import Opening
 from recordings.mcap_reader import McapFile
 from recordings.rig import Camera, rovers
 from stages.data import CameraImage, CameraModel, Pose, Tilt
-
-if TYPE_CHECKING:
-    from recordings.mcap_source import McapSource
 
 LEAD = 1_000_000_000  # ns; tilt and pose are read this much beyond the ends of a range, to interpolate at its frames
 AHEAD = 100_000_000  # ns; so much later a calibration may be logged than the image it is for
@@ -118,7 +116,7 @@ class McapLog:
     """
 
     path: Path
-    source: McapSource
+    source: LogSettings
     start: float | None = None
     end: float | None = None
     opening: Opening = field(init=False)

@@ -4,19 +4,17 @@ log cannot give why not."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from recordings.decode import frame_name, frame_of, pose_of, tilt_of
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError, counted
+from recordings.log_settings import LogSettings
 from recordings.mcap_cameras import CAMERAS, first_infos, unfit_images, unread_images
 from recordings.mcap_messages import Messages, attempt
 from recordings.mcap_reader import McapFile
 from recordings.rig import Camera, Frames, baseline_note, calibrated_pair, mounted, rovers
 from stages.data import LEVEL_FRAME, Mount, Pose
-
-if TYPE_CHECKING:
-    from recordings.mcap_source import McapSource
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
 _TRANSFORMS_LOOKED_AT = 100  # messages from the first one of the rover on; others may come more rarely
@@ -33,7 +31,7 @@ class Opening:
     mount: how the camera sits on the rover; problems: (stream, loss) that came up.
     """
 
-    def __init__(self, file: McapFile, source: McapSource) -> None:
+    def __init__(self, file: McapFile, source: LogSettings) -> None:
         self.file, self.source, self.messages = file, source, Messages(file)
         self.static, self.problems = self._read_static()
         self.undecodable = self._sealed_topics()

@@ -17,9 +17,9 @@ import numpy as np
 from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.around import Windows, windows
-from stages.kernels.pair import Rule
 from stages.kernels.prior import prior_costs
 from stages.kernels.ranges import Range, lanes_for, ranges_of, whole_range
+from stages.kernels.rule import Rule
 from stages.kernels.semiglobal import match
 from stages.stage import Stage, check_rectified, parameter
 

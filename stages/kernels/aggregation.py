@@ -16,14 +16,13 @@ place.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 
 from stages.data import Array
 from stages.kernels.census import census_costs
 from stages.kernels.compiled import kernel, part
+from stages.kernels.rule import Rule
 from stages.kernels.sharing import AtOnce, by_bands, in_turn
 from stages.kernels.vectors import (
     Width,
@@ -39,9 +38,6 @@ from stages.kernels.vectors import (
     spread,
     store,
 )  # fmt: skip
-
-if TYPE_CHECKING:
-    from stages.kernels.pair import Rule
 
 BLOCK = 64
 FAR = 255  # beyond either end of the search range

@@ -19,7 +19,8 @@ from stages.kernels.aggregation import FAR, aggregate_reference, next_path
 from stages.kernels.census import PLANES, census_costs
 from stages.kernels.compiled import kernel, part
 from stages.kernels.gradient import LARGEST, raw_costs
-from stages.kernels.pair import Pair, Rule
+from stages.kernels.pair import Pair
+from stages.kernels.rule import Rule
 from stages.kernels.selection import find_winner, fit_row, select_reference
 from stages.kernels.sharing import AtOnce, by_bands, shared_by
 from stages.kernels.vectors import (

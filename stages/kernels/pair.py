@@ -1,4 +1,4 @@
-"""What the matcher's searches are told, and what they read of the images, made once for a frame."""
+"""What the matcher's searches read of the images, made once for a frame."""
 
 from __future__ import annotations
 
@@ -11,27 +11,11 @@ from stages.data import Array
 from stages.kernels.aggregation import brightness_steps
 from stages.kernels.census import census
 from stages.kernels.gradient import gradients
+from stages.kernels.rule import Rule
 from stages.kernels.sharing import AtOnce, in_turn
 from stages.kernels.vectors import Width
 
 NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)
-
-
-class Rule(NamedTuple):
-    """How to match: see `stages.Match` for the meaning of each."""
-
-    gradient: bool  # census and gradient, or census alone
-    diagonals: bool  # 8 paths, or 4
-    p1: int
-    table: Array  # (256,) uint8, p2 for each step of brightness
-    unseen: int  # cost of a partner outside the right image
-    disparities: int
-    minimum: int
-    uniqueness: int
-    consistency: int
-    speckle_range: float
-    speckle_size: int
-    calibration: Array  # (256,) float32, confidence for each amount of evidence
 
 
 class Pair(NamedTuple):

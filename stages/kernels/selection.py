@@ -10,12 +10,11 @@ lane from pixel to pixel, as the partners do.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import part
+from stages.kernels.rule import Rule
 from stages.kernels.vectors import (
     byte,
     count_up,
@@ -31,9 +30,6 @@ from stages.kernels.vectors import (
     store,
     where_less,
 )  # fmt: skip
-
-if TYPE_CHECKING:
-    from stages.kernels.pair import Rule
 
 
 @part
@@ -92,7 +88,7 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):  # typ
     """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
 
     winner, votes, partners: of `find_winners` and `find_partners`; first: (W,) int32, disparity of the first lane;
-    top: the last lane that is a disparity; rule: `pair.Rule`; into pixels (W,) float32, px, NaN = unknown, and
+    top: the last lane that is a disparity; rule: `Rule`; into pixels (W,) float32, px, NaN = unknown, and
     evidence (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown.
 
     A winner at an end of the search range, or with a neighbour outside the right image, is none: its lines would lean

@@ -26,8 +26,9 @@ from stages.kernels.around import Windows, search_around
 from stages.kernels.blank import blank_windows, drop_blank
 from stages.kernels.compiled import kernel
 from stages.kernels.gradient import smoothed_costs
-from stages.kernels.pair import Pair, Rule, describe
+from stages.kernels.pair import Pair, describe
 from stages.kernels.ranges import Range, lanes_for, move_paths, within
+from stages.kernels.rule import Rule
 from stages.kernels.selection import find_partners, find_winners, fit_row
 from stages.kernels.sharing import AtOnce, by_bands, shared_by
 from stages.kernels.speckles import drop_speckles
