@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from typing import Any
 
@@ -50,6 +50,11 @@ class Entry:
         """Where a key of it stands."""
         return self.item.value[key].place  # type: ignore[no-any-return]
 
+    def place_at_fault(self, keys: Iterable[str]) -> Place:
+        """Where it went wrong, as far as can be told: at the last of the keys that the command line set, if any."""
+        by_hand = [place for place in map(self.place_of, keys) if place.line is None]
+        return by_hand[-1] if by_hand else self.place
+
     def given(self, but: Collection[str] = ()) -> dict[str, Value]:
         """What it says beside its class, but for some keys."""
         return {key: value for key, value in self.item.value.items() if key != "use" and key not in but}
@@ -78,9 +83,9 @@ class Entry:
         try:
             return self.kind(**values)
         except (Exception, SystemExit) as error:  # whatever a stage of the user's own may raise
-            by_hand = [self.place_of(key) for key in values if self.place_of(key).line is None]
-            named = [self.place_of(key) for key in values if f"{self.kind.__name__}.{key}" in str(error)]
-            raise (named or by_hand or [self.place])[-1].error(failure(error)) from error
+            named = [key for key in values if f"{self.kind.__name__}.{key}" in str(error)]
+            place = self.place_of(named[-1]) if named else self.place_at_fault(values)
+            raise place.error(failure(error)) from error
 
 
 def _class(use: str, place: Place) -> type:

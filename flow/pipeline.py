@@ -131,7 +131,8 @@ def _inputs(name: str, entry: Entry, streams: list[str]) -> dict[str, str]:
         if port not in inputs and port not in unneeded:
             raise entry.place.error(f"'{name}' lacks its input '{port}' ({entry.use} needs it)")
     if is_aligner(entry.kind) and len(set(inputs.values())) < len(inputs):
-        raise entry.place.error(f"'{name}' aligns '{next(iter(inputs.values()))}' with itself; name two streams")
+        twice = f"'{name}' aligns '{next(iter(inputs.values()))}' with itself; name two streams"
+        raise entry.place_at_fault(inputs).error(twice)
     if not inputs:
         raise entry.place.error(f"'{name}' has no input: give it a stream, for it works once for each item of one")
     return inputs
