@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from stages.covariance import levered
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.level import level_transform
+from stages.pose_check import PoseCheck
 from stages.stage import Finding, Severity, Stage, counted, parameter
 
 VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once
@@ -41,11 +42,13 @@ class _State:
 
 @dataclass
 class _Memory:
-    """The state after the last frame, how many poses were made, and the last segment of the motion."""
+    """The state after the last frame, how many poses were made, the last segment of the motion, and what is thought of
+    the poses that were logged."""
 
     state: _State | None = None
     visual: int = 0
     segment: int = 0
+    check: PoseCheck = field(default_factory=PoseCheck)
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,7 @@ class Locate(Stage):
         """
         self._memory.segment = motion.segment
         if logged is not None:
+            self._memory.check.add(motion, logged, mount)
             return logged
         if motion.camera is None:
             raise ValueError(f"Locate: no pose can be told from the images: {motion.lost}")
@@ -87,9 +91,11 @@ class Locate(Stage):
         return self._pose(motion.stamp, state, mount)
 
     def finding(self) -> Finding | None:
-        """Where poses come from, if not from the log, and how often tracking was lost: a warning where that parts them;
-        None where they are given and it never was."""
+        """Where poses come from, if not from the log, and how often tracking was lost: a warning where that parts them,
+        and where those of the log do not fit the images; None where they are given and do."""
         memory = self._memory
+        if doubt := memory.check.doubt():
+            return Finding(doubt, Severity.WARNING)
         lost = "tracking was lost " + ("once" if memory.segment == 2 else f"{memory.segment - 1} times")
         if memory.state is None:
             return Finding(f"{lost} by visual odometry; the poses are the log's own") if memory.segment > 1 else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -127,6 +128,44 @@ def test_a_lost_track_is_a_mere_note_where_the_log_has_the_poses():
         motion = motions(DRIVE.cameras(1), DRIVE.stamps(1), segment=segment)[0]
         stage(motion, Tilt(7, DRIVE.ups(1)[0]), mount_of(DRIVE), pose)
     assert stage.finding() == Finding("tracking was lost 2 times by visual odometry; the poses are the log's own")
+
+
+def frozen(poses: list[Pose]) -> list[Pose]:
+    return [replace(pose, position=poses[0].position) for pose in poses]
+
+
+def askew(poses: list[Pose]) -> list[Pose]:
+    by = Rotation.from_euler("z", 90, degrees=True)
+    return [replace(pose, quaternion=(by * Rotation.from_quat(pose.quaternion)).as_quat()) for pose in poses]
+
+
+def leaping(poses: list[Pose]) -> list[Pose]:
+    return [replace(pose, position=pose.position + (5.0 if number > 9 else 0.0)) for number, pose in enumerate(poses)]
+
+
+def slipping(poses: list[Pose]) -> list[Pose]:
+    return [replace(pose, position=1.1 * pose.position) for pose in poses]
+
+
+@pytest.mark.parametrize("based", [True, False])
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda poses: poses, None),
+    (slipping, None),
+    (frozen, r"does not move as the images tell: steps of 0\.0\d m for theirs of 0\.\d\d m"),
+    (askew, "does not move as the images tell"),
+    (leaping, r"jumps once against the images, by up to 8\.\d m"),
+])  # fmt: skip
+def test_a_logged_pose_that_does_not_fit_the_images_is_a_warning(change, said, based):
+    stage, mount = Locate(), mount_of(DRIVE, based)
+    poses = change(located(DRIVE, Locate(), based))
+    given = motions(DRIVE.cameras(), DRIVE.stamps())
+    for motion, up, pose in zip(given, DRIVE.ups(), poses, strict=True):
+        assert stage(motion, Tilt(motion.stamp, up), mount, pose) is pose
+    found = stage.finding()
+    assert (found is None) == (said is None)
+    if found is not None and said is not None:
+        assert re.search(said, found.sentence)
+        assert found.severity == Severity.WARNING
 
 
 def test_without_base_link_it_is_the_cameras_pose():
