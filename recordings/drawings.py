@@ -169,8 +169,8 @@ def _scale(low: float, high: float, unit: str, palette: int) -> tuple[tuple[str,
 
 
 def same_view(one: StereoCamera, other: StereoCamera) -> bool:
-    """Whether both cameras see alike, rectified or not: a pair at half size, say, does not."""
-    return all(getattr(one, name) == getattr(other, name) for name in ("width", "height", "cx", "cx_right"))
+    """Whether both left cameras see alike, rectified or not: one at half size, say, does not."""
+    return all(getattr(one, name) == getattr(other, name) for name in ("width", "height", "cx"))
 
 
 @draws(StereoFrame)

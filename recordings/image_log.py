@@ -30,7 +30,7 @@ SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
 FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
 CAMERA_FRAMES = {"left": "left_camera_optical", "right": "right_camera_optical"}
 # Ground truth that data sets put beside their images, as Middlebury's mask0nocc.png.
-_NOT_CAMERA_FRAMES = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
+_NOT_CAMERAS = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
 _LISTED = 5  # files in a sentence
 _LARGEST = 1e9  # px or m
 _REQUIRED, _OPTIONAL = ("fx", "cx", "cy", "baseline"), ("fy", "cx_right", "width", "height")
@@ -111,7 +111,7 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
     near = (f for pattern in ("*", "*/*") for f in folder.glob(pattern) if not f.parent.name.startswith("."))
     files = sorted((f for f in near if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
     named = {file.relative_to(folder).as_posix(): file for file in files}
-    names = {name: file for name, file in named.items() if not _NOT_CAMERA_FRAMES.search(name)}
+    names = {name: file for name, file in named.items() if not _NOT_CAMERAS.search(name)}
     for word, other in SIDES:
         partners = {name: word.sub(other, name) for name in names if word.search(name)}
         pairs = [(one, two) for one, two in partners.items() if two in names and not _counted(one, word, names)]

@@ -121,14 +121,19 @@ class Opening:
         return frame, mount, {}
 
     def _unjoined_base(self) -> dict[str, str]:
-        """Why the source's 'base_frame' cannot be as it is set, where the camera does not sit on such a frame."""
+        """Why the source's 'base_frame' cannot be as it is set, where the camera sits on others but not on that."""
         base = self.source.base_frame
         if base == type(self.source).base_frame or self.mount is None or self.mount.base_from_camera is not None:
             return {}
-        known = ", ".join(f"'{name}'" for name in sorted(self.static.edges)) or "nothing"
+        assert self.cameras is not None  # or there were no mount
+        own = {self.tilt_frame, *(camera.frame_id for camera in self.cameras)}
+        joined = (name for name in self.static.edges if self.static.between(name, self.cameras[0].frame_id) is not None)
+        others = ", ".join(f"'{name}'" for name in sorted(set(joined) - own))
+        if not others:
+            return {}
         return {
             "base_frame": f"the source's 'base_frame' is set to '{base}', which /tf_static does not join to the camera "
-            f"(it joins {known}); set the rover's"
+            f"as it does {others}; set it to one of these, or record where the camera sits on it"
         }
 
     def _moving_pose(self, chosen: Mapping[str, str]) -> dict[str, str]:
@@ -144,12 +149,13 @@ class Opening:
         moving = rovers(pose, self.cameras[0], self.source.base_frame, self.static).child_frame_id
         base = self.mount.base_from_camera if self.mount is not None else self.static.between(moving, camera)
         why = ""
-        if resting in (LEVEL_FRAME, camera, image, told, moving):
+        if resting in (LEVEL_FRAME, image, told, moving) or self.static.between(resting, camera) is not None:
             why = f"{topic} is a pose in the frame '{resting}', which moves with the rover; record it in one that rests"
         elif moving not in (camera, image) and (base is None or base.parent != moving):
+            renamed = ", or set 'base_frame' of the source where it has another name"
             why = (
                 f"{topic} is the pose of '{told}', and nothing tells how the camera '{camera}' sits on it; record "
-                "that in /tf_static, or set 'base_frame' of the source where it has another name"
+                f"that in /tf_static{'' if told == self.source.base_frame else renamed}"
             )
         return {"odometry": why} if why else {}
 

@@ -99,9 +99,9 @@ class Fuse(Stage):
         sight = sight_of(cloud, placed, self.resolution, self.region)
         if pose.frame_id != self._map.frame_id:
             self._map.begin(pose.frame_id, cloud.stamp)
-        self._map.ups += up
         known, seen = sight.known, self._seen(sight)
         cells, plane = self._joined(sight, seen)
+        self._map.ups += up
         now = self._map.age(cloud.stamp)
         cells[known] = merged(cells[known], seen.raised(plane), now, self.contradiction, self.shared)
         hidden = ~known & np.isfinite(sight.ceiling) & (cells["frames"] == 0)

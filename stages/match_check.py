@@ -11,11 +11,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from stages.data import Disparity, MatchHealth, Source
+from stages.data import Disparity, MatchHealth, Mount, Source, Tilt
 from stages.stage import Finding, Severity, Stage, counted, parameter
-
-_EVERY = 8  # px; enough to tell
-_HANGING = 1.5  # how much larger the disparities of the upper half are where that is nearer; ground in view makes it 2
 
 
 @dataclass(frozen=True)
@@ -31,13 +28,17 @@ class CheckMatches(Stage):
 
     ordered: ClassVar[bool] = True
 
-    def __call__(self, disparity: Disparity) -> MatchHealth:
-        """What is matched, of the right half of the image: part of the left one no other camera sees."""
+    def __call__(self, disparity: Disparity, tilt: Tilt | None = None, mount: Mount | None = None) -> MatchHealth:
+        """What is matched, of the right half of the image: part of the left one no other camera sees.
+
+        tilt, mount: tell a camera that hangs; without them it is taken to stand.
+        """
         height, width = disparity.pixels.shape
         source = disparity.source[:, width // 2 :]
         matched = (source == Source.MEASURED) | (source == Source.PLANE)
         rows = max(1, round(self.lowest * height))
-        near = float(matched[_towards_the_ground(disparity)][-rows:].mean())
+        hangs = tilt is not None and mount is not None and (mount.camera_from_inclinometer @ tilt.up)[1] > 0
+        near = float((matched[:rows] if hangs else matched[-rows:]).mean())
         self._near.append(near)
         return MatchHealth(disparity.stamp, float(matched.mean()), near)
 
@@ -52,13 +53,3 @@ class CheckMatches(Stage):
             "right",
             Severity.WARNING,
         )
-
-
-def _towards_the_ground(disparity: Disparity) -> slice:
-    """The rows in the order in which disparities grow: downwards, but where the camera hangs upside down."""
-    some = slice(None, None, _EVERY), slice(None, None, _EVERY)
-    measured, pixels = disparity.source[some] == Source.MEASURED, disparity.pixels[some]
-    middle = len(pixels) // 2
-    upper, lower = pixels[:middle][measured[:middle]], pixels[middle:][measured[middle:]]
-    hangs = len(upper) and len(lower) and np.median(upper) > _HANGING * np.median(lower)
-    return slice(None, None, -1) if hangs else slice(None)

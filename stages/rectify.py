@@ -50,7 +50,8 @@ class Rectify(Stage):
     columns: int | None = parameter(
         None,
         "columns by which the right image is moved to the left; by default as many as its principal point lies farther"
-        " right, where the images show that this much is needed for disparities not to be below 0",
+        " right, where the images show that this much is needed for disparities not to be below 0. What is nearest has"
+        " then larger disparities, and of a rectified image as many columns at its left edge are lost",
         unit="px", low=0, high=1024,
     )  # fmt: skip
 
@@ -167,11 +168,11 @@ def _rectified(frame: StereoFrame, row_terms: tuple[float, ...] = (), columns: i
     camera, terms = frame.camera, row_terms if any(row_terms) else ()
     left, right = frame.left, frame.right
     if camera.raw is not None:
-        left = cv2.remap(left, *_rectifying_maps(*_frozen(camera.raw[0]), ()), cv2.INTER_CUBIC)
-        right = cv2.remap(right, *_rectifying_maps(*_frozen(camera.raw[1]), terms), cv2.INTER_CUBIC)
+        left = cv2.remap(left, *_rectifying_maps(*_frozen(camera.raw[0]), (), 0), cv2.INTER_CUBIC)
+        right = cv2.remap(right, *_rectifying_maps(*_frozen(camera.raw[1]), terms, columns), cv2.INTER_CUBIC)
     elif terms:
         right = moved_down(right, terms)
-    if columns:
+    if columns and camera.raw is None:
         right = np.pad(right[:, columns:], [(0, 0), (0, min(columns, camera.width))] + [(0, 0)] * (right.ndim - 2))
     camera = replace(camera, raw=None, cx_right=camera.cx_right - columns)
     return StereoFrame(frame.stamp, left, right, camera)
@@ -185,18 +186,19 @@ def _frozen(model: CameraModel) -> tuple[str, int, int, bytes]:
 
 @lru_cache(maxsize=8)
 def _rectifying_maps(
-    model: str, width: int, height: int, values: bytes, terms: tuple[float, ...]
+    model: str, width: int, height: int, values: bytes, terms: tuple[float, ...], first: int
 ) -> tuple[Array, Array]:
-    """Where in the raw image each rectified pixel lies, moved down by the offset, in cv2.remap's fixed point."""
+    """Where in the raw image each rectified pixel lies, moved down by the offset, in cv2.remap's fixed point; from the
+    rectified column `first` on."""
     numbers = np.frombuffer(values)
     k, r, p, d = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:30].reshape(3, 4), numbers[30:]
     if wrong := CameraModel(width, height, k, d, r, p, model).unusable:
         raise ValueError(f"Rectify: {wrong}")
     undistort = cv2.fisheye.initUndistortRectifyMap if model == "equidistant" else cv2.initUndistortRectifyMap
-    down = offset_field(terms, width, height)
+    down = offset_field(terms, width, height, first)
     above = int(np.ceil(np.abs(down).max())) if terms else 0  # rows beyond the image that the offset may look up
     projection = p[:, :3].copy()
-    projection[1, 2] += above
+    projection[:2, 2] += -first, above
     x, y = undistort(k, d, r, projection, (width, height + 2 * above), cv2.CV_32FC1)
     if terms:
         columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))

@@ -81,9 +81,9 @@ def offset_at(terms: Sequence[float], x: Array, y: Array) -> Array:
     return sum((term * column for term, column in zip(terms, _basis(x, y), strict=False)), np.zeros(()))
 
 
-def offset_field(terms: Sequence[float], width: int, height: int) -> Array:
-    """The offset at every pixel, (H, W) float32, px."""
-    columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+def offset_field(terms: Sequence[float], width: int, height: int, first: int = 0) -> Array:
+    """The offset at every pixel, (H, W) float32, px, from the column `first` on."""
+    columns, rows = np.arange(first, first + width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
     field = offset_at(terms, *_centred(columns, rows, (height, width)))
     return np.broadcast_to(field, (height, width)).astype(np.float32)
 

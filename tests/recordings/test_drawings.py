@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import rerun as rr
 
+from recordings.drawings import same_view
 from recordings.rerun_sink import RerunSink
-from stages.data import LEVEL_FRAME, Cell, Pose, StereoFrame, Transform
+from stages.data import LEVEL_FRAME, Cell, Pose, StereoCamera, StereoFrame, Transform
 from tests.recordings.recorded_scene import (
     HEIGHT,
     START,
@@ -161,3 +162,10 @@ def test_the_logs_own_pose_is_drawn_once(tmp_path: Path) -> None:
     sink.write(Record(START, {"logged": items["pose"], "pose": items["pose"]}))
     sink.close({"verdict": "COMPLETE"})
     assert [path for path in entities(tmp_path / "run.rrd") if "trajectory" in path] == ["/pose/trajectory"]
+
+
+def test_a_pair_is_seen_alike_though_the_right_image_was_moved():
+    camera = StereoCamera(500, 500, 320, 240, 0.1, 640, 480)
+    assert same_view(camera, replace(camera, cx_right=260.0))
+    assert not same_view(camera, replace(camera, width=320, height=240, cx=160.0, cx_right=160.0))
+    assert not same_view(camera, replace(camera, cx=300.0))

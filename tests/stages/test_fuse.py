@@ -259,7 +259,10 @@ TRACK = """
 import sys
 import numpy as np
 from stages import Fuse, PointCloud, Pose, Transform
-fuse, step = Fuse(region=11.0, window=25.0), 8.0
+def peak():
+    with open("/proc/self/status") as status:
+        return next(int(line.split()[1]) / 1024 for line in status if line.startswith("VmHWM"))
+before, fuse, step = peak(), Fuse(region=11.0, window=25.0), 8.0
 x, y = (axis.ravel() + 0.025 for axis in np.meshgrid(np.arange(-4, 4, 0.05), np.arange(-10, 10, 0.05)))
 points = np.column_stack([x, y, 0.1 * np.sin(x)]).astype(np.float32)
 n = len(points)
@@ -271,9 +274,7 @@ for frame in range(int(sys.argv[1]) // 8):
     fuse(cloud, pose)
 tiles = fuse._map.cells.tiles.values()
 cells = sum(int((tile["frames"] > 0).sum()) for tile in tiles)
-with open("/proc/self/status") as status:
-    size = {line.split(":")[0]: int(line.split()[1]) / 1024 for line in status if line.startswith(("VmHWM", "RssFile"))}
-print(cells, sum(tile.nbytes for tile in tiles) / 1e6, size["VmHWM"] - size["RssFile"])
+print(cells, sum(tile.nbytes for tile in tiles) / 1e6, peak() - before)
 """
 
 
@@ -281,8 +282,8 @@ print(cells, sum(tile.nbytes for tile in tiles) / 1e6, size["VmHWM"] - size["Rss
 @pytest.mark.parametrize("metres", [160, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_kilometre_of_20_metres_width_fits_into_500_megabytes(metres):
     done = subprocess.run([sys.executable, "-c", TRACK, str(metres)], capture_output=True, text=True, check=True)
-    cells, map_size, process_size = (float(value) for value in done.stdout.split())
+    cells, map_size, grown = (float(value) for value in done.stdout.split())
     assert cells == pytest.approx(metres * 20 / 0.05**2, rel=0.01)
     assert map_size < 0.26 * metres + 2
-    # Of the 500 MB 80 are for the libraries' files, of whose pages systems map more or fewer at a time.
-    assert process_size < 500 - 80 - 0.26 * (1000 - metres)
+    # Of the 500 MB 150 are for the libraries: how much of their files is in memory differs between systems.
+    assert grown < 350 - 0.26 * (1000 - metres)

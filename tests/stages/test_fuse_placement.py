@@ -108,6 +108,18 @@ def test_a_pose_in_a_frame_that_leans_is_told(degrees, told):
         assert found.severity == "warning"
 
 
+def test_a_frame_that_is_refused_does_not_lean_the_map():
+    fuse, lean = Fuse(), Rotation.from_euler("x", 29, degrees=True)
+    for frame in range(3):
+        fuse(*drive(frame), MOUNT)
+    for frame in (3, 4):
+        cloud, pose = drive(frame)
+        quaternion = (lean * Rotation.from_quat(pose.quaternion)).as_quat()
+        with pytest.raises(ValueError, match="left out of the regional map"):
+            fuse(cloud, replace(pose, position=pose.position + np.array([0, 0, 5.0]), quaternion=quaternion), MOUNT)
+    assert fuse.finding() is None
+
+
 @pytest.mark.parametrize("jump", [np.array([0, 0, up]) for up in (0.6, -0.4, 30.0, -1e3, 1e6)])
 def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jump):
     fuse = Fuse()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recordings.simulator import Simulation
-from stages import CheckMatches, Disparity, Source, StereoFrame
+from stages import CheckMatches, Disparity, Mount, Source, StereoFrame, Tilt
 from stages.stage import Severity
 from tests.bench.refining import stereo_part
 
@@ -30,16 +30,12 @@ def test_the_warning_asks_for_the_lowest_rows_and_for_most_frames():
     assert "0 % is matched (median of 5 frames)" in found.sentence
 
 
-@pytest.mark.parametrize("hangs", [False, True])
-def test_of_a_camera_that_hangs_upside_down_the_nearest_ground_is_above(hangs):
-    away = np.linspace(10, 60, 80, dtype=np.float32)[:, None] + np.zeros((1, 100), np.float32)
-    matched = np.ones(away.shape, bool)
-    matched[:10] = False  # sky
-    shown = disparity_with(matched)
-    shown = Disparity(0, away, shown.source, shown.confidence)
-    if hangs:
-        shown = Disparity(0, shown.pixels[::-1], shown.source[::-1], shown.confidence)
-    assert CheckMatches()(shown).near == 1
+@pytest.mark.parametrize(("up", "near"), [([0.0, -1.0, -0.3], 1), ([0.0, 1.0, -0.3], 0), (None, 1)])
+def test_of_a_camera_that_hangs_upside_down_the_nearest_ground_is_above(up, near):
+    matched = np.ones((80, 100), bool)
+    matched[:10] = False
+    tilt = None if up is None else Tilt(0, np.array(up) / np.linalg.norm(up))
+    assert CheckMatches()(disparity_with(matched), tilt, Mount(0, np.eye(3))).near == near
 
 
 @pytest.mark.parametrize("pipeline", ["rover", "fast"])

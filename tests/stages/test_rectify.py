@@ -282,6 +282,18 @@ def test_a_calibration_that_hardly_any_camera_has_is_a_warning(changes, words):
     assert stage == plain
 
 
+def test_of_a_raw_image_nothing_is_lost_that_it_shows():
+    image = np.random.default_rng(0).integers(0, 256, (LARGE[1], LARGE[0], 3), np.uint8)
+    k = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    p_left, p_right = np.c_[k, [0, 0, 0]], np.c_[k, [-100.0, 0, 0]]
+    p_right[0, 2] = 380.0  # the rectified image begins 60 columns before the raw one
+    models = (CameraModel(*LARGE, k, np.zeros(5), np.eye(3), p) for p in (p_left, p_right))
+    raw = StereoFrame(1, image, image, StereoCamera.from_models(*models, "cam", rectified=False))
+    moved = Rectify(row_offset=0.0, columns=60)(raw)
+    assert moved.camera.cx_right == 320
+    assert np.array_equal(moved.right, image)
+
+
 def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
     frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), StereoCamera(500, 500, 320, 240, 0.1, *LARGE))
     bad = CameraModel(*LARGE, K, np.zeros(5), np.eye(3), P_LEFT, "pinhole")
