@@ -44,16 +44,16 @@ def _number(value: Any, kind: type, parameter: Field[Any]) -> float | int:
         wanted = {"int": "a whole number", "float": "a number"}[kind.__name__]
         raise ValueError(f"expected {wanted}{f' in {unit}' if unit else ''}, not {given!r}")
     low, high = parameter.metadata.get("low"), parameter.metadata.get("high")
-    for wrong, wanted in (
-        (not math.isfinite(value), "finite"),
-        (low is not None and value < low, f"at least {_limit(low, unit)}"),
-        (high is not None and value > high, f"at most {_limit(high, unit)}"),
-    ):
-        if wrong:
-            raise ValueError(f"must be {wanted}, not {given}")
+    if not math.isfinite(value):
+        raise ValueError(f"must be finite, not {given}")
+    if low is not None and value < low:
+        raise ValueError(f"must be at least {_limit(low, unit)}, not {given}")
+    if high is not None and value > high:
+        raise ValueError(f"must be at most {_limit(high, unit)}, not {given}")
     return kind(value)  # type: ignore[no-any-return]
 
 
-def _limit(value: float | None, unit: str) -> str:
-    text = as_written(value or 0, unit)
+def _limit(value: float, unit: str) -> str:
+    """A limit with its unit, 0 too."""
+    text = as_written(value, unit)
     return text if text[-1].isalpha() else f"{text} {unit}".rstrip()
