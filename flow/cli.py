@@ -203,14 +203,14 @@ def _info(options: argparse.Namespace) -> int:
     say(json.dumps(description, indent=2) if options.json else format_description(description))
     if not options.json:
         why = description["refused"]
-        fits = f"would be refused: {why}" if why else f"has all it needs{_but(description['frames'])}"
+        fits = f"would be refused: {why}" if why else f"has all it needs{_but(graph, description['frames'])}"
         say(f"run -p {options.pipeline}: {fits}")
     return INCOMPLETE if description["damage"] else COMPLETE
 
 
-def _but(frames: dict[str, Any]) -> str:
+def _but(graph: Graph, frames: dict[str, Any]) -> str:
     """What keeps a run from making a single frame of a log that has all streams, in words."""
-    if not frames["pairs"]:
+    if not frames["pairs"] and {"left", "right"} <= graph.source_streams:
         return ", but no left image would find its right one (see frames)"
     return ", but no frame would find its tilt (see frames)" if frames["with_tilt"] == 0 else ""
 
