@@ -23,7 +23,6 @@ from stages.data import Array
 from stages.kernels.census import census_costs
 from stages.kernels.compiled import kernel, part
 from stages.kernels.rule import Rule
-from stages.kernels.sharing import AtOnce, by_bands, in_turn
 from stages.kernels.vectors import (
     Width,
     above_smallest,
@@ -44,26 +43,25 @@ FAR = 255  # beyond either end of the search range
 SIDES = ((0, -1), (-1, -1), (-1, 0), (-1, 1))  # (dy, dx) to q of a sweep down; of a sweep up their opposites
 
 
-def brightness_steps(image: Array, both: AtOnce = in_turn) -> Array:
+def brightness_steps(image: Array) -> Array:
     """Absolute differences to the four neighbours of `SIDES`.
 
-    image: (H, W) uint8; both: calls two functions, on one thread or two. Returns (4, H + 1, S) uint8
-    with S >= W + 2: pixel (y, x) is at [:, y, x + 1], differences to pixels outside the image are arbitrary.
+    image: (H, W) uint8. Returns (4, H + 1, S) uint8 with S >= W + 2: pixel (y, x) is at [:, y, x + 1], differences to
+    pixels outside the image are arbitrary.
     """
     height, columns = image.shape
     stride = -(-(columns + 2) // BLOCK) * BLOCK
     padded = cv2.copyMakeBorder(image, 1, 1, 2, 1 + stride - columns, cv2.BORDER_REPLICATE)
     steps = np.empty((len(SIDES), height + 1, stride), np.uint8)
-    given = padded.reshape(-1), padded.shape[1], steps.reshape(-1), height + 1, stride
-    by_bands(both, height + 1, lambda first, end: _brightness_steps(*given, first, end, Width(BLOCK)))
+    _brightness_steps(padded.reshape(-1), padded.shape[1], steps.reshape(-1), height + 1, stride, Width(BLOCK))
     return steps
 
 
 @kernel
-def _brightness_steps(image, image_stride, steps, rows, stride, first, end, width):  # type: ignore[no-untyped-def]
+def _brightness_steps(image, image_stride, steps, rows, stride, width):  # type: ignore[no-untyped-def]
     for side in range(len(SIDES)):
         dy, dx = SIDES[side]
-        for y in range(first, end):
+        for y in range(rows):
             for i in range(0, stride, lanes_in(width)):
                 here = (y + 1) * image_stride + i + 1
                 one, other = load(image, here, width), load(image, here + dy * image_stride + dx, width)

@@ -9,11 +9,16 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.compiled import kernel
+from stages.kernels.sharing import with_margin
+
+WINDOW = 5  # px, of the census
 
 
-def blank_windows(image: Array) -> Array:
-    """Whether the window of each pixel of an image (H, W) uint8 is blank, (H, W) bool."""
-    return np.asarray(cv2.morphologyEx(image, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) == 0)
+def blank_windows(image: Array, first: int, end: int) -> Array:
+    """Whether the windows of the pixels of rows first to end of an image (H, W) uint8 are blank, (end - first, W)
+    bool."""
+    rows, own = with_margin(image, first, end, WINDOW // 2)
+    return np.asarray(cv2.morphologyEx(rows, cv2.MORPH_GRADIENT, np.ones((WINDOW, WINDOW), np.uint8))[own] == 0)
 
 
 @kernel

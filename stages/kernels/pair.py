@@ -40,8 +40,10 @@ def describe(
     both: AtOnce = in_turn,
 ) -> Pair:
     """What the searches read of gray images, (H, W) uint8. prior: of `prior.prior_costs`, or None."""
-    left_planes, right_planes = both(lambda: _described(left, rule), lambda: _described(right, rule, width))
-    steps, columns = brightness_steps(left, both), left.shape[1]
+    columns = left.shape[1]
+    (left_planes, steps), right_planes = both(
+        lambda: (_described(left, rule), brightness_steps(left)), lambda: _described(right, rule, width)
+    )
     place = np.arange(columns + width.lanes) + rule.minimum
     outside = np.where((place < 0) | (place > columns - 1), np.uint8(255), np.uint8(0))
     whole_from, whole_to = max(0, -rule.minimum), columns + 1 - rule.minimum - width.lanes

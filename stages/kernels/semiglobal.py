@@ -81,12 +81,12 @@ def match(
             )  # fmt: skip
         else:
             _search_rows(left, right, rule, prior, search, memory, pixels, evidence, space, both)
-        blank, partner = both(lambda: blank_windows(left), lambda: blank_windows(right))
-        if excluded is not None:
-            blank |= excluded
 
         def drop(first: int, end: int) -> None:
-            drop_blank(*(layer[first:end] for layer in (blank, partner, pixels, evidence)))
+            unmatched = blank_windows(left, first, end)
+            if excluded is not None:
+                unmatched |= excluded[first:end]
+            drop_blank(unmatched, blank_windows(right, first, end), pixels[first:end], evidence[first:end])
 
         by_bands(both, len(left), drop)
         drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, space, both)

@@ -124,7 +124,7 @@ def test_disparities_are_those_of_a_search_that_lacks_the_rest_of_the_range(
         total = np.minimum(down + up, 255)[:, :, each.first : each.first + n]
         for y in range(each.top, each.end):
             pixels[y], evidence[y] = select_reference(total[y], np.full(columns, least), least, n, rule)
-    drop_blank(*(blank_windows(image) for image in (left, right)), pixels, evidence)
+    drop_blank(*(blank_windows(image, 0, len(image)) for image in (left, right)), pixels, evidence)
     np.testing.assert_array_equal(found.pixels, pixels)
     np.testing.assert_array_equal(found.confidence, rule.calibration[evidence])
     for threads, memory in ((2, 1 << 30), (1, 1), (2, 1)):
