@@ -6,6 +6,7 @@ Heavy modules are imported by the command that needs them, so that `roverflow --
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import logging
 import math
@@ -72,6 +73,8 @@ def _sentence(error: BaseException, shown: bool) -> str:
 def _exit_code(error: BaseException) -> int:
     if isinstance(error, RoverflowError):
         return error.exit_code
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        return UNUSABLE
     return UNUSABLE if isinstance(error, LogError) and not isinstance(error, UnwritableError) else FAILED
 
 

@@ -58,6 +58,7 @@ def test_a_file_that_is_no_log_is_refused_in_one_sentence(tmp_path, capsys, cont
         assert "odd.mcap" in said
         assert said.count("\n") == 1
     assert roverflow("run", tmp_path / "nowhere.mcap") == 2
+    assert roverflow("info", tmp_path / ("long" * 100)) == 2
 
 
 def test_what_a_stage_cannot_do_without_is_asked_for_before_anything_runs(traverse, tmp_path, capsys):

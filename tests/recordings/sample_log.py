@@ -12,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from scipy.spatial.transform import Rotation
+from zstandard import ZstdCompressor
 
 from recordings import McapSource
 from recordings.inventory import describe
@@ -71,6 +72,7 @@ LAYOUTS: dict[str, dict[str, Any]] = {
     },
     "no chunks": {"use_chunking": False, "enable_data_crcs": True},
     "no crcs": {"enable_crcs": False},
+    "messages compressed one by one": {"compression": CompressionType.NONE, "pack": ZstdCompressor().compress},
 }
 
 
@@ -103,9 +105,14 @@ def write_sample(
 
 
 def rewritten(
-    path: Path, out: Path, time: Callable[[str, int], int] = lambda topic, log_time: log_time, **options: Any
+    path: Path,
+    out: Path,
+    time: Callable[[str, int], int] = lambda topic, log_time: log_time,
+    pack: Callable[[bytes], bytes] = bytes,
+    **options: Any,
 ) -> Path:
-    """The same messages as another kind of MCAP file; options as of mcap.writer.Writer. time: changes a log time."""
+    """The same messages as another kind of MCAP file; options as of mcap.writer.Writer. time: changes a log time;
+    pack: changes a message's bytes."""
     with path.open("rb") as source, out.open("wb") as target:
         writer = Writer(target, **options)
         writer.start(profile="ros2", library="test")
@@ -115,7 +122,7 @@ def rewritten(
                 known = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
             log_time = time(channel.topic, message.log_time)
-            writer.add_message(channels[channel.id], log_time, message.data, message.publish_time)
+            writer.add_message(channels[channel.id], log_time, pack(message.data), message.publish_time)
         writer.finish()
     return out
 
