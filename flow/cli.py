@@ -287,7 +287,7 @@ def simulate(out: Path, **settings: Any) -> None:
     """Write a simulated traverse; `settings` are fields of `recordings.simulator.Simulation`."""
     from tqdm import tqdm
 
-    from recordings.simulator import Simulation
+    from recordings.simulator import Simulation, write_log
 
     try:
         simulation = Simulation(**settings)
@@ -298,7 +298,7 @@ def simulate(out: Path, **settings: Any) -> None:
         def progress(done: int, total: int) -> None:
             bar.update(done - bar.n)
 
-        simulation.write(out, progress)
+        write_log(simulation, out, progress)
     say(f"{out}: {counted(simulation.frames, 'frame')} with ground truth ({out.stat().st_size / 1e6:.1f} MB)")
 
 

@@ -22,10 +22,10 @@ SMALL = ("--set", "disparities=64")
 @pytest.fixture(scope="session")
 def traverse(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated log of four small frames, with ground truth."""
-    from recordings.simulator import Simulation
+    from recordings.simulator import Simulation, write_log
 
     path = tmp_path_factory.mktemp("traverse") / "traverse.mcap"
-    Simulation(frames=FRAMES, width=320, height=240).write(path)
+    write_log(Simulation(frames=FRAMES, width=320, height=240), path)
     return path
 
 

@@ -16,7 +16,7 @@ import pytest
 from flow.cli import main
 from recordings.mcap_reader import iter_decoded
 from recordings.ros2 import stamp_of
-from recordings.simulator import Simulation
+from recordings.simulator import Simulation, write_log
 from recordings.simulator.traverse import level_pose
 from tests.tilt_faults import FAULTS, PIPELINE
 
@@ -35,7 +35,7 @@ def simulation(request: pytest.FixtureRequest) -> Simulation:
 @pytest.fixture(scope="module")
 def log(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("tilt") / "log.mcap"
-    simulation.write(path)
+    write_log(simulation, path)
     return path
 
 

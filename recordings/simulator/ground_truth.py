@@ -1,28 +1,118 @@
-"""What is true of a frame's map beyond heights and hazards: what could be seen of it, and of which rocks how much.
+"""What is exactly true of a simulated frame: its disparities, its map, what could be seen of that, and its rocks.
 
-A cell could be seen if a line of sight from each camera reaches some of its surface, tried at nine points of it, be
-there a pixel on that line or not: a map may have values between the pixels, but not behind what hides them.
+Disparity comes per left pixel from the rays that made the images; elevation and hazards from looking straight down on
+the cell centres of the frame's own level frame, the frame a reader would build from the true tilt. A cell could be seen
+if a line of sight from each camera reaches some of its surface, tried at nine points of it, be there a pixel on that
+line or not: a map may have values between the pixels, but not behind what hides them.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from recordings.simulator import raycast
 from recordings.simulator.compiled import allocating
-from stages.data import Array
-
-if TYPE_CHECKING:
-    from recordings.simulator.simulation import FrameTruth, Simulation
+from recordings.simulator.simulation import FrameTruth, Simulation
+from stages.data import LEVEL_FRAME, Array, Cell, Disparity, ElevationMap, NavigationMap, Reason, Source
 
 FINE = 3  # points along each side of a cell
 SHORT = 0.002  # m before its end that a line of sight may stop
+HAZARD_ROCK = 0.2  # m, height above the ground around it
+HAZARD_SLOPE = float(np.radians(20))
+ROCKS_WITHIN = 10.0  # m of base_link
 
 
-def map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, top: Array, visible: Array,
-               surface: Array) -> dict[str, Array]:  # fmt: skip
+def true_disparity(simulation: Simulation, stamp: int, truth: FrameTruth) -> Disparity:
+    """fx * baseline / depth, px; NaN in the sky."""
+    camera = simulation.camera
+    pixels = np.where(np.isfinite(truth.depth), camera.fx * camera.baseline / truth.depth, np.nan).astype(np.float32)
+    known = np.isfinite(pixels)
+    source = np.where(known, np.uint8(Source.MEASURED), np.uint8(Source.UNKNOWN))
+    return Disparity(stamp, pixels, source, known.astype(np.float32), camera=camera)
+
+
+def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[ElevationMap, NavigationMap]:
+    """Elevation (top surface, rocks included) with the mask `visible`, and hazards, over the square about base_link.
+
+    The elevation map has the layers of `_map_layers` besides. A cell is a hazard if its centre lies on a rock at least
+    0.2 m high or on ground steeper than 20 degrees. A cell is visible if a pixel that both cameras see hits it within
+    the region.
+    """
+    terrain, half, step = simulation.terrain, simulation.map_half_width, simulation.map_resolution
+    count = round(2 * half / step)
+    middle = -half + (np.arange(count) + 0.5) * step
+    x, y = np.meshgrid(middle, middle)
+    world = truth.level(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
+    top, surface = raycast.tops_at(terrain.scene, world[:, 0], world[:, 1], float(terrain.scene.ceiling))
+    elevation = (top - truth.level.translation[2]).reshape(x.shape).astype(np.float32)
+    on_high_rock = np.append(terrain.rocks.height >= HAZARD_ROCK, False)[np.maximum(surface, raycast.GROUND)]
+    hazard = on_high_rock | (terrain.slope(world[:, 0], world[:, 1]) > HAZARD_SLOPE)
+    cells = np.where(hazard, np.int8(Cell.HAZARD), np.int8(Cell.FREE)).reshape(x.shape)
+    visible = visible_cells(simulation, truth, count)
+    more = _map_layers(simulation, truth, x, y, elevation, visible, surface.reshape(x.shape))
+    layers = {"elevation": elevation, "visible": visible, **more}
+    reason = np.where(on_high_rock, Reason.STEP, np.where(hazard, Reason.SLOPE, Reason.CLEAR)).astype(np.uint8)
+    return (
+        ElevationMap(stamp, layers, step, (-half, -half), LEVEL_FRAME),
+        NavigationMap(stamp, cells, reason.reshape(x.shape), step, (-half, -half), LEVEL_FRAME),
+    )
+
+
+def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Array:
+    """(count, count) float32: 1 where a pixel that both cameras see hits the cell within the region, else 0."""
+    camera, shape = simulation.camera, truth.depth.shape
+    mount = truth.level.inverse().after(truth.base.after(simulation.mounts[0]))
+    a, b = (np.arange(shape[1]) - camera.cx) / camera.fx, ((np.arange(shape[0]) - camera.cy) / camera.fy)[:, None]
+    known = (truth.seen == 255) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
+    rows = slice(int(known.any(axis=1).argmax()), None)  # sky and far ground above them
+    known, b, places = known[rows], b[rows], []
+    depth = np.where(known, truth.depth[rows], 0.0)
+    for axis in (1, 0):
+        right, down, ahead = mount.rotation[axis]
+        place = depth * (right * a + (down * b + ahead))
+        place += mount.translation[axis] + simulation.map_half_width
+        place /= simulation.map_resolution
+        known &= (place >= 0) & (place < count)
+        places.append(place)
+    row, column = (place[known].astype(np.int64) for place in places)
+    hits = np.bincount(row * count + column, minlength=count * count)
+    return (hits > 0).astype(np.float32).reshape(count, count)
+
+
+def rocks_in_level(simulation: Simulation, truth: FrameTruth) -> Array:
+    """Rocks within 10 m of base_link, (N, 7) float32: x, y, z of the base in the level frame, diameter, height, m, and
+    the two columns of `rocks_in_view`."""
+    terrain, here = simulation.terrain, truth.level.translation
+    near = here[:2] + (terrain.rocks.center - here[:2] + terrain.extent / 2) % terrain.extent - terrain.extent / 2
+    points = truth.level.inverse()(np.column_stack([near, terrain.rocks.base]))
+    seen = rocks_in_view(simulation, truth)
+    table = np.column_stack([points, terrain.rocks.diameter, terrain.rocks.height, seen])
+    return table[np.hypot(points[:, 0], points[:, 1]) <= ROCKS_WITHIN].astype(np.float32)
+
+
+def rocks_in_view(simulation: Simulation, truth: FrameTruth) -> Array:
+    """Of each rock of the tile: the pixels that both cameras see within the region, and the part of its height that
+    these span, (N, 2) float32."""
+    camera, rocks = simulation.camera, simulation.terrain.rocks
+    a = (np.arange(camera.width) - camera.cx) / camera.fx
+    b = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
+    seen = (truth.seen == 255) & (truth.surface >= 0) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
+    row, col = np.nonzero(seen)
+    rock, depth = truth.surface[row, col], truth.depth[row, col]
+    up = truth.base.after(simulation.mounts[0]).rotation[2]
+    height = depth * (up[0] * a[col] + up[1] * b[row, 0] + up[2])
+    low, high = np.full(len(rocks), np.inf), np.full(len(rocks), -np.inf)
+    np.minimum.at(low, rock, height)
+    np.maximum.at(high, rock, height)
+    pixels = np.bincount(rock, minlength=len(rocks))
+    shown = np.where(pixels > 0, (high - low) / rocks.height, 0.0)
+    return np.column_stack([pixels, np.minimum(shown, 1.0)]).astype(np.float32)
+
+
+def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, top: Array, visible: Array,
+                surface: Array) -> dict[str, Array]:  # fmt: skip
     """Further true layers over cells with centres x, y (rows, cols), m, in the frame's level frame.
 
     top: (rows, cols) elevation, m; visible: (rows, cols), 1 where a pixel of both cameras hits the cell; surface:
@@ -68,25 +158,6 @@ def in_sight(simulation: Simulation, truth: FrameTruth, points: Array) -> Array:
         _clear_lines(simulation.terrain.scene, eye.translation, points[asked], clear)
         seen[asked] = clear
     return seen
-
-
-def rocks_in_view(simulation: Simulation, truth: FrameTruth) -> Array:
-    """Of each rock of the tile: the pixels that both cameras see within the region, and the part of its height that
-    these span, (N, 2) float32."""
-    camera, rocks = simulation.camera, simulation.terrain.rocks
-    a = (np.arange(camera.width) - camera.cx) / camera.fx
-    b = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
-    seen = (truth.seen == 255) & (truth.surface >= 0) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
-    row, col = np.nonzero(seen)
-    rock, depth = truth.surface[row, col], truth.depth[row, col]
-    up = truth.base.after(simulation.mounts[0]).rotation[2]
-    height = depth * (up[0] * a[col] + up[1] * b[row, 0] + up[2])
-    low, high = np.full(len(rocks), np.inf), np.full(len(rocks), -np.inf)
-    np.minimum.at(low, rock, height)
-    np.maximum.at(high, rock, height)
-    pixels = np.bincount(rock, minlength=len(rocks))
-    shown = np.where(pixels > 0, (high - low) / rocks.height, 0.0)
-    return np.column_stack([pixels, np.minimum(shown, 1.0)]).astype(np.float32)
 
 
 def _in_images(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, z: Array) -> Array:

@@ -1,13 +1,14 @@
-"""The messages of a simulated log: what a rover would record, and the exact truth under /truth.
+"""The log of a simulated traverse: what a rover would record, and the exact truth under /truth.
 
-Disparity and occlusion come per left pixel from the rays that made the images; elevation and hazards from looking
-straight down on the cell centres of the frame's own level frame, the frame a reader would build from the true tilt.
-Each function returns (log time, topic, message) triples for one moment.
+Messages are made moment by moment, as (log time, topic, message) triples.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,29 +16,36 @@ from scipy.spatial.transform import Rotation
 from recordings import ros2
 from recordings.rig import pinhole
 from recordings.ros2_types import make
-from recordings.simulator import ground_truth, raycast, traverse
-from stages.data import (
-    LEVEL_FRAME,
-    Array,
-    Cell,
-    Disparity,
-    ElevationMap,
-    NavigationMap,
-    Pose,
-    Reason,
-    Source,
-    Transform,
-)
-
-if TYPE_CHECKING:
-    from recordings.simulator.simulation import FrameTruth, Simulation
+from recordings.ros2_writer import Ros2Writer
+from recordings.simulator import ground_truth, traverse
+from recordings.simulator.simulation import FrameTruth, Simulation
+from stages.data import LEVEL_FRAME, Pose, Transform
 
 Logged = tuple[int, str, Any]
 
-HAZARD_ROCK = 0.2  # m, height above the ground around it
-HAZARD_SLOPE = float(np.radians(20))
-ROCKS_WITHIN = 10.0  # m of base_link
 ROCK_FIELDS = ("x", "y", "z", "diameter", "height", "pixels", "shown")
+
+
+def write_log(simulation: Simulation, out: Path, progress: Callable[[int, int], None] | None = None) -> None:
+    """Write the log of a traverse. progress: called with (frames written, frames) after each frame."""
+    with Ros2Writer(Path(out)) as writer:
+        for _, make_messages, index in sorted(_moments(simulation), key=lambda moment: moment[0]):
+            for log_time, topic, message in make_messages():
+                writer.write(topic, message, log_time)
+            if index is not None and progress is not None:
+                progress(index + 1, simulation.frames)
+
+
+def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], list[Logged]], int | None]]:
+    """(log time, maker of the messages then written, frame index or None), unordered; made on demand."""
+    yield simulation.begin, partial(static_transforms, simulation, simulation.begin), None
+    sensors = ((inclinometer, simulation.tilt_rate, 4_000_000), (odometry, simulation.odometry_rate, 9_000_000))
+    for make_messages, rate, latency in sensors:
+        for number, stamp in enumerate(simulation.sensor_stamps(rate)):
+            yield stamp + latency, partial(make_messages, simulation, number, stamp, stamp + latency), None
+    for index in range(simulation.frames):
+        at = simulation.stamp(index) + 21_000_000
+        yield at, partial(frame, simulation, index, at), index
 
 
 def static_transforms(simulation: Simulation, log_time: int) -> list[Logged]:
@@ -83,9 +91,9 @@ def _camera_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> d
 
 
 def _truth_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> dict[str, Any]:
-    elevation, hazards = truth_maps(simulation, stamp, truth)
+    elevation, hazards = ground_truth.truth_maps(simulation, stamp, truth)
     return {
-        "/truth/disparity": ros2.disparity_image(true_disparity(simulation, stamp, truth)),
+        "/truth/disparity": ros2.disparity_image(ground_truth.true_disparity(simulation, stamp, truth)),
         "/truth/occlusion": ros2.image(stamp, traverse.LEFT_FRAME, truth.seen),
         "/truth/elevation_map": ros2.grid_map(elevation),
         "/truth/navigation_map": ros2.occupancy_grid(hazards),
@@ -95,76 +103,8 @@ def _truth_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> di
     }
 
 
-def true_disparity(simulation: Simulation, stamp: int, truth: FrameTruth) -> Disparity:
-    """fx * baseline / depth, px; NaN in the sky."""
-    camera = simulation.camera
-    pixels = np.where(np.isfinite(truth.depth), camera.fx * camera.baseline / truth.depth, np.nan).astype(np.float32)
-    known = np.isfinite(pixels)
-    source = np.where(known, np.uint8(Source.MEASURED), np.uint8(Source.UNKNOWN))
-    return Disparity(stamp, pixels, source, known.astype(np.float32), camera=camera)
-
-
-def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[ElevationMap, NavigationMap]:
-    """Elevation (top surface, rocks included) with the mask `visible`, and hazards, over the square about base_link.
-
-    The elevation map has the layers of `ground_truth.map_layers` besides. A cell is a hazard if its centre lies on a
-    rock at least 0.2 m high or on ground steeper than 20 degrees. A cell is visible if a pixel that both cameras see
-    hits it within the region.
-    """
-    terrain, half, step = simulation.terrain, simulation.map_half_width, simulation.map_resolution
-    count = round(2 * half / step)
-    middle = -half + (np.arange(count) + 0.5) * step
-    x, y = np.meshgrid(middle, middle)
-    world = truth.level(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
-    top, surface = raycast.tops_at(terrain.scene, world[:, 0], world[:, 1], float(terrain.scene.ceiling))
-    elevation = (top - truth.level.translation[2]).reshape(x.shape).astype(np.float32)
-    on_high_rock = np.append(terrain.rocks.height >= HAZARD_ROCK, False)[np.maximum(surface, raycast.GROUND)]
-    hazard = on_high_rock | (terrain.slope(world[:, 0], world[:, 1]) > HAZARD_SLOPE)
-    cells = np.where(hazard, np.int8(Cell.HAZARD), np.int8(Cell.FREE)).reshape(x.shape)
-    visible = visible_cells(simulation, truth, count)
-    more = ground_truth.map_layers(simulation, truth, x, y, elevation, visible, surface.reshape(x.shape))
-    layers = {"elevation": elevation, "visible": visible, **more}
-    reason = np.where(on_high_rock, Reason.STEP, np.where(hazard, Reason.SLOPE, Reason.CLEAR)).astype(np.uint8)
-    return (
-        ElevationMap(stamp, layers, step, (-half, -half), LEVEL_FRAME),
-        NavigationMap(stamp, cells, reason.reshape(x.shape), step, (-half, -half), LEVEL_FRAME),
-    )
-
-
-def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Array:
-    """(count, count) float32: 1 where a pixel that both cameras see hits the cell within the region, else 0."""
-    camera, shape = simulation.camera, truth.depth.shape
-    mount = truth.level.inverse().after(truth.base.after(simulation.mounts[0]))
-    a, b = (np.arange(shape[1]) - camera.cx) / camera.fx, ((np.arange(shape[0]) - camera.cy) / camera.fy)[:, None]
-    known = (truth.seen == 255) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
-    rows = slice(int(known.any(axis=1).argmax()), None)  # sky and far ground above them
-    known, b, places = known[rows], b[rows], []
-    depth = np.where(known, truth.depth[rows], 0.0)
-    for axis in (1, 0):
-        right, down, ahead = mount.rotation[axis]
-        place = depth * (right * a + (down * b + ahead))
-        place += mount.translation[axis] + simulation.map_half_width
-        place /= simulation.map_resolution
-        known &= (place >= 0) & (place < count)
-        places.append(place)
-    row, column = (place[known].astype(np.int64) for place in places)
-    hits = np.bincount(row * count + column, minlength=count * count)
-    return (hits > 0).astype(np.float32).reshape(count, count)
-
-
-def rocks_in_level(simulation: Simulation, truth: FrameTruth) -> Array:
-    """Rocks within 10 m of base_link, (N, 7) float32: x, y, z of the base in the level frame, diameter, height, m, and
-    the two columns of `ground_truth.rocks_in_view`."""
-    terrain, here = simulation.terrain, truth.level.translation
-    near = here[:2] + (terrain.rocks.center - here[:2] + terrain.extent / 2) % terrain.extent - terrain.extent / 2
-    points = truth.level.inverse()(np.column_stack([near, terrain.rocks.base]))
-    seen = ground_truth.rocks_in_view(simulation, truth)
-    table = np.column_stack([points, terrain.rocks.diameter, terrain.rocks.height, seen])
-    return table[np.hypot(points[:, 0], points[:, 1]) <= ROCKS_WITHIN].astype(np.float32)
-
-
 def _rocks_message(simulation: Simulation, stamp: int, truth: FrameTruth) -> Any:
-    table = rocks_in_level(simulation, truth)
+    table = ground_truth.rocks_in_level(simulation, truth)
     fields = [
         make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=ros2.FLOAT32, count=1)
         for place, name in enumerate(ROCK_FIELDS)

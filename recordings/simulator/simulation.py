@@ -6,16 +6,14 @@ short one; every random stream has its own seed, so equal parameters give equal 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, partial
-from pathlib import Path
+from functools import cached_property
 
 import numpy as np
 
-from recordings.ros2_writer import Ros2Writer
-from recordings.simulator import log, raycast, shading, sunlight, traverse
+from recordings.simulator import raycast, shading, sunlight, traverse
 from recordings.simulator.odometry import dead_reckoning
 from recordings.simulator.terrain import Terrain, make_terrain
 from stages.data import Array, Pose, StereoCamera, Transform
@@ -176,6 +174,11 @@ class Simulation:
         """Time of the first sensor sample, ns."""
         return self.start - MARGIN
 
+    def sensor_stamps(self, rate: float) -> list[int]:
+        """Stamps, ns, of a sensor of so many Hz, from before the first frame until after the last."""
+        length = (self.stamp(self.frames - 1) + MARGIN - self.begin) / SECOND
+        return [self.begin + round(number / rate * SECOND) for number in range(int(np.ceil(length * rate)) + 1)]
+
     def way(self, stamp: int) -> float:
         """Metres driven since the nominal start, at a time, ns."""
         return (stamp - self.start) / SECOND * self.speed
@@ -187,7 +190,7 @@ class Simulation:
     @cached_property
     def odometry(self) -> tuple[Pose, ...]:
         """The odometry of the whole drive, as logged."""
-        stamps = self._sensor_stamps(self.odometry_rate)
+        stamps = self.sensor_stamps(self.odometry_rate)
         ways = np.array([self.way(stamp) for stamp in stamps])
         bases = [self.base_at(stamp) for stamp in stamps]
         return tuple(dead_reckoning(stamps, bases, ways, self.odometry_scale, self.odometry_turn, self._rng(5)))
@@ -216,31 +219,6 @@ class Simulation:
             )  # fmt: skip
             images = next(pictures), next(pictures)
         return FrameTruth(base, traverse.level_pose(base), depth, surface, seen, images)
-
-    def write(self, out: Path, progress: Callable[[int, int], None] | None = None) -> None:
-        """Write the log. progress: called with (frames written, frames) after each frame."""
-        with Ros2Writer(Path(out)) as writer:
-            for _, make_messages, index in sorted(self._events(), key=lambda event: event[0]):
-                for log_time, topic, message in make_messages():
-                    writer.write(topic, message, log_time)
-                if index is not None and progress is not None:
-                    progress(index + 1, self.frames)
-
-    def _events(self) -> Iterator[tuple[int, Callable[[], list[log.Logged]], int | None]]:
-        """(log time, maker of the messages then written, frame index or None), unordered; made on demand."""
-        yield self.begin, partial(log.static_transforms, self, self.begin), None
-        sensors = ((log.inclinometer, self.tilt_rate, 4_000_000), (log.odometry, self.odometry_rate, 9_000_000))
-        for make, rate, latency in sensors:
-            for number, stamp in enumerate(self._sensor_stamps(rate)):
-                yield stamp + latency, partial(make, self, number, stamp, stamp + latency), None
-        for index in range(self.frames):
-            at = self.stamp(index) + 21_000_000
-            yield at, partial(log.frame, self, index, at), index
-
-    def _sensor_stamps(self, rate: float) -> list[int]:
-        """Stamps, ns, of a sensor of so many Hz, from before the first frame until after the last."""
-        length = (self.stamp(self.frames - 1) + MARGIN - self.begin) / SECOND
-        return [self.begin + round(number / rate * SECOND) for number in range(int(np.ceil(length * rate)) + 1)]
 
     def _intrinsics(self) -> tuple[float, float, float, float]:
         return self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy

@@ -24,7 +24,7 @@ from recordings import McapSource, ros2
 from recordings.decode import transform_of
 from recordings.mcap_reader import iter_decoded
 from recordings.measures import without_plane
-from recordings.simulator import Simulation, raycast, traverse
+from recordings.simulator import Simulation, raycast, traverse, write_log
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Pose, Transform
 
 RUNS = ((11, 0.05), (12, 0.15), (13, 0.15))
@@ -80,7 +80,7 @@ def traverse_of(seed: int, abundance: float) -> Simulation:
 def region(simulation: Simulation, folder: Path) -> Region:
     """The regional map of a traverse, by the command line's default pipeline."""
     log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
-    simulation.write(log)
+    write_log(simulation, log)
     command = [sys.executable, "-m", "flow.cli", "run", log, "-o", out, "--no-rrd", "--summary", summary]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     frames = _frames(out)

@@ -29,7 +29,7 @@ from flow.align import Token
 from flow.allocator import keep_freed_memory
 from flow.pipeline import load
 from recordings.score_table import ROWS, terrain_figures, terrain_lines
-from recordings.simulator import log, traverse
+from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
 from recordings.terrain_measures import TerrainTally, TrueGround
 from stages.data import Array, Cell, Disparity, Mount, Source, StereoFrame, Tilt, Transform
@@ -61,8 +61,8 @@ def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any]
         }
         up = (truth.base.rotation @ inclinometer.rotation)[2]
         exact = {"disparity": seen_by_both(simulation, stamp, truth), "tilt": Tilt(stamp, up / np.linalg.norm(up))}
-        elevation, hazards = log.truth_maps(simulation, stamp, truth)
-        rocks = log.rocks_in_level(simulation, truth)[:, [0, 1, 3, 4, 5, 6]]
+        elevation, hazards = ground_truth.truth_maps(simulation, stamp, truth)
+        rocks = ground_truth.rocks_in_level(simulation, truth)[:, [0, 1, 3, 4, 5, 6]]
         ground = TrueGround.of(elevation, hazards.cells == Cell.HAZARD, rocks)
         assert ground is not None
         yield given, exact, ground
@@ -103,7 +103,7 @@ def tilt_error(simulation: Simulation, tilt: Tilt) -> Array:
 
 def seen_by_both(simulation: Simulation, stamp: int, truth: FrameTruth) -> Disparity:
     """The true disparity of the pixels that both cameras see, as if measured without error."""
-    true = log.true_disparity(simulation, stamp, truth)
+    true = ground_truth.true_disparity(simulation, stamp, truth)
     known = truth.seen == 255
     source = np.where(known, np.uint8(Source.MEASURED), np.uint8(Source.UNKNOWN))
     pixels = np.where(known, true.pixels, np.float32(np.nan))

@@ -19,7 +19,7 @@ from recordings import ros2, scoring
 from recordings.errors import LogError
 from recordings.ros2_writer import Ros2Writer
 from recordings.score_table import ROWS, format_brief, format_score, terrain_lines
-from recordings.simulator import Simulation, log
+from recordings.simulator import Simulation, ground_truth, write_log
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
 from tests.recordings.sample_log import rewritten
 
@@ -31,7 +31,7 @@ SMALL = Simulation(
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("truth") / "log.mcap"
-    SMALL.write(path)
+    write_log(SMALL, path)
     return path
 
 
@@ -71,12 +71,12 @@ class Run:
         return path
 
     def messages(self, stamp, frame):
-        true = log.true_disparity(SMALL, stamp, frame)
+        true = ground_truth.true_disparity(SMALL, stamp, frame)
         disparity = Disparity(
             stamp, self.disparity(true.pixels.copy()), true.source, true.confidence,
             camera=replace(SMALL.camera, **self.lens),
         )  # fmt: skip
-        terrain, navigation = log.truth_maps(SMALL, stamp, frame)
+        terrain, navigation = ground_truth.truth_maps(SMALL, stamp, frame)
         inside = slice(self.crop, 320 - self.crop), slice(self.crop, 320 - 2 * self.crop)
         mean = np.where(np.isnan(terrain.layers["mean"]), terrain.layers["elevation"], terrain.layers["mean"])
         layer = np.ascontiguousarray(self.elevation(mean)[inside])
@@ -188,7 +188,7 @@ def test_a_run_of_which_nothing_fits_is_no_score(tmp_path, truth, frames):
 
 def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth, frames):
     widths = [
-        math.ceil(np.nanmax(log.true_disparity(SMALL, 0, frame).pixels) / 16) * 16 for frame in frames
+        math.ceil(np.nanmax(ground_truth.true_disparity(SMALL, 0, frame).pixels) / 16) * 16 for frame in frames
     ]  # fmt: skip
     found = scored(tmp_path, truth, frames).disparity["cropped_image"]
     assert found["leftmost_columns_cropped"] == sorted(set(widths))
@@ -216,7 +216,7 @@ def test_a_tilted_map_is_worse_far_off_and_perfect_once_levelled(tmp_path, truth
 def test_values_where_nobody_could_see_the_ground_are_made_up(tmp_path, truth, frames):
     x = (np.arange(320) + 0.5) * 0.05 - 8
     near = np.hypot(x[None, :], x[:, None]) < 8
-    in_view = [log.truth_maps(SMALL, 0, frame)[0].layers["in_view"][near] > 0.5 for frame in frames]
+    in_view = [ground_truth.truth_maps(SMALL, 0, frame)[0].layers["in_view"][near] > 0.5 for frame in frames]
     found = scored(tmp_path, truth, frames).terrain["made_up"]
     assert found["of_values"] == found["of_cells"] == pytest.approx(1 - np.mean(in_view))
 
@@ -241,7 +241,7 @@ def test_a_map_that_calls_everything_free_finds_no_rock(tmp_path, truth, frames)
 
 
 def test_cells_called_free_on_rocks_or_out_of_view_are_a_share_of_all_free_cells(tmp_path, truth, frames):
-    maps = [log.truth_maps(SMALL, 0, frame) for frame in frames]
+    maps = [ground_truth.truth_maps(SMALL, 0, frame) for frame in frames]
     found = scored(tmp_path, truth, frames, cells=np.zeros_like).terrain["hazards"]
     assert found["free_hazard"] == np.mean([navigation.cells == Cell.HAZARD for _, navigation in maps])
     assert found["free_on_rock"] == np.mean([navigation.reason == Reason.STEP for _, navigation in maps])

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import ros2
 from recordings.mcap_reader import iter_decoded
-from recordings.simulator import Simulation, log, raycast, terrain, traverse
+from recordings.simulator import Simulation, ground_truth, raycast, terrain, traverse, write_log
 from recordings.simulator.odometry import dead_reckoning
 from stages.data import Cell, Transform
 
@@ -31,7 +31,7 @@ def seen():
 @pytest.fixture(scope="module")
 def logged(tmp_path_factory):
     path = tmp_path_factory.mktemp("log") / "traverse.mcap"
-    SMALL.write(path)
+    write_log(SMALL, path)
     messages: dict[str, list] = {}
     order = []
     for topic, log_time, message in iter_decoded(path):
@@ -43,7 +43,7 @@ def logged(tmp_path_factory):
 def world_points(seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Every surface pixel's place in the world by way of the disparity image and the static transforms."""
     camera = SMALL.camera
-    disparity = log.true_disparity(SMALL, 0, seen).pixels.astype(np.float64)
+    disparity = ground_truth.true_disparity(SMALL, 0, seen).pixels.astype(np.float64)
     v, u = np.nonzero(np.isfinite(disparity))
     z = camera.fx * camera.baseline / disparity[v, u]
     optical = np.column_stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
@@ -90,7 +90,7 @@ def test_nothing_stands_between_the_camera_and_what_it_sees(seen):
 
 def residual(simulation: Simulation, truth, low: float, high: float, shift: float) -> float:
     """Mean squared gray level between the left image and the right one, warped by the true disparity plus `shift`."""
-    disparity = log.true_disparity(simulation, 0, truth).pixels
+    disparity = ground_truth.true_disparity(simulation, 0, truth).pixels
     left, right = (picture.astype(np.float32) for picture in truth.images)
     height, width = left.shape
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -276,7 +276,7 @@ def test_the_inclinometer_and_its_mount_give_the_true_tilt(logged):
 
 
 def test_true_elevation_is_where_the_seen_ground_is(seen):
-    elevation, hazards = log.truth_maps(SMALL, 0, seen)
+    elevation, hazards = ground_truth.truth_maps(SMALL, 0, seen)
     points, v, u = world_points(seen)
     local = seen.level.inverse()(points)
     kept = (seen.surface[v, u] == raycast.GROUND) & (np.abs(local[:, :2]).max(axis=1) < 8)
@@ -293,8 +293,8 @@ def test_true_elevation_is_where_the_seen_ground_is(seen):
 
 
 def test_high_rocks_are_hazards_and_open_ground_is_free(seen):
-    elevation, hazards = log.truth_maps(SMALL, 0, seen)
-    rocks = log.rocks_in_level(SMALL, seen)
+    elevation, hazards = ground_truth.truth_maps(SMALL, 0, seen)
+    rocks = ground_truth.rocks_in_level(SMALL, seen)
     high = rocks[(rocks[:, 4] >= 0.2) & (np.abs(rocks[:, :2]).max(axis=1) < 7.9)]
     assert len(high) > 5
     column, row = np.floor((high[:, :2] + 8) / 0.05).astype(int).T
@@ -381,7 +381,7 @@ def test_equal_simulations_write_equal_bytes_whatever_the_threads(tmp_path: Path
     written = []
     for name, threads, seed in (("a", 1, 1), ("b", 3, 1), ("c", 1, 2)):
         small = Simulation(frames=1, width=96, height=72, relief_cells=256, threads=threads, seed=seed)
-        small.write(tmp_path / name)
+        write_log(small, tmp_path / name)
         written.append((tmp_path / name).read_bytes())
     assert written[0] == written[1]
     assert written[0] != written[2]

@@ -10,9 +10,8 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from recordings.score_table import terrain_lines
-from recordings.simulator import log
+from recordings.simulator import Simulation, ground_truth
 from recordings.simulator.ground_truth import in_sight, rocks_in_view
-from recordings.simulator.simulation import Simulation
 from recordings.terrain_measures import TerrainTally, TrueGround
 from stages.data import Array, Cell, ElevationMap
 
@@ -151,7 +150,7 @@ def test_a_truth_without_the_simulators_layers_is_no_truth() -> None:
 @pytest.fixture(scope="module")
 def simulated() -> tuple[Any, ElevationMap]:
     truth = SMALL.frame(0)
-    return truth, log.truth_maps(SMALL, SMALL.stamp(0), truth)[0]
+    return truth, ground_truth.truth_maps(SMALL, SMALL.stamp(0), truth)[0]
 
 
 def test_every_cell_that_a_pixel_hits_is_in_view_and_the_others_in_view_lie_between(simulated: Any) -> None:

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recordings.simulator import Simulation
-from recordings.simulator.log import true_disparity
+from recordings.simulator.ground_truth import true_disparity
 from stages.data import Disparity, Source, StereoFrame
 from stages.match import COSTS, Match
 from tests.bench.stereo_scores import load_scene, rows_filled

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings.simulator import Simulation
-from recordings.simulator.log import true_disparity
+from recordings.simulator.ground_truth import true_disparity
 from stages import CameraMotion, Disparity, StereoCamera, StereoFrame, Transform, VisualOdometry
 from stages.tracking import view
 

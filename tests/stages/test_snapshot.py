@@ -9,7 +9,7 @@ import pytest
 
 import stages
 from recordings.simulator import Simulation
-from recordings.simulator.log import true_disparity
+from recordings.simulator.ground_truth import true_disparity
 from stages import (
     CheckMatches,
     CheckTilt,
