@@ -109,10 +109,11 @@ def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
     """A store of exactly the types the schema defines, completed by standard ones it refers to but leaves out."""
     store = _typestore("empty")
     with _registering:
-        # MCAP separates a schema's definitions by lines of '='; an IDL one is headed by "IDL: package/msg/Name".
+        # MCAP separates a schema's definitions by lines of '='; an IDL one is headed by "IDL: package/msg/Name". The
+        # definitions that it includes are among the others, and the parser knows no #include.
         if encoding == "ros2idl":
             for part in re.split(r"^={20,}\s*$", text, flags=re.MULTILINE):
-                body = re.sub(r"^\s*IDL:.*$", "", part, count=1, flags=re.MULTILINE)
+                body = re.sub(r"^\s*(IDL:|#).*$", "", part, flags=re.MULTILINE)
                 if body.strip():
                     store.register(get_types_from_idl(body))
         else:

@@ -51,6 +51,7 @@ from stages.data import (
     StereoCamera,
     Transform,
 )  # fmt: skip
+from tests.recordings.idl import idl_schema
 from tests.recordings.sample_log import data_folder, model, write_sample
 
 STAMP = 1_700_000_000_123_456_789
@@ -315,6 +316,17 @@ def test_a_schema_may_leave_out_standard_types() -> None:
     raw = bytes(TYPES.serialize_cdr(header, "std_msgs/msg/Header")) + np.float32(2.5).tobytes()
     message = decoder(raw)
     assert (message.header.frame_id, message.pitch) == ("abc", 2.5)
+
+
+def test_schemas_in_idl_read_as_rosidl_writes_them(tmp_path: Path) -> None:
+    seen = set()
+    with write_sample(tmp_path / "log.mcap").open("rb") as log:
+        for schema, _, message in make_reader(log).iter_messages():
+            assert schema is not None
+            decoded = decoder_for(schema.name, "ros2idl", idl_schema(schema.name))(message.data)
+            assert bytes(TYPES.serialize_cdr(decoded, schema.name)) == message.data
+            seen.add(schema.name.rpartition("/")[2])
+    assert seen == {"Image", "CameraInfo", "Imu", "Odometry", "TFMessage"}
 
 
 RECURSIVE = {
