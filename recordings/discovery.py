@@ -71,10 +71,9 @@ def discover(
 ) -> Topics:
     """The topics of each role.
 
-    settings: with the topics that the user named; bare_angles: whether they say how bare pitch and roll are to be
-    read; frame_of: topic -> the frame_id of its
-    messages; untilted: Imu topic -> why it has no orientation, None where it has; unplaced: topic of transforms -> why
-    they tell no pose of the rover, None where they do.
+    settings: with the topics that the user named; bare_angles: whether they say how bare pitch and roll are to be read;
+    frame_of: topic -> the frame_id of its messages; untilted: Imu topic -> why it has no orientation, None where it
+    has; unplaced: topic of transforms -> why they tell no pose of the rover, None where they do.
     """
     told = (
         settings.left, settings.right, settings.left_info, settings.right_info, settings.inclinometer,
@@ -108,6 +107,8 @@ def _find_images(topics: Sequence[Topic], settings: LogSettings, found: Topics) 
     for side, given in (("left", settings.left), ("right", settings.right)):
         if given is not None and given not in names:
             found.refuse(side, side, _not_there(side, given, "image", images))
+        elif given is not None and settings.left == settings.right:
+            found.refuse(side, side, f"the source's 'left' and 'right' are both set to {given}; set one to the other's")
     if found.missing:
         return
     told = settings.left or settings.right  # then only its partner can be the other

@@ -41,6 +41,13 @@ def test_cameras_of_two_places_are_not_better_or_worse_than_each_other(tmp_path:
         assert "/rear/left/image_rect with /rear/right/image_rect" in log.missing["left"]
     with McapSource(right="/front/right/image_raw").open(path) as log:
         assert log.topics["left"] == "/front/left/image_raw"
+    with McapSource(left=topics[0], right=topics[0]).open(path) as log:
+        assert (
+            log.refused["right"]
+            == f"the source's 'left' and 'right' are both set to {topics[0]}; set one to the other's"
+        )
+    with McapSource(left=topics[2], right=topics[1]).open(path) as log:  # whatever they are called
+        assert (log.topics["left"], log.topics["right"]) == (topics[2], topics[1])
 
 
 def test_one_camera_may_send_its_images_compressed(tmp_path: Path) -> None:
