@@ -25,6 +25,7 @@ from stages.data import Array, Disparity, Source, StereoFrame
 
 IMAGES, CALIBRATION, MASK = ("im0.png", "im1.png"), "calib.txt", "mask0nocc.png"
 TRUTHS = ("disp0GT.pfm", "disp0.pfm")  # the first that is there
+ROUNDED = 1.0  # px, by how much doffs may differ from what cam0 and cam1 say
 HEIGHT = 1.0  # m; the data set does not tell how its camera stood
 _PFM = re.compile(rb"Pf\s+(\d+)\s+(\d+)\s+([-+.\deE]+)(?:\r\n|\s)")
 _NUMBERS = ("doffs", "baseline", "width", "height", "ndisp")
@@ -119,6 +120,8 @@ def read_pfm(path: Path) -> Array:
     if have != due or not due:
         raise LogError(f"{path} has {have} bytes of pixels where {width}x{height} take {due}; get it again")
     rows = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end()).reshape(height, width)
+    if not np.isfinite(rows).any():
+        raise LogError(f"{path} has no pixel that is known; get it again")
     return np.where(np.isfinite(rows), rows, np.nan).astype(np.float32)[::-1].copy()
 
 
@@ -129,7 +132,7 @@ def _is_scene(folder: Path) -> bool:
 def _calibration(path: Path) -> tuple[dict[str, str], dict[str, float]]:
     """calib.txt as text, and as fx, fy, cx, cy, cx_right, width, height, ndisp (px), baseline (m)."""
     try:
-        lines = _bytes(path).decode().splitlines()
+        lines = _bytes(path).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise LogError(f"{path} is not a text file; get it again") from error
     text = {key.strip(): value.strip() for key, found, value in (line.partition("=") for line in lines) if found}
@@ -137,17 +140,25 @@ def _calibration(path: Path) -> tuple[dict[str, str], dict[str, float]]:
         if name not in text:
             raise LogError(f"{path} lacks '{name}'; it needs {', '.join(('cam0', *_NUMBERS))}")
     try:
-        cam0 = np.array([row.split() for row in text["cam0"].strip("[]").split(";")], np.float64)
+        cam0 = _matrix(text["cam0"])
         values = {name: float(text[name]) for name in _NUMBERS}
         (fx, _, cx), (_, fy, cy) = (float(value) for value in cam0[0]), (float(value) for value in cam0[1])
+        beside = float(_matrix(text["cam1"])[0, 2]) - cx if "cam1" in text else values["doffs"]
     except (ValueError, IndexError) as error:
         raise LogError(f"{path} has a line that is no number or matrix ({error}); get it again") from error
-    right, baseline = cx + values.pop("doffs"), values["baseline"] / 1000  # which is in mm
-    values |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "cx_right": right, "baseline": baseline}
+    doffs, baseline = values.pop("doffs"), values["baseline"] / 1000  # which is in mm
+    values |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "cx_right": cx + doffs, "baseline": baseline}
     for name, value in values.items():
         if not np.isfinite(value) or (name in _POSITIVE and value <= 0):
             raise LogError(f"{path}: {name} is {value:g}, which no camera has; get it again")
+    if abs(beside - doffs) > ROUNDED:
+        raise LogError(f"{path}: doffs is {doffs:g}, by cam0 and cam1 it is {beside:g}; get it again")
     return text, values
+
+
+def _matrix(text: str) -> Array:
+    """A matrix as Matlab writes one: [1 2; 3 4]."""
+    return np.array([row.split() for row in text.strip("[]").split(";")], np.float64)
 
 
 def _codes(path: Path) -> Array:

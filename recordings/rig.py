@@ -27,7 +27,6 @@ EVER = 0  # ns, the stamp of what holds throughout: frames may be before the log
 _SAME = 1e-6  # m and matrix elements; two transforms of the same frames that differ by more contradict each other
 _PARALLEL = 1e-3  # rad; cameras turned against each other by less need no rectification: a pixel at 1000 px
 _BESIDE = 0.01  # of the baseline; and so for cameras that are shifted against each other by less in y and z
-_ALIKE = 1e-3  # of a focal length or of cy; and so for lenses that differ by less: a pixel at 1000 px
 _AGREEING = 0.05  # of a baseline; what tells it twice tells the same where it differs by less
 SHORTEST, LONGEST = 1.0, 1e6  # px, focal lengths
 _SHRUNK = 0.1  # of the focal length; what rectification makes smaller than that is no image
@@ -136,7 +135,7 @@ def calibrated_pair(
             f"the baseline is {baseline:.4g} m, so {topics[0]} is the right camera: exchange 'left' and 'right' "
             "of the source"
         )
-    if differing := _unlike(left, right):
+    if differing := left.unlike(right):
         raise LogError(
             f"P of the CameraInfo of {topics[0]} and {topics[1]} are not those of a rectified pair: {differing}; "
             "record the stereo calibration"
@@ -230,15 +229,7 @@ def _beside(left: CameraModel, right: CameraModel, placed: Transform) -> bool:
     """
     turned = Rotation.from_matrix(left.r @ placed.rotation @ right.r.T).magnitude()
     x, y, z = left.r @ placed.translation
-    return turned < _PARALLEL and max(abs(y), abs(z)) < _BESIDE * abs(x) and not _unlike(left, right)
-
-
-def _unlike(left: CameraModel, right: CameraModel) -> str:
-    """By what the projections of two cameras differ that a rectified pair has in common; empty where by nothing."""
-    shared = {"fx": (0, 0), "fy": (1, 1), "cy": (1, 2)}
-    pairs = {name: (float(left.p[place]), float(right.p[place])) for name, place in shared.items()}
-    differing = [name for name, pair in pairs.items() if not np.isclose(*pair, rtol=_ALIKE, atol=0)]
-    return " and ".join(f"{name} is {pairs[name][0]:.6g} and {pairs[name][1]:.6g} px" for name in differing)
+    return turned < _PARALLEL and max(abs(y), abs(z)) < _BESIDE * abs(x) and not left.unlike(right)
 
 
 def _joined(left: CameraModel, right: CameraModel, placed: Transform) -> tuple[CameraModel, CameraModel]:

@@ -9,6 +9,7 @@ horizontal heading, y left. What says where things are and how they move stands 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -28,6 +29,7 @@ from stages.publish import check_resolution, publish, publish_image, publish_sta
 from stages.tiles import Tiles as Tiles
 
 LEVEL_FRAME = "level"
+ALIKE = 1e-3  # of a focal length or of cy, by which those of a rectified pair may differ: a pixel at 1000 px
 _OPENCV = (0, 4, 5, 8, 12, 14)  # coefficients; how many there are tells the model, whatever a driver calls it
 DISTORTION_SIZES = {"plumb_bob": _OPENCV, "rational_polynomial": _OPENCV, "equidistant": (4,)}
 
@@ -94,6 +96,13 @@ class CameraModel:
         """Whether R is a rotation."""
         return bool(np.allclose(self.r @ self.r.T, np.eye(3), atol=1e-3) and np.linalg.det(self.r) > 0)
 
+    def unlike(self, right: CameraModel) -> str:
+        """By what the projections of two cameras differ that a rectified pair has in common; empty where by nothing."""
+        shared = {"fx": (0, 0), "fy": (1, 1), "cy": (1, 2)}
+        pairs = {name: (float(self.p[place]), float(right.p[place])) for name, place in shared.items()}
+        differing = [name for name, pair in pairs.items() if not math.isclose(*pair, rel_tol=ALIKE)]
+        return " and ".join(f"{name} is {pairs[name][0]:.6g} and {pairs[name][1]:.6g} px" for name in differing)
+
     @property
     def unusable(self) -> str:
         """Why a raw image cannot be rectified with it, empty where it can."""
@@ -140,7 +149,12 @@ class StereoCamera:
 
     @classmethod
     def from_models(cls, left: CameraModel, right: CameraModel, frame_id: str, rectified: bool) -> StereoCamera:
-        """The rectified camera that two CameraInfo messages describe through their projection matrices."""
+        """The rectified camera that two CameraInfo messages describe through their projection matrices.
+
+        Raises ValueError where these are not those of a rectified pair.
+        """
+        if differing := left.unlike(right):
+            raise ValueError(f"the cameras' P are not those of a rectified pair: {differing}")
         return cls(
             fx=float(left.p[0, 0]), fy=float(left.p[1, 1]), cx=float(left.p[0, 2]), cy=float(left.p[1, 2]),
             baseline=float(left.p[0, 3] / left.p[0, 0] - right.p[0, 3] / right.p[0, 0]),

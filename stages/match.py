@@ -77,7 +77,7 @@ class Match(Stage):
 
     disparities: int = parameter(
         192, "size of the search range, of which the first and the last only bound the others and are not found",
-        unit="px", low=1, high=1024,
+        unit="px", low=3, high=1024,
     )  # fmt: skip
     minimum: int = parameter(0, "smallest disparity searched", unit="px", low=-1024, high=1024)
     farthest: float = parameter(
@@ -139,8 +139,8 @@ class Match(Stage):
         layers = found.pixels, found.source, found.confidence
         if prior is not None and self.nearer == "prior" and not self.around:
             # The search loses what lies within a pixel or two of its end, too.
-            taken = np.isnan(found.pixels) & (prior.source == Source.MEASURED) & np.isfinite(prior.pixels)
-            taken &= prior.pixels > search.stop - BEYOND
+            taken = np.isnan(found.pixels) & (prior.source == Source.MEASURED)
+            taken &= (prior.pixels > search.stop - BEYOND) & (prior.pixels < frame.camera.width)
             for layer, known in zip(layers, (prior.pixels, prior.source, prior.confidence), strict=True):
                 np.copyto(layer, known, where=taken)
         if self.farthest:  # what bounds the range reaches a little beyond

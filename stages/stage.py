@@ -43,6 +43,8 @@ class Stage:
             choices, low, high, unit = (meta.get(key) for key in ("choices", "low", "high", "unit"))
             if choices is not None and value not in choices:
                 raise ValueError(f"{where} must be one of {', '.join(map(str, choices))}, not {value}")
+            if (low, high) != (None, None) and not isinstance(value, numbers.Real):
+                raise ValueError(f"{where} must be a number{f' of {unit}' if unit else ''}, not {value!r}")
             if isinstance(value, numbers.Real) and not math.isfinite(value):
                 raise ValueError(f"{where} must be a finite number{f' of {unit}' if unit else ''}, not {value}")
             if item.type in ("int", "int | None", int) and not isinstance(value, numbers.Integral):

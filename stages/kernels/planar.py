@@ -21,9 +21,9 @@ MEASURED = int(Source.MEASURED)
 def trusted_matches(
     pixels: Array, source: Array, confidence: Array, least: float, excluded: Array, threads: int = 1
 ) -> tuple[Array, Array]:
-    """The measured, finite disparities of at least that confidence, (H, W) float32, NaN elsewhere; and that, or 0.
+    """The measured disparities of at least that confidence, (H, W) float32, NaN elsewhere; and that, or 0.
 
-    excluded: (H, W) bool, what is no match all the same.
+    One that is not within the width of the image is none. excluded: (H, W) bool, what is no match all the same.
     """
     matches, weights = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.float32)
     layers = pixels, source, confidence, excluded, matches, weights
@@ -78,7 +78,7 @@ def trusted_matches_reference(
     pixels: Array, source: Array, confidence: Array, least: float, excluded: Array
 ) -> tuple[Array, Array]:
     """`trusted_matches` in plain numpy."""
-    trusted = (source == MEASURED) & (confidence >= F32(least)) & np.isfinite(pixels) & ~excluded
+    trusted = (source == MEASURED) & (confidence >= F32(least)) & (np.abs(pixels) < pixels.shape[1]) & ~excluded
     return np.where(trusted, pixels, F32(np.nan)), np.where(trusted, confidence, F32(0))
 
 
@@ -95,7 +95,7 @@ def near_median_reference(matches: Array, side: int, near: float) -> Array:
 def _trust(least, pixels, source, confidence, excluded, matches, weights):  # type: ignore[no-untyped-def]
     for y in range(pixels.shape[0]):
         for x in range(pixels.shape[1]):
-            good = (source[y, x] == MEASURED) & (confidence[y, x] >= least) & np.isfinite(pixels[y, x])
+            good = (source[y, x] == MEASURED) & (confidence[y, x] >= least) & (abs(pixels[y, x]) < pixels.shape[1])
             good &= not excluded[y, x]
             matches[y, x] = pixels[y, x] if good else F32(np.nan)
             weights[y, x] = confidence[y, x] if good else F32(0)

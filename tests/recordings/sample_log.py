@@ -72,8 +72,8 @@ LAYOUTS: dict[str, dict[str, Any]] = {
     },
     "no chunks": {"use_chunking": False, "enable_data_crcs": True},
     "no crcs": {"enable_crcs": False},
-    "messages compressed one by one": {"compression": CompressionType.NONE, "pack": ZstdCompressor().compress},
 }
+PACKED = {"messages compressed one by one": {"compression": CompressionType.NONE, "pack": ZstdCompressor().compress}}
 
 
 Edit = Callable[[str, int, Any], Any]

@@ -188,6 +188,11 @@ def calibrate(**changes: object):
         (calibrate(cam0="[-9 0 1; 0 9 1; 0 0 1]"), r"calib\.txt: fx is -9"),
         (calibrate(baseline=0), r"calib\.txt: baseline is 0"),
         (calibrate(ndisp="nan"), r"calib\.txt: ndisp is nan"),
+        (calibrate(doffs=0), r"calib\.txt: doffs is 0, by cam0 and cam1 it is 12\.5"),
+        (
+            spoil("disp0GT.pfm", b"Pf\n96 64\n-1\n" + 96 * 64 * b"\0\0\x80\x7f"),
+            r"disp0GT\.pfm has no pixel that is known",
+        ),
         (calibrate(width=48), r"im0\.png is 96x64, the calibration or the first pair is 48x64"),
         (spoil("disp0GT.pfm", b"P6\n3 2\n255\n" + bytes(18)), r"disp0GT\.pfm is not a PFM file of one channel"),
         (spoil("disp0GT.pfm", b""), r"disp0GT\.pfm is not a PFM file"),

@@ -107,6 +107,15 @@ def test_a_calibration_that_cannot_be_used_is_named(model, count, message):
         Rectify()(StereoFrame(1, image, image, camera))
 
 
+@pytest.mark.parametrize(("place", "name"), [((0, 0), "fx"), ((1, 1), "fy"), ((1, 2), "cy")])
+def test_projections_of_no_rectified_pair_make_no_camera(place, name):
+    left, right = (CameraModel(WIDTH, HEIGHT, K, np.zeros(5), np.eye(3), p) for p in (P_LEFT, P_RIGHT))
+    other = P_RIGHT.copy()
+    other[place] *= 1.05
+    with pytest.raises(ValueError, match=f"not those of a rectified pair: {name} is"):
+        StereoCamera.from_models(left, replace(right, p=other), "cam", rectified=False)
+
+
 def a_pair(terms=(), seed=0, size=SIZE):
     """A textured plane at varying distance, its right image displaced downwards by the offset with these terms."""
     width, height = size

@@ -144,8 +144,8 @@ def test_a_plane_is_not_followed_beyond_the_range_of_all_matches(side):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("bad", [np.inf, -np.inf])
-def test_an_infinite_disparity_is_no_match(box, bad):
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, 1e30, -1e7])
+def test_a_disparity_beyond_the_image_is_no_match(box, bad):
     frame, matches, _ = box
     pixels, holed = matches.pixels.copy(), matches.pixels.copy()
     pixels[100:104, 100:104], holed[100:104, 100:104] = bad, np.nan
