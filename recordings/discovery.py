@@ -64,16 +64,15 @@ class Topics:
 def discover(
     topics: Sequence[Topic],
     settings: LogSettings,
-    bare_angles: bool,
     frame_of: Callable[[str], str],
     untilted: Callable[[str], str | None],
     unplaced: Callable[[str], str | None],
 ) -> Topics:
     """The topics of each role.
 
-    settings: with the topics that the user named; bare_angles: whether they say how bare pitch and roll are to be read;
-    frame_of: topic -> the frame_id of its messages; untilted: Imu topic -> why it has no orientation, None where it
-    has; unplaced: topic of transforms -> why they tell no pose of the rover, None where they do.
+    settings: with the topics that the user named; frame_of: topic -> the frame_id of its messages; untilted: Imu topic
+    -> why it has no orientation, None where it has; unplaced: topic of transforms -> why they tell no pose of the
+    rover, None where they do.
     """
     told = (
         settings.left, settings.right, settings.left_info, settings.right_info, settings.inclinometer,
@@ -86,7 +85,7 @@ def discover(
     for side in ("left", "right"):
         if side in found.chosen:
             _find_info(topics, settings, side, frame_of, found)
-    _find_tilt(topics, settings, bare_angles, untilted, found)
+    _find_tilt(topics, settings, untilted, found)
     _find_pose(topics, settings, unplaced, found)
     return found
 
@@ -170,7 +169,7 @@ def _find_info(
     topics: Sequence[Topic], settings: LogSettings, side: str, frame_of: Callable[[str], str], found: Topics
 ) -> None:
     infos = [topic for topic in topics if topic.schema == INFO and topic.messages]
-    given = settings.left_info if side == "left" else settings.right_info
+    given = getattr(settings, f"{side}_info")
     image = found.chosen[side]
     if given is not None:
         if given in {topic.name for topic in infos}:
@@ -195,13 +194,9 @@ def _find_info(
 
 
 def _find_tilt(
-    topics: Sequence[Topic],
-    settings: LogSettings,
-    bare_angles: bool,
-    untilted: Callable[[str], str | None],
-    found: Topics,
+    topics: Sequence[Topic], settings: LogSettings, untilted: Callable[[str], str | None], found: Topics
 ) -> None:
-    given = settings.inclinometer
+    given, bare_angles = settings.inclinometer, settings.angles() is not None
     if given is not None:
         topic = next((topic for topic in topics if topic.name == given and topic.messages), None)
         if topic is None or topic.schema in (*IMAGES, INFO, TRANSFORMS, *(() if bare_angles else POSES)):
@@ -212,10 +207,8 @@ def _find_tilt(
         else:
             found.chosen["inclinometer"] = given
         return
-    schemas = (*TILTS, BARE_TILT) if bare_angles else TILTS
-    candidates = [topic for topic in topics if topic.schema in schemas and topic.messages]
-    if bare_angles:
-        candidates = [topic for topic in candidates if topic.schema == BARE_TILT]
+    bare = [topic for topic in topics if topic.schema == BARE_TILT and topic.messages]
+    candidates = bare if bare_angles else [topic for topic in topics if topic.schema in TILTS and topic.messages]
     useless = {topic.name: why for topic in candidates if topic.schema == IMU and (why := untilted(topic.name))}
     useful = [topic for topic in candidates if topic.name not in useless]
     named = [topic for topic in useful if re.search("inclin|tilt", topic.name, re.IGNORECASE)]
@@ -223,12 +216,11 @@ def _find_tilt(
     if len(choice) == 1:
         found.chosen["inclinometer"] = choice[0].name
         return
-    bare = [topic for topic in topics if topic.schema == BARE_TILT and topic.messages]
     if len(choice) > 1:
         why = f"several topics could be the inclinometer ({_listed(choice)}); set 'inclinometer' of the source"
     elif candidates:
         why = f"{_listed(candidates)} holds no orientation ({next(iter(useless.values()))}); record one that does"
-    elif bare and not bare_angles:
+    elif bare:
         why = _undefined(bare[0])
     else:
         why = "the log has no tilt (an Imu with orientation, a QuaternionStamped); set 'inclinometer' of the source"

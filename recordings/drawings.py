@@ -14,10 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 import rerun as rr
+from scipy.spatial.transform import Rotation
 
 from recordings import paint
 from recordings.desk import LEDGER, Panel, Place
 from recordings.errors import counted
+from recordings.measures import cell_centres
 from recordings.png import png16
 from stages.data import (
     LEVEL_FRAME,
@@ -250,9 +252,8 @@ def draw_tilt(canvas: Canvas, path: str, tilt: Tilt) -> None:
 @draws(Pose)
 def draw_pose(canvas: Canvas, path: str, pose: Pose) -> None:
     """An arrow along the rover's heading; the desk shows those of all frames so far."""
-    x, y, z, w = pose.quaternion
-    forward = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
-    arrow = rr.Arrows3D(origins=[pose.position], vectors=[0.4 * forward], colors=[AMBER])
+    forward = Rotation.from_quat(pose.quaternion).apply([0.4, 0.0, 0.0])
+    arrow = rr.Arrows3D(origins=[pose.position], vectors=[forward], colors=[AMBER])
     place = Place(Panel.TRAJECTORY, f"{path}/trajectory", f"{path} ({pose.frame_id})", pose.frame_id)
     canvas.log(place.path, arrow, place)
 
@@ -354,7 +355,7 @@ def draw_hazards(canvas: Canvas, path: str, navigation: NavigationMap, terrain: 
     elevation = terrain.layers["elevation"]
     row, col = np.nonzero((navigation.cells == Cell.HAZARD) & np.isfinite(elevation))
     if len(row):
-        x, y = paint.cell_centres(terrain.shape, terrain.resolution, terrain.origin)
+        x, y = cell_centres(terrain)
         centres = np.column_stack([x[col], y[row], elevation[row, col] + LIFT])
         hazards = rr.Points3D(centres, colors=[paint.CELLS[Cell.HAZARD][1]], radii=0.4 * terrain.resolution)
         canvas.log(f"{path}/hazards", hazards, Place(Panel.TERRAIN, f"{path}/hazards", path, terrain.frame_id))

@@ -108,7 +108,7 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
     im0.png with im1.png. Raises LogError where there are none, or an image has no partner."""
     if not folder.is_dir():
         raise LogError(f"{folder} is not a folder; give the folder that holds the left and right images")
-    near = (f for pattern in ("*", "*/*") for f in folder.glob(pattern) if not f.parent.name.startswith("."))
+    near = (f for pattern in ("*", "[!.]*/*") for f in folder.glob(pattern))
     files = sorted((f for f in near if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
     named = {file.relative_to(folder).as_posix(): file for file in files}
     names = {name: file for name, file in named.items() if not _NOT_CAMERAS.search(name)}

@@ -1,6 +1,6 @@
 """What lies where in an MCAP file, and from when: found from its summary, where that is whole (else `mcap_walk` does).
 
-Both ways give the same `Index`, so reading knows one way only.
+Both ways fill an `Index`; only the walk knows the time of every message.
 """
 
 from __future__ import annotations

@@ -16,15 +16,13 @@ from mcap.records import Channel
 
 from recordings.decode import frame_of
 from recordings.errors import LogError, said
-from recordings.mcap_chunk import LARGEST
 from recordings.mcap_index import Lost
 from recordings.mcap_reader import CONVERT, McapFile
-from recordings.ros2_types import decoder_for, full_name
+from recordings.ros2_types import decoder_for, full_name, plain
 
 _PLACES = 4  # in a log, at which messages are looked at until one can be read: a filter may begin with nonsense
 _LOOKED_AT = 20  # messages at most at each of them
 _HEAD = 12  # bytes of a message that end with its header's stamp
-_PACKED = b"\x28\xb5\x2f\xfd"  # begins a frame of zstd; no CDR message begins so
 
 Decoder = Callable[[bytes | memoryview], Any]
 T = TypeVar("T")
@@ -103,7 +101,7 @@ class Messages:
             raise LogError("its messages have no schema")
         decoder = decoder_for(schema.name, schema.encoding, schema.data)
         self.schemas[channel.topic] = full_name(schema.name)
-        return lambda data: decoder(_plain(data, LARGEST))
+        return decoder
 
 
 def attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:
@@ -121,20 +119,10 @@ def attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:
 def peek_stamp(data: memoryview) -> int:
     """The stamp, ns, of a CDR message that begins with a std_msgs/Header, without decoding it; 0 if it is too short."""
     try:
-        head = _plain(data, _HEAD)
+        head = plain(data, _HEAD)
     except zstandard.ZstdError:
         return 0
     if len(head) < _HEAD:
         return 0
     seconds, nanoseconds = struct.unpack_from("<iI" if head[1] else ">iI", head, 4)
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
-
-
-def _plain(data: bytes | memoryview, size: int) -> bytes | memoryview:
-    """The first `size` bytes, at least, of a message, or all of them. rosbag2 may have compressed each by itself, which
-    nothing but the message tells."""
-    if data[: len(_PACKED)] != _PACKED:
-        return data
-    whole = zstandard.frame_content_size(data)
-    with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-        return bytes(stream.read(size if whole < 0 else min(size, whole)))

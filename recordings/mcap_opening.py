@@ -84,8 +84,7 @@ class Opening:
         """The topic of each role, and why others have none."""
         schemas, angles = self.messages.schemas, self.source.angles()
         topics = [Topic(name, schemas[name], self.messages.count(name)) for name in sorted(schemas)]
-        frame_of_first, bare = self.messages.frame_of, angles is not None
-        found = discover(topics, self.source, bare, frame_of_first, self._untilted, self._unplaced)
+        found = discover(topics, self.source, self.messages.frame_of, self._untilted, self._unplaced)
         if angles is not None and (topic := found.chosen.get("inclinometer")):
             checked = self.messages.first(topic, angles.check)
             if isinstance(checked, LogError):

@@ -11,6 +11,7 @@ import struct
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from itertools import accumulate
@@ -195,11 +196,8 @@ class McapFile:
             return _in_order(self._chunk_messages(chunk), before, ordered)
         except BROKEN as error:
             reason = f"the chunk at byte {chunk.chunk_start_offset} is broken and its messages are lost ({said(error)})"
-        try:
-            known = self._message_index(chunk)
-        except BROKEN:
-            known = []
-        known = known or [(number, chunk.message_start_time) for number in chunk.message_index_offsets]
+        channels = chunk.message_index_offsets
+        known = self._message_index(chunk) or [(number, chunk.message_start_time) for number in channels]
         lost = [Lost(channel, log_time, reason) for channel, log_time in known]
         return [*lost] or [Lost(None, chunk.message_start_time, reason)]
 
@@ -217,25 +215,25 @@ class McapFile:
 
     def _contents(self, chunk: ChunkIndex) -> list[Raw | Lost]:
         """Channel and log time of a chunk's messages, from its message index where it has one; a channel's in order."""
-        try:
-            known = self._message_index(chunk)
-        except BROKEN:
-            known = []
+        known = self._message_index(chunk)
         return [Raw(number, time, memoryview(b"")) for number, time in known] or self._chunk_or_lost(chunk)
 
     def _message_index(self, chunk: ChunkIndex) -> list[tuple[int, int]]:
-        """(channel, log time) of each message, from the message index behind a chunk; empty where there is none.
+        """(channel, log time) of each message, from the message index behind a chunk; empty where that lacks or
+        is broken.
 
         Those of one channel are in file order.
         """
         found: list[tuple[int, int]] = []
         first = chunk.chunk_start_offset + chunk.chunk_length
-        for opcode, content in records(read(self._file, first, min(chunk.message_index_length, LARGEST))):
-            if opcode == Opcode.MESSAGE_INDEX:
-                channel, size = struct.unpack_from("<HI", content)
-                pairs = np.frombuffer(content, "<u8", size // 16 * 2, 6).reshape(-1, 2)
-                found.extend((channel, time) for time in pairs[pairs[:, 1].argsort(kind="stable"), 0].tolist())
-        return found
+        with suppress(*BROKEN):
+            for opcode, content in records(read(self._file, first, min(chunk.message_index_length, LARGEST))):
+                if opcode == Opcode.MESSAGE_INDEX:
+                    channel, size = struct.unpack_from("<HI", content)
+                    pairs = np.frombuffer(content, "<u8", size // 16 * 2, 6).reshape(-1, 2)
+                    found.extend((channel, time) for time in pairs[pairs[:, 1].argsort(kind="stable"), 0].tolist())
+            return found
+        return []
 
     def _unaccounted(self, found: dict[int, int]) -> Iterator[Lost]:
         """Messages that the file's statistics count and that nothing else has told of."""

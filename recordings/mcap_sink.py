@@ -65,7 +65,7 @@ class McapSink:
 
     suffix = ".mcap"
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
-    _writer: Ros2Writer | None = field(default=None, init=False, repr=False)
+    _writer: Ros2Writer = field(init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
     empty: bool = field(default=False, init=False, repr=False)  # whether it lacks all results that it is to hold
 
@@ -102,7 +102,7 @@ class McapSink:
 
     def write(self, record: FrameRecord) -> None:
         """Write a frame that is through."""
-        writer, stamp = self._opened(), record.stamp
+        writer, stamp = self._writer, record.stamp
         for stream in self._written:
             data = record.items.get(stream)
             if data is not None:
@@ -123,7 +123,7 @@ class McapSink:
 
     def close(self, summary: Mapping[str, Any]) -> None:
         """Finish the log. summary: of the run: losses after the last frame ("entries"), verdict and counts."""
-        writer, self._writer = self._opened(), None
+        writer = self._writer
         if writer.closed:  # a write failed, which was told then
             return
         entries = list(summary.get("entries", ()))
@@ -144,17 +144,11 @@ class McapSink:
 
     def discard(self) -> None:
         """Give up the log; one that stood under its name stays."""
-        writer, self._writer = self._opened(), None
-        writer.abort()
+        self._writer.abort()
 
     @property
     def _written(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys((*self.results, *self.also)))
-
-    def _opened(self) -> Ros2Writer:
-        if self._writer is None:
-            raise LogError("McapSink has not been opened")
-        return self._writer
 
 
 def _transforms(items: Iterable[Any]) -> Iterator[Transform]:

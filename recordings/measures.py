@@ -12,7 +12,7 @@ from typing import SupportsFloat
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stages.data import Array
+from stages.data import Array, ElevationMap
 
 CLOSE = 0.05  # m, the height error that the Lunar Autonomy Challenge accepts
 NMAD_SCALE = 1.4826  # makes the median deviation of a normal distribution its standard deviation
@@ -25,9 +25,11 @@ def share(part: SupportsFloat, whole: SupportsFloat) -> float:
     return float(part) / float(whole) if float(whole) else float("nan")
 
 
-def added(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:
-    """The counts of two sets of frames as those of one; an empty dict counts nothing."""
-    return {name: first.get(name, 0.0) + second.get(name, 0.0) for name in first | second}
+def cell_centres(grid: ElevationMap) -> tuple[Array, Array]:
+    """x of each column (cols,) and y of each row (rows,) of a grid, m."""
+    rows, cols = grid.shape
+    left, bottom = grid.origin
+    return left + (np.arange(cols) + 0.5) * grid.resolution, bottom + (np.arange(rows) + 0.5) * grid.resolution
 
 
 def in_ring(radius: Array, low: float, high: float) -> Array:

@@ -14,6 +14,7 @@ from functools import cache
 import cv2
 import numpy as np
 
+from recordings.measures import cell_centres
 from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason, Source
 
 Rgb = tuple[int, int, int]
@@ -75,7 +76,7 @@ def top_eight_bits(*images: Array) -> tuple[Array, ...]:
     that the pictures of a traverse do not flicker.
     """
     deep = [pixels for pixels in images if pixels.dtype != np.uint8]
-    top = max((_percentiles(pixels[::4, ::4].ravel(), 99.9)[0] for pixels in deep), default=0.0)
+    top = max((np.percentile(pixels[::4, ::4], 99.9, method="nearest") for pixels in deep), default=0.0)
     shift = max(0, int(top).bit_length() - 8)
     return tuple(
         pixels if pixels.dtype == np.uint8 else np.minimum(pixels >> shift, 255).astype(np.uint8) for pixels in images
@@ -85,7 +86,7 @@ def top_eight_bits(*images: Array) -> tuple[Array, ...]:
 def disparity_limit(disparity: Array) -> float:
     """The upper end of the colour range, px: the 99.5th percentile rounded up to a multiple of 16, at least 16."""
     known = _some_known(disparity[::4, ::4])
-    return 16.0 * max(1.0, math.ceil(_percentiles(known, 99.5)[0] / 16.0)) if known.size else 16.0
+    return max(16.0, 16.0 * np.ceil(np.percentile(known, 99.5, method="nearest") / 16.0)) if known.size else 16.0
 
 
 def paint_disparity(disparity: Array, limit: float | None = None) -> Array:
@@ -134,7 +135,7 @@ def elevation_limits(elevation: Array) -> tuple[float, float]:
     known = _some_known(elevation)
     if not known.size:
         return 0.0, 1.0
-    low, high = _percentiles(known, 1.0, 99.0)
+    low, high = np.percentile(known, (1.0, 99.0), method="nearest").tolist()
     low = math.floor(low * 10.0) / 10.0
     return low, max(math.ceil(high * 10.0) / 10.0, low + 0.2)
 
@@ -145,7 +146,7 @@ def value_limits(layer: Array) -> tuple[float, float]:
     known = _some_known(layer)
     if not known.size:
         return 0.0, 1.0
-    low, high = _percentiles(known, 1.0, 99.0)
+    low, high = np.percentile(known, (1.0, 99.0), method="nearest").tolist()
     return low, high if high > low else low + 1.0
 
 
@@ -158,13 +159,6 @@ def _some_known(layer: Array) -> Array:
     """The known values of a layer, every n-th of many."""
     known = layer[np.isfinite(layer)]
     return known[:: max(1, known.size // SAMPLE)]
-
-
-def _percentiles(values: Array, *ranks: float) -> list[float]:
-    """The values of these ranks, percent, each the nearest that there is."""
-    places = [round(rank / 100.0 * (values.size - 1)) for rank in ranks]
-    ordered = np.partition(values, places)
-    return [float(ordered[place]) for place in places]
 
 
 def hillshade(elevation: Array, resolution: float, light: Array = _LIGHT) -> Array:
@@ -198,19 +192,13 @@ def paint_elevation(terrain: ElevationMap, limits: tuple[float, float] | None = 
     return rgb
 
 
-def cell_centres(shape: tuple[int, int], resolution: float, origin: tuple[float, float]) -> tuple[Array, Array]:
-    """x of each column (cols,) and y of each row (rows,) of a grid, m."""
-    rows, cols = shape
-    return origin[0] + (np.arange(cols) + 0.5) * resolution, origin[1] + (np.arange(rows) + 0.5) * resolution
-
-
 def surface(terrain: ElevationMap) -> tuple[Array, Array]:
     """The terrain as a mesh: vertices (n, 3) float32, one a known cell in grid order, and triangles (m, 3) uint32.
 
     A triangle stands only where its three cells are known: holes stay holes.
     """
     elevation, (rows, cols) = terrain.layers["elevation"], terrain.shape
-    x, y = cell_centres(terrain.shape, terrain.resolution, terrain.origin)
+    x, y = cell_centres(terrain)
     at = np.flatnonzero(np.isfinite(elevation))
     row, col = np.divmod(at, cols)
     vertices = np.column_stack([x[col], y[row], elevation.ravel()[at]]).astype(np.float32)

@@ -15,7 +15,7 @@ import numpy as np
 
 from recordings import paint
 from recordings.errors import LogError
-from recordings.mcap_reader import iter_decoded
+from recordings.mcap_reader import McapFile, iter_decoded
 from recordings.ros2 import read_disparity, read_grid_map, read_occupancy_grid
 from stages.data import Array, ElevationMap, NavigationMap
 
@@ -29,7 +29,8 @@ def draw(result: Path, out: Path) -> list[Path]:
     """Write `frame-NNNN-{disparity,elevation,navigation}.png` of the first, middle and last frame of a result log into
     the folder `out`; returns the files, sorted. Raises LogError where the log holds nothing to draw.
     """
-    stamps = sorted({stamp for _, stamp, _ in iter_decoded(result, PAINTERS)})
+    with McapFile(result) as log:
+        stamps = np.unique(log.times(log.channels_of(PAINTERS))).tolist()
     if not stamps:
         raise LogError(f"{result} holds none of {', '.join(PAINTERS)}; draw pictures of a result log")
     chosen = {stamps[number]: number for number in (0, len(stamps) // 2, len(stamps) - 1)}

@@ -23,7 +23,7 @@ from recordings.desk import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Pane
 from recordings.drawings import PICTURES, Canvas, same_view
 from recordings.errors import LogError, counted
 from recordings.frame_record import FrameRecord, LossEntry
-from recordings.whole_file import give_name, temporary_name, unwritable
+from recordings.whole_file import give_name, temporary_name, unwritable, writing
 from stages.data import Array, ElevationMap, Pose, StereoFrame
 
 RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well
@@ -62,13 +62,11 @@ class RerunSink:
         """Begin a recording. streams: name -> type of item, in the pipeline's order; about: what to say of the run."""
         self._path, self._streams, self._about = Path(path), tuple(streams), dict(about)
         self._partial = temporary_name(self._path)
-        self._stamp: int | None = None
+        self._stamp = 0  # the latest, ns
         self._frames, self._hung = 0, -1
         self._plots: list[tuple[int, int, dict[str, float]]] = []  # of frames: stamp, number, value of each path
-        try:
+        with writing(self._path):
             self._partial.open("wb").close()
-        except OSError as error:
-            raise unwritable(self._path, error.strerror or str(error)) from error
         try:
             with catch_and_log_exceptions(strict=True):
                 self._begin()
@@ -136,7 +134,7 @@ class RerunSink:
         last = max(0, self._frames - 1)
         drops = [f"{count} {reason}" for reason, count in dict(summary.get("drops", {})).items()]
         self._enter(summary.get("entries", ()), last)
-        self._set_clocks(self._stamp or 0, last)
+        self._set_clocks(self._stamp, last)
         level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
         text = f"{verdict}: {counted(self._frames, 'frame')}{''.join(f', {drop}' for drop in drops)}"
         self._recording.log(LEDGER, rr.TextLog(text, level=level))
@@ -163,7 +161,7 @@ class RerunSink:
 
     def _set_clocks(self, stamp: int, frame: int) -> None:
         """rerun's clocks belong to the calling thread, so every call from outside sets them first."""
-        self._stamp = max(stamp, self._stamp if self._stamp is not None else stamp)
+        self._stamp = max(stamp, self._stamp)
         self._recording.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
         self._recording.set_time(FRAME, sequence=frame)
 
@@ -216,7 +214,7 @@ class RerunSink:
         clocks = _clocks([entry.stamp for entry in losses], [frame] * len(losses))
         columns = rr.TextLog.columns(text=texts, level=[rr.TextLogLevel.WARN] * len(losses))
         self._recording.send_columns(LEDGER, indexes=clocks, columns=columns, strict=True)
-        self._stamp = max(losses[-1].stamp, self._stamp if self._stamp is not None else losses[-1].stamp)
+        self._stamp = max(losses[-1].stamp, self._stamp)
 
     def _arrange(self) -> None:
         """Lay out the desk again when a picture has come to it."""

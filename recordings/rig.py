@@ -7,7 +7,7 @@ log speak of the camera's own frame, so R is applied where they meet the rectifi
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -43,7 +43,7 @@ class Frames:
         """Add a geometry_msgs/TransformStamped. Raises LogError, and keeps what is there, where it contradicts that."""
         transform = transform_of(message)
         parent, child = transform.parent, transform.child
-        known = self.edges.get(parent, {}).get(child) or self.between(parent, child)
+        known = self.between(parent, child)
         if known is None:
             if child in self.parents:
                 raise LogError(f"'{child}' has two parents, '{self.parents[child]}' and '{parent}'; the first is used")
@@ -261,7 +261,7 @@ def _rectifying(left: CameraModel, right: CameraModel, placed: Transform) -> tup
     return replace(left, r=made[0], p=made[2]), replace(right, r=made[1], p=made[3])
 
 
-def mounted(camera: Camera, inclinometer: str, base: str, frames: Frames, given: Iterable[float] | None) -> Mount:
+def mounted(camera: Camera, inclinometer: str, base: str, frames: Frames, given: Sequence[float] | None) -> Mount:
     """How the left camera sits on the rover.
 
     inclinometer, base: their frames; given: quaternion xyzw that turns inclinometer into left rectified camera
@@ -287,12 +287,10 @@ def rovers(pose: Pose, camera: Camera, base: str, frames: Frames) -> Pose:
 
 
 def _camera_from_inclinometer(
-    camera: Camera, inclinometer: str, frames: Frames, given: Iterable[float] | None
+    camera: Camera, inclinometer: str, frames: Frames, given: Sequence[float] | None
 ) -> Array:
     if given is not None:
-        x, y, z, w = given
-        values = np.array([x, y, z, w]) / np.linalg.norm([x, y, z, w])
-        return np.asarray(Rotation.from_quat(values).as_matrix())
+        return np.asarray(Rotation.from_quat(given).as_matrix())
     placed = frames.between(camera.frame_id, inclinometer)
     if placed is None:
         raise LogError(

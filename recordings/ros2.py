@@ -8,7 +8,7 @@ x and y, runs its first index along -x, and stores column-major.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -119,23 +119,27 @@ def read_disparity(message: Any) -> NDArray[np.float32]:
 def point_cloud(cloud: PointCloud) -> Any:
     """sensor_msgs/PointCloud2: x, y, z, rgb (PCL's packing, 0x00RRGGBB in the bits of a float32), sigma, and source
     (the codes of `Source`, as float32) where not all points are measured."""
-    count = len(cloud.points)
     names = ("x", "y", "z", "rgb", "sigma") + (() if cloud.source is None else ("source",))
-    packed = np.zeros((count, len(names)), np.dtype("<f4"))
+    packed = np.zeros((len(cloud.points), len(names)), np.dtype("<f4"))
     for axis in range(3):  # numpy copies column by column faster
         packed[:, axis] = cloud.points[:, axis]
         packed.view(np.uint8)[:, 4 * 3 + 2 - axis] = cloud.colors[:, axis]  # blue in the lowest byte
     packed[:, 4] = cloud.sigma
     if cloud.source is not None:
         packed[:, 5] = cloud.source
+    return float_cloud(cloud.stamp, cloud.frame_id, names, packed)
+
+
+def float_cloud(stamp: int, frame_id: str, names: Sequence[str], points: Array) -> Any:
+    """sensor_msgs/PointCloud2 of (N, len(names)) float32, x, y and z first."""
     fields = [
         make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=FLOAT32, count=1)
         for place, name in enumerate(names)
     ]
     return make(
-        "sensor_msgs/msg/PointCloud2", header=header(cloud.stamp, cloud.frame_id), height=1, width=count,
-        fields=fields, is_bigendian=False, point_step=4 * len(names), row_step=4 * len(names) * count,
-        data=packed.view(np.uint8).reshape(-1), is_dense=bool(np.isfinite(cloud.points).all()),
+        "sensor_msgs/msg/PointCloud2", header=header(stamp, frame_id), height=1, width=len(points), fields=fields,
+        is_bigendian=False, point_step=4 * len(names), row_step=points.nbytes, data=points.view(np.uint8).reshape(-1),
+        is_dense=bool(np.isfinite(points[:, :3]).all()),
     )  # fmt: skip
 
 
@@ -254,16 +258,15 @@ def transform_message(transforms: Iterable[tuple[Transform, int]]) -> Any:
     return make("tf2_msgs/msg/TFMessage", transforms=[_transform(transform, stamp) for transform, stamp in transforms])
 
 
-def imu(stamp: int, frame_id: str, quaternion: Array, covariance: Array | None = None) -> Any:
-    """sensor_msgs/Imu that knows its orientation only: `quaternion` xyzw turns its frame into a world with z up.
+def imu(stamp: int, frame_id: str, attitude: Array, covariance: Array | None = None) -> Any:
+    """sensor_msgs/Imu that knows its orientation only: `attitude`, xyzw, turns its frame into a world with z up.
 
     covariance: (3, 3) of the orientation, rad^2, or None where it is not known (all zeros, as REP 145 has it). Rates
     and accelerations are marked absent by a first covariance element of -1.
     """
     absent = np.array([-1.0, *[0.0] * 8])
-    x, y, z, w = (float(value) for value in quaternion)
     return make(
-        "sensor_msgs/msg/Imu", header=header(stamp, frame_id), orientation=_quaternion((x, y, z, w)),
+        "sensor_msgs/msg/Imu", header=header(stamp, frame_id), orientation=quaternion(attitude),
         orientation_covariance=np.zeros(9) if covariance is None else _flat(covariance),
         angular_velocity=_vector((0.0, 0.0, 0.0)), angular_velocity_covariance=absent,
         linear_acceleration=_vector((0.0, 0.0, 0.0)), linear_acceleration_covariance=absent,
@@ -273,9 +276,8 @@ def imu(stamp: int, frame_id: str, quaternion: Array, covariance: Array | None =
 def odometry(pose: Pose) -> Any:
     """nav_msgs/Odometry of a pose; its twist is marked unknown by a first covariance element of -1."""
     covariance = np.zeros(36) if pose.covariance is None else _flat(pose.covariance)
-    x, y, z, w = (float(value) for value in pose.quaternion)
     placed = make(
-        "geometry_msgs/msg/PoseWithCovariance", pose=_pose(pose.position, (x, y, z, w)), covariance=covariance
+        "geometry_msgs/msg/PoseWithCovariance", pose=_pose(pose.position, pose.quaternion), covariance=covariance
     )  # fmt: skip
     still = make("geometry_msgs/msg/Twist", linear=_vector((0.0, 0.0, 0.0)), angular=_vector((0.0, 0.0, 0.0)))
     twist = make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.array([-1.0, *[0.0] * 35]))
@@ -312,21 +314,21 @@ def _region(width: int, height: int) -> Any:
 
 
 def _transform(transform: Transform, stamp: int) -> Any:
-    x, y, z, w = (float(value) for value in Rotation.from_matrix(transform.rotation).as_quat(canonical=True))
+    turn = Rotation.from_matrix(transform.rotation).as_quat(canonical=True)
     return make(
         "geometry_msgs/msg/TransformStamped", header=header(stamp, transform.parent), child_frame_id=transform.child,
         transform=make(
             "geometry_msgs/msg/Transform",
-            translation=_vector(transform.translation), rotation=_quaternion((x, y, z, w)),
+            translation=_vector(transform.translation), rotation=quaternion(turn),
         ),
     )  # fmt: skip
 
 
-def _pose(position: Any, quaternion: tuple[float, float, float, float]) -> Any:
+def _pose(position: Any, turn: Any) -> Any:
     x, y, z = (float(value) for value in position)
     return make(
         "geometry_msgs/msg/Pose",
-        position=make("geometry_msgs/msg/Point", x=x, y=y, z=z), orientation=_quaternion(quaternion),
+        position=make("geometry_msgs/msg/Point", x=x, y=y, z=z), orientation=quaternion(turn),
     )  # fmt: skip
 
 
@@ -335,8 +337,9 @@ def _vector(values: Any) -> Any:
     return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
-def _quaternion(xyzw: tuple[float, float, float, float]) -> Any:
-    x, y, z, w = xyzw
+def quaternion(xyzw: Any) -> Any:
+    """geometry_msgs/Quaternion."""
+    x, y, z, w = (float(value) for value in xyzw)
     return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 

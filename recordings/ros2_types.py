@@ -15,10 +15,13 @@ from textwrap import shorten
 from threading import RLock
 from typing import Any
 
+import zstandard
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_idl, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from recordings.errors import LogError
+from recordings.mcap_chunk import LARGEST
 
 GRID_MAP = """\
 std_msgs/Header header
@@ -38,6 +41,7 @@ geometry_msgs/Pose pose
 
 LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are 32 bits, with a sign
 
+_PACKED = b"\x28\xb5\x2f\xfd"  # begins a frame of zstd; no CDR message begins so
 _SAID = 100  # characters of what the parser says, which may hold the whole schema
 _registering = RLock()  # rosbags builds classes and codecs in module-wide state
 
@@ -94,7 +98,7 @@ def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable
             f"schema '{schema_name}' is in '{schema_encoding}', which is not a ROS 2 schema (ros2msg, ros2idl)"
         )
     if not text.strip() and name in TYPES.types:
-        return lambda data: TYPES.deserialize_cdr(data, name)
+        return lambda data: TYPES.deserialize_cdr(plain(data), name)
     try:
         # Definitions hold what editors leave: a byte order mark, Windows line ends, comments that are not UTF-8.
         store = _store_of(name, schema_encoding, text.decode("utf-8-sig", "replace").replace("\r\n", "\n"))
@@ -102,7 +106,17 @@ def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable
     except Exception as error:  # a parser of foreign text may fail in any way; all mean the same here
         why = shorten(f"{type(error).__name__}: {error}", _SAID, placeholder=" ...")
         raise LogError(f"schema '{schema_name}' cannot be parsed ({why})") from error
-    return lambda data: store.deserialize_cdr(data, name)
+    return lambda data: store.deserialize_cdr(plain(data), name)
+
+
+def plain(data: bytes | memoryview, size: int = LARGEST) -> bytes | memoryview:
+    """The first `size` bytes, at least, of a message, or all of them. rosbag2 may have compressed each by itself, which
+    nothing but the message tells."""
+    if data[: len(_PACKED)] != _PACKED:
+        return data
+    whole = zstandard.frame_content_size(data)
+    with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+        return bytes(stream.read(size if whole < 0 else min(size, whole)))
 
 
 def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
@@ -140,7 +154,7 @@ def _references(fields: Any) -> set[str]:
     """The names of the message types that a list of field definitions refers to."""
     found: set[str] = set()
     for _, (kind, detail) in fields:
-        node, inner = (kind, detail) if int(kind) <= 2 else detail[0]
-        if int(node) == 2:
+        node, inner = (kind, detail) if kind in (Nodetype.BASE, Nodetype.NAME) else detail[0]
+        if node == Nodetype.NAME:
             found.add(inner)
     return found

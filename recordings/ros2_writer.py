@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from recordings.errors import LogError, counted
 from recordings.mcap_reader import McapFile
 from recordings.ros2_types import LAST_STAMP, TYPES
-from recordings.whole_file import give_name, temporary_name, unwritable
+from recordings.whole_file import give_name, temporary_name, unwritable, writing
 
 LARGE = 64 * 1024  # bytes; from here a message gets a chunk of its own
 COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
@@ -35,10 +35,8 @@ class Ros2Writer:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, tuple[int, str]] = {}
         self._counts: dict[str, int] = {}
-        try:
+        with writing(self.path):
             self._file = self._partial.open("wb")
-        except OSError as error:
-            raise self._unwritable(error) from error
         self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=COMPRESSIONS[compression])
         self._writer.start(profile="ros2", library="roverflow")
 
@@ -115,13 +113,12 @@ class Ros2Writer:
     def _unwritable(self, error: OSError) -> LogError:
         """Close what is half there, keep it if it shall be and holds anything, and say so."""
         held = 0
-        if hasattr(self, "_file"):
-            with suppress(OSError):  # what could not be flushed is lost
-                self._file.close()
-            if self._keep:
-                with suppress(LogError), McapFile(self._partial) as log:
-                    held = log.count(set(log.index.channels))
-            if not held:
-                self._partial.unlink(missing_ok=True)
+        with suppress(OSError):  # what could not be flushed is lost
+            self._file.close()
+        if self._keep:
+            with suppress(LogError), McapFile(self._partial) as log:
+                held = log.count(set(log.index.channels))
+        if not held:
+            self._partial.unlink(missing_ok=True)
         kept = f" (the {counted(held, 'message')} that it took are in {self._partial})" if held else ""
         return unwritable(self.path, error.strerror or str(error), kept)

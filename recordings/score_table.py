@@ -199,8 +199,8 @@ def _number(value: float, digits: int) -> str:
 
 
 def _percents(*values: float) -> str:
-    return "; ".join("-" if math.isnan(value) else f"{100 * value:.2f}" for value in values)
+    return "; ".join(_number(100 * value, 2) for value in values)
 
 
 def _cm(value: float) -> str:
-    return "-" if math.isnan(value) else f"{round(100 * value, 2) + 0.0:.2f}"  # never -0.00
+    return _number(100 * value, 2)

@@ -14,7 +14,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -276,7 +276,7 @@ class _Tally:
     def score(self) -> Score:
         """The tally as a score; LogError if there was nothing to compare."""
         if not self.frames:
-            damage = "".join(f", as {why}" for why in self.lost[str(self.truth)])
+            damage = "".join(f", as {why}" for why in islice(self.lost[str(self.truth)], 1))
             raise LogError(
                 f"{self.truth} has no ground truth (/truth/...){damage}; give the log that has it with --truth"
             )

@@ -16,13 +16,14 @@ An unknown cell is neither free nor a hazard: it finds no rock and raises no ala
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from recordings.measures import HeightErrors, added, in_ring, share, without_plane
+from recordings.measures import HeightErrors, cell_centres, in_ring, share, without_plane
 from stages.data import Array, Cell, ElevationMap
 
 NEAR = 8.0  # m from base_link, within which cells and rocks are asked for
@@ -58,10 +59,7 @@ class TrueGround:
         layers = terrain.layers
         if not {"mean", "visible", "in_view", "rock", "slope"} <= layers.keys() or rocks.shape[1] != 6:
             return None
-        x, y = (
-            (np.arange(n) + 0.5) * terrain.resolution + at
-            for n, at in zip(terrain.shape[::-1], terrain.origin, strict=True)
-        )
+        x, y = cell_centres(terrain)
         seen = (layers["visible"] > 0.5) & in_ring(np.hypot(x[None, :], y[:, None]), 0.0, NEAR)
         return cls(x, y, layers["mean"].astype(np.float64), seen, layers["in_view"] > 0.5, hazard, layers["rock"],
                    layers["slope"], rocks)  # fmt: skip
@@ -72,7 +70,7 @@ class TerrainTally:
 
     def __init__(self) -> None:
         self.heights = {ring: (HeightErrors(), HeightErrors()) for ring in RINGS}
-        self.counts: dict[str, float] = {}
+        self.counts = Counter[str]()
 
     def add(
         self, truth: TrueGround, layers: dict[str, Array], cells: Array | None, tilts: Array | None = None
@@ -89,7 +87,8 @@ class TerrainTally:
         self._add_heights(truth, layers, elevation, np.zeros((1, 2)) if tilts is None else tilts)
         cells = np.full(truth.seen.shape, np.int8(Cell.UNKNOWN)) if cells is None else cells
         hazards, rocks = _hazards(truth, cells), _rocks(truth, cells)
-        self.counts = added(added(self.counts, hazards), rocks)
+        self.counts.update(hazards)
+        self.counts.update(rocks)
         error = (elevation - truth.mean)[truth.seen & np.isfinite(elevation)]
         return {
             "elevation_completeness": share(error.size, hazards["seen"]),
@@ -97,7 +96,7 @@ class TerrainTally:
             "elevation_bias": share(error.sum(), error.size),
             "false_alarm": share(hazards["safe_told"], hazards["safe"]),
             "false_safe": share(hazards["hazards_free"], hazards["hazards"]),
-            **{f"rocks_{name}": rocks.get(f"{name}_{HIGH_ROCK:g}", 0.0) for name in ("in_view", "found")},
+            **{f"rocks_{name}": float(rocks[f"{name}_{HIGH_ROCK:g}"]) for name in ("in_view", "found")},
         }
 
     def _add_heights(self, truth: TrueGround, layers: dict[str, Array], elevation: Array, tilts: Array) -> None:
@@ -116,14 +115,14 @@ class TerrainTally:
             "between_pixels": known & within & truth.in_view & ~truth.seen,
             "cells": within,
         }
-        self.counts = added(self.counts, _summed(counts))
+        self.counts.update(_summed(counts))
         if "variance" in layers:
             variance = layers["variance"].astype(np.float64)
             common = layers.get("common_variance", np.zeros_like(variance))
-            self.counts = added(self.counts, _intervals("random", levelled, variance))
+            self.counts.update(_intervals("random", levelled, variance))
             for east, north in tilts:
                 lean = east * truth.x[None, :] + north * truth.y[:, None]
-                self.counts = added(self.counts, _intervals("total", error + lean, variance + common))
+                self.counts.update(_intervals("total", error + lean, variance + common))
 
     def measures(self) -> dict[str, Any]:
         """All figures; shares 0 to 1, lengths m, NaN where there was nothing to measure.
@@ -146,14 +145,14 @@ class TerrainTally:
         }
         rocks = {
             f"{limit:g} m": {
-                **{name: c.get(f"{name}_{limit:g}", 0.0) for name in ROCK_COUNTS},
-                "recall": share(c.get(f"found_{limit:g}", 0.0), c.get(f"in_view_{limit:g}", 0.0)),
+                **{name: float(c[f"{name}_{limit:g}"]) for name in ROCK_COUNTS},
+                "recall": share(c[f"found_{limit:g}"], c[f"in_view_{limit:g}"]),
             }
             for limit in (HIGH_ROCK, HIGHER_ROCK)
         }
 
         def part(of: str, whole: str) -> float:
-            return share(c.get(of, 0.0), c.get(whole, 0.0))
+            return share(c[of], c[whole])
 
         return {
             "heights": heights,
@@ -178,14 +177,14 @@ class TerrainTally:
         }  # fmt: skip
 
 
-def _intervals(name: str, error: Array, variance: Array) -> dict[str, float]:
+def _intervals(name: str, error: Array, variance: Array) -> dict[str, int]:
     """How many errors of one frame are known, and within one and two standard deviations."""
     judged = np.isfinite(error) & np.isfinite(variance)
     sigmas = np.abs(error[judged]) / np.sqrt(np.maximum(variance[judged], 1e-18))
     return _summed({f"{name}_judged": judged, f"{name}_in_1": sigmas <= 1, f"{name}_in_2": sigmas <= 2})
 
 
-def _hazards(truth: TrueGround, cells: Array) -> dict[str, float]:
+def _hazards(truth: TrueGround, cells: Array) -> dict[str, int]:
     """Sums over one frame, of seen cells: hazards, told, called free; the same of those on a rock; safe ones, told to
     be hazards, also by slope; unknown ones. And of all cells called free, wherever they are, those on a rock, those
     that are hazards, and those that are not in view."""
@@ -214,9 +213,9 @@ def _hazards(truth: TrueGround, cells: Array) -> dict[str, float]:
     return _summed(masks)
 
 
-def _rocks(truth: TrueGround, cells: Array) -> dict[str, float]:
+def _rocks(truth: TrueGround, cells: Array) -> Counter[str]:
     """Sums over one frame: rocks in view and found, and those of which anything is seen, by least height."""
-    counts: dict[str, float] = {}
+    counts = Counter[str]()
     step = float(truth.x[1] - truth.x[0])
     for at_x, at_y, diameter, height, pixels, shown in np.asarray(truth.rocks, np.float64):
         if height < np.float32(HIGH_ROCK) or pixels < 1 or np.hypot(at_x, at_y) >= NEAR:
@@ -226,15 +225,15 @@ def _rocks(truth: TrueGround, cells: Array) -> dict[str, float]:
         lines = slice(*np.searchsorted(truth.y, [at_y - reach, at_y + reach]))
         close = np.hypot(truth.x[None, columns] - at_x, truth.y[lines, None] - at_y) <= reach
         found = bool(np.any((cells[lines, columns] == Cell.HAZARD) & close))
-        in_view = shown >= SHOWN and pixels >= PIXELS
+        in_view = bool(shown >= SHOWN and pixels >= PIXELS)
         for limit in (HIGH_ROCK, HIGHER_ROCK):
             if height >= np.float32(limit):
-                counts = added(counts, {
-                    f"glimpsed_{limit:g}": 1.0, f"glimpsed_found_{limit:g}": float(found),
-                    f"in_view_{limit:g}": float(in_view), f"found_{limit:g}": float(in_view and found),
+                counts.update({
+                    f"glimpsed_{limit:g}": 1, f"glimpsed_found_{limit:g}": found,
+                    f"in_view_{limit:g}": in_view, f"found_{limit:g}": in_view and found,
                 })  # fmt: skip
     return counts
 
 
-def _summed(masks: dict[str, Array]) -> dict[str, float]:
-    return {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}
+def _summed(masks: dict[str, Array]) -> dict[str, int]:
+    return {name: int(np.count_nonzero(mask)) for name, mask in masks.items()}

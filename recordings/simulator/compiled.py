@@ -10,7 +10,7 @@ import functools
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from numba import njit
 from numba.core.caching import CacheImpl, _CacheLocator
@@ -45,16 +45,9 @@ _caches: Any = CacheImpl
 _caches._locator_classes = [_Locator, *_caches._locator_classes]
 
 
-def allocating(loop: Loop) -> Loop:
-    """`njit` for loops that make arrays of their own."""
-    compiled: Any = njit
-    return cast(Loop, compiled(nogil=True, cache=True, error_model="numpy")(loop))
-
-
-def borrowing(loop: Loop) -> Loop:
-    """`njit` for loops that allocate nothing: they only borrow the caller's arrays.
-
-    Counting references to those, as numba does unless told otherwise, would cost a third of the time.
-    """
-    compiled: Any = njit
-    return cast(Loop, compiled(nogil=True, cache=True, error_model="numpy", _nrt=False)(loop))
+_njit: Any = njit  # whose published type lacks the options
+# Loops that make arrays of their own.
+allocating: Callable[[Loop], Loop] = _njit(nogil=True, cache=True, error_model="numpy")
+# Loops that only borrow the caller's arrays: counting references to those, as numba does unless told otherwise, would
+# cost a third of the time.
+borrowing: Callable[[Loop], Loop] = _njit(nogil=True, cache=True, error_model="numpy", _nrt=False)

@@ -62,10 +62,8 @@ def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[E
 
 def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Array:
     """(count, count) float32: 1 where a pixel that both cameras see hits the cell within the region, else 0."""
-    camera, shape = simulation.camera, truth.depth.shape
     mount = truth.level.inverse().after(truth.base.after(simulation.mounts[0]))
-    a, b = (np.arange(shape[1]) - camera.cx) / camera.fx, ((np.arange(shape[0]) - camera.cy) / camera.fy)[:, None]
-    known = (truth.seen == 255) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
+    a, b, known = _seen_within(simulation, truth)
     rows = slice(int(known.any(axis=1).argmax()), None)  # sky and far ground above them
     known, b, places = known[rows], b[rows], []
     depth = np.where(known, truth.depth[rows], 0.0)
@@ -95,11 +93,9 @@ def rocks_in_level(simulation: Simulation, truth: FrameTruth) -> Array:
 def rocks_in_view(simulation: Simulation, truth: FrameTruth) -> Array:
     """Of each rock of the tile: the pixels that both cameras see within the region, and the part of its height that
     these span, (N, 2) float32."""
-    camera, rocks = simulation.camera, simulation.terrain.rocks
-    a = (np.arange(camera.width) - camera.cx) / camera.fx
-    b = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
-    seen = (truth.seen == 255) & (truth.surface >= 0) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
-    row, col = np.nonzero(seen)
+    rocks = simulation.terrain.rocks
+    a, b, seen = _seen_within(simulation, truth)
+    row, col = np.nonzero(seen & (truth.surface >= 0))
     rock, depth = truth.surface[row, col], truth.depth[row, col]
     up = truth.base.after(simulation.mounts[0]).rotation[2]
     height = depth * (up[0] * a[col] + up[1] * b[row, 0] + up[2])
@@ -109,6 +105,14 @@ def rocks_in_view(simulation: Simulation, truth: FrameTruth) -> Array:
     pixels = np.bincount(rock, minlength=len(rocks))
     shown = np.where(pixels > 0, (high - low) / rocks.height, 0.0)
     return np.column_stack([pixels, np.minimum(shown, 1.0)]).astype(np.float32)
+
+
+def _seen_within(simulation: Simulation, truth: FrameTruth) -> tuple[Array, Array, Array]:
+    """The rays' slopes, across (W,) and down (H, 1), and which pixels (H, W) both cameras see within the region."""
+    camera = simulation.camera
+    a = (np.arange(camera.width) - camera.cx) / camera.fx
+    b = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
+    return a, b, (truth.seen == 255) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
 
 
 def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, top: Array, visible: Array,
@@ -147,11 +151,9 @@ def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, t
 
 def in_sight(simulation: Simulation, truth: FrameTruth, points: Array) -> Array:
     """Which points (N, 3) of the world, m, both cameras see within the region: (N,) bool."""
-    seen = np.ones(len(points), bool)
-    for number, mount in enumerate(simulation.mounts[:2]):
-        eye = truth.base.after(mount)
-        if number == 0:
-            seen &= np.linalg.norm(points - eye.translation, axis=1) <= simulation.region
+    eyes = [truth.base.after(mount) for mount in simulation.mounts[:2]]
+    seen: Array = np.linalg.norm(points - eyes[0].translation, axis=1) <= simulation.region
+    for eye in eyes:
         seen &= _within_image(simulation, (points - eye.translation) @ eye.rotation)
         asked = np.flatnonzero(seen)
         clear = np.zeros(len(asked), np.bool_)

@@ -104,16 +104,7 @@ def _truth_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> di
 
 
 def _rocks_message(simulation: Simulation, stamp: int, truth: FrameTruth) -> Any:
-    table = ground_truth.rocks_in_level(simulation, truth)
-    fields = [
-        make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=ros2.FLOAT32, count=1)
-        for place, name in enumerate(ROCK_FIELDS)
-    ]
-    return make(
-        "sensor_msgs/msg/PointCloud2", header=ros2.header(stamp, LEVEL_FRAME), height=1, width=len(table),
-        fields=fields, is_bigendian=False, point_step=4 * len(ROCK_FIELDS), row_step=4 * table.size,
-        data=table.view(np.uint8).reshape(-1), is_dense=True,
-    )  # fmt: skip
+    return ros2.float_cloud(stamp, LEVEL_FRAME, ROCK_FIELDS, ground_truth.rocks_in_level(simulation, truth))
 
 
 def _true_pose(stamp: int, truth: FrameTruth) -> Pose:
@@ -124,6 +115,5 @@ def _true_pose(stamp: int, truth: FrameTruth) -> Pose:
 def _tilt_message(stamp: int, truth: FrameTruth) -> Any:
     """geometry_msgs/QuaternionStamped: level <- base_link, in the header of base_link."""
     rotation = Rotation.from_matrix(truth.level.rotation.T @ truth.base.rotation)
-    x, y, z, w = (float(value) for value in rotation.as_quat(canonical=True))
-    turn = make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    turn = ros2.quaternion(rotation.as_quat(canonical=True))
     return make("geometry_msgs/msg/QuaternionStamped", header=ros2.header(stamp, "base_link"), quaternion=turn)

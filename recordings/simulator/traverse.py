@@ -99,7 +99,7 @@ def inclinometer_reading(base: Transform, mount: Transform, noise: float, rng: n
 
     noise: rad, standard deviation about each horizontal axis.
     """
-    wobble = Rotation.from_rotvec([*rng.normal(0.0, noise, 2), 0.0]) if noise > 0 else Rotation.identity()
+    wobble = Rotation.from_rotvec([*rng.normal(0.0, noise, 2), 0.0])
     attitude = (wobble * Rotation.from_matrix(base.rotation @ mount.rotation)).as_matrix()
     heading = float(np.arctan2(attitude[1, 0], attitude[0, 0]))
     return np.asarray((Rotation.from_euler("z", -heading) * Rotation.from_matrix(attitude)).as_quat(canonical=True))

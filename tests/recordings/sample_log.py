@@ -72,8 +72,8 @@ LAYOUTS: dict[str, dict[str, Any]] = {
     },
     "no chunks": {"use_chunking": False, "enable_data_crcs": True},
     "no crcs": {"enable_crcs": False},
+    "messages compressed one by one": {"compression": CompressionType.NONE, "pack": ZstdCompressor().compress},
 }
-PACKED = {"messages compressed one by one": {"compression": CompressionType.NONE, "pack": ZstdCompressor().compress}}
 
 
 Edit = Callable[[str, int, Any], Any]
@@ -109,15 +109,16 @@ def rewritten(
     out: Path,
     time: Callable[[str, int], int] = lambda topic, log_time: log_time,
     pack: Callable[[bytes], bytes] = bytes,
+    order: Callable[[list[Any]], list[Any]] = list,
     **options: Any,
 ) -> Path:
     """The same messages as another kind of MCAP file; options as of mcap.writer.Writer. time: changes a log time;
-    pack: changes a message's bytes."""
+    pack: changes a message's bytes; order: changes which message follows which."""
     with path.open("rb") as source, out.open("wb") as target:
         writer = Writer(target, **options)
         writer.start(profile="ros2", library="test")
         channels: dict[int, int] = {}
-        for schema, channel, message in make_reader(source).iter_messages():
+        for schema, channel, message in order(list(make_reader(source).iter_messages())):
             if channel.id not in channels:
                 known = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)

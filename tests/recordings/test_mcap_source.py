@@ -23,7 +23,6 @@ from tests.recordings.sample_log import (
     HEIGHT,
     LAYOUTS,
     LEFT,
-    PACKED,
     PERIOD,
     RIGHT,
     START,
@@ -94,11 +93,11 @@ def test_the_mount_holds_for_frames_behind_a_clock_that_was_set_back(tmp_path: P
     assert all(mount.stamp <= image.stamp for image in images)
 
 
-@pytest.mark.parametrize("layout", [*LAYOUTS, *PACKED])
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout_of_file_gives_the_same_items(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str
 ) -> None:
-    other = rewritten(sample, tmp_path / "other.mcap", **{**LAYOUTS, **PACKED}[layout])
+    other = rewritten(sample, tmp_path / "other.mcap", **LAYOUTS[layout])
     assert [(t, s, essence(i)) for t, s, i in items_of(other)] == [(t, s, essence(i)) for t, s, i in whole]
     assert inventory_of(other)["frames"]["pairs"] == FRAMES
 

@@ -2,36 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from recordings import McapSource, mcap_messages
 from recordings.mcap_index import JITTER
-from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, inventory_of, items_of
+from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, inventory_of, items_of, rewritten
 
 BACK = 2 * PERIOD + PERIOD // 2
 FIRST = 3  # the first frame after the clock was set back
-
-
-def reordered(source: Path, out: Path, order: Callable[[list[Any]], list[Any]], **options: Any) -> Path:
-    """The messages of a log in another order in the file."""
-    with source.open("rb") as stream, out.open("wb") as file:
-        writer, channels = Writer(file, **options), dict[int, int]()
-        writer.start(profile="ros2", library="test")
-        for schema, channel, message in order(list(make_reader(stream).iter_messages())):
-            if channel.id not in channels:
-                known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, "cdr", known)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        writer.finish()
-    return out
 
 
 def set_back(messages: list[Any]) -> list[Any]:
@@ -49,7 +32,7 @@ def set_back(messages: list[Any]) -> list[Any]:
 def test_what_follows_a_clock_set_back_is_lost_until_that_time_has_come(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, options: dict[str, Any]
 ) -> None:
-    path = reordered(sample, tmp_path / "log.mcap", set_back, **options)
+    path = rewritten(sample, tmp_path / "log.mcap", order=set_back, **options)
     events = items_of(path)
     good = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
     assert good == [essence(item) for time, _, item in whole if time < START + FIRST * PERIOD]
@@ -81,7 +64,7 @@ def test_a_clock_that_is_a_second_beyond_where_it_was_loses_nothing_from_there_o
             message.log_time = START + 20 * (message.log_time - START - (BACK if is_back else 0))
         return messages
 
-    events = items_of(reordered(sample, tmp_path / "log.mcap", back_and_on, **options))
+    events = items_of(rewritten(sample, tmp_path / "log.mcap", order=back_and_on, **options))
     lost = [(stream, item) for _, stream, item in events if isinstance(item, Exception)]
     assert sorted(stream for stream, _ in lost) == ["inclinometer", "left", "left", "odometry", "right", "right"]
     good = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
@@ -98,7 +81,7 @@ def test_no_image_from_behind_the_fall_meets_a_tilt_from_before_it(
         kept = [found for found in messages if found[1].topic != LEFT or found[2].log_time not in rare]
         return set_back(kept)
 
-    path = reordered(sample, tmp_path / "log.mcap", rare_images, **options)
+    path = rewritten(sample, tmp_path / "log.mcap", order=rare_images, **options)
     left = [item for _, stream, item in items_of(path) if stream == "left"]
     assert [item.stamp for item in left if not isinstance(item, Exception)] == [START]
     assert len([item for item in left if str(item).startswith(f"{LEFT}: the log's clock was set back")]) == 2
@@ -115,7 +98,7 @@ def test_a_log_written_topic_by_topic_or_with_jitter_loses_nothing(
         assert max(b[2].log_time - a[2].log_time for row in rows for a, b in pairwise(row)) == JITTER
         return [row[place] for row in rows for place in sorted(range(len(row)), key=lambda number: number ^ 1)]
 
-    events = items_of(reordered(sample, tmp_path / "log.mcap", by_topic, **options))
+    events = items_of(rewritten(sample, tmp_path / "log.mcap", order=by_topic, **options))
     assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
     assert sorted((t, s, essence(i)) for t, s, i in events) == sorted((t, s, essence(i)) for t, s, i in whole)
 
@@ -131,7 +114,7 @@ def test_a_clock_set_back_by_all_that_was_recorded_takes_no_sensor(
                 message.log_time -= 100 * PERIOD
         return messages
 
-    with McapSource().open(reordered(sample, tmp_path / "log.mcap", far_back)) as log:
+    with McapSource().open(rewritten(sample, tmp_path / "log.mcap", order=far_back)) as log:
         assert log.missing == {}
         stamps = [
             item.stamp for _, stream, item in log.events() if stream == "left" and not isinstance(item, Exception)
@@ -148,7 +131,7 @@ def test_a_log_time_that_leaps_ahead_alone_is_no_clock_set_back(
         found.log_time += 10**13
         return messages
 
-    events = items_of(reordered(sample, tmp_path / "log.mcap", one_ahead, **options))
+    events = items_of(rewritten(sample, tmp_path / "log.mcap", order=one_ahead, **options))
     assert not [item for _, _, item in events if isinstance(item, Exception)]
     assert sum(stream == "left" for _, stream, _ in events) == FRAMES
 
@@ -160,5 +143,5 @@ def test_static_transforms_hold_whenever_they_were_logged(sample: Path, tmp_path
         nothing = replace(message, log_time=START + 9 * PERIOD, data=message.data[:4] + bytes(4))
         return [(schema, channel, nothing), (schema, channel, message), *others]
 
-    with McapSource().open(reordered(sample, tmp_path / "log.mcap", late_before)) as log:
+    with McapSource().open(rewritten(sample, tmp_path / "log.mcap", order=late_before)) as log:
         assert (log.missing, log.opening.problems) == ({}, [])
