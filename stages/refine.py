@@ -26,6 +26,7 @@ from stages.kernels.sharing import by_bands, shared_by, with_margin
 from stages.kernels.slic import superpixels
 from stages.kernels.smoother import smooth
 from stages.kernels.sources import Trust, name_sources
+from stages.kernels.subpixel import fit_brightness
 from stages.kernels.surfaces import surfaces
 from stages.stage import Stage, check_joined, check_same_time, parameter
 
@@ -47,8 +48,9 @@ TRUST = Trust(
 class Refine(Stage):
     """A denser and smoother disparity image, with the superpixels it was made with.
 
-    Only MEASURED pixels are matches; all others count as holes. What moves by at most `inlier_distance` stays MEASURED,
-    where the images bear it out; where they do not, as in a noisy sky, it becomes FILLED.
+    Only MEASURED pixels are matches; all others count as holes. First brightness tells their fraction of a pixel, which
+    matching draws to 0. What then moves by at most `inlier_distance` stays MEASURED, where the images bear it out;
+    where they do not, as in a noisy sky, it becomes FILLED.
     A match that moves farther has been replaced by what lies about it: it becomes PLANE, as a hole that a plane fills.
     Without planes, `plane_weight` 0 and no `plane_fill`, no superpixels are made.
     With `fill` background the other holes are filled from what lies about them and looks like them, from the farther
@@ -60,6 +62,10 @@ class Refine(Stage):
     burnt_out: int = parameter(
         250, "level of a colour from which an even patch is burnt out, a sky say, and matches nothing; 256 = never",
         low=0, high=256,
+    )  # fmt: skip
+    fit_radius: int = parameter(
+        2, "radius of the windows by which brightness tells the fraction of a pixel of a match, 0 = not asked",
+        unit="px", low=0, high=16,
     )  # fmt: skip
     median: int = parameter(5, "side of the median filter over matches, 0 = none", unit="px", choices=(0, 3, 5))
     near: float = parameter(
@@ -101,12 +107,14 @@ class Refine(Stage):
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         check_joined(self, frame, disparity)
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
-        image = eight_bit(frame.left)[0]
-        guide = gray(image)
+        image, other = eight_bit(frame.left, frame.right)
+        guide, right = gray(image), gray(other)
         matches, weights = trusted_matches(
             disparity.pixels, disparity.source, disparity.confidence, self.trusted,
             _burnt_out(frame.left, guide, self.burnt_out, self.threads), self.threads,
         )  # fmt: skip
+        if self.fit_radius:
+            matches = fit_brightness(guide, right, matches, self.fit_radius, self.threads)
         pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
         within, labels, agreed = extent(pixels, self.threads), None, np.zeros(pixels.shape, bool)
         if self.plane_weight or self.plane_fill:
@@ -117,7 +125,7 @@ class Refine(Stage):
         refined = self._sharpened(self._bilateral(filled, guide), guessed, guide)
         source, confidence = name_sources(
             matches, disparity.confidence, agreed, kinds, refined,
-            self._borne_out(refined, guessed, guide, frame.right), self.inlier_distance, TRUST, self.threads,
+            self._borne_out(refined, guessed, guide, right), self.inlier_distance, TRUST, self.threads,
         )  # fmt: skip
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
 
@@ -182,7 +190,7 @@ class Refine(Stage):
         """Where the images vary alike, so shifted, (H, W) bool."""
         if self.correlation == 0:
             return np.ones(pixels.shape, bool)
-        return correlation(pixels, guessed, guide, gray(eight_bit(right)[0]), self.threads) >= F32(self.correlation)
+        return correlation(pixels, guessed, guide, right, self.threads) >= F32(self.correlation)
 
     def _sharpened(self, pixels: Array, guessed: Array, guide: Array) -> Array:
         if self.edge_radius == 0:
