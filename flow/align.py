@@ -14,8 +14,9 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, get_type_hints
+from typing import Any
 
+from flow.graph import hints_of
 from flow.ledger import Absent, Entry, Reason, failure
 
 
@@ -62,9 +63,11 @@ class Pair:
     def output(kinds: dict[str, type]) -> type:
         """The type of the pairs; raises TypeError where the left type cannot be paired with the right one."""
         method = getattr(kinds["left"], "pair_with", None)
-        hints = get_type_hints(method) if method else {}
+        hints = hints_of(method) if method else {}
         if not issubclass(kinds["right"], hints.get("right", ())):
             raise TypeError(f"a {kinds['left'].__name__} cannot be paired with a {kinds['right'].__name__}")
+        if not isinstance(hints.get("return"), type):
+            raise TypeError(f"{kinds['left'].__name__}.pair_with does not say which one type it returns")
         return hints["return"]  # type: ignore[no-any-return]
 
     def start(self, name: str, inputs: dict[str, str]) -> PairState:
@@ -185,11 +188,12 @@ class Interpolate(_Sampler):
         exact = before is not None and before.stamp == stamp
         if not final and (after is None or samples[-1].stamp < stamp + self.smooth) and (self.smooth or not exact):
             return None
-        if before is not None and exact and (after is None or not self.smooth):
+        wide = before is not None and after is not None and after.stamp - before.stamp > self.max_gap
+        if before is not None and exact and (after is None or wide or not self.smooth):
             return before.value
         if before is None or after is None:
             return _none(name, stamp, samples, final)
-        if after.stamp - before.stamp > self.max_gap:
+        if wide:
             limit = f"{_time(self.max_gap)} ({node}.max_gap)"
             return f"{name} has a gap of {_time(after.stamp - before.stamp)}, more than {limit}"
         near = self._near(samples, stamp)

@@ -46,6 +46,7 @@ class _Frame:
     stamp: int
     values: dict[str, Any]
     entries: list[Entry]
+    coming: set[str]  # streams that are there or being made
     seconds: dict[str, float] = field(default_factory=dict)
     begun: set[_Work] = field(default_factory=set)
     done: set[_Work] = field(default_factory=set)
@@ -107,7 +108,7 @@ class Engine:
 
         Stamps must increase. values: stream -> item or Absent, for every stream that no stage makes.
         """
-        frame = _Frame(self.admitted, stamp, dict(values), list(entries))
+        frame = _Frame(self.admitted, stamp, dict(values), list(entries), set(values))
         frame.entries += [value.cause for value in values.values() if isinstance(value, Absent)]
         with self._condition:
             first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
@@ -197,7 +198,8 @@ class Engine:
                     frame.begun.add(work)
                     work.inbox.discard(frame.index)
                     if work.output:
-                        self._expect(frame, work.consumers, work.output)
+                        frame.coming.add(work.output)
+                        self._expect(frame, work.consumers)
                     else:
                         self._writing += 1
                     return work, frame
@@ -214,10 +216,10 @@ class Engine:
             return True
         return all(len(c.inbox) < self._capacity or frame.index in c.inbox for c in consumers)
 
-    def _expect(self, frame: _Frame, nodes: Iterable[_Work], coming: str = "") -> None:
-        """Note `frame` in the inbox of those of the nodes whose inputs are all there, counting `coming` as there."""
+    def _expect(self, frame: _Frame, nodes: Iterable[_Work]) -> None:
+        """Note `frame` in the inbox of those of the nodes whose inputs are all there or being made."""
         for work in nodes:
-            if work not in frame.begun and all(s in frame.values or s == coming for s in work.inputs):
+            if work not in frame.begun and frame.coming.issuperset(work.inputs):
                 work.inbox.add(frame.index)
 
     def _deliver(self, work: _Work, frame: _Frame, value: Any) -> list[bool]:
@@ -234,8 +236,6 @@ class Engine:
         self._complete(work, frame)
         if isinstance(value, Absent):
             self._pass_absence(frame)
-        else:
-            self._expect(frame, work.consumers)
         return list(self._retire())
 
     def _complete(self, work: _Work, frame: _Frame) -> None:
@@ -253,6 +253,7 @@ class Engine:
                 frame.begun.add(work)
                 work.inbox.discard(frame.index)
                 frame.values[work.output] = lost[0]
+                frame.coming.add(work.output)
                 self._complete(work, frame)
         self._expect(frame, self._work)
 

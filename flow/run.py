@@ -149,24 +149,20 @@ def run(
     used = {use: sink for use, sink in graph.sinks if use in outputs}
     wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
     sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
-    feeder, engine, finished = Feeder(graph, ledger), None, False
-    started = 0.0
+    feeder, started, finished = Feeder(graph, ledger), 0.0, False
+    engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
     try:
         said = "\n".join(f"{name}: {found['sentence']}" for name, found in surveys.items())
         if not stop.finishing() and sinks.open(streams, {**(about or {}), "surveys": said}):
-            engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
-            try:
-                started = time.perf_counter() - wall
-                finished = _feed(feeder, _read(log.events(graph.source_streams), stop), engine, stop)
-            finally:
-                engine.finish(stop.abandoning)
-            sinks.errors += [engine.failure] if engine.failure else []
+            started = time.perf_counter() - wall
+            finished = _feed(feeder, _read(log.events(graph.source_streams), stop), engine, stop)
     finally:
+        engine.finish(stop.abandoning)
+        sinks.errors += [engine.failure] if engine.failure else []
         times = {"wall_seconds": time.perf_counter() - wall, "start_seconds": started}
         times["cpu_seconds"] = time.process_time() - cpu
-        kept = engine is not None and engine.whole == engine.admitted and not len(ledger)
-        whole = finished and kept and not sinks.errors
-        sinks.discard(only_empty=bool(engine and engine.through))
+        whole = finished and engine.whole == engine.admitted and not len(ledger) and not sinks.errors
+        sinks.discard(only_empty=engine.through > 0)
         summary = {
             "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
@@ -216,8 +212,8 @@ def _feed(feeder: Feeder, events: Iterable[Event], engine: Engine, stop: Stop) -
 
 def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
     """The events of a log; a source that breaks down ends the log with its exception, and a stop in the middle."""
-    log_time, source = 0, iter(events)
-    while True:
+    log_time, source, broken = 0, iter(events), False
+    while not broken:
         try:
             stop.reading = True
             event = next(source)
@@ -226,11 +222,10 @@ def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
         except KeyboardInterrupt:
             raise _StoppedError from None
         except Exception as error:  # the rest of the log is lost, what was read of it is not
-            yield log_time, "log", error
-            return
+            event, broken = (log_time, "log", error), True
         finally:
             stop.reading = False
-        if stop.finishing():
+        if stop.finishing() and not broken:
             raise _StoppedError
         log_time = event[0]
         yield event
@@ -242,19 +237,18 @@ def _peak_memory_mb() -> float:
     return round(peak * (1 if sys.platform == "darwin" else 1024) / 1e6, 1)
 
 
-def _counted(feeder: Feeder, engine: Engine | None, ledger: Ledger, times: dict[str, float]) -> dict[str, Any]:
+def _counted(feeder: Feeder, engine: Engine, ledger: Ledger, times: dict[str, float]) -> dict[str, Any]:
     """Of the summary, what is counted and timed."""
-    frames_out = engine.whole if engine else 0
     return {
-        "frames_in": engine.admitted if engine else 0,
-        "frames_out": frames_out,
-        "frames_through": engine.through if engine else 0,  # whole or not
+        "frames_in": engine.admitted,
+        "frames_out": engine.whole,
+        "frames_through": engine.through,  # whole or not
         "drops": ledger.counts(),
         "messages": dict(sorted(feeder.messages.items())),
-        "seconds": {name: round(value, 6) for name, value in (engine.seconds if engine else {}).items()},
+        "seconds": {name: round(value, 6) for name, value in engine.seconds.items()},
         **{name: round(value, 6) for name, value in times.items()},
-        "frames_per_second": round(frames_out / times["wall_seconds"], 4),
+        "frames_per_second": round(engine.whole / times["wall_seconds"], 4),
         "peak_memory_mb": _peak_memory_mb(),
         "ledger": [entry.as_dict() for entry in ledger.entries],
-        "entries": [*(engine.late_entries if engine else ()), *feeder.late_entries],
+        "entries": [*engine.late_entries, *feeder.late_entries],
     }

@@ -105,7 +105,7 @@ class Assess(Stage):
     def _window(self, elevation: ElevationMap) -> tuple[slice, slice]:
         """The rows and columns that anything can be told of: those of the observed cells, and of the widest window."""
         found = find_objects(np.isfinite(elevation.layers["elevation"]).astype(np.int8))
-        reach = _cells(max(self.surroundings, self.footprint, self.wheel_track), elevation.resolution)
+        reach = _reach(max(self.surroundings, self.footprint, self.wheel_track) / 2, elevation.resolution)
         rows, cols = found[0] if found else (slice(0, 1), slice(0, 1))
         first_row, first_col = max(rows.start - reach, 0), max(cols.start - reach, 0)
         return slice(first_row, rows.stop + reach), slice(first_col, cols.stop + reach)
@@ -118,8 +118,8 @@ class Assess(Stage):
         ground = self._ground(height, observed, elevation.resolution)
         step, support = self._step(elevation, height, observed, ground)
         passable = observed & ~(step >= self.obstacle)
-        steepness = window_planes(height, passable, _cells(self.wheel, elevation.resolution), _WHEEL_LEVERAGE)
-        roughness = window_planes(height, passable, _cells(self.footprint, elevation.resolution), _LEVERAGE)[3]
+        steepness = window_planes(height, passable, _reach(self.wheel / 2, elevation.resolution), _WHEEL_LEVERAGE)
+        roughness = window_planes(height, passable, _reach(self.footprint / 2, elevation.resolution), _LEVERAGE)[3]
         layers = {
             "ground": ground.height,
             "step": step,
@@ -139,8 +139,8 @@ class Assess(Stage):
         Where the plane between the wheels is not known (the middle of a large rock), the height is that of the
         surroundings' plane; where that is not known, a step is measured against the level.
         """
-        wide = _cells(max(self.surroundings, self.footprint), resolution)
-        narrow = _cells(self.wheel_track, resolution)
+        wide = _reach(max(self.surroundings, self.footprint) / 2, resolution)
+        narrow = _reach(self.wheel_track / 2, resolution)
         ground = observed
         for above, below in _WITHIN:
             around = window_planes(height, ground, wide, _LEVERAGE)
@@ -151,7 +151,7 @@ class Assess(Stage):
             level = np.where(np.isfinite(local[0]), local[0], around[0])
             ground = observed & (np.abs(height - level) <= share * self.obstacle)
         local = window_planes(height, ground, narrow, _LEVERAGE)
-        footprint = _cells(self.footprint, resolution)
+        footprint = _reach(self.footprint / 2, resolution)
         under = local if footprint == narrow else window_planes(height, ground, footprint, _LEVERAGE)
         level = np.where(np.isfinite(local[0]), local[0], around[0])
         trend, planes = self._trend(around[1:3], resolution), np.where(ground, local[:3], np.nan)
@@ -205,11 +205,6 @@ def _slope(plane: Array, resolution: float) -> Array:
 def _finite(layer: Array | None, height: Array) -> Array:
     """A layer of heights as float64, with `height` where it is missing or not finite."""
     return height if layer is None else np.where(np.isfinite(layer), layer, height).astype(np.float64)
-
-
-def _cells(width: float, resolution: float) -> int:
-    """Half a window's width in whole cells, at least one."""
-    return max(1, round(width / resolution / 2))
 
 
 def _reach(distance: float, resolution: float) -> int:

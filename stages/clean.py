@@ -56,19 +56,28 @@ class Clean(Stage):
         return cloud.only(keep)
 
     def _organised(self, cloud: PointCloud) -> Array:
-        """Indices of the points that stay, by their neighbours in the image."""
+        """Indices of the points that stay, by their neighbours in the image.
+
+        Those that are not measured are no evidence, so they support nobody and are cropped only.
+        """
         if cloud.shape is None:
             raise ValueError("Clean: the cloud does not say its image's shape; set it, or use method: knn")
-        if not cloud.measured.all():
-            return self._with_guesses(cloud)
-        if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < cloud.shape[0] * cloud.shape[1]:
-            raise ValueError(f"Clean: the cloud has pixel indices outside its image of shape {cloud.shape}")
+        measured = np.flatnonzero(cloud.measured)
+        square = np.einsum("ij,ij->i", cloud.points, cloud.points)
+        kept = ~cloud.measured & (cloud.points[:, 2] > 0) & (square <= (self.region + self.margin) ** 2)
+        kept[measured[self._supported(cloud.only(measured), cloud.shape)]] = True
+        return np.flatnonzero(kept)
+
+    def _supported(self, cloud: PointCloud, shape: tuple[int, int]) -> Array:
+        """Indices of the points that stay of a cloud all of whose points are measured."""
+        if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < shape[0] * shape[1]:
+            raise ValueError(f"Clean: the cloud has pixel indices outside its image of shape {shape}")
         kept = np.flatnonzero(
             supported(
                 cloud.points,
                 cloud.sigma,
                 cloud.pixel,
-                cloud.shape,
+                shape,
                 self.region + self.margin,
                 self.deviations,
                 self.spread,
@@ -76,16 +85,7 @@ class Clean(Stage):
                 self.least,
             )
         )
-        return kept[self._whole(cloud, kept, cloud.shape)]
-
-    def _with_guesses(self, cloud: PointCloud) -> Array:
-        """The same where not all points are measured: the others are no evidence, so they support nobody and are
-        cropped only."""
-        square = np.einsum("ij,ij->i", cloud.points, cloud.points)
-        kept = ~cloud.measured & (cloud.points[:, 2] > 0) & (square <= (self.region + self.margin) ** 2)
-        measured = np.flatnonzero(cloud.measured)
-        kept[measured[self._organised(cloud.only(measured))]] = True
-        return np.flatnonzero(kept)
+        return kept[self._whole(cloud, kept, shape)]
 
     def _whole(self, cloud: PointCloud, kept: Array, shape: tuple[int, int]) -> Array:
         """Which of the points that were kept are of a patch that is large enough and in order, (len(kept),) bool.

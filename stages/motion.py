@@ -113,6 +113,12 @@ class Pose:
         near = later.quaternion if self.quaternion @ later.quaternion >= 0 else -later.quaternion
         return replace(self, stamp=stamp, position=position, quaternion=_slerp(self.quaternion, near, share))
 
+    @property
+    def placed(self) -> Transform:
+        """Frame `child_frame_id` in frame `frame_id`."""
+        rotation = Rotation.from_quat(self.quaternion).as_matrix()
+        return Transform(self.frame_id, self.child_frame_id, rotation, self.position)
+
     def of(self, part: Transform) -> Pose:
         """The pose of another frame, `part.child`, that sits on this one, `part.parent`, as `part` tells."""
         turn = Rotation.from_quat(self.quaternion)
@@ -138,6 +144,13 @@ class Mount:
         publish_stamp(self)
         publish_vector(self, "camera_from_inclinometer", (3, 3))
         check_rotation(self.camera_from_inclinometer, "Mount.camera_from_inclinometer")
+
+    def camera_on(self, part: str, camera: str) -> Transform | None:
+        """The frame `camera` in the frame `part` of the rover; None where that is neither the camera nor the base."""
+        if part == camera:
+            return Transform(camera, camera, np.eye(3), np.zeros(3))
+        base = self.base_from_camera
+        return base if base is not None and base.parent == part else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,7 +60,7 @@ def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tupl
     """
     assert cloud.sensor is not None
     child = _child_from_camera(pose, cloud.sensor, mount)
-    camera = Rotation.from_quat(pose.quaternion).as_matrix() @ child.rotation
+    camera = pose.placed.rotation @ child.rotation
     turned = camera @ cloud.sensor.rotation.T
     lean = float(np.arccos(np.clip(turned[2, 2], -1.0, 1.0)))
     if lean > _LARGEST_LEAN:
@@ -76,15 +76,14 @@ def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tupl
 
 def _child_from_camera(pose: Pose, sensor: Transform, mount: Mount | None) -> Transform:
     """The camera in the frame whose pose is given."""
-    if pose.child_frame_id == sensor.child:
-        return Transform(sensor.child, sensor.child, np.eye(3), np.zeros(3))
-    base = mount.base_from_camera if mount is not None else None
-    if base is None or base.parent != pose.child_frame_id:
+    mount = mount or Mount(0, np.eye(3))
+    seat = mount.camera_on(pose.child_frame_id, sensor.child)
+    if seat is None:
         raise ValueError(
             f"Fuse: the pose is that of '{pose.child_frame_id}', and nothing tells how the camera '{sensor.child}' "
             "sits on it; record its static transform, or set base_frame of the source"
         )
-    return base
+    return seat
 
 
 def sight_of(cloud: PointCloud, placed: Transform, resolution: float, region: float) -> Sight:

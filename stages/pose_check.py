@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, Pose, Transform
 
@@ -30,11 +29,11 @@ class PoseCheck:
 
     def add(self, motion: CameraMotion, pose: Pose, mount: Mount) -> None:
         """Take note of a frame."""
-        placed = None if motion.camera is None else _camera(pose, mount, motion.camera.child)
-        if motion.camera is None or placed is None:
+        seat = None if motion.camera is None else mount.camera_on(pose.child_frame_id, motion.camera.child)
+        if motion.camera is None or seat is None:
             self.last = None
             return
-        now = motion.segment, pose.frame_id, motion.camera, placed
+        now = motion.segment, pose.frame_id, motion.camera, pose.placed.after(seat)
         if self.last is not None and self.last[:2] == now[:2]:
             seen, told = (_step(before, after) for before, after in zip(self.last[2:], now[2:], strict=True))
             self.steps.append(np.linalg.norm([seen, told, seen - told], axis=1))
@@ -58,17 +57,6 @@ class PoseCheck:
             times = "once" if len(jumps) == 1 else f"{len(jumps)} times"
             return f"the logged pose jumps {times} against the images, by up to {jumps.max():.1f} m"
         return ""
-
-
-def _camera(pose: Pose, mount: Mount, camera: str) -> Transform | None:
-    """The camera in the pose's frame; None where nothing tells how it sits there."""
-    placed = Transform(
-        pose.frame_id, pose.child_frame_id, Rotation.from_quat(pose.quaternion).as_matrix(), pose.position
-    )
-    if pose.child_frame_id == camera:
-        return placed
-    base = mount.base_from_camera
-    return placed.after(base) if base is not None and base.parent == pose.child_frame_id else None
 
 
 def _step(before: Transform, after: Transform) -> Array:

@@ -16,13 +16,14 @@ import numpy as np
 from stages.data import Array, Disparity, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.bilateral import joint_bilateral
+from stages.kernels.blank import contrast
 from stages.kernels.correlation import correlation
 from stages.kernels.depth_edges import sharpen_edges
 from stages.kernels.extent import Extent, extent, within_reach
 from stages.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.kernels.planar import near_median, pull_to_planes, trusted_matches
 from stages.kernels.planes import Planes, fit_planes
-from stages.kernels.sharing import by_bands, shared_by, with_margin
+from stages.kernels.sharing import by_bands, shared_by
 from stages.kernels.slic import superpixels
 from stages.kernels.smoother import smooth
 from stages.kernels.sources import Trust, name_sources
@@ -206,9 +207,7 @@ def _burnt_out(image: Array, guide: Array, level: int, threads: int) -> Array:
         rows = image[first:end]
         bright = rows >= level if image.ndim == 2 else cv2.inRange(rows, (0,) * 3, (level - 1,) * 3) == 0
         if bright.any():
-            levels, own = with_margin(guide, first, end, 2)
-            step = cv2.morphologyEx(levels, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
-            burnt[first:end] = bright & (step[own] <= EVEN)
+            burnt[first:end] = bright & (contrast(guide, first, end) <= EVEN)
 
     if image.dtype == np.uint8:  # of more bits nothing tells where the sensor ends
         by_bands(shared_by(threads), len(image), mark)

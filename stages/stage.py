@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any
 
-from stages.data import Disparity, StereoFrame
+from stages.data import LEVEL_FRAME, Disparity, PointCloud, StereoFrame
 
 WIDEST = 4000  # cells, of a map
 
@@ -108,6 +108,13 @@ def check_rectified(stage: Stage, frame: StereoFrame) -> None:
     if frame.camera.raw is not None:
         name = type(stage).__name__
         raise ValueError(f"{name}: the frame is not rectified; put stages.Rectify before stages.{name}")
+
+
+def check_level(stage: Stage, cloud: PointCloud) -> None:
+    """Refuse a cloud that is not in frame `level`."""
+    if cloud.frame_id != LEVEL_FRAME:
+        name = type(stage).__name__
+        raise ValueError(f"{name}: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
 
 
 def check_joined(stage: Stage, frame: StereoFrame, disparity: Disparity) -> None:

@@ -77,7 +77,11 @@ class Fit:
 
     def misfit(self, undo: Array) -> float:
         """The squared residuals after `undo`, (3, 3), has changed the inclinometer's vectors."""
-        return float(np.sum(np.square(self.carried(self.evidence.ups @ (self.evidence.mount @ undo).T))))
+        return self.misfit_of(self.evidence.ups @ (self.evidence.mount @ undo).T)
+
+    def misfit_of(self, ups: Array, cameras: Array | None = None) -> float:
+        """The same for directions in the camera."""
+        return float(np.sum(np.square(self.carried(ups, cameras))))
 
     def slope(self, undo: Array) -> float:
         """The squared slope of the ground in view, on the average, in units of what is likely."""
@@ -141,9 +145,8 @@ def radians_as_degrees(fit: Fit) -> Cause | None:
     if np.any(rest < 0):
         return None
     ups = np.column_stack([level, np.sqrt(rest)]) @ fit.evidence.mount.T
-    misfit = float(np.sum(np.square(fit.carried(ups))))
     remedy = "check the unit of source.pitch and source.roll (rad, not deg), or the inclinometer's driver"
-    return Cause("radians are taken for degrees", remedy, misfit, fit.slope_of(ups), 1)
+    return Cause("radians are taken for degrees", remedy, fit.misfit_of(ups), fit.slope_of(ups), 1)
 
 
 @cache
@@ -161,7 +164,7 @@ def wrong_mount(fit: Fit, least: float) -> Cause:
     """The rotation that the mount lacks, by Gauss-Newton from the most fitting of all right angles."""
     mount = fit.evidence.mount
     starts = [mount @ turn @ mount.T for turn in _right_angles()]
-    cost = [float(np.sum(np.square(fit.carried(fit.ups @ s.T)))) + fit.slope_of(fit.ups @ s.T) for s in starts]
+    cost = [fit.misfit_of(fit.ups @ s.T) + fit.slope_of(fit.ups @ s.T) for s in starts]
     turn = starts[int(np.argmin(cost))] if min(cost) < 0.25 * cost[0] else np.eye(3)
     for _ in range(8):
         ups = fit.ups @ turn.T
@@ -185,8 +188,9 @@ def wrong_mount(fit: Fit, least: float) -> Cause:
         f"it is turned by that about ({along[0]:.2f}, {along[1]:.2f}, {along[2]:.2f}) of its own axes; check "
         f"/tf_static, or set source.camera_from_inclinometer to [{x:.4f}, {y:.4f}, {z:.4f}, {w:.4f}]"
     )
-    misfit = float(np.sum(np.square(fit.carried(ups))))
-    return Cause(fault, remedy, misfit, fit.slope_of(ups), 3, angle / least, spread / least, turn @ mount)
+    return Cause(
+        fault, remedy, fit.misfit_of(ups), fit.slope_of(ups), 3, angle / least, spread / least, turn @ mount
+    )  # fmt: skip
 
 
 def late_stamps(whole: Fit, sound: Cause, least: float) -> Cause | None:
@@ -209,7 +213,7 @@ def late_stamps(whole: Fit, sound: Cause, least: float) -> Cause | None:
             inside = within[kept] == stretch
             if inside.any():
                 cameras[inside] = spline(seconds[inside] - late).as_matrix()
-        return float(np.sum(np.square(fit.carried(fit.ups, cameras))))
+        return fit.misfit_of(fit.ups, cameras)
 
     step = 0.05
     times = np.arange(-LONGEST, LONGEST + step / 2, step)

@@ -124,10 +124,9 @@ def _pairs(earlier: View, later: View) -> tuple[Array, Array]:
 
 def _tracked_step(earlier: View, later: View, matrix: Array, turn: Array, shift: Array, least: int) -> Step | None:
     """The pose fitted to patches of the earlier image, tracked from where the given pose puts them."""
-    points, start = _ahead(earlier, later, matrix, turn, shift)
+    points, start, guess = _ahead(earlier, later, matrix, turn, shift)
     if len(points) < least:
         return None
-    guess = cv2.projectPoints(points, turn, shift, matrix, None)[0].reshape(-1, 2).astype(np.float32)
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         earlier.gray, later.gray, start, guess.copy(), winSize=(PATCH, PATCH), maxLevel=1, criteria=stop,
@@ -139,18 +138,18 @@ def _tracked_step(earlier: View, later: View, matrix: Array, turn: Array, shift:
     return _fitted(points[good], start[good], found[good].astype(np.float64), matrix, turn, shift, least)
 
 
-def _ahead(earlier: View, later: View, matrix: Array, turn: Array, shift: Array) -> tuple[Array, Array]:
-    """The earlier view's points that the later image shows, and where the earlier image shows them."""
+def _ahead(earlier: View, later: View, matrix: Array, turn: Array, shift: Array) -> tuple[Array, Array, Array]:
+    """The earlier view's points that the later image shows, and where the earlier and the later image show them."""
     known = np.isfinite(earlier.points[:, 2])
     points, places = earlier.points[known], earlier.places[known]
     depth = (points @ cv2.Rodrigues(turn)[0].T + shift.ravel())[:, 2]
     points, places = points[depth > 0.1], places[depth > 0.1]
     if not len(points):
-        return points, places
+        return points, places, places
     at = cv2.projectPoints(points, turn, shift, matrix, None)[0].reshape(-1, 2)
     height, width = later.gray.shape
     inside = np.all((at > PATCH / 2) & (at < np.array([width, height]) - PATCH / 2), axis=1)
-    return points[inside], places[inside]
+    return points[inside], places[inside], at[inside].astype(np.float32)
 
 
 def _fitted(

@@ -17,7 +17,7 @@ from stages.kernels.grid import FIGURES, cell_percentile, cell_statistics
 from stages.kernels.neighbours import lie_of_cells
 from stages.kernels.occlusion import lowest_sight
 from stages.kernels.spread import laid_along_sight
-from stages.stage import Stage, check_cells, parameter
+from stages.stage import Stage, check_cells, check_level, parameter
 
 Grid = tuple[float, tuple[float, float], int, float]  # resolution, origin, rows and columns, region
 FINEST = 0.5  # of a cell, below which a point's reach is not worth following
@@ -86,8 +86,7 @@ class Voxelise(Stage):
 
     def __call__(self, cloud: PointCloud) -> ElevationMap:
         """The elevation map of a cloud in frame `level`."""
-        if cloud.frame_id != LEVEL_FRAME:
-            raise ValueError(f"Voxelise: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
+        check_level(self, cloud)
         half = int(np.ceil(self.region / self.resolution - 1e-9))
         origin = (-half * self.resolution, -half * self.resolution)
         measured, guessed = self._parted(cloud)

@@ -12,7 +12,7 @@ import numpy as np
 
 from stages.data import LEVEL_FRAME, PointCloud, VoxelMap
 from stages.kernels.voxels import voxel_means
-from stages.stage import Stage, check_cells, parameter
+from stages.stage import Stage, check_cells, check_level, parameter
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,7 @@ class Voxels(Stage):
 
     def __call__(self, cloud: PointCloud) -> VoxelMap:
         """The cubes of a cloud in frame `level`; there may be none."""
-        if cloud.frame_id != LEVEL_FRAME:
-            raise ValueError(f"Voxels: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
+        check_level(self, cloud)
         x, y = cloud.points[:, 0], cloud.points[:, 1]
         inside = cloud.measured & np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.region**2)
         near = cloud.only(inside)

@@ -21,13 +21,11 @@ import numpy as np
 
 from stages.data import Array
 from stages.kernels.census import census_costs
-from stages.kernels.compiled import kernel, part
+from stages.kernels.compiled import part
 from stages.kernels.rule import Rule
 from stages.kernels.vectors import (
-    Width,
     above_smallest,
     byte,
-    difference,
     lanes_in,
     lesser,
     load,
@@ -53,19 +51,10 @@ def brightness_steps(image: Array) -> Array:
     stride = -(-(columns + 2) // BLOCK) * BLOCK
     padded = cv2.copyMakeBorder(image, 1, 1, 2, 1 + stride - columns, cv2.BORDER_REPLICATE)
     steps = np.empty((len(SIDES), height + 1, stride), np.uint8)
-    _brightness_steps(padded.reshape(-1), padded.shape[1], steps.reshape(-1), height + 1, stride, Width(BLOCK))
+    here = np.s_[1 : height + 2, 1 : stride + 1]
+    for (dy, dx), step in zip(SIDES, steps, strict=True):
+        cv2.absdiff(padded[here], padded[1 + dy : height + 2 + dy, 1 + dx : stride + 1 + dx], dst=step)
     return steps
-
-
-@kernel
-def _brightness_steps(image, image_stride, steps, rows, stride, width):  # type: ignore[no-untyped-def]
-    for side in range(len(SIDES)):
-        dy, dx = SIDES[side]
-        for y in range(rows):
-            for i in range(0, stride, lanes_in(width)):
-                here = (y + 1) * image_stride + i + 1
-                one, other = load(image, here, width), load(image, here + dy * image_stride + dx, width)
-                store(steps, (side * rows + y) * stride + i, difference(one, other))
 
 
 @part
@@ -107,20 +96,13 @@ def aggregate_row(  # type: ignore[no-untyped-def]
         if pulled:
             cost = plus_capped(cost, load(pair.prior_costs, begin[x], width))
         path = _continued(path, cost, small_step, byte(table, byte(steps, beside)), width)
-        total_here = path
-        at = (columns + x) * n
-        moved = _continued_at(paths, at, cost, small_step, byte(table, byte(steps, upright)), width)
-        store(paths, at, moved)
-        total_here = plus_capped(total_here, moved)
+        p2 = byte(table, byte(steps, upright))
+        total_here = plus_capped(path, _follow(paths, (columns + x) * n, cost, small_step, p2, width))
         if rule.diagonals:
-            at = fall * n
-            moved = _continued_at(paths, at, cost, small_step, byte(table, byte(steps, falling)), width)
-            store(paths, at, moved)
-            total_here = plus_capped(total_here, moved)
-            at = (2 * columns + rise) * n
-            moved = _continued_at(paths, at, cost, small_step, byte(table, byte(steps, rising)), width)
-            store(paths, at, moved)
-            total_here = plus_capped(total_here, moved)
+            p2 = byte(table, byte(steps, falling))
+            total_here = plus_capped(total_here, _follow(paths, fall * n, cost, small_step, p2, width))
+            p2 = byte(table, byte(steps, rising))
+            total_here = plus_capped(total_here, _follow(paths, (2 * columns + rise) * n, cost, small_step, p2, width))
         here = place + x * n
         if final:
             store(total, x * n, plus_capped(total_here, load(sums, here, width)))
@@ -138,11 +120,13 @@ def _continued(path, cost, p1, p2, width):  # type: ignore[no-untyped-def]
 
 
 @part
-def _continued_at(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
-    """L of the next pixel of a path that is kept in `paths`, above its smallest value."""
+def _follow(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+    """`_continued` of a path that is kept in `paths`, and is there again."""
     path = load(paths, at, width)
     near = lesser(shifted_in_memory(path, paths, at, FAR, 1), shifted_in_memory(path, paths, at, FAR, -1))
-    return next_path(path, near, cost, p1, p2, width)
+    moved = next_path(path, near, cost, p1, p2, width)
+    store(paths, at, moved)
+    return moved
 
 
 @part

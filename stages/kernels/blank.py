@@ -14,11 +14,16 @@ from stages.kernels.sharing import with_margin
 WINDOW = 5  # px, of the census
 
 
-def blank_windows(image: Array, first: int, end: int) -> Array:
-    """Whether the windows of the pixels of rows first to end of an image (H, W) uint8 are blank, (end - first, W)
-    bool."""
+def contrast(image: Array, first: int, end: int) -> Array:
+    """By how much the gray levels in the windows of the pixels of rows first to end of an image (H, W) uint8 differ,
+    (end - first, W) uint8."""
     rows, own = with_margin(image, first, end, WINDOW // 2)
-    return np.asarray(cv2.morphologyEx(rows, cv2.MORPH_GRADIENT, np.ones((WINDOW, WINDOW), np.uint8))[own] == 0)
+    return np.asarray(cv2.morphologyEx(rows, cv2.MORPH_GRADIENT, np.ones((WINDOW, WINDOW), np.uint8))[own])
+
+
+def blank_windows(image: Array, first: int, end: int) -> Array:
+    """Whether the windows of the pixels of rows first to end are blank, (end - first, W) bool."""
+    return np.asarray(contrast(image, first, end) == 0)
 
 
 @kernel

@@ -29,7 +29,7 @@ log.setLevel(logging.INFO)  # one line in the life of an installation: shown eve
 def digest() -> str:
     """Hexadecimal digest of all that the compiled kernels depend on."""
     total = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
-    for file in sorted(FOLDER.glob("*.py")):
+    for file in sorted([*FOLDER.glob("*.py"), FOLDER.parent / "data.py"]):  # the codes of `Source` are compiled in
         total.update(b"%s %d " % (file.name.encode(), file.stat().st_size) + file.read_bytes())
     return total.hexdigest()
 

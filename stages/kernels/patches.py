@@ -87,10 +87,7 @@ def _patches(inverse, tolerance, slope):  # type: ignore[no-untyped-def]
                 join(parent, i, above)
     # Parents come before their children, so one pass in order reaches every root.
     for i in range(height * width):
-        parent[i] = parent[parent[i]]
-    for i in range(height * width):
-        if not inverse[i // width, i % width] > 0.0:
-            parent[i] = -1
+        parent[i] = parent[parent[i]] if inverse[i // width, i % width] > 0.0 else -1
     return parent.reshape(height, width)
 
 

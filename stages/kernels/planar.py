@@ -66,11 +66,8 @@ def pull_to_planes(
     """
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     given = pixels, coefficients, labels, within, F32(near), F32(weight), margin
-    both = shared_by(threads)
-    middle = len(pixels) // 2
-    ranges = both(lambda: _range(pixels[:middle]), lambda: _range(pixels[middle:]))
-    low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
-    by_bands(both, len(pixels), lambda first, end: _pull(*given, low, high, first, end, pulled, spoke))
+    low, high = np.fmin.reduce(pixels, axis=None), np.fmax.reduce(pixels, axis=None)
+    by_bands(shared_by(threads), len(pixels), lambda first, end: _pull(*given, low, high, first, end, pulled, spoke))
     return pulled, spoke
 
 
@@ -107,17 +104,6 @@ def _move_near(matches, median, near, moved):  # type: ignore[no-untyped-def]
         for x in range(matches.shape[1]):
             d, m = matches[y, x], median[y, x]
             moved[y, x] = m if abs(m - d) <= near else d
-
-
-@kernel
-def _range(pixels):  # type: ignore[no-untyped-def]
-    low, high = F32(np.inf), F32(-np.inf)
-    for y in range(pixels.shape[0]):
-        for x in range(pixels.shape[1]):
-            d = pixels[y, x]
-            low = d if d < low else low
-            high = d if d > high else high
-    return low, high
 
 
 @kernel

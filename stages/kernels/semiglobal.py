@@ -18,6 +18,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from stages.data import Array
@@ -90,13 +91,7 @@ def match(
 
         by_bands(both, len(left), drop)
         drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, space, both)
-        confidence, source = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
-
-        def grade(first: int, end: int) -> None:
-            _grade(rule.calibration, *(layer[first:end] for layer in (evidence, confidence, source)))
-
-        by_bands(both, len(left), grade)
-    return Matches(pixels, source, confidence)
+    return Matches(pixels, (evidence > 0).view(np.uint8), cv2.LUT(evidence, rule.calibration))
 
 
 def _search_rows(
@@ -108,14 +103,6 @@ def _search_rows(
     upper, lower = _halves(pair, rule, space, ranges, memory, pixels, evidence)
     both(upper.arrive, lower.arrive)
     both(lambda: upper.cross(lower), lambda: lower.cross(upper))
-
-
-@kernel
-def _grade(calibration, evidence, confidence, source):  # type: ignore[no-untyped-def]
-    for y in range(evidence.shape[0]):
-        for x in range(evidence.shape[1]):
-            confidence[y, x] = calibration[evidence[y, x]]
-            source[y, x] = evidence[y, x] > 0
 
 
 @kernel
