@@ -282,6 +282,12 @@ def test_smoothing_does_not_lag_at_either_end_of_the_stream_and_gaps_are_gaps():
     assert reasons(smoothing([(0, 0.0), (10, 1.0), (90, 9.0), (100, 10.0)], [50], 50)) == [Reason.UNALIGNED]
 
 
+def test_a_sample_at_the_very_stamp_counts_though_a_gap_follows_it():
+    for smooth in (0, 50):
+        samples = [(30, 3.0), (40, 4.0), (50, 5.0), (120, 12.0), (130, 13.0)]
+        assert values(smoothing(samples, [50], smooth)) == [(50, 5.0)]
+
+
 def test_what_cannot_be_smoothed_is_refused_before_anything_runs():
     with pytest.raises(TypeError, match="a Number cannot be smoothed"):
         Interpolate(smooth=10).output({"stream": Number, "at": Number})

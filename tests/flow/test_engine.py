@@ -1,6 +1,8 @@
 """The engine delivers every frame once, in order, to every sink, whatever fails or how many workers there are."""
 
 import threading
+import time
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -87,6 +89,43 @@ def test_inboxes_stay_bounded_when_the_end_of_the_line_is_slow(tmp_path):
     helper.join()
     assert most[0] <= 2 * (len(pipeline.stages) + 1) + 3
     assert [record.index for record in sink.records] == list(range(60))
+
+
+class SlowAdd:
+    """Joins two streams slowly, frame by frame."""
+
+    ordered = True
+
+    def __call__(self, a: Couple, b: Couple) -> Couple:
+        time.sleep(0.01)
+        return a
+
+
+@pytest.mark.parametrize("workers", [2, 8])
+def test_the_inbox_of_a_join_stays_bounded_while_its_inputs_are_being_made(tmp_path, monkeypatch, workers):
+    text = (
+        PIPELINE[: PIPELINE.index("  twice:")]
+        + """
+  twice:  {use: tests.flow.toys.Scale, couple: both, nap: 2 ms}
+  thrice: {use: tests.flow.toys.Scale, couple: both, nap: 2 ms}
+  sum:    {use: tests.flow.toys.Add, a: twice, b: thrice}
+sinks: [{use: tests.flow.toys.Keep}]
+"""
+    )
+    stages = [
+        replace(node, actor=SlowAdd()) if node.name == "sum" else node for node in graph(tmp_path, text=text).stages
+    ]
+    engine, most, expect = Engine(stages, {}, Ledger(), workers=workers, capacity=2), [0], Engine._expect
+
+    def watched(self, *arguments):
+        expect(self, *arguments)
+        most.append(max(len(work.inbox) for work in self._work))
+
+    monkeypatch.setattr(Engine, "_expect", watched)
+    for index in range(30):
+        engine.admit(index, {"both": Couple(index, 1.0)}, [])
+    engine.finish()
+    assert max(most) == 2
 
 
 def test_a_frame_that_has_nothing_to_work_on_is_through_at_once(tmp_path):

@@ -58,6 +58,9 @@ def test_kernels_are_announced_once_kept_and_made_again_after_a_change_anywhere(
     after, said = run()
     assert after != first
     assert "compiling kernels" in said
+    codes = tmp_path / "stages" / "data.py"  # the values of its enumerations are compiled in
+    codes.write_text(f"{codes.read_text()}\n# changed\n")
+    assert "compiling kernels" in run()[1]
 
 
 def test_what_was_compiled_just_now_gives_the_same_bits_as_what_is_loaded(run):
