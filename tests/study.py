@@ -27,7 +27,7 @@ from tests.bench.stereo_scores import errors, rows_filled
 
 PLAIN: dict[str, Any] = {
     "median": 0, "plane_weight": 0, "plane_fill": False, "surface": 0, "bilateral_radius": 0, "edge_radius": 0,
-    "trusted": 0,
+    "trusted": 0, "fit_radius": 0,
 }  # fmt: skip
 SEEDS = (1, 2, 3)
 ABUNDANCES = (0.05, 0.15, 0.10)
@@ -153,7 +153,8 @@ STEPS: dict[str, Chain] = {
     "+ view from the right": refined("checked", **PLAIN),
     "+ matched again about that": refined("checked_again", **PLAIN),
     "+ doubtful matches dropped": refined("checked_again", **{**PLAIN, "trusted": 0.5}),
-    "+ median": refined("checked_again", **{**PLAIN, "trusted": 0.5, "median": 3}),
+    "+ fractions from brightness": refined("checked_again", **{**PLAIN, "trusted": 0.5, "fit_radius": 2}),
+    "+ median": refined("checked_again", **{**PLAIN, "trusted": 0.5, "fit_radius": 2, "median": 3}),
     "+ planes of superpixels": refined("checked_again", surface=0, plane_fill=False, bilateral_radius=0, edge_radius=0),
     "+ they fill holes": refined("checked_again", surface=0, bilateral_radius=0, edge_radius=0),
     "+ planes of surfaces": refined("checked_again", bilateral_radius=0, edge_radius=0),
@@ -171,6 +172,7 @@ VARIANTS: dict[str, Chain] = {
     "rover, matched a third time": remade(matched_again=thrice),
     "rover with half the range": part_of_range(2),
     "rover with a third of the range": part_of_range(3),
+    "rover, fractions from matching": refined("checked_again", fit_radius=0),
     "rover without planes": refined("checked_again", plane_weight=0, plane_fill=False, surface=0),
     "rover without surfaces": refined("checked_again", surface=0),
     "rover, planes draw more: 0.7": refined("checked_again", plane_weight=0.7),

@@ -7,8 +7,8 @@ pixels: a match is moved by the shift d that makes the left window most like the
     d = -sum (g - mean g) (e - mean e) / sum ((g - mean g)^2 + NOISE^2)    with e(p) = L(p) - R(p - disparity(p))
 
 and g the mean of both images' gradients along the row; in between, the right image is a Catmull-Rom spline. The window
-is what of the square about a pixel has about its disparity, so that no edge of depth is in it. Where there is little
-contrast, or little of a window, the match stays about where it was.
+is what of the square about a pixel has about its disparity, so that no edge of depth is in it, and of that every other
+pixel, as on a chessboard. Where there is little contrast, or little of a window, the match stays about where it was.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 ALIKE = F32(1.5)  # px, by which disparities in a window differ at most
-LEAST = F32(1 / 3)  # of the square, that a window must have
+LEAST = F32(1 / 3)  # of the square's pixels that count, which a window must have
 NOISE = F32(4)  # gray levels, of a contrast that tells little
 FARTHEST = F32(0.3)  # px, that a match is moved
 LANES = 64  # pixels of a row that are worked on at once
@@ -67,13 +67,13 @@ def _move(framed, disparity, radius, moved, first, end):  # type: ignore[no-unty
     """Rows first to end of disparities, each moved by what its window says."""
     height, width = disparity.shape
     sums = np.empty(5 * LANES, np.float32)
-    least = LEAST * F32((2 * radius + 1) ** 2)
+    least = LEAST * F32((2 * radius + 1) ** 2 // 2)
     for y in range(first, end):
         for start in range(0, width, LANES):
             sums[:] = 0
             own = framed[0, y, start + radius : start + radius + LANES]
             for v in range(max(y - radius, 0), min(y + radius + 1, height)):
-                for at in range(start, start + 2 * radius + 1):
+                for at in range(start + ((v - y + radius) & 1), start + 2 * radius + 1, 2):
                     there = slice(at, at + LANES)
                     _add(own, framed[0, v, there], framed[1, v, there], framed[2, v, there], sums)
             for j in range(min(LANES, width - start)):
@@ -115,11 +115,13 @@ def fit_brightness_reference(left: Array, right: Array, disparity: Array, radius
             error[y, x] = left[y, x] - spline @ t ** np.arange(4)
             slope = spline[1:] @ (np.array([1, 2, 3]) * t ** np.arange(3))
             gradient[y, x] = (slope + (float(left[y, x + 1]) - float(left[y, x - 1])) / 2) / 2
+    chessboard = np.indices(disparity.shape).sum(axis=0) % 2
     for y, x in np.argwhere(np.isfinite(error)):
         window = tuple(slice(max(0, place - radius), place + radius + 1) for place in (y, x))
         with np.errstate(invalid="ignore"):
             inside = (abs(disparity[window] - disparity[y, x]) <= ALIKE) & np.isfinite(error[window])
-        if np.count_nonzero(inside) >= LEAST * (2 * radius + 1) ** 2:
+        inside &= chessboard[window] == chessboard[y, x]
+        if np.count_nonzero(inside) >= LEAST * ((2 * radius + 1) ** 2 // 2):
             g, e = (layer[window][inside] - layer[window][inside].mean() for layer in (gradient, error))
             step = (g @ e) / (g @ g + len(g) * float(NOISE) ** 2)
             moved[y, x] -= np.clip(step, -FARTHEST, FARTHEST)
