@@ -22,7 +22,7 @@ import numpy as np
 
 from flow.allocator import keep_freed_memory
 from recordings.simulator import Simulation
-from stages import Match, Rectify, StereoCamera, StereoFrame
+from stages import Disparity, Match, MatchOpenCV, Rectify, Refine, StereoCamera, StereoFrame
 from stages.data import Array
 
 WIDTH, HEIGHT = 1280, 960
@@ -168,6 +168,29 @@ def accuracy(folder: Path) -> None:
         print(f"{'  over OpenCV HH':34} {ratio[0]:10.3f} {points:+8.1f} {ratio[2]:15.3f} {ratio[3]:13.3f}")
 
 
+def fractions() -> None:
+    """Print by how much a surface that faces the camera is drawn to whole pixels: the median error at each fraction."""
+    right = gray_pair().right
+    x, y = (grid.astype(np.float32) for grid in np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)))
+    noise = np.random.default_rng(0)
+    ways: dict[str, Callable[[StereoFrame], Disparity]] = {
+        "OpenCV HH": MatchOpenCV(disparities=64),
+        **{cost: Match(cost=cost, disparities=64) for cost in COSTS},
+        "census+gradient, refined": lambda frame: Refine()(frame, Match(disparities=64)(frame)),
+    }
+    steps = np.arange(1, 10) / 10
+    print(f"\n{'median error, px, of 20 px and':34} {' '.join(f'{step:6.1f}' for step in steps)}")
+    found: dict[str, list[float]] = {name: [] for name in ways}
+    for step in steps:
+        shifted = cv2.remap(right.astype(np.float32), x - np.float32(20 + step), y, cv2.INTER_LANCZOS4)
+        images = (np.clip(np.rint(view + noise.normal(0, 1, view.shape)), 0, 255) for view in (shifted, right))
+        frame = StereoFrame(0, *(image.astype(np.uint8) for image in images), gray_pair().camera)
+        for name, way in ways.items():
+            found[name].append(float(np.nanmedian(way(frame).pixels[20:-20, 100:-20])) - 20 - step)
+    for name, errors in found.items():
+        print(f"{name:34} {' '.join(f'{error:+6.2f}' for error in errors)}")
+
+
 def rows(folder: Path) -> None:
     """Print how the row correction changes what is matched on real rover images, right of the columns that only the
     left camera sees and below the sky."""
@@ -196,6 +219,7 @@ def main() -> None:
     speed()
     with tempfile.TemporaryDirectory() as cache:
         start_up(Path(cache))
+    fractions()
     data = os.environ.get("ROVERFLOW_DATA")
     if data:
         accuracy(Path(data) / "middlebury-q")
