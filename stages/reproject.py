@@ -27,7 +27,7 @@ class Reproject(Stage):
 
     max_depth: float = parameter(20.0, "points deeper than this are left out", unit="m", low=0.1)
     filled: bool = parameter(False, "whether filled disparities, which no camera measured, become points")
-    sigma_best: float = parameter(0.096, "disparity standard deviation at confidence 1", unit="px", low=1e-3)
+    sigma_best: float = parameter(0.086, "disparity standard deviation at confidence 1", unit="px", low=1e-3)
     sigma_worst: float = parameter(42.0, "disparity standard deviation at confidence 0", unit="px", low=1e-3)
     sigma_plane: float = parameter(0.75, "disparity standard deviation where only a plane knows", unit="px", low=0.0)
     sigma_filled: float = parameter(3.0, "disparity standard deviation of a filled pixel", unit="px", low=0.0)
