@@ -64,7 +64,7 @@ def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Arra
     """(count, count) float32: 1 where a pixel that both cameras see hits the cell within the region, else 0."""
     mount = truth.level.inverse().after(truth.base.after(simulation.mounts[0]))
     a, b, known = _seen_within(simulation, truth)
-    rows = slice(int(known.any(axis=1).argmax()), None)  # sky and far ground above them
+    rows = slice(int(np.argmax(known.any(axis=1))), None)  # sky and far ground above them
     known, b, places = known[rows], b[rows], []
     depth = np.where(known, truth.depth[rows], 0.0)
     for axis in (1, 0):

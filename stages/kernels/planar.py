@@ -66,7 +66,7 @@ def pull_to_planes(
     """
     pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     given = pixels, coefficients, labels, within, F32(near), F32(weight), margin
-    low, high = np.fmin.reduce(pixels, axis=None), np.fmax.reduce(pixels, axis=None)
+    low, high = (extreme.reduce(pixels.ravel(), keepdims=True)[0] for extreme in (np.fmin, np.fmax))
     by_bands(shared_by(threads), len(pixels), lambda first, end: _pull(*given, low, high, first, end, pulled, spoke))
     return pulled, spoke
 
