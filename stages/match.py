@@ -77,7 +77,7 @@ class Match(Stage):
 
     disparities: int = parameter(
         192, "size of the search range, of which the first and the last only bound the others and are not found",
-        unit="px", low=3, high=1024,
+        unit="px", low=1, high=1024,
     )  # fmt: skip
     minimum: int = parameter(0, "smallest disparity searched", unit="px", low=-1024, high=1024)
     farthest: float = parameter(

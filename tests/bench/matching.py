@@ -170,7 +170,7 @@ def accuracy(folder: Path) -> None:
 
 def fractions() -> None:
     """Print by how much a surface that faces the camera is drawn to whole pixels: the median error at each fraction."""
-    right = gray_pair().right
+    pair = gray_pair()
     x, y = (grid.astype(np.float32) for grid in np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)))
     noise = np.random.default_rng(0)
     ways: dict[str, Callable[[StereoFrame], Disparity]] = {
@@ -182,9 +182,9 @@ def fractions() -> None:
     print(f"\n{'median error, px, of 20 px and':34} {' '.join(f'{step:6.1f}' for step in steps)}")
     found: dict[str, list[float]] = {name: [] for name in ways}
     for step in steps:
-        shifted = cv2.remap(right.astype(np.float32), x - np.float32(20 + step), y, cv2.INTER_LANCZOS4)
-        images = (np.clip(np.rint(view + noise.normal(0, 1, view.shape)), 0, 255) for view in (shifted, right))
-        frame = StereoFrame(0, *(image.astype(np.uint8) for image in images), gray_pair().camera)
+        shifted = cv2.remap(pair.right.astype(np.float32), x - np.float32(20 + step), y, cv2.INTER_LANCZOS4)
+        images = (np.clip(np.rint(view + noise.normal(0, 1, view.shape)), 0, 255) for view in (shifted, pair.right))
+        frame = StereoFrame(0, *(image.astype(np.uint8) for image in images), pair.camera)
         for name, way in ways.items():
             found[name].append(float(np.nanmedian(way(frame).pixels[20:-20, 100:-20])) - 20 - step)
     for name, errors in found.items():

@@ -150,7 +150,7 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
 
 @settings(max_examples=25, deadline=None)
 @given(
-    st.integers(16, 90), st.integers(16, 90), st.sampled_from([4, 8]), st.sampled_from([3, 13, 50, 64, 70, 96]),
+    st.integers(16, 90), st.integers(16, 90), st.sampled_from([4, 8]), st.sampled_from([1, 13, 50, 64, 70, 96]),
     st.integers(-15, 15), st.sampled_from(sorted(COSTS)), st.integers(0, 99),
 )  # fmt: skip
 def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, disparities, minimum, cost, seed):
@@ -272,7 +272,6 @@ def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
         ({"p2": 220}, "at most 196 with cost census\\+gradient"),
         ({"paths": 5}, "must be one of 4, 8"),
         ({"cost": "sad"}, "must be one of census, census\\+gradient"),
-        ({"disparities": 2}, "disparities must be 3 to 1024 px"),
         ({"farthest": "12m"}, "farthest must be a number of m, not '12m'"),
     ],
 )
