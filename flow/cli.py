@@ -188,7 +188,7 @@ def _info_arguments(sub: argparse.ArgumentParser) -> None:
 
 
 def _info(options: argparse.Namespace) -> int:
-    from flow.pipeline import load
+    from flow.config.loader import load
     from flow.run import fitted
     from recordings import McapSource
     from recordings.inventory import describe, format_description
@@ -238,8 +238,8 @@ def _graph_arguments(sub: argparse.ArgumentParser) -> None:
 
 
 def _graph(options: argparse.Namespace) -> int:
-    from flow.draw import draw
-    from flow.pipeline import load
+    from flow.config.draw import draw
+    from flow.config.loader import load
 
     say(draw(load(options.pipeline, options.set), options.format))
     return COMPLETE

@@ -31,7 +31,7 @@ def replay(
     from threadpoolctl import threadpool_limits
     from tqdm import tqdm
 
-    from flow import pipeline as pipelines
+    from flow.config import loader as pipelines
     from flow.run import Stop, interrupts, run
 
     graph = pipelines.load(pipeline, overrides)

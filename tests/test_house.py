@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flow.pipeline import load
+from flow.config.loader import load
 
 ROOT = Path(__file__).parent.parent
 ROOMS = {"flow", "stages", "recordings"}

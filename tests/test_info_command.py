@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from flow.pipeline import SHIPPED
+from flow.config.loader import SHIPPED
 from tests.conftest import FRAMES, roverflow
 from tests.recordings.sample_log import RIGHT, TILT, write_sample
 

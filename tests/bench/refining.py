@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from flow.allocator import keep_freed_memory
-from flow.pipeline import load
+from flow.config.loader import load
 from stages import Disparity, Match, StereoFrame
 from stages.data import Array
 from stages.kernels.planes import fit_planes

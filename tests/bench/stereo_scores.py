@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flow.pipeline import load
+from flow.config.loader import load
 from recordings.middlebury import read_scene
 from recordings.stereo_measures import StereoErrors
 from stages.data import Array, Disparity, StereoFrame

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from flow import arguments
 from flow.align import Token
 from flow.allocator import keep_freed_memory
-from flow.pipeline import load
+from flow.config.loader import load
 from recordings.score_table import ROWS, terrain_figures, terrain_lines
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import pytest
 
+from flow.config.loader import load
 from flow.errors import PipelineError
-from flow.pipeline import load
 from flow.run import Stop, run
 from stages.stage import Finding
 from tests.flow.toys import Couple, Keep, Log, Number

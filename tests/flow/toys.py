@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from flow.pipeline import load
+from flow.config.loader import load
 from flow.run import run
 from stages.stage import Finding, Severity
 

@@ -11,19 +11,19 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, get_args
 
-from flow.document import Value, nearest, read, settled
-from flow.entry import Entry, mapping
+from flow.config.node_spec import Entry, mapping
+from flow.config.yaml_tree import Value, nearest, read, settled
 from flow.errors import UsageError
 from flow.graph import Graph, Node, Place, accepts, clock_of, in_order, is_aligner, output_of, ports_of, unfit
 
-SHIPPED = Path(__file__).parent / "pipelines"
+SHIPPED = Path(__file__).parent.parent / "pipelines"
 _BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"
 
 
 def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     """The pipeline `name`: one that ships with the product, or the path of a YAML file.
 
-    overrides: settings of the command line (see `flow.document.settled`), applied before anything is checked.
+    overrides: settings of the command line (see `flow.config.yaml_tree.settled`), applied before anything is checked.
     """
     path = _find(name)
     try:

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flow.config.loader import load
+from flow.config.units import as_written, quantity
 from flow.errors import PipelineError, UsageError
-from flow.pipeline import load
-from flow.units import as_written, quantity
 
 GOOD = """\
 source: {use: tests.flow.toys.Source, gain: 2.5}

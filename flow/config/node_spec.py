@@ -7,10 +7,10 @@ from collections.abc import Collection, Iterable
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from typing import Any
 
-from flow.document import Value, nearest
+from flow.config.values import coerced
+from flow.config.yaml_tree import Value, nearest
 from flow.graph import Place, hints_of, is_aligner
 from flow.ledger import failure
-from flow.values import coerced
 
 _NEEDED = {  # what a class of that role needs to have
     "source": ("streams", "open"),

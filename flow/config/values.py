@@ -7,7 +7,7 @@ from dataclasses import Field
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
-from flow.units import as_written, check_bare, quantity
+from flow.config.units import as_written, check_bare, quantity
 
 
 def coerced(value: Any, kind: Any, parameter: Field[Any]) -> Any:
