@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
 
-from flow.graph import hints_of
-from flow.ledger import Absent, Entry, Reason, failure
+from flow.runtime.graph import hints_of
+from flow.runtime.ledger import Absent, Entry, Reason, failure
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ from typing import Any
 
 from flow.arguments import check_demo, check_outputs, count, seconds, size, workers
 from flow.errors import RoverflowError, SinkError, UsageError
-from flow.graph import Graph
 from flow.program import INTERRUPTED
-from flow.replay import as_json, product_version, replay
 from flow.report import counted, headline, report, say
+from flow.runtime.graph import Graph
+from flow.runtime.replay import as_json, product_version, replay
 from recordings.earlier_output import is_ours
 from recordings.errors import LogError, UnwritableError
 from recordings.whole_file import writing, written
@@ -189,7 +189,7 @@ def _info_arguments(sub: argparse.ArgumentParser) -> None:
 
 def _info(options: argparse.Namespace) -> int:
     from flow.config.loader import load
-    from flow.run import fitted
+    from flow.runtime.run import fitted
     from recordings import McapSource
     from recordings.inventory import describe, format_description
 

@@ -18,7 +18,7 @@ def program() -> int:
             if signal.getsignal(number) is signal.SIG_DFL:
                 signal.signal(number, signal.default_int_handler)  # so that nothing half done is left behind
         _open_what_is_closed()
-        from flow.allocator import keep_freed_memory
+        from flow.runtime.malloc import keep_freed_memory
 
         keep_freed_memory()
         from flow.cli import main

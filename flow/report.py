@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from flow.findings import NOTE, WARNING, lines
-from flow.ledger import Reason, Verdict
+from flow.runtime.findings import NOTE, WARNING, lines
+from flow.runtime.ledger import Reason, Verdict
 
 
 def say(text: str) -> None:

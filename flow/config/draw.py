@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 from flow.config.units import as_written
-from flow.graph import Graph
+from flow.runtime.graph import Graph
 
 _BOX_WIDTH, _BOX_HEIGHT, _GAP_X, _GAP_Y, _MARGIN = 168, 44, 76, 22, 16
 

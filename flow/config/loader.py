@@ -14,7 +14,7 @@ from typing import Any, get_args
 from flow.config.node_spec import Entry, mapping
 from flow.config.yaml_tree import Value, nearest, read, settled
 from flow.errors import UsageError
-from flow.graph import Graph, Node, Place, accepts, clock_of, in_order, is_aligner, output_of, ports_of, unfit
+from flow.runtime.graph import Graph, Node, Place, accepts, clock_of, in_order, is_aligner, output_of, ports_of, unfit
 
 SHIPPED = Path(__file__).parent.parent / "pipelines"
 _BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"

@@ -9,8 +9,8 @@ from typing import Any
 
 from flow.config.values import coerced
 from flow.config.yaml_tree import Value, nearest
-from flow.graph import Place, hints_of, is_aligner
-from flow.ledger import failure
+from flow.runtime.graph import Place, hints_of, is_aligner
+from flow.runtime.ledger import failure
 
 _NEEDED = {  # what a class of that role needs to have
     "source": ("streams", "open"),

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from flow.errors import UsageError
-from flow.graph import Place
+from flow.runtime.graph import Place
 
 MOST = 100_000  # values that a pipeline file may hold
 

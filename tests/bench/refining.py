@@ -18,8 +18,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flow.allocator import keep_freed_memory
 from flow.config.loader import load
+from flow.runtime.malloc import keep_freed_memory
 from stages import Disparity, Match, StereoFrame
 from stages.data import Array
 from stages.kernels.planes import fit_planes

@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 
 from flow import arguments
 from flow.align import Token
-from flow.allocator import keep_freed_memory
 from flow.config.loader import load
+from flow.runtime.malloc import keep_freed_memory
 from recordings.score_table import ROWS, terrain_figures, terrain_lines
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from flow.config.loader import load
-from flow.run import run
+from flow.runtime.run import run
 from stages.stage import Finding, Severity
 
 

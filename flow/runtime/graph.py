@@ -71,7 +71,7 @@ class Sink(Protocol):
         """Begin an output; nothing stands under `path` itself until `close`."""
 
     def write(self, record: Any) -> None:
-        """Take one `flow.engine.FrameRecord`."""
+        """Take one `flow.runtime.engine.FrameRecord`."""
 
     def close(self, summary: Mapping[str, Any]) -> None:
         """Finish the output and give it its name."""

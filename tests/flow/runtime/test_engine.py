@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flow.engine import Engine
-from flow.graph import Node, Place
-from flow.ledger import Absent, Entry, Ledger, Reason
+from flow.runtime.engine import Engine
+from flow.runtime.graph import Node, Place
+from flow.runtime.ledger import Absent, Entry, Ledger, Reason
 from tests.flow.toys import MS, PIPELINE, Couple, Keep, Number, graph, replayed, traverse
 
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from flow.align import Answers, Token
-from flow.graph import Event, Graph
-from flow.ledger import Absent, Entry, Ledger, Reason
+from flow.runtime.graph import Event, Graph
+from flow.runtime.ledger import Absent, Entry, Ledger, Reason
 
 # ns; a stamp that runs ahead of the log's clock by this much more than the one before it is in doubt
 DOUBT = 1_000_000_000

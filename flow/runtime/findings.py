@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from flow.graph import Graph
-from flow.ledger import failure
+from flow.runtime.graph import Graph
+from flow.runtime.ledger import failure
 
 Finding = dict[str, str]
 

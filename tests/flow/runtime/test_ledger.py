@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from flow.ledger import Entry, Ledger, Reason, failure
+from flow.runtime.ledger import Entry, Ledger, Reason, failure
 from stages import Match
 
 

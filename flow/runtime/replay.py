@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.errors import UsageError
-from flow.graph import Graph
+from flow.runtime.graph import Graph
 
 
 def replay(
@@ -32,7 +32,7 @@ def replay(
     from tqdm import tqdm
 
     from flow.config import loader as pipelines
-    from flow.run import Stop, interrupts, run
+    from flow.runtime.run import Stop, interrupts, run
 
     graph = pipelines.load(pipeline, overrides)
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})

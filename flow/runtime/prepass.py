@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from flow.feeder import Feeder
-from flow.findings import WARNING, Finding, finding, plain
-from flow.graph import Event, Graph, Node
-from flow.ledger import Absent, Ledger, failure
+from flow.runtime.findings import WARNING, Finding, finding, plain
+from flow.runtime.frame_assembler import Feeder
+from flow.runtime.graph import Event, Graph, Node
+from flow.runtime.ledger import Absent, Ledger, failure
 
 EXCERPTS = 9
 

@@ -7,7 +7,7 @@ import pytest
 
 from flow.config.loader import load
 from flow.errors import PipelineError
-from flow.run import Stop, run
+from flow.runtime.run import Stop, run
 from stages.stage import Finding
 from tests.flow.toys import Couple, Keep, Log, Number
 
@@ -16,7 +16,7 @@ source: {use: tests.flow.toys.Source}
 streams:
   pair:     {use: flow.align.pair, left: left, right: right, slop: 1 ns}
   scaled:   {use: tests.flow.toys.Scale, couple: pair, factor: 2 m, bad: [%s]}
-  centred:  {use: tests.flow.test_survey.Centre, couple: scaled}
+  centred:  {use: tests.flow.runtime.test_prepass.Centre, couple: scaled}
   doubled:  {use: tests.flow.toys.Add, a: centred, b: pair}
 sinks:
   - {use: tests.flow.toys.Keep}

@@ -19,8 +19,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from flow.graph import Node, Sink
-from flow.ledger import Absent, Entry, Ledger, Reason, failure
+from flow.runtime.graph import Node, Sink
+from flow.runtime.ledger import Absent, Entry, Ledger, Reason, failure
 
 
 @dataclass(frozen=True)

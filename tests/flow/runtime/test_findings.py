@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from flow.findings import plain
 from flow.report import headline, report
-from flow.run import run
+from flow.runtime.findings import plain
+from flow.runtime.run import run
 from stages.stage import Finding
 from tests.flow.toys import Log, graph, replayed, traverse
 

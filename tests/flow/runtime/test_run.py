@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flow.errors import SinkError, UsageError
-from flow.feeder import Feeder
-from flow.ledger import Ledger
-from flow.run import Stop, interrupts, run
+from flow.runtime.frame_assembler import Feeder
+from flow.runtime.ledger import Ledger
+from flow.runtime.run import Stop, interrupts, run
 from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, Text, graph, replayed, replayed_log, traverse
 
 

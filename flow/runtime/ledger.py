@@ -37,6 +37,9 @@ class Verdict(StrEnum):
     INCOMPLETE = "INCOMPLETE"
 
 
+FLOW = Path(__file__).resolve().parent.parent
+
+
 @dataclass(frozen=True)
 class Entry:
     """One loss. stamp: ns of the log's clock; stage: the node that noticed; detail: one sentence."""
@@ -75,7 +78,7 @@ def _calls(error: BaseException) -> list[TracebackType]:
     """The way from the stage that was called to where an exception came up; empty where none had been called."""
     calls, call = list[TracebackType](), error.__traceback__
     while call is not None:
-        if _file(call).parent != Path(__file__).parent and not _file(call).name.startswith("<"):
+        if FLOW not in _file(call).parents and not _file(call).name.startswith("<"):
             calls.append(call)
         call = call.tb_next
     return calls

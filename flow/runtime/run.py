@@ -14,13 +14,13 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from flow.engine import Engine
 from flow.errors import PipelineError, SinkError, UsageError
-from flow.feeder import Feeder
-from flow.findings import NOTE, WARNING, Finding, finding, findings
-from flow.graph import Event, Graph, Log, Sink
-from flow.ledger import Ledger, Verdict, failure
-from flow.survey import surveyed
+from flow.runtime.engine import Engine
+from flow.runtime.findings import NOTE, WARNING, Finding, finding, findings
+from flow.runtime.frame_assembler import Feeder
+from flow.runtime.graph import Event, Graph, Log, Sink
+from flow.runtime.ledger import Ledger, Verdict, failure
+from flow.runtime.prepass import surveyed
 
 
 class Stop:
