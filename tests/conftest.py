@@ -10,7 +10,7 @@ from hypothesis import settings
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from flow.cli import main
+from flow.cli.main import main
 
 settings.register_profile("untimed", deadline=None)  # the first example may compile a kernel
 settings.load_profile("untimed")

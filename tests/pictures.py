@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import tifffile
 
-from flow.cli import main as roverflow
+from flow.cli.main import main as roverflow
 from recordings import paint
 from recordings.simulator import Simulation
 from stages.data import Array, Cell, ElevationMap, Reason

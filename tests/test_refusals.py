@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import rerun
 
-from flow.arguments import check_demo
+from flow.cli.arguments import check_demo
 from flow.errors import UsageError
 from recordings import McapSource, RerunSink
 from recordings.earlier_output import is_ours
@@ -346,7 +346,7 @@ def test_a_place_that_cannot_be_written_is_the_same_fault_of_every_command(trave
 
 def test_a_full_output_is_said_in_a_sentence():
     """A disk that is full where the drawing of a graph is sent to."""
-    code = "import sys; from flow.cli import main; sys.exit(main(['graph']))"
+    code = "import sys; from flow.cli.main import main; sys.exit(main(['graph']))"
     with Path("/dev/full").open("w") as full:
         done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     assert done.returncode == 1

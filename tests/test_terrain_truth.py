@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flow.cli import main
+from flow.cli.main import main
 from recordings.simulator.simulation import Simulation
 from stages.data import Source
 from tests.bench.terrain import RUNS, SLOPE, TILT_NOISE, Run, frames, nodes, score, through, tilt_errors

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flow.cli import main
+from flow.cli.main import main
 from recordings.mcap_reader import iter_decoded
 from recordings.ros2 import stamp_of
 from recordings.simulator import Simulation, write_log

@@ -81,7 +81,7 @@ def region(simulation: Simulation, folder: Path) -> Region:
     """The regional map of a traverse, by the command line's default pipeline."""
     log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
     write_log(simulation, log)
-    command = [sys.executable, "-m", "flow.cli", "run", log, "-o", out, "--no-rrd", "--summary", summary]
+    command = [sys.executable, "-m", "flow.cli.main", "run", log, "-o", out, "--no-rrd", "--summary", summary]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     frames = _frames(out)
     errors = _errors(simulation, [frame["/nav/regional_map"] for frame in frames.values()])

@@ -24,8 +24,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flow import arguments
 from flow.align import Token
+from flow.cli.main import arguments
 from flow.config.loader import load
 from flow.runtime.malloc import keep_freed_memory
 from recordings.score_table import ROWS, terrain_figures, terrain_lines

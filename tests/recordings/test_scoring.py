@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
-from flow.cli import main
+from flow.cli.main import main
 from recordings import ros2, scoring
 from recordings.errors import LogError
 from recordings.ros2_writer import Ros2Writer

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from flow.report import headline, report
+from flow.cli.report import headline, report
 from flow.runtime.findings import plain
 from flow.runtime.run import run
 from stages.stage import Finding

@@ -21,10 +21,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flow.arguments import check_demo, check_outputs, count, seconds, size, workers
+from flow.cli.arguments import check_demo, check_outputs, count, seconds, size, workers
+from flow.cli.program import INTERRUPTED
+from flow.cli.report import counted, headline, report, say
 from flow.errors import RoverflowError, SinkError, UsageError
-from flow.program import INTERRUPTED
-from flow.report import counted, headline, report, say
 from flow.runtime.graph import Graph
 from flow.runtime.replay import as_json, product_version, replay
 from recordings.earlier_output import is_ours
@@ -440,6 +440,6 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    from flow.program import program
+    from flow.cli.program import program
 
     sys.exit(program())

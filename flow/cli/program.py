@@ -8,7 +8,7 @@ INTERRUPTED = 130
 
 
 def program() -> int:
-    """`flow.cli.main` for a process of its own: while it begins and when it is through, too, an interrupt is no
+    """`flow.cli.main.main` for a process of its own: while it begins and when it is through, too, an interrupt is no
     traceback, and the exit code is that of `main`."""
     import os
     import signal
@@ -21,7 +21,7 @@ def program() -> int:
         from flow.runtime.malloc import keep_freed_memory
 
         keep_freed_memory()
-        from flow.cli import main
+        from flow.cli.main import main
 
         code = main()
     except KeyboardInterrupt:
