@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Disparity, StereoFrame
 from stages.intensity import eight_bit, gray
 from stages.kernels.bilateral import joint_bilateral
@@ -23,7 +24,6 @@ from stages.kernels.extent import Extent, extent, within_reach
 from stages.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.kernels.planar import near_median, pull_to_planes, trusted_matches
 from stages.kernels.planes import Planes, fit_planes
-from stages.kernels.sharing import by_bands, shared_by
 from stages.kernels.slic import superpixels
 from stages.kernels.smoother import smooth
 from stages.kernels.sources import Trust, name_sources

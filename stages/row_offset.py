@@ -17,8 +17,8 @@ from itertools import repeat
 import cv2
 import numpy as np
 
+from stages.compiled.hamming import clear_partners
 from stages.data import Array
-from stages.kernels.hamming import clear_partners
 from stages.robust import NORMAL, tukey_weights
 
 FEATURES = 4000  # per image

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from stages.compiled.hamming import clear_partners
 from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
-from stages.kernels.hamming import clear_partners
 from stages.robust import tukey_weights
 
 DETECTION_WIDTH = 640  # px; features are looked for in an image of at most about this width

@@ -19,11 +19,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.data import Array
-from stages.kernels.census import census_costs
-from stages.kernels.compiled import part
-from stages.kernels.rule import Rule
-from stages.kernels.vectors import (
+from stages.compiled.jit import part
+from stages.compiled.simd import (
     above_smallest,
     byte,
     lanes_in,
@@ -35,6 +32,9 @@ from stages.kernels.vectors import (
     spread,
     store,
 )  # fmt: skip
+from stages.data import Array
+from stages.kernels.census import census_costs
+from stages.kernels.rule import Rule
 
 BLOCK = 64
 FAR = 255  # beyond either end of the search range

@@ -14,16 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.data import Array
-from stages.kernels.aggregation import FAR, aggregate_reference, next_path
-from stages.kernels.census import PLANES, census_costs
-from stages.kernels.compiled import kernel, part
-from stages.kernels.gradient import LARGEST, raw_costs
-from stages.kernels.pair import Pair
-from stages.kernels.rule import Rule
-from stages.kernels.selection import find_winner, fit_row, select_reference
-from stages.kernels.sharing import AtOnce, by_bands, shared_by
-from stages.kernels.vectors import (
+from stages.compiled.jit import kernel, part
+from stages.compiled.parallel import AtOnce, by_bands, shared_by
+from stages.compiled.simd import (
     Width,
     average,
     byte,
@@ -37,7 +30,14 @@ from stages.kernels.vectors import (
     store,
     where_less,
 )  # fmt: skip
-from stages.kernels.workspace import Workspace
+from stages.compiled.workspace import Workspace
+from stages.data import Array
+from stages.kernels.aggregation import FAR, aggregate_reference, next_path
+from stages.kernels.census import PLANES, census_costs
+from stages.kernels.gradient import LARGEST, raw_costs
+from stages.kernels.pair import Pair
+from stages.kernels.rule import Rule
+from stages.kernels.selection import find_winner, fit_row, select_reference
 
 STEP = 4  # windows begin at multiples of it, so that those of neighbours mostly begin together
 EDGE = 1  # lanes at either end of a window that cannot win

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import fast_kernel, kernel
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
-from stages.kernels.compiled import fast_kernel, kernel
-from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 FAR = F32(1e15)  # in scales of the difference in disparity; its square is still far from the largest float32

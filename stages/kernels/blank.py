@@ -7,9 +7,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import with_margin
 from stages.data import Array
-from stages.kernels.compiled import kernel
-from stages.kernels.sharing import with_margin
 
 WINDOW = 5  # px, of the census
 

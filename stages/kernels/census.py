@@ -11,9 +11,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.data import Array
-from stages.kernels.compiled import kernel, part
-from stages.kernels.vectors import (
+from stages.compiled.jit import kernel, part
+from stages.compiled.simd import (
     Width,
     both,
     byte,
@@ -28,6 +27,7 @@ from stages.kernels.vectors import (
     store,
     where_less,
 )  # fmt: skip
+from stages.data import Array
 
 BITS = 24
 PLANES = BITS // 8

@@ -10,9 +10,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from stages.compiled.jit import kernel, part
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
-from stages.kernels.compiled import kernel, part
-from stages.kernels.sharing import by_bands, shared_by
 
 RADIUS = 7  # px, of the square over which is correlated
 # Change along a row, of the image smoothed a little, which takes more from noise than from texture.

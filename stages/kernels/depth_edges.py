@@ -13,9 +13,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from stages.compiled.jit import fast_part, kernel, part
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
-from stages.kernels.compiled import fast_part, kernel, part
-from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 FINE = 16  # parts of a pixel, to which a median is found

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import by_bands, shared_by, with_margin
 from stages.data import Array
-from stages.kernels.compiled import kernel
-from stages.kernels.sharing import by_bands, shared_by, with_margin
 
 SIDE = 15  # px, of the square about a pixel that tells evidence from a speck
 SHARE = 0.5  # of what such a square knows in the mean; what stands in one that knows less is a speck

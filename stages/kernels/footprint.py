@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.kernels.compiled import kernel
 
 # Least determinant / trace of the cells' spread, which is close to its smaller eigenvalue: 1/3 of 3x3 cells, at most
 # 1/4 of a band two cells wide, which has no slope across. No ratio of small integers equals it, so that rounding does

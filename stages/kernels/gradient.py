@@ -12,10 +12,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.data import Array
-from stages.kernels.census import census_costs_reference, differing_bits, seen_costs
-from stages.kernels.compiled import kernel, part
-from stages.kernels.vectors import (
+from stages.compiled.jit import kernel, part
+from stages.compiled.simd import (
     Width,
     average,
     byte,
@@ -29,6 +27,8 @@ from stages.kernels.vectors import (
     spread,
     store,
 )  # fmt: skip
+from stages.data import Array
+from stages.kernels.census import census_costs_reference, differing_bits, seen_costs
 
 DX, DY = 3, 4  # after the planes of census
 PLANES = 5

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.kernels.compiled import kernel
 
 FIGURES = ("count", "sum", "sum_of_squares", "minimum", "maximum", "noise")
 

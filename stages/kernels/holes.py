@@ -11,10 +11,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
-from stages.kernels.compiled import kernel
 from stages.kernels.extent import Extent
-from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 APART = 2.0  # px of disparity that make two surfaces

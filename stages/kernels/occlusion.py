@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.kernels.compiled import kernel
 
 
 def lowest_sight(

@@ -12,8 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.kernels.compiled import kernel
 
 CLEAR = 1.1  # ratio of depths from which one is the nearer
 ROUNDS = 3  # what is out of order may hide that something else is

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.kernels.compiled import kernel
 
 # Four rings of eight neighbours: rings of 1 to 4 px, so that a cloud of every 2nd, 3rd or 4th pixel has some as well.
 _RINGS = 4

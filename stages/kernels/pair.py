@@ -7,13 +7,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from stages.compiled.parallel import AtOnce, in_turn
+from stages.compiled.simd import Width
 from stages.data import Array
 from stages.kernels.aggregation import brightness_steps
 from stages.kernels.census import census
 from stages.kernels.gradient import gradients
 from stages.kernels.rule import Rule
-from stages.kernels.sharing import AtOnce, in_turn
-from stages.kernels.vectors import Width
 
 NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)
 

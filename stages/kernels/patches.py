@@ -11,9 +11,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from stages.compiled.jit import kernel
+from stages.compiled.union_find import join, root
 from stages.data import Array
-from stages.kernels.compiled import kernel
-from stages.kernels.union import join, root
 
 # Pixels looked ahead for the next point: a cloud may hold every 4th only.
 _GAP = 4

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stages.compiled.jit import fast_part, kernel
+from stages.compiled.parallel import AtOnce, by_bands, in_turn, shared_by
 from stages.data import Array
-from stages.kernels.compiled import fast_part, kernel
-from stages.kernels.sharing import AtOnce, by_bands, in_turn, shared_by
 
 F32 = np.float32
 U64 = np.uint64

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
-from stages.kernels.compiled import kernel
-from stages.kernels.sharing import by_bands, shared_by
 
 PHASES = 4
 MARGIN = 16

@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import by_bands, shared_by
+from stages.compiled.simd import Width
 from stages.data import Array
-from stages.kernels.compiled import kernel
-from stages.kernels.sharing import by_bands, shared_by
-from stages.kernels.vectors import Width
 
 MARGIN = 8  # px to either side of what the prior has in a band
 OUTLIERS = 0.001  # share of a band's prior, at either end, that does not count: it is less than a speck

@@ -10,8 +10,8 @@ from functools import reduce
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.kernels.compiled import kernel
 
 
 def lowest_around(heights: Array, use: Array, trend: Array, radius: int) -> tuple[Array, Array]:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.kernels.compiled import kernel
 
 
 def transform_points(points: Array, rotation: Array, translation: Array) -> Array:

@@ -6,9 +6,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
-from stages.kernels.compiled import kernel
-from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 LARGEST_STEP = 1.0  # px of the small image, within a surface

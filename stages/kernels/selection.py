@@ -12,10 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.data import Array
-from stages.kernels.compiled import part
-from stages.kernels.rule import Rule
-from stages.kernels.vectors import (
+from stages.compiled.jit import part
+from stages.compiled.simd import (
     byte,
     count_up,
     either,
@@ -30,6 +28,8 @@ from stages.kernels.vectors import (
     store,
     where_less,
 )  # fmt: skip
+from stages.data import Array
+from stages.kernels.rule import Rule
 
 
 @part

@@ -21,20 +21,20 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import AtOnce, by_bands, shared_by
+from stages.compiled.simd import Width
+from stages.compiled.workspace import Workspace, Workspaces
 from stages.data import Array
 from stages.kernels.aggregation import aggregate_row
 from stages.kernels.around import Windows, search_around
 from stages.kernels.blank import blank_windows, drop_blank
-from stages.kernels.compiled import kernel
 from stages.kernels.gradient import smoothed_costs
 from stages.kernels.pair import Pair, describe
 from stages.kernels.ranges import Range, lanes_for, move_paths, within
 from stages.kernels.rule import Rule
 from stages.kernels.selection import find_partners, find_winners, fit_row
-from stages.kernels.sharing import AtOnce, by_bands, shared_by
 from stages.kernels.speckles import drop_speckles
-from stages.kernels.vectors import Width
-from stages.kernels.workspace import Workspace, Workspaces
 
 _workspaces = Workspaces()
 

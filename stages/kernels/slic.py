@@ -13,12 +13,12 @@ import math
 import cv2
 import numpy as np
 
+from stages.compiled.jit import fast_kernel, fast_part, kernel
+from stages.compiled.parallel import AtOnce, by_bands, in_turn, shared_by
+from stages.compiled.union_find import join, root
+from stages.compiled.workspace import Workspaces
 from stages.data import Array
-from stages.kernels.compiled import fast_kernel, fast_part, kernel
 from stages.kernels.scaling import halved
-from stages.kernels.sharing import AtOnce, by_bands, in_turn, shared_by
-from stages.kernels.union import join, root
-from stages.kernels.workspace import Workspaces
 
 F32 = np.float32
 _workspaces = Workspaces()

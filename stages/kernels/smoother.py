@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from stages.compiled.jit import fast_kernel, kernel
 from stages.data import Array
-from stages.kernels.compiled import fast_kernel, kernel
 
 F32 = np.float32
 BLOCK = 320  # columns solved together: their working set stays in the second-level cache

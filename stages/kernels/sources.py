@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Source
-from stages.kernels.compiled import kernel
 from stages.kernels.holes import KEPT, MISMATCH
-from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 OWN = 0.5, 0.75, 1.0

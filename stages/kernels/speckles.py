@@ -13,11 +13,11 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import AtOnce, by_bands, in_turn
+from stages.compiled.union_find import join, root
+from stages.compiled.workspace import Workspace
 from stages.data import Array
-from stages.kernels.compiled import kernel
-from stages.kernels.sharing import AtOnce, by_bands, in_turn
-from stages.kernels.union import join, root
-from stages.kernels.workspace import Workspace
 
 
 def drop_speckles(

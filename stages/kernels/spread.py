@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array, Transform
-from stages.kernels.compiled import kernel
 
 PLACES = np.array([-1.0, -0.5, 0.5, 1.0])  # of the reach
 

@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel, part
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
-from stages.kernels.compiled import kernel, part
-from stages.kernels.sharing import by_bands, shared_by
 
 F32 = np.float32
 ALIKE = F32(1.5)  # px, by which disparities in a window differ at most

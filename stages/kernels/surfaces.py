@@ -11,9 +11,9 @@ import math
 import cv2
 import numpy as np
 
+from stages.compiled.jit import kernel
+from stages.compiled.parallel import shared_by
 from stages.data import Array
-from stages.kernels.compiled import kernel
-from stages.kernels.sharing import shared_by
 
 ITERATIONS = 3
 AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])

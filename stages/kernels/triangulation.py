@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array, Source, StereoCamera
-from stages.kernels.compiled import kernel
 
 _FILLED = int(Source.FILLED)
 _PLANE = int(Source.PLANE)

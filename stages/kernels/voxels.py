@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.kernels.compiled import kernel
 
 
 def voxel_means(points: Array, colors: Array, edge: float) -> tuple[Array, Array, Array]:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numba import njit
 
+from stages.compiled.simd import Width
 from stages.kernels.aggregation import aggregate_reference, aggregate_row, brightness_steps
 from stages.kernels.census import census_costs_reference, census_reference
 from stages.kernels.pair import NO_PRIOR, Pair, describe
 from stages.kernels.prior import prior_costs, prior_costs_reference
-from stages.kernels.vectors import Width
 from tests.stages.test_census import rule_of
 from tests.stages.test_match_opencv import textured
 

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stages.compiled.parallel import shared_by
+from stages.compiled.simd import Width
+from stages.compiled.workspace import Workspace
 from stages.kernels.around import EDGE, Windows, search_around, search_around_reference, windows
 from stages.kernels.pair import describe
 from stages.kernels.prior import prior_costs
-from stages.kernels.sharing import shared_by
-from stages.kernels.vectors import Width
-from stages.kernels.workspace import Workspace
 from tests.stages.test_census import rule_of
 from tests.stages.test_match_opencv import textured
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from numba import njit
 
+from stages.compiled.simd import Width, lanes_in, store
 from stages.kernels.census import census, census_costs, census_costs_reference, census_reference
 from stages.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
 from stages.kernels.pair import describe
 from stages.kernels.ranges import lanes_for
 from stages.kernels.rule import Rule
-from stages.kernels.vectors import Width, lanes_in, store
 from tests.stages.test_match_opencv import textured
 
 

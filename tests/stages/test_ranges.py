@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stages.compiled.simd import Width
 from stages.data import Disparity, Source
 from stages.kernels.aggregation import aggregate_reference
 from stages.kernels.blank import blank_windows, drop_blank
@@ -17,7 +18,6 @@ from stages.kernels.prior import prior_costs, prior_costs_reference
 from stages.kernels.ranges import LEAST_KNOWN, MARGIN, NARROW, Range, lanes_for, move_paths, ranges_of, within
 from stages.kernels.selection import select_reference
 from stages.kernels.semiglobal import match
-from stages.kernels.vectors import Width
 from stages.match import Match
 from tests.stages.test_around import views
 from tests.stages.test_census import rule_of

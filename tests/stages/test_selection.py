@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
+from stages.compiled.parallel import shared_by
+from stages.compiled.simd import Width
+from stages.compiled.workspace import Workspace
 from stages.kernels.ranges import lanes_for
 from stages.kernels.selection import find_partners, find_winners, fit_row, select_reference
-from stages.kernels.sharing import shared_by
 from stages.kernels.speckles import drop_speckles, drop_speckles_reference
-from stages.kernels.vectors import Width
-from stages.kernels.workspace import Workspace
 from tests.stages.test_census import rule_of
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from skimage import data, segmentation
 
+from stages.compiled.parallel import in_turn
 from stages.kernels import slic
-from stages.kernels.sharing import in_turn
 
 
 @pytest.fixture(scope="module")

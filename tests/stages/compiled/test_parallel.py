@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from stages.kernels.sharing import BANDS, at_once, by_bands, in_turn, shared_by, with_margin
+from stages.compiled.parallel import BANDS, at_once, by_bands, in_turn, shared_by, with_margin
 
 
 def test_both_results_come_back_and_from_two_threads_if_there_are_two():

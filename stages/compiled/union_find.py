@@ -6,7 +6,7 @@ and van Leeuwen, 1984), which keeps them short without ranks.
 
 from __future__ import annotations
 
-from stages.kernels.compiled import part
+from stages.compiled.jit import part
 
 
 @part

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stages.compiled.hamming import MOST, clear_partners, nearest_two, nearest_two_reference
 from stages.data import Array
-from stages.kernels.hamming import MOST, clear_partners, nearest_two, nearest_two_reference
 
 
 def descriptors(count: int, seed: int, flips: int = 128) -> Array:

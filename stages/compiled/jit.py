@@ -20,17 +20,23 @@ from numba import njit
 from numba.core import event
 from numba.core.caching import CacheImpl, _CacheLocator
 
-FOLDER = Path(__file__).resolve().parent
+FOLDER = Path(__file__).resolve().parent.parent  # stages/
 log = logging.getLogger(__name__)
 log.setLevel(logging.INFO)  # one line in the life of an installation: shown even where only errors are
+
+
+def _sources() -> list[Path]:
+    """The kernels of all steps, what they share, and the data types, whose codes are compiled in."""
+    rooms = {"kernels", "compiled", "data"}
+    return sorted(file for file in FOLDER.rglob("*.py") if file.parent.name in rooms or file.name == "data.py")
 
 
 @functools.cache
 def digest() -> str:
     """Hexadecimal digest of all that the compiled kernels depend on."""
     total = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
-    for file in sorted([*FOLDER.glob("*.py"), FOLDER.parent / "data.py"]):  # the codes of `Source` are compiled in
-        total.update(b"%s %d " % (file.name.encode(), file.stat().st_size) + file.read_bytes())
+    for file in sorted(_sources()):  # the codes of `Source` are compiled in
+        total.update(b"%s %d " % (str(file.relative_to(FOLDER)).encode(), file.stat().st_size) + file.read_bytes())
     return total.hexdigest()
 
 
@@ -41,7 +47,7 @@ class _KernelCacheLocator(_CacheLocator):
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
-        if Path(py_file).resolve().parent != FOLDER:
+        if FOLDER not in Path(py_file).resolve().parents:
             return None
         candidates = (locator.from_function(py_func, py_file) for locator in cls.usual)
         locator = next((candidate for candidate in candidates if candidate is not None), None)
@@ -57,7 +63,7 @@ class _Announcement(event.Listener):
         self.made = False
 
     def on_start(self, event: Any) -> None:
-        if not self.made and str(event.data["dispatcher"].py_func.__module__).startswith(__package__):
+        if not self.made and str(event.data["dispatcher"].py_func.__module__).startswith("stages."):
             self.made = True
             log.warning("compiling kernels for this machine and these settings, once; it takes some seconds")
 

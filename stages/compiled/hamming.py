@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.data import Array
-from stages.kernels.compiled import kernel
-from stages.kernels.vectors import (
+from stages.compiled.jit import kernel
+from stages.compiled.simd import (
     Width,
     byte,
     either,
@@ -27,6 +26,7 @@ from stages.kernels.vectors import (
     store,
     where_less,
 )  # fmt: skip
+from stages.data import Array
 
 BYTES = 32  # of a descriptor
 BLOCK = 64  # descriptors compared at a time
