@@ -12,8 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from stages.covariance import cross_matrix, levered
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
+from stages.data.covariance import cross_matrix, levered
 from stages.stage import Finding, Stage, check_joined, parameter
 from stages.tracking import Step, View, step_between, view
 

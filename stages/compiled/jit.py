@@ -28,7 +28,7 @@ log.setLevel(logging.INFO)  # one line in the life of an installation: shown eve
 def _sources() -> list[Path]:
     """The kernels of all steps, what they share, and the data types, whose codes are compiled in."""
     rooms = {"kernels", "compiled", "data"}
-    return sorted(file for file in FOLDER.rglob("*.py") if file.parent.name in rooms or file.name == "data.py")
+    return sorted(file for file in FOLDER.rglob("*.py") if file.parent.name in rooms)
 
 
 @functools.cache

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from stages.covariance import levered
-from stages.publish import Array, check_rotation, publish_stamp, publish_vector
+from stages.data.arrays import Array, check_rotation, publish_stamp, publish_vector
+from stages.data.covariance import levered
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.publish import Array
+from stages.data.arrays import Array
 
 
 def levered(covariance: Array, way: Array) -> Array:

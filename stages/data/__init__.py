@@ -4,7 +4,7 @@ Conventions, everywhere: `stamp` is int nanoseconds of the log's clock; lengths 
 read-only once published; unknown is NaN (or -1 where the type says so), never a number that could be a value.
 
 Camera frame: left optical frame, x right, y down, z forward. Level frame: z up against gravity, x the rover's
-horizontal heading, y left. What says where things are and how they move stands in `stages.motion`.
+horizontal heading, y left. What says where things are and how they move stands in `stages.data.motion`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from typing import cast
 
 import numpy as np
 
-from stages.motion import CameraMotion as CameraMotion
-from stages.motion import Mount as Mount
-from stages.motion import Pose as Pose
-from stages.motion import Tilt as Tilt
-from stages.motion import TiltHealth as TiltHealth
-from stages.motion import Transform as Transform
-from stages.publish import Array as Array
-from stages.publish import check_resolution, publish, publish_image, publish_stamp, publish_vector, read_only
+from stages.data.arrays import Array as Array
+from stages.data.arrays import check_resolution, publish, publish_image, publish_stamp, publish_vector, read_only
+from stages.data.motion import CameraMotion as CameraMotion
+from stages.data.motion import Mount as Mount
+from stages.data.motion import Pose as Pose
+from stages.data.motion import Tilt as Tilt
+from stages.data.motion import TiltHealth as TiltHealth
+from stages.data.motion import Transform as Transform
 from stages.tiles import Tiles as Tiles
 
 LEVEL_FRAME = "level"
