@@ -32,7 +32,7 @@ from stages.match import Match
 from stages.match_check import CheckMatches
 from stages.match_opencv import MatchOpenCV
 from stages.odometry import VisualOdometry
-from stages.rectify import Rectify
+from stages.rectification.rectify import Rectify
 from stages.refine import Refine
 from stages.reproject import Reproject
 from stages.scale import Enlarge, Halve, Swap

@@ -2,7 +2,7 @@
 
 Each camera's undistortion and rectifying rotation are folded into one table of source positions (Bouguet's method, as
 in image_pipeline), computed once per camera and then only looked up. What the calibration leaves of a row offset is
-measured (stages.row_offset) and folded into the right camera's table.
+measured (stages.rectification.row_offset) and folded into the right camera's table.
 
 A right camera whose principal point lies farther right than the left one's has disparities below 0 for all that is far
 off, which no matcher searches by itself: then its image is moved to the left by whole columns.
@@ -23,7 +23,7 @@ import numpy as np
 
 from stages.data import Array, CameraModel, StereoCamera, StereoFrame
 from stages.intensity import eight_bit, gray
-from stages.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
+from stages.rectification.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
 from stages.stage import Finding, Severity, Stage, counted, parameter
 
 LARGEST_OFFSET = 64.0  # px

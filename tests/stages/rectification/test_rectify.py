@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from stages.data import CameraModel, StereoCamera, StereoFrame
-from stages.rectify import Rectify, _rectifying_maps
-from stages.row_offset import measure, offset_field
+from stages.rectification.rectify import Rectify, _rectifying_maps
+from stages.rectification.row_offset import measure, offset_field
 
 SIZE = WIDTH, HEIGHT = 320, 240
 K = np.array([[260.0, 0, 158], [0, 262.0, 121], [0, 0, 1]])
