@@ -3,7 +3,6 @@
 from stages.assess import Assess
 from stages.binarise import Binarise
 from stages.clean import Clean
-from stages.crosscheck import CrossCheck
 from stages.data import (
     CameraImage,
     CameraModel,
@@ -28,14 +27,15 @@ from stages.data import (
 from stages.fuse import Fuse
 from stages.level import Level
 from stages.locate import Locate
-from stages.match import Match
-from stages.match_check import CheckMatches
-from stages.match_opencv import MatchOpenCV
+from stages.matching.lr_check import CrossCheck
+from stages.matching.match import Match
+from stages.matching.match_health import CheckMatches
+from stages.matching.match_opencv import MatchOpenCV
+from stages.matching.pyramid import Enlarge, Halve, Swap
 from stages.odometry import VisualOdometry
 from stages.rectification.rectify import Rectify
 from stages.refine import Refine
 from stages.reproject import Reproject
-from stages.scale import Enlarge, Halve, Swap
 from stages.tilt_check import CheckTilt
 from stages.voxelise import Voxelise
 from stages.voxels import Voxels

@@ -15,9 +15,7 @@ import numpy as np
 
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Disparity, StereoFrame
-from stages.intensity import eight_bit, gray
 from stages.kernels.bilateral import joint_bilateral
-from stages.kernels.blank import contrast
 from stages.kernels.correlation import correlation
 from stages.kernels.depth_edges import sharpen_edges
 from stages.kernels.extent import Extent, extent, within_reach
@@ -29,6 +27,8 @@ from stages.kernels.smoother import smooth
 from stages.kernels.sources import Trust, name_sources
 from stages.kernels.subpixel import fit_brightness
 from stages.kernels.surfaces import surfaces
+from stages.matching.intensity import eight_bit, gray
+from stages.matching.kernels.blank_windows import contrast
 from stages.stage import Stage, check_joined, check_same_time, parameter
 
 F32 = np.float32

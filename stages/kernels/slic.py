@@ -18,7 +18,7 @@ from stages.compiled.parallel import AtOnce, by_bands, in_turn, shared_by
 from stages.compiled.union_find import join, root
 from stages.compiled.workspace import Workspaces
 from stages.data import Array
-from stages.kernels.scaling import halved
+from stages.matching.kernels.resample import halved
 
 F32 = np.float32
 _workspaces = Workspaces()

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from stages.data import Array, CameraModel, StereoCamera, StereoFrame
-from stages.intensity import eight_bit, gray
+from stages.matching.intensity import eight_bit, gray
 from stages.rectification.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
 from stages.stage import Finding, Severity, Stage, counted, parameter
 

@@ -18,8 +18,8 @@ from flow.config.loader import load
 from recordings.middlebury import read_scene
 from recordings.stereo_measures import StereoErrors
 from stages.data import Array, Disparity, StereoFrame
-from stages.match import Match
-from stages.match_opencv import MatchOpenCV
+from stages.matching.match import Match
+from stages.matching.match_opencv import MatchOpenCV
 from stages.refine import Refine
 
 

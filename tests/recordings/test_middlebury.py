@@ -231,7 +231,7 @@ def test_what_holds_no_scene_and_what_cannot_hold_the_logs_is_refused(tmp_path: 
 
 
 def test_real_scenes_score_from_their_logs_as_from_their_files(tmp_path: Path) -> None:
-    from stages.match import Match
+    from stages.matching.match import Match
     from tests.bench.stereo_scores import errors, load_scene
 
     for folder in sorted(data_folder("middlebury-q").iterdir()):

@@ -8,7 +8,7 @@ import pytest
 
 from recordings.simulator import Simulation
 from stages.data import Source, StereoFrame
-from stages.match import Match
+from stages.matching.match import Match
 from tests.bench.refining import RELEASED, stereo_part
 from tests.bench.stereo_scores import errors, rows_filled
 from tests.study import real, simulated

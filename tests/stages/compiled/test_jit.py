@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 SCRIPT = """
 import numpy as np
-from stages.kernels.census import census
+from stages.matching.kernels.census import census
 planes = np.zeros((3, 3, 64), np.uint8)
 census(np.arange(120, dtype=np.uint8).reshape(3, 40) // 2, planes)
 print(planes[:, :, :40].sum())

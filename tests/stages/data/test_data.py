@@ -23,7 +23,7 @@ from stages.data import (
     Transform,
     VoxelMap,
 )
-from stages.match import Match
+from stages.matching.match import Match
 from stages.stage import Stage, parameter
 from tests.stages.terrain_scene import CAMERA, blank_frame
 

@@ -5,12 +5,12 @@ import pytest
 from numba import njit
 
 from stages.compiled.simd import Width, lanes_in, store
-from stages.kernels.census import census, census_costs, census_costs_reference, census_reference
-from stages.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
-from stages.kernels.pair import describe
-from stages.kernels.ranges import lanes_for
-from stages.kernels.rule import Rule
-from tests.stages.test_match_opencv import textured
+from stages.matching.kernels.census import census, census_costs, census_costs_reference, census_reference
+from stages.matching.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
+from stages.matching.kernels.matching_inputs import describe
+from stages.matching.kernels.row_ranges import lanes_for
+from stages.matching.kernels.sgm_params import Rule
+from tests.stages.matching.test_match_opencv import textured
 
 
 @njit

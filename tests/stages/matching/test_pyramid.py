@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages import CrossCheck, Disparity, Enlarge, Halve, Match, Source, StereoCamera, StereoFrame, Swap
-from stages.kernels.contradiction import drop_contradicted, drop_contradicted_reference
-from stages.kernels.scaling import doubled, doubled_reference, halved
+from stages.matching.kernels.lr_check import drop_contradicted, drop_contradicted_reference
+from stages.matching.kernels.resample import doubled, doubled_reference, halved
 
 
 def slope_frame(height=97, width=131):

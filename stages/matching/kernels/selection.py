@@ -29,7 +29,7 @@ from stages.compiled.simd import (
     where_less,
 )  # fmt: skip
 from stages.data import Array
-from stages.kernels.rule import Rule
+from stages.matching.kernels.sgm_params import Rule
 
 
 @part

@@ -33,8 +33,8 @@ from stages.compiled.simd import (
     store,
 )  # fmt: skip
 from stages.data import Array
-from stages.kernels.census import census_costs
-from stages.kernels.rule import Rule
+from stages.matching.kernels.census import census_costs
+from stages.matching.kernels.sgm_params import Rule
 
 BLOCK = 64
 FAR = 255  # beyond either end of the search range

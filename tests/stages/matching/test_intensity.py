@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.intensity import eight_bit, gray
+from stages.matching.intensity import eight_bit, gray
 
 
 def test_eight_bit_images_pass_untouched() -> None:

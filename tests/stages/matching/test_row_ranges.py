@@ -9,20 +9,29 @@ from hypothesis import strategies as st
 
 from stages.compiled.simd import Width
 from stages.data import Disparity, Source
-from stages.kernels.aggregation import aggregate_reference
-from stages.kernels.blank import blank_windows, drop_blank
-from stages.kernels.census import census_costs_reference
-from stages.kernels.gradient import smoothed_costs_reference
-from stages.kernels.pair import describe
-from stages.kernels.prior import prior_costs, prior_costs_reference
-from stages.kernels.ranges import LEAST_KNOWN, MARGIN, NARROW, Range, lanes_for, move_paths, ranges_of, within
-from stages.kernels.selection import select_reference
-from stages.kernels.semiglobal import match
-from stages.match import Match
-from tests.stages.test_around import views
-from tests.stages.test_census import rule_of
-from tests.stages.test_match import same
-from tests.stages.test_match_opencv import slanted_pair
+from stages.matching.kernels.aggregation import aggregate_reference
+from stages.matching.kernels.blank_windows import blank_windows, drop_blank
+from stages.matching.kernels.census import census_costs_reference
+from stages.matching.kernels.gradient import smoothed_costs_reference
+from stages.matching.kernels.matching_inputs import describe
+from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
+from stages.matching.kernels.row_ranges import (
+    LEAST_KNOWN,
+    MARGIN,
+    NARROW,
+    Range,
+    lanes_for,
+    move_paths,
+    ranges_of,
+    within,
+)
+from stages.matching.kernels.selection import select_reference
+from stages.matching.kernels.semiglobal import match
+from stages.matching.match import Match
+from tests.stages.matching.test_census import rule_of
+from tests.stages.matching.test_match import same
+from tests.stages.matching.test_match_opencv import slanted_pair
+from tests.stages.matching.test_sgm_local import views
 
 
 @settings(max_examples=60, deadline=None)

@@ -8,7 +8,7 @@ The sums of a large image would not fit the memory. Then the first visit to a ha
 head of each stripe of rows, and before the second sweep enters a stripe, its sums are made again from there: exact too,
 at 1.4 times the time.
 
-Rows may be searched for a part of the range only, each band of them for its own (stages.kernels.ranges).
+Rows may be searched for a part of the range only, each band of them for its own (stages.matching.kernels.row_ranges).
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from stages.compiled.parallel import AtOnce, by_bands, shared_by
 from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace, Workspaces
 from stages.data import Array
-from stages.kernels.aggregation import aggregate_row
-from stages.kernels.around import Windows, search_around
-from stages.kernels.blank import blank_windows, drop_blank
-from stages.kernels.gradient import smoothed_costs
-from stages.kernels.pair import Pair, describe
-from stages.kernels.ranges import Range, lanes_for, move_paths, within
-from stages.kernels.rule import Rule
-from stages.kernels.selection import find_partners, find_winners, fit_row
-from stages.kernels.speckles import drop_speckles
+from stages.matching.kernels.aggregation import aggregate_row
+from stages.matching.kernels.blank_windows import blank_windows, drop_blank
+from stages.matching.kernels.gradient import smoothed_costs
+from stages.matching.kernels.matching_inputs import Pair, describe
+from stages.matching.kernels.row_ranges import Range, lanes_for, move_paths, within
+from stages.matching.kernels.selection import find_partners, find_winners, fit_row
+from stages.matching.kernels.sgm_local import Windows, search_around
+from stages.matching.kernels.sgm_params import Rule
+from stages.matching.kernels.speckles import drop_speckles
 
 _workspaces = Workspaces()
 

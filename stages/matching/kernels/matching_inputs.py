@@ -10,10 +10,10 @@ import numpy as np
 from stages.compiled.parallel import AtOnce, in_turn
 from stages.compiled.simd import Width
 from stages.data import Array
-from stages.kernels.aggregation import brightness_steps
-from stages.kernels.census import census
-from stages.kernels.gradient import gradients
-from stages.kernels.rule import Rule
+from stages.matching.kernels.aggregation import brightness_steps
+from stages.matching.kernels.census import census
+from stages.matching.kernels.gradient import gradients
+from stages.matching.kernels.sgm_params import Rule
 
 NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)
 

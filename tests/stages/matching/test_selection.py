@@ -9,10 +9,10 @@ from numba import njit
 from stages.compiled.parallel import shared_by
 from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace
-from stages.kernels.ranges import lanes_for
-from stages.kernels.selection import find_partners, find_winners, fit_row, select_reference
-from stages.kernels.speckles import drop_speckles, drop_speckles_reference
-from tests.stages.test_census import rule_of
+from stages.matching.kernels.row_ranges import lanes_for
+from stages.matching.kernels.selection import find_partners, find_winners, fit_row, select_reference
+from stages.matching.kernels.speckles import drop_speckles, drop_speckles_reference
+from tests.stages.matching.test_census import rule_of
 
 
 @njit

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import cv2
 
 from stages.data import Disparity, StereoFrame
-from stages.kernels.scaling import doubled, halved
-from stages.match import SMALLEST_SIDE
+from stages.matching.kernels.resample import doubled, halved
+from stages.matching.match import SMALLEST_SIDE
 from stages.stage import Stage, check_rectified, check_same_time, parameter
 
 

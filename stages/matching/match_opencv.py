@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from stages.data import Array, Disparity, Source, StereoFrame
-from stages.intensity import eight_bit, gray
+from stages.matching.intensity import eight_bit, gray
 from stages.stage import Stage, check_rectified, parameter
 
 F32 = np.float32

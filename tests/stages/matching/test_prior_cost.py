@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.prior import prior_costs, prior_costs_reference
+from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
 
 
 @settings(max_examples=60, deadline=None)

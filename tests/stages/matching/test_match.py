@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages.data import Disparity, Source, StereoFrame
-from stages.match import COSTS, Match
+from stages.matching.match import COSTS, Match
 from tests.bench.stereo_scores import load_scene, rows_filled
-from tests.stages.test_match_opencv import frame_of, slanted_pair, textured
+from tests.stages.matching.test_match_opencv import frame_of, slanted_pair, textured
 
 ROOT = Path(__file__).parents[2]
 
@@ -306,7 +306,7 @@ DIGEST = """
 import hashlib, sys
 sys.path.insert(0, {root!r})
 from stages import Match
-from tests.stages.test_match_opencv import slanted_pair
+from tests.stages.matching.test_match_opencv import slanted_pair
 frame, _ = slanted_pair(height=64, width=100)
 results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
 results += [Match(around=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 from stages.data import Disparity
-from stages.kernels.contradiction import drop_contradicted
+from stages.matching.kernels.lr_check import drop_contradicted
 from stages.stage import Stage, check_same_time, parameter
 
 

@@ -1,7 +1,7 @@
 """Semi-global matching around a prior: of each pixel only a few disparities are searched, those about what it is
 expected to have.
 
-Cost, paths and selection are those of the search of a whole range (stages.kernels.semiglobal), at a fraction of its
+Cost, paths and selection are those of the search of a whole range (stages.matching.kernels.semiglobal), at a fraction of its
 time, and nothing is too near to be found. The trick is how windows of neighbouring pixels that begin at different
 disparities are brought together: the lanes of each stand in memory between stretches of 255, "not searched", and are
 loaded from as many bytes later or earlier as the other window begins.
@@ -32,12 +32,12 @@ from stages.compiled.simd import (
 )  # fmt: skip
 from stages.compiled.workspace import Workspace
 from stages.data import Array
-from stages.kernels.aggregation import FAR, aggregate_reference, next_path
-from stages.kernels.census import PLANES, census_costs
-from stages.kernels.gradient import LARGEST, raw_costs
-from stages.kernels.pair import Pair
-from stages.kernels.rule import Rule
-from stages.kernels.selection import find_winner, fit_row, select_reference
+from stages.matching.kernels.aggregation import FAR, aggregate_reference, next_path
+from stages.matching.kernels.census import PLANES, census_costs
+from stages.matching.kernels.gradient import LARGEST, raw_costs
+from stages.matching.kernels.matching_inputs import Pair
+from stages.matching.kernels.selection import find_winner, fit_row, select_reference
+from stages.matching.kernels.sgm_params import Rule
 
 STEP = 4  # windows begin at multiples of it, so that those of neighbours mostly begin together
 EDGE = 1  # lanes at either end of a window that cannot win

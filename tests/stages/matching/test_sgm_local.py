@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from stages.compiled.parallel import shared_by
 from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace
-from stages.kernels.around import EDGE, Windows, search_around, search_around_reference, windows
-from stages.kernels.pair import describe
-from stages.kernels.prior import prior_costs
-from tests.stages.test_census import rule_of
-from tests.stages.test_match_opencv import textured
+from stages.matching.kernels.matching_inputs import describe
+from stages.matching.kernels.prior_cost import prior_costs
+from stages.matching.kernels.sgm_local import EDGE, Windows, search_around, search_around_reference, windows
+from tests.stages.matching.test_census import rule_of
+from tests.stages.matching.test_match_opencv import textured
 
 
 def views(height, columns, disparity):

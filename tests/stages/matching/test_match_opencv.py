@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.data import Source, StereoCamera, StereoFrame
-from stages.match_opencv import MatchOpenCV
+from stages.matching.match_opencv import MatchOpenCV
 
 
 def frame_of(left, right):

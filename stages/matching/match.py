@@ -2,7 +2,7 @@
 
 The cost is the census transform, by default with the truncated gradient difference, smoothed over 3x3. The sums of 8
 paths decide the disparity, its fraction of a pixel, and whether left and right agree, in one go
-(stages.kernels.semiglobal).
+(stages.matching.kernels.semiglobal).
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
-from stages.intensity import eight_bit, gray
-from stages.kernels.around import Windows, windows
-from stages.kernels.prior import prior_costs
-from stages.kernels.ranges import Range, lanes_for, ranges_of, whole_range
-from stages.kernels.rule import Rule
-from stages.kernels.semiglobal import match
+from stages.matching.intensity import eight_bit, gray
+from stages.matching.kernels.prior_cost import prior_costs
+from stages.matching.kernels.row_ranges import Range, lanes_for, ranges_of, whole_range
+from stages.matching.kernels.semiglobal import match
+from stages.matching.kernels.sgm_local import Windows, windows
+from stages.matching.kernels.sgm_params import Rule
 from stages.stage import Stage, check_rectified, parameter
 
 SMALLEST_SIDE = 16

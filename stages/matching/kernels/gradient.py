@@ -28,7 +28,7 @@ from stages.compiled.simd import (
     store,
 )  # fmt: skip
 from stages.data import Array
-from stages.kernels.census import census_costs_reference, differing_bits, seen_costs
+from stages.matching.kernels.census import census_costs_reference, differing_bits, seen_costs
 
 DX, DY = 3, 4  # after the planes of census
 PLANES = 5

@@ -5,12 +5,12 @@ import pytest
 from numba import njit
 
 from stages.compiled.simd import Width
-from stages.kernels.aggregation import aggregate_reference, aggregate_row, brightness_steps
-from stages.kernels.census import census_costs_reference, census_reference
-from stages.kernels.pair import NO_PRIOR, Pair, describe
-from stages.kernels.prior import prior_costs, prior_costs_reference
-from tests.stages.test_census import rule_of
-from tests.stages.test_match_opencv import textured
+from stages.matching.kernels.aggregation import aggregate_reference, aggregate_row, brightness_steps
+from stages.matching.kernels.census import census_costs_reference, census_reference
+from stages.matching.kernels.matching_inputs import NO_PRIOR, Pair, describe
+from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
+from tests.stages.matching.test_census import rule_of
+from tests.stages.matching.test_match_opencv import textured
 
 
 @njit
