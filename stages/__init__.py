@@ -34,7 +34,7 @@ from stages.matching.match_opencv import MatchOpenCV
 from stages.matching.pyramid import Enlarge, Halve, Swap
 from stages.odometry import VisualOdometry
 from stages.rectification.rectify import Rectify
-from stages.refine import Refine
+from stages.refinement.refine import Refine
 from stages.reproject import Reproject
 from stages.tilt_check import CheckTilt
 from stages.voxelise import Voxelise

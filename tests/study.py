@@ -21,7 +21,7 @@ import numpy as np
 from recordings.simulator import Simulation
 from stages import Disparity, Match, Rectify, Refine, Source, StereoCamera, StereoFrame
 from stages.data import Array
-from stages.refine import TRUST
+from stages.refinement.refine import TRUST
 from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stage, stereo_part
 from tests.bench.stereo_scores import errors, rows_filled
 

@@ -22,8 +22,8 @@ from flow.config.loader import load
 from flow.runtime.malloc import keep_freed_memory
 from stages import Disparity, Match, StereoFrame
 from stages.data import Array
-from stages.kernels.planes import fit_planes
-from stages.kernels.slic import superpixels
+from stages.refinement.kernels.plane_fit import fit_planes
+from stages.refinement.kernels.slic import superpixels
 from tests.bench.matching import colour_pair, medians
 from tests.bench.stereo_scores import errors, load_scene
 

@@ -20,7 +20,7 @@ from recordings.stereo_measures import StereoErrors
 from stages.data import Array, Disparity, StereoFrame
 from stages.matching.match import Match
 from stages.matching.match_opencv import MatchOpenCV
-from stages.refine import Refine
+from stages.refinement.refine import Refine
 
 
 def paper_stages() -> tuple[MatchOpenCV, Refine]:

@@ -20,7 +20,7 @@ print(planes[:, :, :40].sum())
 
 PLANES = """
 import numpy as np
-from stages.kernels.planes import fit_planes
+from stages.refinement.kernels.plane_fit import fit_planes
 random = np.random.default_rng(0)
 y, x = np.mgrid[:120, :160]
 labels = (y // 11 * 15 + x // 11).astype(np.int32)

@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.data import Source
-from stages.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN
-from stages.kernels.sources import Trust, name_sources, name_sources_reference
+from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN
+from stages.refinement.kernels.pixel_origin import Trust, name_sources, name_sources_reference
 
 TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.83, 0.84, 0.58, 0.56)
 

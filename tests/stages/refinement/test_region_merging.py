@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage import data
 
-from stages.kernels.slic import superpixels
-from stages.kernels.surfaces import surfaces, surfaces_reference
+from stages.refinement.kernels.region_merging import surfaces, surfaces_reference
+from stages.refinement.kernels.slic import superpixels
 
 
 @settings(max_examples=30, deadline=None)

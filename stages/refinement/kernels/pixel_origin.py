@@ -9,7 +9,7 @@ import numpy as np
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Source
-from stages.kernels.holes import KEPT, MISMATCH
+from stages.refinement.kernels.holes import KEPT, MISMATCH
 
 F32 = np.float32
 OWN = 0.5, 0.75, 1.0

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.smoother import LEAST, smooth, smooth_reference
+from stages.refinement.kernels.wls import LEAST, smooth, smooth_reference
 
 
 @settings(max_examples=15, deadline=None)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages import Match, Refine, StereoCamera, StereoFrame
-from stages.kernels.subpixel import FARTHEST, fit_brightness, fit_brightness_reference
+from stages.refinement.kernels.subpixel import FARTHEST, fit_brightness, fit_brightness_reference
 
 HEIGHT, WIDTH = 120, 260
 

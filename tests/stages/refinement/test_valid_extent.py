@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.extent import extent, extent_reference, within_reach
+from stages.refinement.kernels.valid_extent import extent, extent_reference, within_reach
 
 
 @settings(max_examples=60, deadline=None)

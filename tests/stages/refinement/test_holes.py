@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.extent import extent
-from stages.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN, fill_holes, fill_holes_reference
+from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN, fill_holes, fill_holes_reference
+from stages.refinement.kernels.valid_extent import extent
 
 FAR, NEAR = 5.0, 25.0
 DARK, BRIGHT = 60, 190

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.depth_edges import sharpen_edges, sharpen_edges_reference
-from stages.refine import JUMP, JUMP_GRAY
+from stages.refinement.kernels.depth_edges import sharpen_edges, sharpen_edges_reference
+from stages.refinement.refine import JUMP, JUMP_GRAY
 
 
 def sharpened(disparity, image):

@@ -8,7 +8,7 @@ from scipy import ndimage
 from skimage import data, segmentation
 
 from stages.compiled.parallel import in_turn
-from stages.kernels import slic
+from stages.refinement.kernels import slic
 
 
 @pytest.fixture(scope="module")

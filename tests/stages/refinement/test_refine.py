@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.data import Disparity, Source, StereoCamera, StereoFrame
-from stages.refine import EVEN, Refine, _burnt_out
+from stages.refinement.refine import EVEN, Refine, _burnt_out
 from tests.bench.stereo_scores import paper_stages
 
 SHAPE = HEIGHT, WIDTH = 120, 160

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.correlation import correlation, correlation_reference
+from stages.refinement.kernels.correlation import correlation, correlation_reference
 
 
 @settings(max_examples=25, deadline=None)

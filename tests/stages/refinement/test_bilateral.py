@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.bilateral import joint_bilateral, joint_bilateral_reference
+from stages.refinement.kernels.bilateral import joint_bilateral, joint_bilateral_reference
 
 
 def random_disparity(height, width, seed):

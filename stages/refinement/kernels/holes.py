@@ -14,7 +14,7 @@ import numpy as np
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
-from stages.kernels.extent import Extent
+from stages.refinement.kernels.valid_extent import Extent
 
 F32 = np.float32
 APART = 2.0  # px of disparity that make two surfaces

@@ -15,20 +15,20 @@ import numpy as np
 
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Disparity, StereoFrame
-from stages.kernels.bilateral import joint_bilateral
-from stages.kernels.correlation import correlation
-from stages.kernels.depth_edges import sharpen_edges
-from stages.kernels.extent import Extent, extent, within_reach
-from stages.kernels.holes import KEPT, OCCLUSION, fill_holes
-from stages.kernels.planar import near_median, pull_to_planes, trusted_matches
-from stages.kernels.planes import Planes, fit_planes
-from stages.kernels.slic import superpixels
-from stages.kernels.smoother import smooth
-from stages.kernels.sources import Trust, name_sources
-from stages.kernels.subpixel import fit_brightness
-from stages.kernels.surfaces import surfaces
 from stages.matching.intensity import eight_bit, gray
 from stages.matching.kernels.blank_windows import contrast
+from stages.refinement.kernels.bilateral import joint_bilateral
+from stages.refinement.kernels.correlation import correlation
+from stages.refinement.kernels.depth_edges import sharpen_edges
+from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
+from stages.refinement.kernels.pixel_origin import Trust, name_sources
+from stages.refinement.kernels.plane_apply import near_median, pull_to_planes, trusted_matches
+from stages.refinement.kernels.plane_fit import Planes, fit_planes
+from stages.refinement.kernels.region_merging import surfaces
+from stages.refinement.kernels.slic import superpixels
+from stages.refinement.kernels.subpixel import fit_brightness
+from stages.refinement.kernels.valid_extent import Extent, extent, within_reach
+from stages.refinement.kernels.wls import smooth
 from stages.stage import Stage, check_joined, check_same_time, parameter
 
 F32 = np.float32

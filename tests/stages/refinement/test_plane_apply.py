@@ -4,8 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.extent import extent
-from stages.kernels.planar import (
+from stages.refinement.kernels.plane_apply import (
     near_median,
     near_median_reference,
     pull_to_planes,
@@ -13,6 +12,7 @@ from stages.kernels.planar import (
     trusted_matches,
     trusted_matches_reference,
 )
+from stages.refinement.kernels.valid_extent import extent
 
 
 def scene(height, width, seed):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.kernels.planes import fit_planes, fit_planes_reference, known_points
+from stages.refinement.kernels.plane_fit import fit_planes, fit_planes_reference, known_points
 
 SHAPE = (48, 60)
 ALIKE = np.ones(SHAPE, np.float32)  # weights
