@@ -2,7 +2,10 @@
 
 from stages.assess import Assess
 from stages.binarise import Binarise
-from stages.clean import Clean
+from stages.cloud.clean import Clean
+from stages.cloud.level import Level
+from stages.cloud.reproject import Reproject
+from stages.cloud.voxel_grid import Voxels
 from stages.data import (
     CameraImage,
     CameraModel,
@@ -25,7 +28,6 @@ from stages.data import (
     VoxelMap,
 )
 from stages.fuse import Fuse
-from stages.level import Level
 from stages.locate import Locate
 from stages.matching.lr_check import CrossCheck
 from stages.matching.match import Match
@@ -35,10 +37,8 @@ from stages.matching.pyramid import Enlarge, Halve, Swap
 from stages.odometry import VisualOdometry
 from stages.rectification.rectify import Rectify
 from stages.refinement.refine import Refine
-from stages.reproject import Reproject
 from stages.tilt_check import CheckTilt
 from stages.voxelise import Voxelise
-from stages.voxels import Voxels
 
 __all__ = [
     "Assess",

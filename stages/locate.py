@@ -14,9 +14,9 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stages.cloud.level import level_transform
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.data.covariance import levered
-from stages.level import level_transform
 from stages.pose_check import PoseCheck
 from stages.stage import Finding, Severity, Stage, counted, parameter
 

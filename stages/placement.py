@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
-from stages.kernels.rigid import transform_points
 from stages.voxelise import Voxelise
 
 # Beyond this the pose's frame does not have z up. An odometry that knows no tilt may differ by the slope of the ground.

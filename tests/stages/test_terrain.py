@@ -13,7 +13,9 @@ import pytest
 
 from stages.assess import Assess
 from stages.binarise import Binarise
-from stages.clean import Clean
+from stages.cloud.clean import Clean
+from stages.cloud.level import Level
+from stages.cloud.reproject import Reproject
 from stages.data import (
     Array,
     Cell,
@@ -27,8 +29,6 @@ from stages.data import (
     Tilt,
 )
 from stages.fuse import Fuse
-from stages.level import Level
-from stages.reproject import Reproject
 from stages.voxelise import Voxelise
 from tests.stages.terrain_scene import HEIGHT, ROCKS, UP, as_disparity, blank_frame, profile_disparity, seen_disparity
 

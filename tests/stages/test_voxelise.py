@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.clean import Clean
+from stages.cloud.clean import Clean
+from stages.cloud.level import Level
+from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Tilt, Transform
 from stages.kernels.grid import cell_statistics, cell_statistics_reference
 from stages.kernels.neighbours import lie_of_cells, lie_of_cells_reference
 from stages.kernels.occlusion import lowest_sight, lowest_sight_reference
 from stages.kernels.spread import laid_along_sight, laid_along_sight_reference
-from stages.level import Level
-from stages.reproject import Reproject
 from stages.voxelise import Voxelise
 from tests.stages.terrain_scene import (
     CAMERA,

@@ -10,9 +10,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from stages.cloud.kernels.rigid import transform_points, transform_points_reference
+from stages.cloud.level import Level, level_transform
 from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Source, Tilt, Transform
-from stages.kernels.rigid import transform_points, transform_points_reference
-from stages.level import Level, level_transform
 from tests.stages.terrain_scene import HEIGHT, UP, level_from_camera
 
 BARE = Mount(0, np.eye(3))

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from stages.cloud.kernels.triangulation import triangulate
 from stages.data import Disparity, PointCloud, StereoFrame
-from stages.kernels.triangulation import triangulate
 from stages.matching.intensity import eight_bit
 from stages.stage import Stage, check_joined, parameter
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stages.cloud.kernels.voxels import voxel_means
 from stages.data import LEVEL_FRAME, PointCloud, VoxelMap
-from stages.kernels.voxels import voxel_means
 from stages.stage import Stage, check_cells, check_level, parameter
 
 

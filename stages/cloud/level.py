@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Tilt, Transform
-from stages.kernels.rigid import transform_points
 from stages.stage import Stage, parameter
 
 # Below this horizontal share (6 degrees off the vertical) tilt noise decides where a heading points.

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stages.cloud.kernels.voxels import voxel_means, voxel_means_reference
+from stages.cloud.voxel_grid import Voxels
 from stages.data import LEVEL_FRAME, Array, PointCloud, Source
-from stages.kernels.voxels import voxel_means, voxel_means_reference
-from stages.voxels import Voxels
 
 
 def cloud_of(points: Array, colors: Array) -> PointCloud:

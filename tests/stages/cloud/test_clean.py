@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.clean import Clean
+from stages.cloud.clean import Clean
+from stages.cloud.kernels.depth_order import out_of_order, out_of_order_reference
+from stages.cloud.kernels.outliers import supported, supported_reference
+from stages.cloud.kernels.patches import patches, patches_reference
+from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Transform
-from stages.kernels.order import out_of_order, out_of_order_reference
-from stages.kernels.outliers import supported, supported_reference
-from stages.kernels.patches import patches, patches_reference
-from stages.reproject import Reproject
 from tests.stages.terrain_scene import (
     CAMERA,
     HEIGHT,

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stages.cloud.kernels.triangulation import triangulate, triangulate_reference
+from stages.cloud.reproject import Reproject
 from stages.data import CameraModel, Disparity, Source, StereoCamera, StereoFrame
-from stages.kernels.triangulation import triangulate, triangulate_reference
-from stages.reproject import Reproject
 from tests.stages.terrain_scene import CAMERA, as_disparity, blank_frame, seen_disparity
 
 SMALL = StereoCamera(100.0, 110.0, 7.5, 5.25, 0.2, 16, 12, cx_right=9.0)

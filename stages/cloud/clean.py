@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from stages.cloud.kernels.depth_order import out_of_order
+from stages.cloud.kernels.outliers import supported, usual_slope
+from stages.cloud.kernels.patches import depth_images, patches
 from stages.data import Array, PointCloud
-from stages.kernels.order import out_of_order
-from stages.kernels.outliers import supported, usual_slope
-from stages.kernels.patches import depth_images, patches
 from stages.stage import Stage, parameter
 
 
