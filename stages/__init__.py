@@ -1,7 +1,5 @@
 """The method: plain callables over the data types of `stages.data`."""
 
-from stages.assess import Assess
-from stages.binarise import Binarise
 from stages.cloud.clean import Clean
 from stages.cloud.level import Level
 from stages.cloud.reproject import Reproject
@@ -27,7 +25,6 @@ from stages.data import (
     Transform,
     VoxelMap,
 )
-from stages.fuse import Fuse
 from stages.locate import Locate
 from stages.matching.lr_check import CrossCheck
 from stages.matching.match import Match
@@ -37,8 +34,11 @@ from stages.matching.pyramid import Enlarge, Halve, Swap
 from stages.odometry import VisualOdometry
 from stages.rectification.rectify import Rectify
 from stages.refinement.refine import Refine
+from stages.terrain.binarise import Binarise
+from stages.terrain.dem import Voxelise
+from stages.terrain.features import Assess
+from stages.terrain.fuse import Fuse
 from stages.tilt_check import CheckTilt
-from stages.voxelise import Voxelise
 
 __all__ = [
     "Assess",

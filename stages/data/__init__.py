@@ -26,7 +26,7 @@ from stages.data.motion import Pose as Pose
 from stages.data.motion import Tilt as Tilt
 from stages.data.motion import TiltHealth as TiltHealth
 from stages.data.motion import Transform as Transform
-from stages.tiles import Tiles as Tiles
+from stages.data.tiles import Tiles as Tiles
 
 LEVEL_FRAME = "level"
 ALIKE = 1e-3  # of a focal length or of cy, by which those of a rectified pair may differ: a pixel at 1000 px

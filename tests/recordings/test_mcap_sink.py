@@ -26,8 +26,8 @@ from stages.data import (
     TiltHealth,
     Transform,
 )  # fmt: skip
-from tests.stages.region_scene import MOUNT, SECOND, drive
-from tests.stages.region_scene import START as DRIVE
+from tests.stages.terrain.region_scene import MOUNT, SECOND, drive
+from tests.stages.terrain.region_scene import START as DRIVE
 
 START = 1_700_000_000_000_000_000
 STREAMS = {"disparity": Disparity, "points": PointCloud, "elevation_map": ElevationMap, "navigation_map": NavigationMap}

@@ -15,7 +15,7 @@ from stages.cloud.kernels.outliers import supported, supported_reference
 from stages.cloud.kernels.patches import patches, patches_reference
 from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Transform
-from tests.stages.terrain_scene import (
+from tests.stages.terrain.terrain_scene import (
     CAMERA,
     HEIGHT,
     as_disparity,

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from stages.cloud.kernels.rigid import transform_points, transform_points_reference
 from stages.cloud.level import Level, level_transform
 from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Source, Tilt, Transform
-from tests.stages.terrain_scene import HEIGHT, UP, level_from_camera
+from tests.stages.terrain.terrain_scene import HEIGHT, UP, level_from_camera
 
 BARE = Mount(0, np.eye(3))
 # Optical axes in base axes: x right is -y, y down is -z, z forward is x.

@@ -10,7 +10,7 @@ import pytest
 from stages.cloud.kernels.triangulation import triangulate, triangulate_reference
 from stages.cloud.reproject import Reproject
 from stages.data import CameraModel, Disparity, Source, StereoCamera, StereoFrame
-from tests.stages.terrain_scene import CAMERA, as_disparity, blank_frame, seen_disparity
+from tests.stages.terrain.terrain_scene import CAMERA, as_disparity, blank_frame, seen_disparity
 
 SMALL = StereoCamera(100.0, 110.0, 7.5, 5.25, 0.2, 16, 12, cx_right=9.0)
 

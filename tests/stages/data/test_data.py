@@ -25,7 +25,7 @@ from stages.data import (
 )
 from stages.matching.match import Match
 from stages.stage import Stage, parameter
-from tests.stages.terrain_scene import CAMERA, blank_frame
+from tests.stages.terrain.terrain_scene import CAMERA, blank_frame
 
 F32, U8 = np.float32, np.uint8
 QUATERNION = np.array([0, 0, 0, 1.0])

@@ -8,12 +8,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.assess import Assess
-from stages.binarise import Binarise
 from stages.data import Array, Cell
-from stages.kernels.footprint import window_planes, window_planes_reference
-from stages.kernels.relief import lowest_around, lowest_around_reference
-from tests.stages.terrain_scene import map_of, rolling_terrain
+from stages.terrain.binarise import Binarise
+from stages.terrain.features import Assess
+from stages.terrain.kernels.local_minimum import lowest_around, lowest_around_reference
+from stages.terrain.kernels.plane_window import window_planes, window_planes_reference
+from tests.stages.terrain.terrain_scene import map_of, rolling_terrain
 
 
 @settings(max_examples=10, deadline=None)

@@ -13,12 +13,12 @@ from stages.cloud.clean import Clean
 from stages.cloud.level import Level
 from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Tilt, Transform
-from stages.kernels.grid import cell_statistics, cell_statistics_reference
-from stages.kernels.neighbours import lie_of_cells, lie_of_cells_reference
-from stages.kernels.occlusion import lowest_sight, lowest_sight_reference
-from stages.kernels.spread import laid_along_sight, laid_along_sight_reference
-from stages.voxelise import Voxelise
-from tests.stages.terrain_scene import (
+from stages.terrain.dem import Voxelise
+from stages.terrain.kernels.cell_gradient import lie_of_cells, lie_of_cells_reference
+from stages.terrain.kernels.grid import cell_statistics, cell_statistics_reference
+from stages.terrain.kernels.occlusion import lowest_sight, lowest_sight_reference
+from stages.terrain.kernels.splat_along_ray import laid_along_sight, laid_along_sight_reference
+from tests.stages.terrain.terrain_scene import (
     CAMERA,
     HEIGHT,
     UP,

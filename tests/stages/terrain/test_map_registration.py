@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stages import Fuse, Pose, Transform
-from stages.placement import placement
 from stages.stage import Severity
-from tests.stages.region_scene import MOUNT, START, drive, flat, part
+from stages.terrain.map_registration import placement
+from tests.stages.terrain.region_scene import MOUNT, START, drive, flat, part
 
 
 def heights(cloud, placed):

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.data import Array
-from stages.overlap import rise
-from stages.tiles import Tiles
+from stages.data.tiles import Tiles
+from stages.terrain.height_alignment import rise
 
 # What is remembered of a cell, 29 bytes. weight: sum of 1 / variance over its frames; best: the smallest standard
 # deviation among them; below, above: from the height to the cell's extremes; first, last: ms since the first frame;

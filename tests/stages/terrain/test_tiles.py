@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.tiles import SIDE, Tiles
+from stages.data.tiles import SIDE, Tiles
 
 DTYPE = np.dtype([("value", "f4"), ("mark", "u1")])
 places = st.integers(-3 * SIDE, 2 * SIDE)

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from stages.data import Array, ElevationMap
-from stages.kernels.footprint import window_planes
-from stages.kernels.relief import lowest_around
 from stages.stage import Stage, parameter
+from stages.terrain.kernels.local_minimum import lowest_around
+from stages.terrain.kernels.plane_window import window_planes
 
 MOST = 0.85  # share of `max_step`: cells blunt a peak
 # A plane's height at the cell must be known about as well as the mean of four cells. No ratio of small integers equals

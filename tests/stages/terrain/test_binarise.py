@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import binary_dilation
 
-from stages.assess import Assess
-from stages.binarise import Binarise
 from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason
-from tests.stages.terrain_scene import Terrain, map_of, rolling_terrain
+from stages.terrain.binarise import Binarise
+from stages.terrain.features import Assess
+from tests.stages.terrain.terrain_scene import Terrain, map_of, rolling_terrain
 
 TEN_DEGREES = float(np.deg2rad(10))
 

@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.assess import Assess
-from stages.binarise import Binarise
 from stages.cloud.clean import Clean
 from stages.cloud.level import Level
 from stages.cloud.reproject import Reproject
@@ -28,9 +26,19 @@ from stages.data import (
     StereoFrame,
     Tilt,
 )
-from stages.fuse import Fuse
-from stages.voxelise import Voxelise
-from tests.stages.terrain_scene import HEIGHT, ROCKS, UP, as_disparity, blank_frame, profile_disparity, seen_disparity
+from stages.terrain.binarise import Binarise
+from stages.terrain.dem import Voxelise
+from stages.terrain.features import Assess
+from stages.terrain.fuse import Fuse
+from tests.stages.terrain.terrain_scene import (
+    HEIGHT,
+    ROCKS,
+    UP,
+    as_disparity,
+    blank_frame,
+    profile_disparity,
+    seen_disparity,
+)
 
 
 def mapped(

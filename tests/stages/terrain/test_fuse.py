@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from stages import Assess, Binarise, Cell, Fuse, Source
-from stages.placement import placement, sight_of
-from stages.tiles import Tiles
-from tests.stages.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
+from stages.data.tiles import Tiles
+from stages.terrain.map_registration import placement, sight_of
+from tests.stages.terrain.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
 
 
 def test_frames_at_any_heading_make_one_map_of_the_ground():
@@ -52,7 +52,7 @@ def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(
         return replace(sight, terrain=replace(sight.terrain, layers={**sight.terrain.layers, "ceiling": ceiling}))
 
     heights = iter((-0.2, -0.1))
-    monkeypatch.setattr("stages.fuse.sight_of", hiding)
+    monkeypatch.setattr("stages.terrain.fuse.sight_of", hiding)
     fuse = Fuse()
     fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
     terrain = fuse(*drive(1, flat, at=(0.0, 0.0, 1.2)), MOUNT)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.overlap import fit_plane
+from stages.terrain.height_alignment import fit_plane
 
 EXPECTED = np.array([0.05, 0.005, 0.005])
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
-from stages.voxelise import Voxelise
+from stages.terrain.dem import Voxelise
 
 # Beyond this the pose's frame does not have z up. An odometry that knows no tilt may differ by the slope of the ground.
 _LARGEST_LEAN = np.radians(30.0)

@@ -14,11 +14,11 @@ from typing import ClassVar
 import numpy as np
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
-from stages.kernels.neighbours import lie_of_cells
-from stages.overlap import fit_plane, rise
-from stages.placement import Sight, placement, raised, sight_of
-from stages.region import Region, Seen, hidden_below, layers_of, merged, variance_of
 from stages.stage import Finding, Severity, Stage, check_cells, counted, parameter
+from stages.terrain.fused_map import Region, Seen, hidden_below, layers_of, merged, variance_of
+from stages.terrain.height_alignment import fit_plane, rise
+from stages.terrain.kernels.cell_gradient import lie_of_cells
+from stages.terrain.map_registration import Sight, placement, raised, sight_of
 
 MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that no map ends where they still change
 _TELLING = 100  # cells that a frame and the map must share for their heights to tell of a jump

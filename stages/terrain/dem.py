@@ -13,11 +13,11 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
-from stages.kernels.grid import FIGURES, cell_percentile, cell_statistics
-from stages.kernels.neighbours import lie_of_cells
-from stages.kernels.occlusion import lowest_sight
-from stages.kernels.spread import laid_along_sight
 from stages.stage import Stage, check_cells, check_level, parameter
+from stages.terrain.kernels.cell_gradient import lie_of_cells
+from stages.terrain.kernels.grid import FIGURES, cell_percentile, cell_statistics
+from stages.terrain.kernels.occlusion import lowest_sight
+from stages.terrain.kernels.splat_along_ray import laid_along_sight
 
 Grid = tuple[float, tuple[float, float], int, float]  # resolution, origin, rows and columns, region
 FINEST = 0.5  # of a cell, below which a point's reach is not worth following
