@@ -25,20 +25,20 @@ from stages.data import (
     Transform,
     VoxelMap,
 )
-from stages.locate import Locate
+from stages.localisation.pose_filter import Locate
+from stages.localisation.tilt.check import CheckTilt
+from stages.localisation.visual_odometry import VisualOdometry
 from stages.matching.lr_check import CrossCheck
 from stages.matching.match import Match
 from stages.matching.match_health import CheckMatches
 from stages.matching.match_opencv import MatchOpenCV
 from stages.matching.pyramid import Enlarge, Halve, Swap
-from stages.odometry import VisualOdometry
 from stages.rectification.rectify import Rectify
 from stages.refinement.refine import Refine
 from stages.terrain.binarise import Binarise
 from stages.terrain.dem import Voxelise
 from stages.terrain.features import Assess
 from stages.terrain.fuse import Fuse
-from stages.tilt_check import CheckTilt
 
 __all__ = [
     "Assess",

@@ -19,7 +19,7 @@ import numpy as np
 
 from stages.compiled.hamming import clear_partners
 from stages.data import Array
-from stages.robust import NORMAL, tukey_weights
+from stages.robust_weights import NORMAL, tukey_weights
 
 FEATURES = 4000  # per image
 SMALLEST = 32  # px, side of an image that has any

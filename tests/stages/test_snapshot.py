@@ -23,7 +23,7 @@ from stages import (
     Tilt,
     VisualOdometry,
 )
-from tests.stages.drive import Drive, motions
+from tests.stages.localisation.drive import Drive, motions
 
 FRAMES = 6
 

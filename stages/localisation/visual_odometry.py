@@ -14,8 +14,8 @@ import numpy as np
 
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
 from stages.data.covariance import cross_matrix, levered
+from stages.localisation.vo_tracking import Step, View, step_between, view
 from stages.stage import Finding, Stage, check_joined, parameter
-from stages.tracking import Step, View, step_between, view
 
 
 @dataclass

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.tilt_causes import (
+from stages.localisation.tilt.causes import (
     GROUND,
     LEAST_FRAMES,
     Cause,

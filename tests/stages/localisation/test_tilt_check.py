@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stages import CheckTilt, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.data import Array
 from stages.stage import Severity
-from tests.stages.drive import FRAMES, Drive, motions
+from tests.stages.localisation.drive import FRAMES, Drive, motions
 from tests.tilt_faults import flipped
 
 DRIVE = Drive(2, 8.0)

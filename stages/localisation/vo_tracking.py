@@ -15,7 +15,7 @@ import numpy as np
 from stages.compiled.hamming import clear_partners
 from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
-from stages.robust import tukey_weights
+from stages.robust_weights import tukey_weights
 
 DETECTION_WIDTH = 640  # px; features are looked for in an image of at most about this width
 FEATURES = 1500

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from stages.cloud.level import level_transform
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.data.covariance import levered
-from stages.pose_check import PoseCheck
+from stages.localisation.pose_check import PoseCheck
 from stages.stage import Finding, Severity, Stage, counted, parameter
 
 VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once

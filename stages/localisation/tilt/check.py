@@ -14,10 +14,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stages.data import Array, CameraMotion, Mount, PointCloud, Tilt, TiltHealth, Transform
-from stages.robust import NORMAL, tukey_weights
+from stages.localisation.tilt.causes import Evidence
+from stages.localisation.tilt.diagnosis import INCONSISTENT, Diagnosis, diagnose, off_level
+from stages.robust_weights import NORMAL, tukey_weights
 from stages.stage import Finding, Severity, Stage, parameter
-from stages.tilt_causes import Evidence
-from stages.tilt_diagnosis import INCONSISTENT, Diagnosis, diagnose, off_level
 
 MOVED = 0.05  # m, or
 TURNED = float(np.deg2rad(0.3))  # rad, by which a frame must differ from the one kept before

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.simulator import Simulation
 from stages.data import Array, CameraMotion, Transform
-from stages.tilt_causes import Evidence
+from stages.localisation.tilt.causes import Evidence
 
 FRAMES = 50
 SMOOTHED = 0.45  # of a sample's noise is left in the mean of those about a frame

@@ -13,7 +13,7 @@ from recordings.simulator.traverse import level_pose
 from stages import Locate, Mount, Pose, Tilt, Transform
 from stages.data import Array
 from stages.stage import Finding, Severity
-from tests.stages.drive import FRAMES, Drive, motions
+from tests.stages.localisation.drive import FRAMES, Drive, motions
 
 DRIVE = Drive(2, 6.0)
 

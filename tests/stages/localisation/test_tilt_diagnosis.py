@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stages.data import Array
-from stages.tilt_causes import Evidence
-from stages.tilt_diagnosis import diagnose
-from tests.stages.drive import Drive
+from stages.localisation.tilt.causes import Evidence
+from stages.localisation.tilt.diagnosis import diagnose
+from tests.stages.localisation.drive import Drive
 from tests.tilt_faults import degrees_as_radians, exchanged, flipped, radians_as_degrees
 
 DRIVES = [Drive(seed, slope, noise) for seed, slope in ((1, 4.0), (2, 8.0), (3, 5.0)) for noise in (0.3, 0.1)]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages import CameraMotion, Disparity, StereoCamera, StereoFrame, Transform, VisualOdometry
-from stages.tracking import view
+from stages.localisation.vo_tracking import view
 
 FRAMES = 5
 Input = tuple[StereoFrame, Disparity]
