@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 from recordings.decode import unpacked_pixels
 from recordings.discovery import SIDES
 from recordings.errors import LogError, counted
+from recordings.mcap.writer import Ros2Writer
 from recordings.rig import BODY_FROM_OPTICAL, pinhole
 from recordings.ros2 import camera_info, image, imu, transform_message
 from recordings.ros2_types import LAST_STAMP
-from recordings.ros2_writer import Ros2Writer
 from stages.data import Array, StereoCamera, StereoFrame, Transform
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}

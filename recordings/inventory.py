@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import counted
+from recordings.mcap.index import Lost
 from recordings.mcap_cameras import CAMERAS
-from recordings.mcap_index import Lost
 from recordings.mcap_log import McapLog
 from recordings.mcap_messages import peek_stamp
 from stages.data import StereoCamera, Tilt

@@ -20,11 +20,11 @@ from recordings.decode import camera_model, frame_of, pixels_of, pose_of, stamp_
 from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import LogError, said
 from recordings.log_settings import LogSettings
+from recordings.mcap.file import McapFile
+from recordings.mcap.index import Lost, Raw
 from recordings.mcap_cameras import CAMERAS
-from recordings.mcap_index import Lost, Raw
 from recordings.mcap_messages import Decoder, peek_stamp
 from recordings.mcap_opening import Opening
-from recordings.mcap_reader import McapFile
 from recordings.rig import Camera, rovers
 from stages.data import CameraImage, CameraModel, Pose, Tilt
 

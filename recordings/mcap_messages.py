@@ -16,8 +16,8 @@ from mcap.records import Channel
 
 from recordings.decode import frame_of
 from recordings.errors import LogError, said
-from recordings.mcap_index import Lost
-from recordings.mcap_reader import CONVERT, McapFile
+from recordings.mcap.file import CONVERT, McapFile
+from recordings.mcap.index import Lost
 from recordings.ros2_types import decoder_for, full_name, plain
 
 _PLACES = 4  # in a log, at which messages are looked at until one can be read: a filter may begin with nonsense

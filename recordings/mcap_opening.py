@@ -10,9 +10,9 @@ from recordings.decode import frame_name, frame_of, pose_of, tilt_of
 from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError, counted
 from recordings.log_settings import LogSettings
+from recordings.mcap.file import McapFile
 from recordings.mcap_cameras import CAMERAS, first_infos, unfit_images, unread_images
 from recordings.mcap_messages import Messages, attempt
-from recordings.mcap_reader import McapFile
 from recordings.rig import Camera, Frames, baseline_note, calibrated_pair, mounted, rovers
 from stages.data import LEVEL_FRAME, Mount, Pose
 

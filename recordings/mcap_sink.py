@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 from recordings.errors import LogError
 from recordings.frame_record import FrameRecord, LossEntry
+from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
 from recordings.ros2 import (
     diagnostics,
     disparity_image,
@@ -25,7 +26,6 @@ from recordings.ros2 import (
     source_image,
     transform_message,
 )
-from recordings.ros2_writer import COMPRESSIONS, Ros2Writer
 from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
 
 _BUILDERS: dict[type, Callable[[Any], Any]] = {

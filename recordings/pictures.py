@@ -15,7 +15,7 @@ import numpy as np
 
 from recordings import paint
 from recordings.errors import LogError
-from recordings.mcap_reader import McapFile, iter_decoded
+from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import read_disparity, read_grid_map, read_occupancy_grid
 from stages.data import Array, ElevationMap, NavigationMap
 

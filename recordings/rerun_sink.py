@@ -19,11 +19,11 @@ import numpy as np
 import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
+from recordings.atomic_write import give_name, temporary_name, unwritable, writing
 from recordings.desk import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, Place, desk
 from recordings.drawings import PICTURES, Canvas, same_view
 from recordings.errors import LogError, counted
 from recordings.frame_record import FrameRecord, LossEntry
-from recordings.whole_file import give_name, temporary_name, unwritable, writing
 from stages.data import Array, ElevationMap, Pose, StereoFrame
 
 RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well

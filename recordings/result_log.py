@@ -13,7 +13,7 @@ from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
 
 from recordings.errors import LogError
-from recordings.mcap_reader import McapFile
+from recordings.mcap.file import McapFile
 
 
 def part_run(result: Path, log: Path) -> tuple[float | None, float | None]:

@@ -21,7 +21,7 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from recordings.errors import LogError
-from recordings.mcap_chunk import LARGEST
+from recordings.mcap.chunk import LARGEST
 
 GRID_MAP = """\
 std_msgs/Header header

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from recordings import measures, ros2, terrain_measures
 from recordings.errors import LogError, said
+from recordings.mcap.file import McapFile, iter_decoded
 from recordings.mcap_log import is_within, part_of
-from recordings.mcap_reader import McapFile, iter_decoded
 from recordings.pose_measures import PoseTally
 from recordings.result_log import part_run, without_results
 from recordings.stereo_measures import StereoErrors, cropped_columns

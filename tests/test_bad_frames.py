@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from recordings import ros2
-from recordings.mcap_reader import iter_decoded
+from recordings.mcap.file import iter_decoded
 from recordings.ros2_types import TYPES
 from tests.conftest import FRAMES, rewrite, roverflow
 

@@ -21,8 +21,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from recordings.mcap_index import Raw
-from recordings.mcap_reader import McapFile, iter_decoded
+from recordings.mcap.file import McapFile, iter_decoded
+from recordings.mcap.index import Raw
 from recordings.mcap_sink import McapSink
 from recordings.ros2 import read_disparity, stamp_of
 from recordings.simulator import Simulation
@@ -208,9 +208,9 @@ def test_part_of_a_log(traverse, tmp_path):
 
 def test_the_pose_comes_from_tf_where_told(traverse, tmp_path):
     """The simulator's /odometry is left out; its pose is written as /tf among another transform."""
+    from recordings.mcap.writer import Ros2Writer
     from recordings.mcap_source import McapSource
     from recordings.ros2 import transform_message
-    from recordings.ros2_writer import Ros2Writer
     from stages.data import Pose, Transform
 
     log = tmp_path / "tf.mcap"

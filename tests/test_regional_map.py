@@ -10,7 +10,7 @@ import pytest
 import rasterio
 
 from recordings import ros2
-from recordings.mcap_reader import iter_decoded
+from recordings.mcap.file import iter_decoded
 from stages.data import Cell, Reason
 from tests.bench.regional import RUNS, region, shares_within, traverse_of
 from tests.conftest import FRAMES, SMALL, rewrite, roverflow

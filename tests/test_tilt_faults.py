@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from flow.cli.main import main
-from recordings.mcap_reader import iter_decoded
+from recordings.mcap.file import iter_decoded
 from recordings.ros2 import stamp_of
 from recordings.simulator import Simulation, write_log
 from recordings.simulator.traverse import level_pose

@@ -27,9 +27,9 @@ from flow.cli.report import counted, headline, report, say
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.replay import as_json, product_version, replay
+from recordings.atomic_write import writing, written
 from recordings.earlier_output import is_ours
 from recordings.errors import LogError, UnwritableError
-from recordings.whole_file import writing, written
 
 BEGINNING = 0.6  # s of the demo's traverse, one frame
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE = 0, 1, 2, 3

@@ -18,16 +18,16 @@ import cv2
 import numpy as np
 
 from recordings import ros2
+from recordings.atomic_write import written
 from recordings.decode import transform_of
 from recordings.errors import LogError, said
 from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM, STRIP, Mosaic
 from recordings.export.ply import COLOURS, write_ply
-from recordings.mcap_reader import iter_decoded
+from recordings.mcap.file import iter_decoded
 from recordings.paint import hillshade
 from recordings.result_log import without_results
-from recordings.whole_file import written
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Source, Tiles, Transform
 
 REGION = ("/nav/regional_map", "/nav/regional_navigation_map")

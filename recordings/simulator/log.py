@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings import ros2
+from recordings.mcap.writer import Ros2Writer
 from recordings.rig import pinhole
 from recordings.ros2_types import make
-from recordings.ros2_writer import Ros2Writer
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
 from stages.data import LEVEL_FRAME, Pose, Transform

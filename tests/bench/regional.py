@@ -22,7 +22,7 @@ import numpy as np
 
 from recordings import McapSource, ros2
 from recordings.decode import transform_of
-from recordings.mcap_reader import iter_decoded
+from recordings.mcap.file import iter_decoded
 from recordings.measures import without_plane
 from recordings.simulator import Simulation, raycast, traverse, write_log
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Pose, Transform

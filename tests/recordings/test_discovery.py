@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from recordings import McapSource
+from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import camera_info, image, transform_message
 from recordings.ros2_types import make
-from recordings.ros2_writer import Ros2Writer
 from stages.data import Transform
 from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, items_of, model, picture, write_sample
 

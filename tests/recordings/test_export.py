@@ -15,7 +15,7 @@ from PIL import Image
 from recordings import ros2
 from recordings.errors import LogError
 from recordings.export.bundle import export, file_names
-from recordings.ros2_writer import Ros2Writer
+from recordings.mcap.writer import Ros2Writer
 from stages.data import Array, Cell, ElevationMap, NavigationMap, PointCloud, Transform
 
 START = 1_700_000_000_000_000_000

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.mcap_reader import iter_decoded
+from recordings.mcap.file import iter_decoded
 from tests.recordings.sample_log import (
     FRAMES,
     LAYOUTS,

@@ -21,7 +21,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_typestore
 
 from recordings.errors import LogError
-from recordings.mcap_reader import iter_decoded
+from recordings.mcap.file import iter_decoded
+from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import (
     camera_info,
     diagnostics,
@@ -40,7 +41,6 @@ from recordings.ros2 import (
     transform_message,
 )  # fmt: skip
 from recordings.ros2_types import TYPES, decoder_for, make
-from recordings.ros2_writer import Ros2Writer
 from stages.data import (
     Disparity,
     ElevationMap,

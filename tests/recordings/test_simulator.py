@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from recordings import ros2
-from recordings.mcap_reader import iter_decoded
+from recordings.mcap.file import iter_decoded
 from recordings.simulator import Simulation, ground_truth, raycast, terrain, traverse, write_log
 from recordings.simulator.odometry import dead_reckoning
 from stages.data import Cell, Transform

@@ -25,9 +25,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 from recordings import McapSource
 from recordings.errors import LogError
 from recordings.inventory import format_description
-from recordings.mcap_chunk import unpacked
-from recordings.mcap_index import MAGIC, Index, Lost
-from recordings.mcap_reader import McapFile
+from recordings.mcap.chunk import unpacked
+from recordings.mcap.file import McapFile
+from recordings.mcap.index import MAGIC, Index, Lost
 from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, inventory_of, items_of, rewritten
 
 

@@ -16,8 +16,8 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
 from recordings.errors import counted, said
-from recordings.mcap_chunk import HEAD, LARGEST, is_chunk, next_chunk, start_time, unpacked, unpacked_start
-from recordings.mcap_index import (
+from recordings.mcap.chunk import HEAD, LARGEST, is_chunk, next_chunk, start_time, unpacked, unpacked_start
+from recordings.mcap.index import (
     BROKEN,
     MAGIC,
     MESSAGE,

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from recordings import McapSource, mcap_messages
-from recordings.mcap_index import JITTER
+from recordings.mcap.index import JITTER
 from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, inventory_of, items_of, rewritten
 
 BACK = 2 * PERIOD + PERIOD // 2

@@ -15,7 +15,7 @@ import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 
-from recordings.mcap_index import RECORD, read
+from recordings.mcap.index import RECORD, read
 
 LARGEST = 1 << 32  # bytes; a larger chunk is not read
 HEAD = 128  # bytes of a chunk record that tell how long it is

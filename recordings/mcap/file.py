@@ -24,8 +24,8 @@ from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
 from recordings.errors import LogError, counted, said
-from recordings.mcap_chunk import LARGEST, unpacked
-from recordings.mcap_index import (
+from recordings.mcap.chunk import LARGEST, unpacked
+from recordings.mcap.index import (
     BROKEN,
     JITTER,
     LAST_TIME,
@@ -42,7 +42,7 @@ from recordings.mcap_index import (
     read,
     records,
 )
-from recordings.mcap_walk import walk
+from recordings.mcap.walk import walk
 from recordings.ros2_types import decoder_for
 
 CONVERT = "rosbags-convert --src IN.bag --dst OUT --dst-storage mcap"  # of a ROS 1 bag; mcap convert leaves it ROS 1
