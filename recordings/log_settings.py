@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from recordings.decode import Angle, Angles, frame_name
+from recordings.ros2.from_msg import Angle, Angles, frame_name
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from typing import Any, TypeVar
 import zstandard
 from mcap.records import Channel
 
-from recordings.decode import frame_of
 from recordings.errors import LogError, said
 from recordings.mcap.file import CONVERT, McapFile
 from recordings.mcap.index import Lost
-from recordings.ros2_types import decoder_for, full_name, plain
+from recordings.ros2.cdr import decoder_for, full_name, plain
+from recordings.ros2.from_msg import frame_of
 
 _PLACES = 4  # in a log, at which messages are looked at until one can be read: a filter may begin with nonsense
 _LOOKED_AT = 20  # messages at most at each of them

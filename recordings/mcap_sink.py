@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from recordings.errors import LogError
 from recordings.frame_record import FrameRecord, LossEntry
 from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
-from recordings.ros2 import (
+from recordings.ros2.to_msg import (
     diagnostics,
     disparity_image,
     grid_map,

@@ -19,7 +19,7 @@ import numpy as np
 from recordings.errors import LogError
 from recordings.image_log import CAMERA_FRAMES, FIRST_STAMP, read_frame, write_frames
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2 import disparity_image, image
+from recordings.ros2.to_msg import disparity_image, image
 from recordings.stereo_measures import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns
 from stages.data import Array, Disparity, Source, StereoFrame
 

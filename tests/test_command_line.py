@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.mcap.index import Raw
 from recordings.mcap_sink import McapSink
-from recordings.ros2 import read_disparity, stamp_of
+from recordings.ros2.to_msg import read_disparity, stamp_of
 from recordings.simulator import Simulation
 from recordings.simulator.traverse import level_pose
 from stages.data import Source
@@ -210,7 +210,7 @@ def test_the_pose_comes_from_tf_where_told(traverse, tmp_path):
     """The simulator's /odometry is left out; its pose is written as /tf among another transform."""
     from recordings.mcap.writer import Ros2Writer
     from recordings.mcap_source import McapSource
-    from recordings.ros2 import transform_message
+    from recordings.ros2.to_msg import transform_message
     from stages.data import Pose, Transform
 
     log = tmp_path / "tf.mcap"

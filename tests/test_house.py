@@ -36,8 +36,8 @@ def test_imports_run_one_way(room):
 
 def test_the_rule_would_notice_a_stranger(tmp_path):
     file = tmp_path / "wrong.py"
-    file.write_text("from stages import Match\nimport recordings.ros2\n")
-    assert list(imported(file)) == ["stages.Match", "recordings.ros2"]
+    file.write_text("from stages import Match\nimport recordings.ros2.to_msg\n")
+    assert list(imported(file)) == ["stages.Match", "recordings.ros2.to_msg"]
 
 
 def test_importing_a_stage_does_not_import_files_or_viewers():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings.ros2_types import TYPES
+from recordings.ros2.cdr import TYPES
 from stages.data import Array
 from tests.conftest import rewrite
 

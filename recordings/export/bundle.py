@@ -17,9 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recordings import ros2
 from recordings.atomic_write import written
-from recordings.decode import transform_of
 from recordings.errors import LogError, said
 from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
@@ -28,6 +26,8 @@ from recordings.export.ply import COLOURS, write_ply
 from recordings.mcap.file import iter_decoded
 from recordings.paint import hillshade
 from recordings.result_log import without_results
+from recordings.ros2.from_msg import transform_of
+from recordings.ros2.to_msg import to_msg as ros2
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Source, Tiles, Transform
 
 REGION = ("/nav/regional_map", "/nav/regional_navigation_map")

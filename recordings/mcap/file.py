@@ -43,7 +43,7 @@ from recordings.mcap.index import (
     records,
 )
 from recordings.mcap.walk import walk
-from recordings.ros2_types import decoder_for
+from recordings.ros2.cdr import decoder_for
 
 CONVERT = "rosbags-convert --src IN.bag --dst OUT --dst-storage mcap"  # of a ROS 1 bag; mcap convert leaves it ROS 1
 

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
 from recordings.errors import LogError, counted
 from recordings.mcap.file import McapFile
-from recordings.ros2_types import LAST_STAMP, TYPES
+from recordings.ros2.cdr import LAST_STAMP, TYPES
 
 LARGE = 64 * 1024  # bytes; from here a message gets a chunk of its own
 COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings import ros2
 from recordings.mcap.writer import Ros2Writer
 from recordings.rig import pinhole
-from recordings.ros2_types import make
+from recordings.ros2.cdr import make
+from recordings.ros2.to_msg import to_msg as ros2
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
 from stages.data import LEVEL_FRAME, Pose, Transform

@@ -17,7 +17,7 @@ from zstandard import ZstdCompressor
 from recordings import McapSource
 from recordings.inventory import describe
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2 import camera_info, image, imu, odometry, transform_message
+from recordings.ros2.to_msg import camera_info, image, imu, odometry, transform_message
 from stages.data import CameraImage, CameraModel, Pose, Tilt, Transform
 
 WIDTH, HEIGHT = 24, 16

@@ -11,8 +11,8 @@ import pytest
 
 from recordings import McapSource
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2 import camera_info, image, transform_message
-from recordings.ros2_types import make
+from recordings.ros2.cdr import make
+from recordings.ros2.to_msg import camera_info, image, transform_message
 from stages.data import Transform
 from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, items_of, model, picture, write_sample
 
@@ -109,7 +109,7 @@ def test_truth_is_used_with_its_partner_where_it_is_told(tmp_path: Path) -> None
 
 
 def test_a_pose_among_results_is_named_but_not_taken(tmp_path: Path) -> None:
-    from recordings.ros2 import odometry
+    from recordings.ros2.to_msg import odometry
     from stages.data import Pose
 
     path = tmp_path / "log.mcap"

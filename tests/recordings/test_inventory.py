@@ -11,7 +11,7 @@ import pytest
 
 from recordings import McapSource
 from recordings.inventory import format_description
-from recordings.ros2 import transform_message
+from recordings.ros2.to_msg import transform_message
 from stages.data import Transform
 from tests.recordings.sample_log import (
     BASELINE,

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.ros2 import header, transform_message
-from recordings.ros2_types import make
+from recordings.ros2.cdr import make
+from recordings.ros2.to_msg import header, transform_message
 from stages.data import CameraImage, Mount, Transform
 from tests.recordings.sample_log import (
     BASELINE,

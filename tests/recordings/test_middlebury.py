@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from recordings import McapSource, ros2, scoring
+from recordings import McapSource, scoring
 from recordings.errors import LogError
 from recordings.image_log import FIRST_STAMP
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
 from recordings.middlebury import import_scene, logs_of, read_pfm, read_scene
+from recordings.ros2.to_msg import to_msg as ros2
 from recordings.score_table import format_score
 from stages.data import Disparity, StereoFrame
 from tests.recordings import middlebury_scene as scenes

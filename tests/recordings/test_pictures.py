@@ -14,7 +14,7 @@ from recordings import paint
 from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.pictures import MARGIN, disparity_picture, draw, elevation_picture, navigation_picture
-from recordings.ros2 import disparity_image, grid_map, occupancy_grid
+from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
 from stages.data import LEVEL_FRAME, Array, Cell, Disparity, ElevationMap, NavigationMap
 
 START, STEP = 1_000_000_000, 500_000_000

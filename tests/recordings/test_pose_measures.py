@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings.pose_measures import PoseTally
-from recordings.ros2 import odometry
+from recordings.ros2.to_msg import odometry
 from recordings.score_table import place_lines
 from stages.data import Pose
 

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from recordings.decode import camera_model, pixels_of, pose_of, up_of
 from recordings.errors import LogError
-from recordings.ros2 import camera_info, header, image
-from recordings.ros2_types import make
+from recordings.ros2.cdr import make
+from recordings.ros2.from_msg import camera_model, pixels_of, pose_of, up_of
+from recordings.ros2.to_msg import camera_info, header, image
 from stages.data import CameraModel
 from tests.recordings.sample_log import HEIGHT, WIDTH, picture
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from recordings.ros2_types import TYPES
+from recordings.ros2.cdr import TYPES
 
 BASE, NAME, ARRAY = 1, 2, 3  # kinds of fields in the type store; a sequence is 4
 NAMES = {"float64": "double", "float32": "float", "bool": "boolean", "byte": "octet"}

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recordings.ros2_types import make
+from recordings.ros2.cdr import make
 from stages.data import (
     Array,
     CameraModel,

@@ -23,7 +23,8 @@ from rosbags.typesys import Stores, get_typestore
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2 import (
+from recordings.ros2.cdr import TYPES, decoder_for, make
+from recordings.ros2.to_msg import (
     camera_info,
     diagnostics,
     disparity_image,
@@ -40,7 +41,6 @@ from recordings.ros2 import (
     stamp_of,
     transform_message,
 )  # fmt: skip
-from recordings.ros2_types import TYPES, decoder_for, make
 from stages.data import (
     Disparity,
     ElevationMap,
@@ -51,7 +51,7 @@ from stages.data import (
     StereoCamera,
     Transform,
 )  # fmt: skip
-from tests.recordings.idl import idl_schema
+from tests.recordings.ros2.idl import idl_schema
 from tests.recordings.sample_log import data_folder, model, write_sample
 
 STAMP = 1_700_000_000_123_456_789

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
-from recordings.ros2 import stamp_of
-from recordings.ros2_types import LAST_STAMP
+from recordings.ros2.cdr import LAST_STAMP
+from recordings.ros2.to_msg import stamp_of
 from stages.data import Array, CameraModel, Pose, Tilt, Transform
 
 # Encoding -> (dtype, channels in the message, conversion to gray or RGB)
