@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from recordings.mcap_sink import McapSink
-    from recordings.mcap_source import McapSource
     from recordings.rerun_sink import RerunSink
+    from recordings.source.mcap_source import McapSource
 
 __all__ = ["McapSink", "McapSource", "RerunSink"]
 
-_HOMES = {"McapSink": "mcap_sink", "McapSource": "mcap_source", "RerunSink": "rerun_sink"}
+_HOMES = {"McapSink": "mcap_sink", "McapSource": "source.mcap_source", "RerunSink": "rerun_sink"}
 
 
 def __getattr__(name: str) -> Any:

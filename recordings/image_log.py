@@ -17,13 +17,13 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from recordings.discovery import SIDES
 from recordings.errors import LogError, counted
 from recordings.mcap.writer import Ros2Writer
-from recordings.rig import BODY_FROM_OPTICAL, pinhole
 from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.from_msg import unpacked_pixels
 from recordings.ros2.to_msg import camera_info, image, imu, transform_message
+from recordings.source.calibration import BODY_FROM_OPTICAL, pinhole
+from recordings.source.discovery import SIDES
 from stages.data import Array, StereoCamera, StereoFrame, Transform
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}

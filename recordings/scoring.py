@@ -24,10 +24,10 @@ from scipy.spatial.transform import Rotation
 from recordings import measures, terrain_measures
 from recordings.errors import LogError, said
 from recordings.mcap.file import McapFile, iter_decoded
-from recordings.mcap_log import is_within, part_of
 from recordings.pose_measures import PoseTally
 from recordings.result_log import part_run, without_results
 from recordings.ros2.to_msg import to_msg as ros2
+from recordings.source.log import is_within, part_of
 from recordings.stereo_measures import StereoErrors, cropped_columns
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
 

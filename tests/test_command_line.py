@@ -209,8 +209,8 @@ def test_part_of_a_log(traverse, tmp_path):
 def test_the_pose_comes_from_tf_where_told(traverse, tmp_path):
     """The simulator's /odometry is left out; its pose is written as /tf among another transform."""
     from recordings.mcap.writer import Ros2Writer
-    from recordings.mcap_source import McapSource
     from recordings.ros2.to_msg import transform_message
+    from recordings.source.mcap_source import McapSource
     from stages.data import Pose, Transform
 
     log = tmp_path / "tf.mcap"

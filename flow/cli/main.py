@@ -191,7 +191,7 @@ def _info(options: argparse.Namespace) -> int:
     from flow.config.loader import load
     from flow.runtime.run import fitted
     from recordings import McapSource
-    from recordings.inventory import describe, format_description
+    from recordings.source.inventory import describe, format_description
 
     graph = load(options.pipeline, options.set)
     if not isinstance(graph.source, McapSource):

@@ -14,11 +14,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.mcap.writer import Ros2Writer
-from recordings.rig import pinhole
 from recordings.ros2.cdr import make
 from recordings.ros2.to_msg import to_msg as ros2
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
+from recordings.source.calibration import pinhole
 from stages.data import LEVEL_FRAME, Pose, Transform
 
 Logged = tuple[int, str, Any]

@@ -24,10 +24,10 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.inventory import format_description
 from recordings.mcap.chunk import unpacked
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MAGIC, Index, Lost
+from recordings.source.inventory import format_description
 from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, inventory_of, items_of, rewritten
 
 

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from recordings import McapSource, mcap_messages
+from recordings import McapSource
 from recordings.mcap.index import JITTER
+from recordings.source import topics as mcap_messages
 from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, inventory_of, items_of, rewritten
 
 BACK = 2 * PERIOD + PERIOD // 2

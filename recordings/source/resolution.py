@@ -6,14 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from recordings.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.errors import LogError, counted
-from recordings.log_settings import LogSettings
 from recordings.mcap.file import McapFile
-from recordings.mcap_cameras import CAMERAS, first_infos, unfit_images, unread_images
-from recordings.mcap_messages import Messages, attempt
-from recordings.rig import Camera, Frames, baseline_note, calibrated_pair, mounted, rovers
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, tilt_of
+from recordings.source.calibration import Camera, Frames, baseline_note, calibrated_pair, mounted, rovers
+from recordings.source.cameras import CAMERAS, first_infos, unfit_images, unread_images
+from recordings.source.discovery import TRANSFORMS, Topic, Topics, discover
+from recordings.source.settings import LogSettings
+from recordings.source.topics import Messages, attempt
 from stages.data import LEVEL_FRAME, Mount, Pose
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")

@@ -210,7 +210,7 @@ def test_an_imu_that_is_nonsense_for_long_is_still_an_inclinometer(tmp_path: Pat
             message.orientation_covariance = np.full(9, -1.0)
         return message
 
-    monkeypatch.setattr("recordings.mcap_messages._LOOKED_AT", 1)
+    monkeypatch.setattr("recordings.source.topics._LOOKED_AT", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
 

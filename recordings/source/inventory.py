@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from recordings.errors import counted
 from recordings.mcap.index import Lost
-from recordings.mcap_cameras import CAMERAS
-from recordings.mcap_log import McapLog
-from recordings.mcap_messages import peek_stamp
+from recordings.source.cameras import CAMERAS
+from recordings.source.log import McapLog
+from recordings.source.topics import peek_stamp
 from stages.data import StereoCamera, Tilt
 
 Stamps = NDArray[np.int64]

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from recordings.errors import LogError
-from recordings.log_settings import LogSettings
-from recordings.mcap_log import McapLog
+from recordings.source.log import McapLog
+from recordings.source.settings import LogSettings
 from stages.data import CameraImage, Mount, Pose, Tilt
 
 

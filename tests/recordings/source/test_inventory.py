@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from recordings import McapSource
-from recordings.inventory import format_description
 from recordings.ros2.to_msg import transform_message
+from recordings.source.inventory import format_description
 from stages.data import Transform
 from tests.recordings.sample_log import (
     BASELINE,
@@ -26,7 +26,7 @@ from tests.recordings.sample_log import (
     rewritten,
     write_sample,
 )
-from tests.recordings.test_mcap_log import copied
+from tests.recordings.source.test_log import copied
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings.discovery import looks_rectified
 from recordings.errors import LogError
 from recordings.ros2.from_msg import transform_of
+from recordings.source.discovery import looks_rectified
 from stages.data import Array, CameraModel, Mount, Pose, StereoCamera, Transform
 
 # A camera's axes (x right, y down, z forward) in the rover's (x forward, y left, z up), when it looks straight ahead.

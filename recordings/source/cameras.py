@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.mcap_messages import Messages
 from recordings.ros2.from_msg import camera_model, frame_of, pixels_of, unread_encoding
+from recordings.source.topics import Messages
 from stages.data import Array, CameraModel
 
 CAMERAS = ("left", "right")

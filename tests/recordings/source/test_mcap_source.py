@@ -285,7 +285,7 @@ def test_a_camera_whose_images_are_all_broken_is_missing_before_the_run(
             message.data = message.data[:-5]
         return message
 
-    monkeypatch.setattr("recordings.mcap_messages._LOOKED_AT", 1)
+    monkeypatch.setattr("recordings.source.topics._LOOKED_AT", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert list(log.missing) == (["right"] if whole is None else [])
         if whole is None:

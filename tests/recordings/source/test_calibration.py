@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.rig import Frames, calibrated_pair
 from recordings.ros2.to_msg import transform_message
+from recordings.source.calibration import Frames, calibrated_pair
 from stages.data import CameraModel, Transform
 from tests.recordings.sample_log import FRAMES, LEFT, START, TRANSFORMS, model, tilt_quaternion, write_sample
 

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import LogError, said
-from recordings.log_settings import LogSettings
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import Lost, Raw
-from recordings.mcap_cameras import CAMERAS
-from recordings.mcap_messages import Decoder, peek_stamp
-from recordings.mcap_opening import Opening
-from recordings.rig import Camera, rovers
 from recordings.ros2.from_msg import camera_model, frame_of, pixels_of, pose_of, stamp_or, tilt_of
+from recordings.source.calibration import Camera, rovers
+from recordings.source.cameras import CAMERAS
+from recordings.source.discovery import BARE_TILT, IMAGES, POSES, TILTS
+from recordings.source.resolution import Opening
+from recordings.source.settings import LogSettings
+from recordings.source.topics import Decoder, peek_stamp
 from stages.data import CameraImage, CameraModel, Pose, Tilt
 
 LEAD = 1_000_000_000  # ns; tilt and pose are read this much beyond the ends of a range, to interpolate at its frames
