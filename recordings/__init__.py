@@ -6,13 +6,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from recordings.mcap_sink import McapSink
-    from recordings.rerun_sink import RerunSink
+    from recordings.sinks.mcap_sink import McapSink
+    from recordings.sinks.rerun_sink import RerunSink
     from recordings.source.mcap_source import McapSource
 
 __all__ = ["McapSink", "McapSource", "RerunSink"]
 
-_HOMES = {"McapSink": "mcap_sink", "McapSource": "source.mcap_source", "RerunSink": "rerun_sink"}
+_HOMES = {"McapSink": "sinks.mcap_sink", "McapSource": "source.mcap_source", "RerunSink": "sinks.rerun_sink"}
 
 
 def __getattr__(name: str) -> Any:

@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recordings import paint
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2.to_msg import read_disparity, read_grid_map, read_occupancy_grid
+from recordings.sinks import colormaps as paint
 from stages.data import Array, ElevationMap, NavigationMap
 
 MAP_HEIGHT = 900  # px; maps are enlarged by a whole factor to about that

@@ -18,8 +18,8 @@ import numpy as np
 import tifffile
 
 from flow.cli.main import main as roverflow
-from recordings import paint
 from recordings.simulator import Simulation
+from recordings.sinks import colormaps as paint
 from stages.data import Array, Cell, ElevationMap, Reason
 from tests.bench.refining import DISPARITIES, stereo_part
 from tests.bench.terrain import frames, measured_tilt, through

@@ -28,8 +28,8 @@ from flow.errors import RoverflowError, SinkError, UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.replay import as_json, product_version, replay
 from recordings.atomic_write import writing, written
-from recordings.earlier_output import is_ours
 from recordings.errors import LogError, UnwritableError
+from recordings.sinks.overwrite import is_ours
 
 BEGINNING = 0.6  # s of the demo's traverse, one frame
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE = 0, 1, 2, 3

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.recorded_scene import START, STEP, Record, record_of, scene
 from tests.recordings.sample_log import items_of, write_sample
+from tests.recordings.sinks.recorded_scene import START, STEP, Record, record_of, scene
 
 
 @pytest.fixture(scope="session")

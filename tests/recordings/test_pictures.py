@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings import paint
 from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.pictures import MARGIN, disparity_picture, draw, elevation_picture, navigation_picture
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
+from recordings.sinks import colormaps as paint
 from stages.data import LEVEL_FRAME, Array, Cell, Disparity, ElevationMap, NavigationMap
 
 START, STEP = 1_000_000_000, 500_000_000

@@ -1,6 +1,6 @@
-"""Writes every intermediate of a run into a rerun recording, for the debugging desk of `recordings.desk`.
+"""Writes every intermediate of a run into a rerun recording, for the debugging desk of `recordings.sinks.blueprint`.
 
-The pictures are in `recordings.drawings`; this is their clock, their ledger and their file. rerun's errors, by
+The pictures are in `recordings.sinks.loggers`; this is their clock, their ledger and their file. rerun's errors, by
 its default mere warnings, are raised.
 """
 
@@ -20,10 +20,10 @@ import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
-from recordings.desk import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, Place, desk
-from recordings.drawings import PICTURES, Canvas, same_view
 from recordings.errors import LogError, counted
 from recordings.frame_record import FrameRecord, LossEntry
+from recordings.sinks.blueprint import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, Place, desk
+from recordings.sinks.loggers import PICTURES, Canvas, same_view
 from stages.data import Array, ElevationMap, Pose, StereoFrame
 
 RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well

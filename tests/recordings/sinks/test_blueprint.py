@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from recordings.desk import Panel, Place, desk
+from recordings.sinks.blueprint import Panel, Place, desk
 
 
 def views(part: Any) -> list[Any]:

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import rerun as rr
 
-from recordings.desk import CLOCK, FRAME
 from recordings.errors import LogError
-from recordings.rerun_sink import PLOTTED, RESERVE, RerunSink
+from recordings.sinks.blueprint import CLOCK, FRAME
+from recordings.sinks.rerun_sink import PLOTTED, RESERVE, RerunSink
 from stages.data import Mount
-from tests.recordings.recorded_scene import START, STEP, STREAMS, Loss, Record, entities, record_of, rows, scene
+from tests.recordings.sinks.recorded_scene import START, STEP, STREAMS, Loss, Record, entities, record_of, rows, scene
 
 
 def test_every_intermediate_is_there(rrd: Path) -> None:
@@ -177,7 +177,7 @@ def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it was not foreseen, rerun tells it only to its log: the sink has to find out."""
-    monkeypatch.setattr("recordings.rerun_sink._room", lambda file: RESERVE)
+    monkeypatch.setattr("recordings.sinks.rerun_sink._room", lambda file: RESERVE)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = RerunSink()
     sink.open(tmp_path / "run.rrd", STREAMS, {})

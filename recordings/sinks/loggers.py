@@ -16,11 +16,11 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from recordings import paint
-from recordings.desk import LEDGER, Panel, Place
 from recordings.errors import counted
 from recordings.measures import cell_centres
-from recordings.png import png16
+from recordings.sinks import colormaps as paint
+from recordings.sinks.blueprint import LEDGER, Panel, Place
+from recordings.sinks.png16 import png16
 from stages.data import (
     LEVEL_FRAME,
     Array,

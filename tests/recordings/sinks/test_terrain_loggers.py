@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from recordings.paint import REASONS
-from recordings.rerun_sink import RerunSink
+from recordings.sinks.colormaps import REASONS
+from recordings.sinks.rerun_sink import RerunSink
 from stages.data import LEVEL_FRAME, Reason, VoxelMap
-from tests.recordings.recorded_scene import START, Record, entities, rows, scene
+from tests.recordings.sinks.recorded_scene import START, Record, entities, rows, scene
 
 
 def test_a_map_that_a_later_one_contains_is_drawn_as_that_one_only(tmp_path: Path) -> None:

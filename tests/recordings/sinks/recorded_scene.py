@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from recordings.desk import CLOCK, FRAME
-from recordings.rerun_sink import RerunSink
+from recordings.sinks.blueprint import CLOCK, FRAME
+from recordings.sinks.rerun_sink import RerunSink
 from stages.data import (
     LEVEL_FRAME,
     Array,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from recordings.drawings import same_view
-from recordings.rerun_sink import RerunSink
+from recordings.sinks.loggers import same_view
+from recordings.sinks.rerun_sink import RerunSink
 from stages.data import LEVEL_FRAME, Cell, Pose, StereoCamera, StereoFrame, Transform
-from tests.recordings.recorded_scene import (
+from tests.recordings.sinks.recorded_scene import (
     HEIGHT,
     START,
     STEP,
