@@ -7,7 +7,7 @@ import json
 import pytest
 
 from tests.conftest import roverflow
-from tests.recordings.middlebury_scene import write_scene
+from tests.recordings.importers.middlebury_scene import write_scene
 
 MATCHING = """
 source: {use: recordings.McapSource}

@@ -17,7 +17,7 @@ from flow.errors import UsageError
 from recordings import McapSource, RerunSink
 from recordings.sinks.overwrite import is_ours
 from tests.conftest import SMALL, rewrite, roverflow
-from tests.recordings.middlebury_scene import write_scene
+from tests.recordings.importers.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
 TAKEN = "is there already and no {} of roverflow; choose another name or remove it"

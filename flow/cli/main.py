@@ -314,7 +314,7 @@ def _import_images_arguments(sub: argparse.ArgumentParser) -> None:
 
 
 def _import_images(options: argparse.Namespace) -> int:
-    from recordings.image_log import import_images, pair_images
+    from recordings.importers.images import import_images, pair_images
 
     left, right = pair_images(options.source)
     check_outputs({"input log": options.out}, [options.calibration, *left, *right], is_ours)
@@ -332,7 +332,7 @@ def _import_middlebury_arguments(sub: argparse.ArgumentParser) -> None:
 
 
 def _import_middlebury(options: argparse.Namespace) -> int:
-    from recordings.middlebury import import_scene, logs_of
+    from recordings.importers.middlebury import import_scene, logs_of
 
     scenes, broken = logs_of(options.source, options.out), list[LogError]()
     for folder, log in scenes:
@@ -358,8 +358,8 @@ def _score_arguments(sub: argparse.ArgumentParser) -> None:
 
 
 def _score(options: argparse.Namespace) -> int:
-    from recordings.score_table import format_score
-    from recordings.scoring import score
+    from recordings.scoring.score import score
+    from recordings.scoring.table import format_score
 
     truth = options.truth or options.result
     check_outputs({"score": options.json}, [options.result, truth], is_ours)
@@ -407,9 +407,9 @@ def _demo_arguments(sub: argparse.ArgumentParser) -> None:
 
 def _demo(options: argparse.Namespace) -> int:
     from recordings.export.bundle import export
-    from recordings.pictures import draw
-    from recordings.score_table import format_brief
-    from recordings.scoring import score
+    from recordings.export.png_pages import draw
+    from recordings.scoring.score import score
+    from recordings.scoring.table import format_brief
 
     folder = options.out
     check_demo(folder, is_ours)

@@ -14,7 +14,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from recordings.measures import cell_centres
+from recordings.scoring.metrics import cell_centres
 from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason, Source
 
 Rgb = tuple[int, int, int]

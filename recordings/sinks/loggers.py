@@ -17,7 +17,7 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from recordings.errors import counted
-from recordings.measures import cell_centres
+from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps as paint
 from recordings.sinks.blueprint import LEDGER, Panel, Place
 from recordings.sinks.png16 import png16

@@ -22,9 +22,9 @@ import numpy as np
 
 from recordings import McapSource
 from recordings.mcap.file import iter_decoded
-from recordings.measures import without_plane
 from recordings.ros2.from_msg import transform_of
 from recordings.ros2.to_msg import to_msg as ros2
+from recordings.scoring.metrics import without_plane
 from recordings.simulator import Simulation, raycast, traverse, write_log
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Pose, Transform
 

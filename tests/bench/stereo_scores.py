@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from flow.config.loader import load
-from recordings.middlebury import read_scene
-from recordings.stereo_measures import StereoErrors
+from recordings.importers.middlebury import read_scene
+from recordings.scoring.stereo_metrics import StereoErrors
 from stages.data import Array, Disparity, StereoFrame
 from stages.matching.match import Match
 from stages.matching.match_opencv import MatchOpenCV

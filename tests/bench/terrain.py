@@ -28,10 +28,10 @@ from flow.align import Token
 from flow.cli.main import arguments
 from flow.config.loader import load
 from flow.runtime.malloc import keep_freed_memory
-from recordings.score_table import ROWS, terrain_figures, terrain_lines
+from recordings.scoring.table import ROWS, terrain_figures, terrain_lines
+from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
-from recordings.terrain_measures import TerrainTally, TrueGround
 from stages.data import Array, Cell, Disparity, Mount, Source, StereoFrame, Tilt, Transform
 
 SLOPE, TILT_NOISE = np.radians(5.0), np.radians(0.3)

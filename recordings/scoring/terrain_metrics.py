@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from recordings.measures import HeightErrors, cell_centres, in_ring, share, without_plane
+from recordings.scoring.metrics import HeightErrors, cell_centres, in_ring, share, without_plane
 from stages.data import Array, Cell, ElevationMap
 
 NEAR = 8.0  # m from base_link, within which cells and rocks are asked for

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recordings.pose_measures import PoseTally
 from recordings.ros2.to_msg import odometry
-from recordings.score_table import place_lines
+from recordings.scoring.pose_metrics import PoseTally
+from recordings.scoring.table import place_lines
 from stages.data import Pose
 
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.errors import LogError
+from recordings.export.png_pages import MARGIN, disparity_picture, draw, elevation_picture, navigation_picture
 from recordings.mcap.writer import Ros2Writer
-from recordings.pictures import MARGIN, disparity_picture, draw, elevation_picture, navigation_picture
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
 from recordings.sinks import colormaps as paint
 from stages.data import LEVEL_FRAME, Array, Cell, Disparity, ElevationMap, NavigationMap

@@ -11,7 +11,7 @@ import pytest
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.image_log import import_images, pair_images
+from recordings.importers.images import import_images, pair_images
 from tests.recordings.sample_log import data_folder, picture
 
 CALIBRATION = {"fx": 20.0, "cx": 11.5, "cy": 7.5, "baseline": 0.25}

@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from recordings import McapSource, scoring
+from recordings import McapSource
 from recordings.errors import LogError
-from recordings.image_log import FIRST_STAMP
+from recordings.importers.images import FIRST_STAMP
+from recordings.importers.middlebury import import_scene, logs_of, read_pfm, read_scene
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
-from recordings.middlebury import import_scene, logs_of, read_pfm, read_scene
 from recordings.ros2.to_msg import to_msg as ros2
-from recordings.score_table import format_score
+from recordings.scoring.score import score as scoring
+from recordings.scoring.table import format_score
 from stages.data import Disparity, StereoFrame
-from tests.recordings import middlebury_scene as scenes
-from tests.recordings.middlebury_scene import write_pfm, write_scene
+from tests.recordings.importers import middlebury_scene as scenes
+from tests.recordings.importers.middlebury_scene import write_pfm, write_scene
 from tests.recordings.sample_log import data_folder
 
 

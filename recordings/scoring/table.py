@@ -7,9 +7,9 @@ from textwrap import wrap
 from typing import Any
 
 from recordings.errors import counted
-from recordings.measures import share
-from recordings.scoring import Score
-from recordings.stereo_measures import CROP_STEP, REGIONS, THRESHOLDS
+from recordings.scoring.metrics import share
+from recordings.scoring.score import Score
+from recordings.scoring.stereo_metrics import CROP_STEP, REGIONS, THRESHOLDS
 
 ROWS = (
     "DEM RMSE 0-8 m, tilt and all, cm",

@@ -21,14 +21,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings import measures, terrain_measures
 from recordings.errors import LogError, said
 from recordings.mcap.file import McapFile, iter_decoded
-from recordings.pose_measures import PoseTally
-from recordings.result_log import part_run, without_results
 from recordings.ros2.to_msg import to_msg as ros2
+from recordings.scoring.pose_metrics import PoseTally
+from recordings.scoring.result_log import part_run, without_results
+from recordings.scoring.score import metrics as measures
+from recordings.scoring.score import terrain_metrics as terrain_measures
+from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
 from recordings.source.log import is_within, part_of
-from recordings.stereo_measures import StereoErrors, cropped_columns
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")

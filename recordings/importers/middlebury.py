@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.image_log import CAMERA_FRAMES, FIRST_STAMP, read_frame, write_frames
+from recordings.importers.images import CAMERA_FRAMES, FIRST_STAMP, read_frame, write_frames
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, image
-from recordings.stereo_measures import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns
+from recordings.scoring.stereo_metrics import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns
 from stages.data import Array, Disparity, Source, StereoFrame
 
 IMAGES, CALIBRATION, MASK = ("im0.png", "im1.png"), "calib.txt", "mask0nocc.png"

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings import measures
+from recordings.scoring.score import metrics as measures
 
 NAN = float("nan")
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from recordings.score_table import terrain_lines
+from recordings.scoring.table import terrain_lines
+from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
 from recordings.simulator import Simulation, ground_truth
 from recordings.simulator.ground_truth import in_sight, rocks_in_view
-from recordings.terrain_measures import TerrainTally, TrueGround
 from stages.data import Array, Cell, ElevationMap
 
 SMALL = Simulation(frames=1, width=320, height=240, abundance=0.15, relief_cells=512, seed=5, threads=1)

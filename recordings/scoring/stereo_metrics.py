@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from recordings.measures import share
+from recordings.scoring.metrics import share
 from stages.data import Array
 
 THRESHOLDS = (0.5, 1.0, 2.0, 4.0)  # px

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.stereo_measures import StereoErrors, cropped_columns
+from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
 
 NAN, INF = float("nan"), float("inf")
 
