@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130  # exit codes
+
 
 class RoverflowError(Exception):
     """Base of the family; `exit_code` is what the command line leaves with."""

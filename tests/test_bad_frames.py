@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from recordings.mcap.file import iter_decoded
+from recordings.ros2 import to_msg as ros2
 from recordings.ros2.cdr import TYPES
-from recordings.ros2.to_msg import to_msg as ros2
 from tests.conftest import FRAMES, rewrite, roverflow
 
 BAD = 1  # the frame that is made bad

@@ -300,7 +300,7 @@ def test_what_a_full_disk_took_is_kept_and_so_is_the_result_before(traverse, tmp
 
 
 def test_a_reader_that_leaves_does_not_change_the_exit_code(traverse):
-    command = f"{sys.executable} -m flow.cli.main info {traverse} | true; exit ${{PIPESTATUS[0]}}"
+    command = f"{sys.executable} -m flow info {traverse} | true; exit ${{PIPESTATUS[0]}}"
     assert subprocess.run(["bash", "-c", command], cwd=ROOT, stderr=subprocess.PIPE).returncode == 0
 
 
@@ -318,7 +318,7 @@ def test_an_interrupt_leaves_a_readable_result_and_exits_130(traverse, tmp_path)
     pipeline, out = tmp_path / "slow.yaml", tmp_path / "out.mcap"
     pipeline.write_text(SLOW)
     arguments = ["run", traverse, "-p", pipeline, "-o", out, "--no-rrd", "--workers", "1"]
-    command = [sys.executable, "-m", "flow.cli.main", *map(str, arguments)]
+    command = [sys.executable, "-m", "flow", *map(str, arguments)]
     child = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     until = time.monotonic() + 60
     while not list(tmp_path.glob("*.partial")) and time.monotonic() < until:
@@ -367,7 +367,7 @@ AT_EXIT = "atexit.register(os.kill, os.getpid(), signal.SIGINT)"
 @pytest.mark.parametrize("moment", [ON_IMPORT.format("flow.cli.report"), ON_IMPORT.format("rerun"), AT_EXIT])
 def test_an_interrupt_while_the_program_begins_or_ends_is_no_traceback(moment):
     heard = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # what runs in the background may ignore it
-    code = f"import atexit, os, signal, sys\n{heard}\n{moment}\nfrom flow.cli.program import program\nsys.exit(program())"
+    code = f"import atexit, os, signal, sys\n{heard}\n{moment}\nimport flow.__main__"
     done = subprocess.run([sys.executable, "-c", code, "graph"], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == (0 if moment == AT_EXIT else 130)  # at the exit all is done
     assert done.stderr == ("" if moment == AT_EXIT else "roverflow: interrupted\n")
@@ -376,7 +376,7 @@ def test_an_interrupt_while_the_program_begins_or_ends_is_no_traceback(moment):
 def test_a_stage_that_still_works_when_its_frame_is_abandoned_does_not_hold_or_break_the_exit():
     code = """
 import atexit, sys, threading, time
-from flow import cli, program
+from flow.cli import __main__ as program, main as cli
 def abandoned():
     threading.Thread(target=time.sleep, args=(60,), daemon=True, name="worker-0").start()
     print("INCOMPLETE")
@@ -393,13 +393,13 @@ sys.exit(program.program())
 def test_a_program_that_is_started_without_a_stream_works_all_the_same(traverse, tmp_path, closed):
     arguments = ["run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--end", "0.8"]
     command = ["bash", "-c", f'"$@" {"" if closed == "stdout" else "2"}>&-', "bash"]
-    command += [sys.executable, "-m", "flow.cli.main", *map(str, arguments)]
+    command += [sys.executable, "-m", "flow", *map(str, arguments)]
     assert subprocess.run(command, cwd=ROOT, capture_output=True).returncode == 0
     assert raw_messages(tmp_path / "out.mcap")
 
 
 def test_help_imports_nothing_heavy():
-    code = "import sys, flow.cli.main; flow.cli.main.parser().format_help(); print(sorted({'numpy', 'cv2'} & set(sys.modules)))"
+    code = "import sys; from flow.cli.main import parser; parser().format_help(); print(sorted({'numpy', 'cv2'} & set(sys.modules)))"
     assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "[]"
 
 

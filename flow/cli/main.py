@@ -22,9 +22,17 @@ from pathlib import Path
 from typing import Any
 
 from flow.cli.arguments import check_demo, check_outputs, count, seconds, size, workers
-from flow.cli.program import INTERRUPTED
 from flow.cli.report import counted, headline, report, say
-from flow.errors import RoverflowError, SinkError, UsageError
+from flow.errors import (
+    COMPLETE,
+    FAILED,
+    INCOMPLETE,
+    INTERRUPTED,
+    UNUSABLE,
+    RoverflowError,
+    SinkError,
+    UsageError,
+)
 from flow.runtime.graph import Graph
 from flow.runtime.replay import as_json, product_version, replay
 from recordings.atomic_write import writing, written
@@ -32,7 +40,6 @@ from recordings.errors import LogError, UnwritableError
 from recordings.sinks.overwrite import is_ours
 
 BEGINNING = 0.6  # s of the demo's traverse, one frame
-COMPLETE, FAILED, UNUSABLE, INCOMPLETE = 0, 1, 2, 3
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -438,8 +445,3 @@ def _demo(options: argparse.Namespace) -> int:
     say(f"the timeline: rerun {shlex.quote(str(rrd))}")
     return _exit_code_of(summary)
 
-
-if __name__ == "__main__":
-    from flow.cli.program import program
-
-    sys.exit(program())

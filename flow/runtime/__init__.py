@@ -1,0 +1,1 @@
+"""A run: graph, alignment into frames, scheduling, ledger of losses, pre-pass over the log, summary."""

@@ -1,0 +1,1 @@
+"""The MCAP container: read whatever its state, and written."""

@@ -1,0 +1,1 @@
+"""Error metrics of a result log against ground truth."""

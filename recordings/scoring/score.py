@@ -23,11 +23,11 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError, said
 from recordings.mcap.file import McapFile, iter_decoded
-from recordings.ros2.to_msg import to_msg as ros2
+from recordings.ros2 import to_msg as ros2
+from recordings.scoring import metrics as measures
+from recordings.scoring import terrain_metrics as terrain_measures
 from recordings.scoring.pose_metrics import PoseTally
 from recordings.scoring.result_log import part_run, without_results
-from recordings.scoring.score import metrics as measures
-from recordings.scoring.score import terrain_metrics as terrain_measures
 from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
 from recordings.source.log import is_within, part_of
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.mcap.writer import Ros2Writer
+from recordings.ros2 import to_msg as ros2
 from recordings.ros2.cdr import make
-from recordings.ros2.to_msg import to_msg as ros2
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
 from recordings.source.calibration import pinhole

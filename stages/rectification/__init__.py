@@ -1,0 +1,1 @@
+"""Rectification and the row offset that calibration leaves."""

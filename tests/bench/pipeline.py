@@ -46,7 +46,7 @@ def _bench(log: Path, pipeline: str, size: str, disparities: int, cores: int) ->
 
 
 def _roverflow(*arguments: object) -> None:
-    subprocess.run([sys.executable, "-m", "flow.cli.main", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([sys.executable, "-m", "flow", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
 
 
 if __name__ == "__main__":

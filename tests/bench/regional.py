@@ -22,8 +22,8 @@ import numpy as np
 
 from recordings import McapSource
 from recordings.mcap.file import iter_decoded
+from recordings.ros2 import to_msg as ros2
 from recordings.ros2.from_msg import transform_of
-from recordings.ros2.to_msg import to_msg as ros2
 from recordings.scoring.metrics import without_plane
 from recordings.simulator import Simulation, raycast, traverse, write_log
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Pose, Transform
@@ -82,7 +82,7 @@ def region(simulation: Simulation, folder: Path) -> Region:
     """The regional map of a traverse, by the command line's default pipeline."""
     log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
     write_log(simulation, log)
-    command = [sys.executable, "-m", "flow.cli.main", "run", log, "-o", out, "--no-rrd", "--summary", summary]
+    command = [sys.executable, "-m", "flow", "run", log, "-o", out, "--no-rrd", "--summary", summary]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     frames = _frames(out)
     errors = _errors(simulation, [frame["/nav/regional_map"] for frame in frames.values()])

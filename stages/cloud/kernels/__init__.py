@@ -1,0 +1,1 @@
+"""Compiled loops of the point cloud stages, each beside its plain reference."""

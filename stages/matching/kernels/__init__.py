@@ -1,0 +1,1 @@
+"""Compiled loops of the matcher, one algorithm a file, each beside its plain reference."""

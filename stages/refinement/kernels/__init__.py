@@ -1,0 +1,1 @@
+"""Compiled loops of refinement, one algorithm a file, each beside its plain reference."""

@@ -1,0 +1,1 @@
+"""Compiled loops over map grids, each beside its plain reference."""

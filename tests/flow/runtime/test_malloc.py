@@ -26,7 +26,7 @@ for thread in threads:
     thread.join()
 ctypes.CDLL(None).malloc_stats()
 """
-PROGRAM = "import sys; sys.argv = ['roverflow', 'graph']; from flow.cli.program import program; program()\n"
+PROGRAM = "import sys; sys.argv = ['roverflow', 'graph']; from flow.cli.__main__ import program; program()\n"
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left alone")

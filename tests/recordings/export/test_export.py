@@ -15,7 +15,7 @@ from PIL import Image
 from recordings.errors import LogError
 from recordings.export.bundle import export, file_names
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2.to_msg import to_msg as ros2
+from recordings.ros2 import to_msg as ros2
 from stages.data import Array, Cell, ElevationMap, NavigationMap, PointCloud, Transform
 
 START = 1_700_000_000_000_000_000

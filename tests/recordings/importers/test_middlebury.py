@@ -17,8 +17,8 @@ from recordings.importers.images import FIRST_STAMP
 from recordings.importers.middlebury import import_scene, logs_of, read_pfm, read_scene
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2.to_msg import to_msg as ros2
-from recordings.scoring.score import score as scoring
+from recordings.ros2 import to_msg as ros2
+from recordings.scoring import score as scoring
 from recordings.scoring.table import format_score
 from stages.data import Disparity, StereoFrame
 from tests.recordings.importers import middlebury_scene as scenes

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from flow.cli.main import main
 from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2.to_msg import to_msg as ros2
-from recordings.scoring.score import score as scoring
+from recordings.ros2 import to_msg as ros2
+from recordings.scoring import score as scoring
 from recordings.scoring.table import ROWS, format_brief, format_score, terrain_lines
 from recordings.simulator import Simulation, ground_truth, write_log
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform

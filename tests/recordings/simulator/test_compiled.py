@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 BELOW = """
 import numpy as np
 from recordings.simulator import ground_truth, raycast

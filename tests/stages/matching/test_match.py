@@ -21,7 +21,7 @@ from stages.matching.match import COSTS, Match
 from tests.bench.stereo_scores import load_scene, rows_filled
 from tests.stages.matching.test_match_opencv import frame_of, slanted_pair, textured
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def same(one, other):

@@ -1,0 +1,168 @@
+"""Cameras and their images: one calibrated camera, the rectified pair, the stereo frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from stages.data.arrays import Array, publish_image, publish_stamp, publish_vector
+
+ALIKE = 1e-3  # of a focal length or of cy, by which those of a rectified pair may differ: a pixel at 1000 px
+_OPENCV = (0, 4, 5, 8, 12, 14)  # coefficients; how many there are tells the model, whatever a driver calls it
+DISTORTION_SIZES = {"plumb_bob": _OPENCV, "rational_polynomial": _OPENCV, "equidistant": (4,)}
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """Calibration of one camera, the fields of sensor_msgs/CameraInfo.
+
+    k: (3, 3) intrinsics of the raw image, px; d: (n,) distortion coefficients; model: "plumb_bob",
+    "rational_polynomial" or "equidistant"; r: (3, 3) rectifying rotation; p: (3, 4) projection of the rectified image,
+    px, with p[0, 3] = -fx * baseline for the right camera of a pair.
+    """
+
+    width: int
+    height: int
+    k: Array
+    d: Array
+    r: Array
+    p: Array
+    model: str = "plumb_bob"
+
+    def __post_init__(self) -> None:
+        for name, shape in (("k", (3, 3)), ("d", (np.size(self.d),)), ("r", (3, 3)), ("p", (3, 4))):
+            publish_vector(self, name, shape)
+
+    @property
+    def turns(self) -> bool:
+        """Whether R is a rotation."""
+        return bool(np.allclose(self.r @ self.r.T, np.eye(3), atol=1e-3) and np.linalg.det(self.r) > 0)
+
+    def unlike(self, right: CameraModel) -> str:
+        """By what the projections of two cameras differ that a rectified pair has in common; empty where by nothing."""
+        shared = {"fx": (0, 0), "fy": (1, 1), "cy": (1, 2)}
+        pairs = {name: (float(self.p[place]), float(right.p[place])) for name, place in shared.items()}
+        differing = [name for name, pair in pairs.items() if not math.isclose(*pair, rel_tol=ALIKE)]
+        return " and ".join(f"{name} is {pairs[name][0]:.6g} and {pairs[name][1]:.6g} px" for name in differing)
+
+    @property
+    def unusable(self) -> str:
+        """Why a raw image cannot be rectified with it, empty where it can."""
+        sizes = DISTORTION_SIZES.get(self.model)
+        if sizes is None:
+            return f"unknown distortion model '{self.model}'; use {', '.join(DISTORTION_SIZES)}"
+        if self.d.size not in sizes:
+            wanted = " or ".join(map(str, sizes))
+            return f"a {self.model} camera has {wanted} distortion coefficients, the calibration has {self.d.size}"
+        if not min(self.k[0, 0], self.k[1, 1]) > 0:
+            return "the calibration of a raw image has no focal length in K"
+        if not self.turns:
+            return "R of the calibration is not a rotation"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoCamera:
+    """A rectified stereo camera: Z = fx * baseline / (d + cx_right - cx), x_right = x_left - d.
+
+    fx, fy, cx, cy, cx_right: px of the left rectified image; baseline: m, > 0; width, height: px; frame_id: the left
+    optical frame; raw: both cameras' own calibration where the images still have to be rectified, else None.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline: float
+    width: int
+    height: int
+    cx_right: float = cast(float, None)
+    frame_id: str = "camera"
+    raw: tuple[CameraModel, CameraModel] | None = None
+
+    def __post_init__(self) -> None:
+        if self.cx_right is None:
+            object.__setattr__(self, "cx_right", self.cx)
+        for name in ("fx", "fy", "baseline", "width", "height"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"StereoCamera.{name} must be positive, not {getattr(self, name)}")
+        if not np.all(np.isfinite([self.fx, self.fy, self.cx, self.cy, self.cx_right, self.baseline])):
+            raise ValueError("StereoCamera has a calibration value that is not finite")
+
+    @classmethod
+    def from_models(cls, left: CameraModel, right: CameraModel, frame_id: str, rectified: bool) -> StereoCamera:
+        """The rectified camera that two CameraInfo messages describe through their projection matrices.
+
+        Raises ValueError where these are not those of a rectified pair.
+        """
+        if differing := left.unlike(right):
+            raise ValueError(f"the cameras' P are not those of a rectified pair: {differing}")
+        return cls(
+            fx=float(left.p[0, 0]), fy=float(left.p[1, 1]), cx=float(left.p[0, 2]), cy=float(left.p[1, 2]),
+            baseline=float(left.p[0, 3] / left.p[0, 0] - right.p[0, 3] / right.p[0, 0]),
+            width=left.width, height=left.height, cx_right=float(right.p[0, 2]), frame_id=frame_id,
+            raw=None if rectified else (left, right),
+        )  # fmt: skip
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the calibration says that hardly any camera has, a sentence each: it may be of another image size."""
+        size, said = f"{self.width}x{self.height}", []
+        for name, extent in (("cx", self.width), ("cx_right", self.width), ("cy", self.height)):
+            if not 0.2 * extent <= getattr(self, name) <= 0.8 * extent:
+                outer = f"{name} of {getattr(self, name):g} px lies in the outer fifth of {size} images"
+                said.append(f"{outer}: check that the calibration is for this size")
+        if self.baseline > 5:
+            said.append(f"the baseline is {self.baseline:g} m: check that it is given in metres")
+        return tuple(said)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraImage:
+    """One image of one camera, with its calibration.
+
+    pixels: uint8 or uint16, (H, W) or (H, W, 3) RGB; frame_id: the camera's optical frame; rectified: whether `pixels`
+    are rectified already.
+    """
+
+    stamp: int
+    pixels: Array
+    model: CameraModel
+    frame_id: str
+    rectified: bool
+
+    def __post_init__(self) -> None:
+        publish_stamp(self)
+        publish_image(self, "pixels")
+
+    def pair_with(self, right: CameraImage) -> StereoFrame:
+        """The stereo frame of this (left) image and its right partner; it carries the left image's stamp."""
+        camera = StereoCamera.from_models(self.model, right.model, self.frame_id, self.rectified and right.rectified)
+        return StereoFrame(self.stamp, self.pixels, right.pixels, camera)
+
+
+@dataclass(frozen=True, eq=False)
+class StereoFrame:
+    """A pair of images taken at one time. left, right: uint8 or uint16, (H, W) or (H, W, 3) RGB."""
+
+    stamp: int
+    left: Array
+    right: Array
+    camera: StereoCamera
+
+    def __post_init__(self) -> None:
+        publish_stamp(self)
+        publish_image(self, "left")
+        publish_image(self, "right")
+        if self.left.shape != self.right.shape:
+            raise ValueError(f"StereoFrame: left is {self.left.shape}, right is {self.right.shape}")
+        if self.left.dtype != self.right.dtype:
+            raise ValueError(f"StereoFrame: left is {self.left.dtype}, right is {self.right.dtype}; record both alike")
+        if self.left.shape[:2] != (self.camera.height, self.camera.width):
+            raise ValueError(
+                f"StereoFrame: images are {self.left.shape[1]}x{self.left.shape[0]}, "
+                f"the calibration is for {self.camera.width}x{self.camera.height}"
+            )
