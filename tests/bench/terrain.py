@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flow.align import Token
-from flow.cli.main import arguments
+from flow.cli import arguments
 from flow.config.loader import load
 from flow.runtime.malloc import keep_freed_memory
 from recordings.scoring.table import ROWS, terrain_figures, terrain_lines

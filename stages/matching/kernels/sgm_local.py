@@ -1,7 +1,7 @@
 """Semi-global matching around a prior: of each pixel only a few disparities are searched, those about what it is
 expected to have.
 
-Cost, paths and selection are those of the search of a whole range (stages.matching.kernels.semiglobal), at a fraction of its
+Cost, paths and selection are those of the search of a whole range (`semiglobal`), at a fraction of its
 time, and nothing is too near to be found. The trick is how windows of neighbouring pixels that begin at different
 disparities are brought together: the lanes of each stand in memory between stretches of 255, "not searched", and are
 loaded from as many bytes later or earlier as the other window begins.

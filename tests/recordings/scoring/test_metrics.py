@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.scoring.score import metrics as measures
+from recordings.scoring import metrics as measures
 
 NAN = float("nan")
 
