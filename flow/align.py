@@ -17,7 +17,7 @@ from itertools import islice
 from typing import Any
 
 from flow.runtime.graph import hints_of
-from flow.runtime.ledger import Absent, Entry, Reason, failure
+from flow.runtime.ledger import Absent, Loss, LossReason, failure
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ HISTORY = 10_000_000_000
 SMOOTHED = 3  # samples that smoothing needs; a line through two smooths nothing
 GIVEN_UP = 100  # messages without a partner that are remembered, to say by how much their partner came too late
 
-Answer = Token | Entry
+Answer = Token | Loss
 Answers = Iterable[Answer]
 
 
@@ -112,7 +112,7 @@ class PairState:
             while queue:
                 yield self._unmatched(port, "the log ended before its partner came")
 
-    def _unmatched(self, port: str, why: str = "") -> Entry:
+    def _unmatched(self, port: str, why: str = "") -> Loss:
         """Give up the first that waits. why: what to say unless its partner was given up before it came; where there is
         nothing, how far off the nearest is that waits or was given up."""
         other = "left" if port == "right" else "right"
@@ -126,7 +126,7 @@ class PairState:
             limit = f"{_time(self.rule.slop)} ({self.name}.slop)"
             why = f"the nearest {self.inputs[other]} without a partner is {_time(apart)} away, more than {limit}"
         self.given_up[port].append((token.stamp, arrived))
-        return Entry(self.inputs[port], token.stamp, self.name, Reason.UNMATCHED, why)
+        return Loss(self.inputs[port], token.stamp, self.name, LossReason.UNMATCHED, why)
 
 
 @dataclass(frozen=True)
@@ -288,13 +288,13 @@ class SamplerState:
             try:
                 value = self.rule.choose(self.name, self.stream, token.stamp, self.samples, final)
             except Exception as error:
-                value = Absent(Entry(self.name, token.stamp, self.name, Reason.FAILED, failure(error)))
+                value = Absent(Loss(self.name, token.stamp, self.name, LossReason.FAILED, failure(error)))
             if value is None:
                 return
             self.wanted.popleft()
             self.passed = token.stamp
             if isinstance(value, str):
-                value = Absent(Entry(self.name, token.stamp, self.name, Reason.UNALIGNED, value))
+                value = Absent(Loss(self.name, token.stamp, self.name, LossReason.UNALIGNED, value))
             yield Token(token.stamp, value)
 
     def _forget(self, log_time: int) -> None:
@@ -333,7 +333,7 @@ def _paired(name: str, left: Token, right: Token) -> Any:
     try:
         return left.value.pair_with(right.value)
     except Exception as error:
-        return Absent(Entry(name, left.stamp, name, Reason.FAILED, failure(error)))
+        return Absent(Loss(name, left.stamp, name, LossReason.FAILED, failure(error)))
 
 
 pair, interpolate, nearest, latest = Pair, Interpolate, Nearest, Latest

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 
-class LossEntry(Protocol):
+class Loss(Protocol):
     """One entry of the ledger: what was lost, when (ns), at which stage, and why."""
 
     @property
@@ -33,7 +33,7 @@ class FrameRecord(Protocol):
     @property
     def items(self) -> Mapping[str, Any]: ...
     @property
-    def entries(self) -> Sequence[LossEntry]: ...
+    def entries(self) -> Sequence[Loss]: ...
     @property
     def seconds(self) -> Mapping[str, float]: ...
     @property

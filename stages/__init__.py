@@ -3,21 +3,21 @@
 from stages.cloud.clean import Clean
 from stages.cloud.level import Level
 from stages.cloud.reproject import Reproject
-from stages.cloud.voxel_grid import Voxels
+from stages.cloud.voxel_grid import VoxelGrid
 from stages.data import (
     CameraImage,
     CameraModel,
     CameraMotion,
     Cell,
+    CellReason,
     Disparity,
     ElevationMap,
     MatchHealth,
     Mount,
     NavigationMap,
+    PixelOrigin,
     PointCloud,
     Pose,
-    Reason,
-    Source,
     StereoCamera,
     StereoFrame,
     Tilt,
@@ -25,59 +25,59 @@ from stages.data import (
     Transform,
     VoxelMap,
 )
-from stages.localisation.pose_filter import Locate
+from stages.localisation.pose_filter import PoseFilter
 from stages.localisation.tilt.check import CheckTilt
 from stages.localisation.visual_odometry import VisualOdometry
-from stages.matching.lr_check import CrossCheck
+from stages.matching.lr_check import LeftRightCheck
 from stages.matching.match import Match
 from stages.matching.match_health import CheckMatches
 from stages.matching.match_opencv import MatchOpenCV
-from stages.matching.pyramid import Enlarge, Halve, Swap
+from stages.matching.pyramid import Halve, SwapViews, Upsample
 from stages.rectification.rectify import Rectify
 from stages.refinement.refine import Refine
 from stages.terrain.binarise import Binarise
 from stages.terrain.dem import Voxelise
-from stages.terrain.features import Assess
+from stages.terrain.features import TerrainFeatures
 from stages.terrain.fuse import Fuse
 
 __all__ = [
-    "Assess",
     "Binarise",
     "CameraImage",
     "CameraModel",
     "CameraMotion",
     "Cell",
+    "CellReason",
     "CheckMatches",
     "CheckTilt",
     "Clean",
-    "CrossCheck",
     "Disparity",
     "ElevationMap",
-    "Enlarge",
     "Fuse",
     "Halve",
+    "LeftRightCheck",
     "Level",
-    "Locate",
     "Match",
     "MatchHealth",
     "MatchOpenCV",
     "Mount",
     "NavigationMap",
+    "PixelOrigin",
     "PointCloud",
     "Pose",
-    "Reason",
+    "PoseFilter",
     "Rectify",
     "Refine",
     "Reproject",
-    "Source",
     "StereoCamera",
     "StereoFrame",
-    "Swap",
+    "SwapViews",
+    "TerrainFeatures",
     "Tilt",
     "TiltHealth",
     "Transform",
+    "Upsample",
     "VisualOdometry",
+    "VoxelGrid",
     "VoxelMap",
     "Voxelise",
-    "Voxels",
 ]

@@ -20,13 +20,21 @@ import tifffile
 from flow.cli.main import main as roverflow
 from recordings.simulator import Simulation
 from recordings.sinks import colormaps as paint
-from stages.data import Array, Cell, ElevationMap, Reason
+from stages.data import Array, Cell, CellReason, ElevationMap
 from tests.bench.refining import DISPARITIES, stereo_part
 from tests.bench.terrain import frames, measured_tilt, through
 from tests.study import devon
 
 VIEWS = ((11, 0.05, 15), (12, 0.15, 0), (13, 0.15, 15))  # seed, rocks k, frame of 30: the first or the middle one
-SHOWN = (Reason.CLEAR, Reason.STEP, Reason.BESIDE, Reason.SLOPE, Reason.OCCLUDED, Reason.UNSURE, Reason.UNOBSERVED)
+SHOWN = (
+    CellReason.CLEAR,
+    CellReason.STEP,
+    CellReason.BESIDE,
+    CellReason.SLOPE,
+    CellReason.OCCLUDED,
+    CellReason.UNSURE,
+    CellReason.UNOBSERVED,
+)
 WIDTH, HEIGHT = 440, 330  # px of each panel
 TRAVERSE = ("--frames", "40", "--seed", "12", "--rocks", "0.1")
 ZOOM = 2
@@ -56,7 +64,7 @@ def terrain_picture() -> Array:
         told = paint.legend_colours(navigation.reason, paint.REASONS)
         true = paint.legend_colours(
             np.select([~ground.seen, ground.rock >= 0.2, ground.hazard],
-                      [Reason.UNOBSERVED, Reason.STEP, Reason.SLOPE], Reason.CLEAR), paint.REASONS,
+                      [CellReason.UNOBSERVED, CellReason.STEP, CellReason.SLOPE], CellReason.CLEAR), paint.REASONS,
         )  # fmt: skip
         maps = [_ahead(grid, terrain) for grid in (paint.paint_elevation(terrain), told, true)]
         rows.append(np.hstack([cv2.resize(given["stereo"].left, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), *maps]))

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from recordings.simulator import Simulation
-from stages import Disparity, Match, Rectify, Refine, Source, StereoCamera, StereoFrame
+from stages import Disparity, Match, PixelOrigin, Rectify, Refine, StereoCamera, StereoFrame
 from stages.data import Array
 from stages.refinement.refine import TRUST
 from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stage, stereo_part
@@ -219,7 +219,7 @@ def print_fills(cases: list[Case]) -> None:
     shares = []
     for case in cases:
         disparity = stereo_part("rover", case.frame, case.disparities, entry="rectified")["disparity"]
-        filled = (disparity.source == Source.FILLED) & np.isfinite(case.truth)
+        filled = (disparity.source == PixelOrigin.FILLED) & np.isfinite(case.truth)
         filled[:, : case.disparities] = False
         wrong, seen = np.abs(disparity.pixels - case.truth) > 1, case.mask == 255
         shares.append([100 * wrong[filled & area].mean() for area in (seen, ~seen)])
@@ -236,7 +236,7 @@ def print_skies(cases: list[Case]) -> None:
     for case in cases:
         streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
         for name, chain in (("asked", refined("checked_again")), ("not", refined("checked_again", correlation=0.0))):
-            measured = chain(streams, case).source == Source.MEASURED
+            measured = chain(streams, case).source == PixelOrigin.MEASURED
             known = np.isfinite(case.truth) & (case.mask == 255)
             shares.setdefault(name, []).append((measured[case.mask == 0].mean(), measured[known].mean()))
     (sky, ground), (sky_else, ground_else) = (100 * np.mean(values, axis=0) for values in shares.values())
@@ -248,7 +248,7 @@ def print_worth(cases: list[Case]) -> None:
     """Print what share of the pixels of an origin is right within 1 px, beside the confidence that `rover` states."""
     origins: dict[str, Callable[[Disparity], Array]] = {
         f"measured, {low} to {high}": lambda found, low=low, high=high: (
-            (found.source == Source.MEASURED) & (found.confidence >= low) & (found.confidence < high)
+            (found.source == PixelOrigin.MEASURED) & (found.confidence >= low) & (found.confidence < high)
         )
         for low, high in pairwise((0.6, 0.8, 0.9, 0.95, 1.01))
     }
@@ -340,7 +340,7 @@ def main(folder: Path) -> None:
 
 
 def _legend() -> Iterator[str]:
-    for code, colour in zip(Source, ("black", "green", "blue", "orange"), strict=True):
+    for code, colour in zip(PixelOrigin, ("black", "green", "blue", "orange"), strict=True):
         yield f"{code.name.lower()} {colour}"
 
 

@@ -62,7 +62,7 @@ def test_what_the_rover_is_reaches_every_stage_that_asks(pipeline):
     nodes = load(pipeline, [f"{name}={value}" for name, value in told.items()]).nodes
     assert [node.actor.resolution for node in nodes if hasattr(node.actor, "resolution")] == [0.1] * 3
     assert [node.actor.region for node in nodes if node.name in ("cleaned", "cells")] == [6.0] * 2
-    actors = [node.actor for node in nodes if type(node.actor).__name__ in ("Assess", "Binarise")]
+    actors = [node.actor for node in nodes if type(node.actor).__name__ in ("TerrainFeatures", "Binarise")]
     assert len(actors) == 4
     wanted = {"wheel": 0.6, "max_step": 0.4, "max_slope": np.radians(25), "wheel_track": 2, "ground_clearance": 1}
     for actor in actors:

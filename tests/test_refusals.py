@@ -423,7 +423,7 @@ def test_a_pipeline_whose_aliases_hold_each_other_is_refused_at_once(tmp_path, c
 
 @pytest.mark.parametrize(("settings", "said"), [
     (["region=1km"], "stages.Clean.region: must be at most 200 m, not 1km"),
-    (["wheel=1km"], "stages.Assess.wheel: must be at most 5 m, not 1km"),
+    (["wheel=1km"], "stages.TerrainFeatures.wheel: must be at most 5 m, not 1km"),
     (["cells.region=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
     (["regional_cells.window=400m"], "makes a map 8000 cells of 0.05 m wide, and 4000 is the most"),
 ])  # fmt: skip

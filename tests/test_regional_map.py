@@ -11,7 +11,7 @@ import rasterio
 
 from recordings.mcap.file import iter_decoded
 from recordings.ros2 import to_msg as ros2
-from stages.data import Cell, Reason
+from stages.data import Cell, CellReason
 from tests.bench.regional import RUNS, region, shares_within, traverse_of
 from tests.conftest import FRAMES, SMALL, rewrite, roverflow
 
@@ -38,14 +38,17 @@ def test_a_result_log_says_why_each_cell_is_a_hazard_or_unknown(result, stream):
         for topic in (f"/nav/{stream}", f"/nav/{stream}/reason")
     )
     assert len(grids) == len(reasons) == FRAMES
-    told = {Cell.FREE: {Reason.CLEAR}, Cell.UNKNOWN: {Reason.UNOBSERVED, Reason.OCCLUDED, Reason.UNSURE}}
-    told[Cell.HAZARD] = set(Reason) - told[Cell.FREE] - told[Cell.UNKNOWN] - {Reason.ELEVATION}
+    told = {
+        Cell.FREE: {CellReason.CLEAR},
+        Cell.UNKNOWN: {CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNSURE},
+    }
+    told[Cell.HAZARD] = set(CellReason) - told[Cell.FREE] - told[Cell.UNKNOWN] - {CellReason.ELEVATION}
     for grid, reason in zip(grids, reasons, strict=True):
         navigation = ros2.read_occupancy_grid(grid, reason)
         assert reason.info.pose.position.x == pytest.approx(navigation.origin[0] + reason.info.length_x / 2)
         for state, why in told.items():
             assert set(np.unique(navigation.reason[navigation.cells == state]).tolist()) <= {*why}
-        assert Reason.STEP in navigation.reason
+        assert CellReason.STEP in navigation.reason
 
 
 def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tmp_path, capsys):

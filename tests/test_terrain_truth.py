@@ -11,7 +11,7 @@ import pytest
 
 from flow.cli.main import main
 from recordings.simulator.simulation import Simulation
-from stages.data import Source
+from stages.data import PixelOrigin
 from tests.bench.terrain import RUNS, SLOPE, TILT_NOISE, Run, frames, nodes, score, through, tilt_errors
 
 COMPARED = {name: pipeline for name, pipeline in RUNS.items() if pipeline == "rover"}
@@ -102,7 +102,7 @@ def test_two_thirds_of_the_matchers_errors_are_within_their_sigma_at_every_confi
         for given, exact, _ in frames(traverse_of(seed, abundance), 15):
             streams, _ = through("rover", given | {"tilt": exact["tilt"]})
             found, cloud, truth = streams["disparity"], streams["cloud"], exact["disparity"].pixels.ravel()
-            measured = (cloud.source == Source.MEASURED) & np.isfinite(truth[cloud.pixel])
+            measured = (cloud.source == PixelOrigin.MEASURED) & np.isfinite(truth[cloud.pixel])
             pixel, camera = cloud.pixel[measured], given["stereo"].camera
             disparity = found.pixels.ravel()[pixel]
             sigma = cloud.sigma[measured] * disparity**2 / (camera.fx * camera.baseline)  # px

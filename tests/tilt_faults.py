@@ -23,7 +23,7 @@ streams:
   matched:   {use: stages.Match, frame: stereo, disparities: 64, speckle_size: 100}
   cloud:     {use: stages.Reproject, frame: stereo, disparity: matched}
   motion:    {use: stages.VisualOdometry, frame: stereo, disparity: matched}
-  pose:      {use: stages.Locate, motion: motion, tilt: tilt, mount: mounting}
+  pose:      {use: stages.PoseFilter, motion: motion, tilt: tilt, mount: mounting}
   health:    {use: stages.CheckTilt, motion: motion, tilt: tilt, mount: mounting, cloud: cloud}
 sinks:
   - {use: recordings.McapSink, results: [pose]}

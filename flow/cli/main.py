@@ -444,4 +444,3 @@ def _demo(options: argparse.Namespace) -> int:
     say(f"\n{len(pictures)} pictures in {folder / 'pictures'}, {len(maps)} files of the map in {folder / 'maps'}")
     say(f"the timeline: rerun {shlex.quote(str(rrd))}")
     return _exit_code_of(summary)
-

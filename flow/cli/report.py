@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.runtime.findings import NOTE, WARNING, lines
-from flow.runtime.ledger import Reason, Verdict
+from flow.runtime.ledger import LossReason, Verdict
 
 
 def say(text: str) -> None:
@@ -31,8 +31,8 @@ def headline(summary: dict[str, Any]) -> str:
     frames = f"{whole} of {counted(of, 'frame')}" if all_but else counted(whole, "frame")
     cut_off = summary["interrupted"] and summary["verdict"] != Verdict.COMPLETE
     said = f"interrupted after {frames}" if cut_off else f"{frames} whole"
-    losses = {reason: number for reason, number in drops.items() if reason != Reason.ABANDONED}
-    abandoned = f", {drops[Reason.ABANDONED]} abandoned" if Reason.ABANDONED in drops else ""
+    losses = {reason: number for reason, number in drops.items() if reason != LossReason.ABANDONED}
+    abandoned = f", {drops[LossReason.ABANDONED]} abandoned" if LossReason.ABANDONED in drops else ""
     lost = ", ".join(f"{number} {reason}" for reason, number in losses.items())
     count = f", {counted(sum(losses.values()), 'loss', 'losses')}: {lost}" if losses else ""
     return f"{summary['verdict']}: {said}{abandoned}{count}; {summary['frames_per_second']:.2f} frames/s"

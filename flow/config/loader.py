@@ -11,10 +11,21 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, get_args
 
-from flow.config.node_spec import Entry, mapping
+from flow.config.node_spec import NodeSpec, mapping
 from flow.config.yaml_tree import Value, nearest, read, settled
 from flow.errors import UsageError
-from flow.runtime.graph import Graph, Node, Place, accepts, clock_of, in_order, is_aligner, output_of, ports_of, unfit
+from flow.runtime.graph import (
+    Graph,
+    Node,
+    YamlLocation,
+    accepts,
+    clock_of,
+    in_order,
+    is_aligner,
+    output_of,
+    ports_of,
+    unfit,
+)
 
 SHIPPED = Path(__file__).parent.parent / "pipelines"
 _BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"
@@ -34,7 +45,7 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
         raise UsageError(f"cannot read the pipeline {path}: {error}") from error
     if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))  # stages may stand beside the file that uses them
-    tree = read(text, lambda line: Place(path.name, line))
+    tree = read(text, lambda line: YamlLocation(path.name, line))
     if tree.value is None:
         raise tree.place.error(f"the file is empty; {_BEGIN}")
     _check_keys(tree)
@@ -70,12 +81,12 @@ def _graph(path: Path, text: str, tree: Value) -> Graph:
     for key in ("source", "streams", "sinks"):
         if key not in top:
             raise tree.place.error(f"the pipeline has no '{key}'; {_BEGIN}")
-    from_source = Entry.read(top["source"], "the source", "source")
+    from_source = NodeSpec.read(top["source"], "the source", "source")
     source = from_source.made()
     streams = mapping(top["streams"], "'streams'")
     if not isinstance(top["sinks"].value, list) or not top["sinks"].value:
         raise top["sinks"].place.error("'sinks' must be a list of at least one sink")
-    to_sinks = [Entry.read(item, "a sink", "sink") for item in top["sinks"].value]
+    to_sinks = [NodeSpec.read(item, "a sink", "sink") for item in top["sinks"].value]
     sinks = tuple((entry.use, entry.made()) for entry in to_sinks)
     for entry in to_sinks:
         if [use for use, _ in sinks].count(entry.use) > 1:
@@ -84,7 +95,7 @@ def _graph(path: Path, text: str, tree: Value) -> Graph:
     clocks = {name: name for name in kinds}
     for name, item in streams.items():
         _check_name(name, item.place, kinds)
-    entries = {name: Entry.read(item, f"stream '{name}'", "stage") for name, item in streams.items()}
+    entries = {name: NodeSpec.read(item, f"stream '{name}'", "stage") for name, item in streams.items()}
     wiring = {name: _inputs(name, entry, [*kinds, *streams]) for name, entry in entries.items()}
     places = {name: item.place for name, item in streams.items()}
     nodes = []
@@ -99,7 +110,7 @@ def _graph(path: Path, text: str, tree: Value) -> Graph:
     return graph
 
 
-def _check_name(name: str, place: Place, of_source: Collection[str]) -> None:
+def _check_name(name: str, place: YamlLocation, of_source: Collection[str]) -> None:
     """Whether a stream may be called so."""
     if not (name.isascii() and name.isidentifier()):
         raise place.error(f"'{name}' is no name of a stream; letters, digits and underscores make one, no digit first")
@@ -109,7 +120,7 @@ def _check_name(name: str, place: Place, of_source: Collection[str]) -> None:
         raise place.error(f"'{name}' is already a stream of the source; choose another name")
 
 
-def _inputs(name: str, entry: Entry, streams: list[str]) -> dict[str, str]:
+def _inputs(name: str, entry: NodeSpec, streams: list[str]) -> dict[str, str]:
     """Port -> stream, as the entry of stream `name` wires them."""
     try:
         ports, unneeded = ports_of(entry.kind)
@@ -138,7 +149,7 @@ def _inputs(name: str, entry: Entry, streams: list[str]) -> dict[str, str]:
     return inputs
 
 
-def _node(name: str, entry: Entry, inputs: dict[str, str], kinds: dict[str, type], clocks: dict[str, str]) -> Node:
+def _node(name: str, entry: NodeSpec, inputs: dict[str, str], kinds: dict[str, type], clocks: dict[str, str]) -> Node:
     """The node that makes the stream `name`; kinds, clocks: of the streams before it."""
     actor = entry.made({*inputs, "optional"})
     wanted, _ = ports_of(entry.kind)
@@ -157,7 +168,7 @@ def _node(name: str, entry: Entry, inputs: dict[str, str], kinds: dict[str, type
     return Node(name, entry.use, actor, inputs, output, clock, optional.value, entry.place)
 
 
-def _check_clock(nodes: list[Node], place: Place) -> None:
+def _check_clock(nodes: list[Node], place: YamlLocation) -> None:
     """Whether all stages share one clock, and all alignment comes before them; place: of the streams."""
     stages = [node for node in nodes if not node.aligns]
     if not stages:
@@ -174,7 +185,7 @@ def _check_clock(nodes: list[Node], place: Place) -> None:
             )
 
 
-def _check_streams(sink: Any, entry: Entry, graph: Graph) -> None:
+def _check_streams(sink: Any, entry: NodeSpec, graph: Graph) -> None:
     """Whether the streams that a sink's entry names are there, and of the frames."""
     for key in set(getattr(sink, "names_streams", ())) & entry.given().keys():
         for name in entry.item.value[key].plain():

@@ -9,7 +9,7 @@ from typing import Any
 
 from flow.config.values import coerced
 from flow.config.yaml_tree import Value, nearest
-from flow.runtime.graph import Place, hints_of, is_aligner
+from flow.runtime.graph import YamlLocation, hints_of, is_aligner
 from flow.runtime.ledger import failure
 
 _NEEDED = {  # what a class of that role needs to have
@@ -20,7 +20,7 @@ _NEEDED = {  # what a class of that role needs to have
 
 
 @dataclass(frozen=True)
-class Entry:
+class NodeSpec:
     """The source, a stream or a sink as the file describes it; `kind` is the class that it names by `use`."""
 
     item: Value
@@ -28,7 +28,7 @@ class Entry:
     kind: type
 
     @classmethod
-    def read(cls, item: Value, what: str, role: str) -> Entry:
+    def read(cls, item: Value, what: str, role: str) -> NodeSpec:
         """The entry, its class found and fit for its role; what: it is, in words."""
         use = mapping(item, what).get("use")
         if use is None:
@@ -42,15 +42,15 @@ class Entry:
         return cls(item, use.value, kind)
 
     @property
-    def place(self) -> Place:
+    def place(self) -> YamlLocation:
         """Where it begins."""
         return self.item.place
 
-    def place_of(self, key: str) -> Place:
+    def place_of(self, key: str) -> YamlLocation:
         """Where a key of it stands."""
         return self.item.value[key].place  # type: ignore[no-any-return]
 
-    def place_at_fault(self, keys: Iterable[str]) -> Place:
+    def place_at_fault(self, keys: Iterable[str]) -> YamlLocation:
         """Where it went wrong, as far as can be told: at the last of the keys that the command line set, if any."""
         by_hand = [place for place in map(self.place_of, keys) if place.line is None]
         return by_hand[-1] if by_hand else self.place
@@ -88,7 +88,7 @@ class Entry:
             raise place.error(failure(error)) from error
 
 
-def _class(use: str, place: Place) -> type:
+def _class(use: str, place: YamlLocation) -> type:
     """The dataclass of that name."""
     module_name, _, name = use.rpartition(".")
     try:

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from flow.errors import UsageError
-from flow.runtime.graph import Place
+from flow.runtime.graph import YamlLocation
 
 MOST = 100_000  # values that a pipeline file may hold
 
@@ -24,7 +24,7 @@ class Value:
     """A YAML value and where it stands; mappings and sequences hold `Value`s."""
 
     value: Any
-    place: Place
+    place: YamlLocation
 
     def plain(self) -> Any:
         """The value without places."""
@@ -41,7 +41,7 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
-def read(text: str, at: Callable[[int], Place]) -> Value:
+def read(text: str, at: Callable[[int], YamlLocation]) -> Value:
     """YAML as values; at: the place of a line of it. Raises PipelineError where it is none."""
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -58,7 +58,7 @@ def read(text: str, at: Callable[[int], Place]) -> Value:
         raise at(line).error(f"not valid YAML: {error.problem}") from error
 
 
-def _located(node: yaml.Node, at: Callable[[int], Place], loader: yaml.SafeLoader) -> Value:
+def _located(node: yaml.Node, at: Callable[[int], YamlLocation], loader: yaml.SafeLoader) -> Value:
     place = at(node.start_mark.line + 1)
     if isinstance(node, yaml.MappingNode):
         mapping: dict[str, Value] = {}
@@ -147,7 +147,7 @@ def _change(override: str) -> tuple[list[str], Value]:
     names = path.strip().split(".")
     if not (separator and all(names)):
         raise UsageError(f"--set {override}: expected stream.param=value, or name=value of the pipeline's settings")
-    return names, read(text, lambda line: Place(f"--set {override}", None))
+    return names, read(text, lambda line: YamlLocation(f"--set {override}", None))
 
 
 def _changed(item: Value, what: str, names: Sequence[str], value: Value) -> Value:

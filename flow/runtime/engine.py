@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flow.runtime.graph import Node, Sink
-from flow.runtime.ledger import Absent, Entry, Ledger, Reason, failure
+from flow.runtime.ledger import Absent, Ledger, Loss, LossReason, failure
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class FrameRecord:
     index: int
     stamp: int
     items: Mapping[str, Any]
-    entries: tuple[Entry, ...]
+    entries: tuple[Loss, ...]
     seconds: Mapping[str, float]
     queues: Mapping[str, int]
 
@@ -45,7 +45,7 @@ class _Frame:
     index: int
     stamp: int
     values: dict[str, Any]
-    entries: list[Entry]
+    entries: list[Loss]
     coming: set[str]  # streams that are there or being made
     seconds: dict[str, float] = field(default_factory=dict)
     begun: set[_Work] = field(default_factory=set)
@@ -93,7 +93,7 @@ class Engine:
         self._telling = threading.Lock()
         self.failure: tuple[str, BaseException] | None = None
         self.admitted = self.through = self.whole = 0
-        self.late_entries: list[Entry] = []  # losses of the frames that did not get through
+        self.late_entries: list[Loss] = []  # losses of the frames that did not get through
         self.seconds = dict.fromkeys((work.name for work in self._work), 0.0)
         self._threads = [
             threading.Thread(target=self._work_loop, name=f"worker-{index}", daemon=True) for index in range(workers)
@@ -102,7 +102,7 @@ class Engine:
             thread.start()
 
     def admit(
-        self, stamp: int, values: dict[str, Any], entries: Iterable[Entry], stop: Callable[[], bool] = lambda: False
+        self, stamp: int, values: dict[str, Any], entries: Iterable[Loss], stop: Callable[[], bool] = lambda: False
     ) -> bool:
         """Take a frame in, waiting for room; False if the engine failed or `stop()` became true before there was any.
 
@@ -145,7 +145,7 @@ class Engine:
             self._over = True
             for frame in self._frames:
                 detail = "the run ended before it was through"
-                entry = self._ledger.add(Entry("frame", frame.stamp, "engine", Reason.ABANDONED, detail))
+                entry = self._ledger.add(Loss("frame", frame.stamp, "engine", LossReason.ABANDONED, detail))
                 self.late_entries += [*frame.entries, entry]
 
     # -- scheduling: everything below, up to the work itself, runs under the lock --------------------------------
@@ -228,7 +228,7 @@ class Engine:
             if work.output is None:
                 self.failure = self.failure or (work.name, value)
             stream = work.output or "frame"
-            entry = self._ledger.add(Entry(stream, frame.stamp, work.name, Reason.FAILED, failure(value)))
+            entry = self._ledger.add(Loss(stream, frame.stamp, work.name, LossReason.FAILED, failure(value)))
             frame.entries.append(entry)
             value = Absent(entry)
         if work.output:

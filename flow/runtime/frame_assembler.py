@@ -15,7 +15,7 @@ from typing import Any
 
 from flow.align import Answers, Token
 from flow.runtime.graph import Event, Graph
-from flow.runtime.ledger import Absent, Entry, Ledger, Reason
+from flow.runtime.ledger import Absent, Ledger, Loss, LossReason
 
 # ns; a stamp that runs ahead of the log's clock by this much more than the one before it is in doubt
 DOUBT = 1_000_000_000
@@ -32,7 +32,7 @@ class ReadyFrame:
 
     stamp: int
     values: dict[str, Any]
-    entries: list[Entry]
+    entries: list[Loss]
 
 
 @dataclass(eq=False)
@@ -117,7 +117,7 @@ def _judged(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:
     yield from waiting
 
 
-class Feeder:
+class FrameAssembler:
     """Feeds the events of one log through the aligners of a graph."""
 
     def __init__(self, graph: Graph, ledger: Ledger) -> None:
@@ -131,7 +131,7 @@ class Feeder:
         made = {node.name for node in graph.stages}
         self._entry_streams = [stream for stream in graph.frame_streams if stream not in made]
         self._waiting: dict[str, deque[Token]] = {stream: deque() for stream in self._entry_streams}
-        self._entries: list[Entry] = []
+        self._entries: list[Loss] = []
         self.messages: Counter[str] = Counter()
 
     def frames(self, events: Iterable[Event]) -> Iterator[ReadyFrame]:
@@ -145,11 +145,11 @@ class Feeder:
             for name, aligner in self._aligners.items():
                 self._answer(name, log_time, aligner.tick(log_time))
             if isinstance(item, Exception):
-                self._lose(Entry(stream, log_time, "source", Reason.UNREADABLE, str(item)))
+                self._lose(Loss(stream, log_time, "source", LossReason.UNREADABLE, str(item)))
             elif stream in self._wanted:
                 self.messages[stream] += 1
                 if message.fault:
-                    self._lose(Entry(stream, item.stamp, "source", Reason.OUT_OF_ORDER, message.fault))
+                    self._lose(Loss(stream, item.stamp, "source", LossReason.OUT_OF_ORDER, message.fault))
                 else:
                     self._take(stream, log_time, Token(item.stamp, item))
             yield from self._ready()
@@ -158,7 +158,7 @@ class Feeder:
         yield from self._ready()
 
     @property
-    def late_entries(self) -> list[Entry]:
+    def late_entries(self) -> list[Loss]:
         """Losses noticed after the last frame that entered the engine."""
         tokens = [token for queue in self._waiting.values() for token in queue]
         return [*self._entries, *(token.value.cause for token in tokens if isinstance(token.value, Absent))]
@@ -178,14 +178,14 @@ class Feeder:
 
     def _answer(self, name: str, log_time: int, answers: Answers) -> None:
         for answer in answers:
-            if isinstance(answer, Entry):
+            if isinstance(answer, Loss):
                 self._lose(answer)
             else:
                 if isinstance(answer.value, Absent) and answer.value.cause.stage == name:
                     self._ledger.add(answer.value.cause)
                 self._take(name, log_time, answer)
 
-    def _lose(self, entry: Entry) -> None:
+    def _lose(self, entry: Loss) -> None:
         self._entries.append(self._ledger.add(entry))
 
     def _ready(self) -> Iterator[ReadyFrame]:

@@ -78,7 +78,7 @@ class Sink(Protocol):
 
 
 @dataclass(frozen=True)
-class Place:
+class YamlLocation:
     """Where something stands: a line of a pipeline file, or a setting on the command line (`line` is then None)."""
 
     file: str
@@ -101,7 +101,7 @@ class Node:
     output: type
     clock: str
     optional: bool
-    place: Place
+    place: YamlLocation
 
     @property
     def aligns(self) -> bool:
@@ -229,7 +229,7 @@ def accepts(wanted: Any, given: type) -> bool:
     return wanted is Any or (isinstance(wanted, type) and issubclass(given, wanted))
 
 
-def output_of(actor: Any, kinds: dict[str, type], place: Place) -> type:
+def output_of(actor: Any, kinds: dict[str, type], place: YamlLocation) -> type:
     """The type of the stream that `actor` makes out of inputs of these types."""
     if is_aligner(type(actor)):
         try:
@@ -242,7 +242,7 @@ def output_of(actor: Any, kinds: dict[str, type], place: Place) -> type:
     return returned
 
 
-def clock_of(name: str, actor: Any, clocks: dict[str, str], place: Place) -> str:
+def clock_of(name: str, actor: Any, clocks: dict[str, str], place: YamlLocation) -> str:
     """The clock of stream `name`; `clocks` maps input ports to theirs."""
     if is_aligner(type(actor)):
         return name if actor.clock is None else clocks[actor.clock]
@@ -252,7 +252,7 @@ def clock_of(name: str, actor: Any, clocks: dict[str, str], place: Place) -> str
     return next(iter(clocks.values()))
 
 
-def in_order(inputs: Mapping[str, Iterable[str]], places: Mapping[str, Place]) -> list[str]:
+def in_order(inputs: Mapping[str, Iterable[str]], places: Mapping[str, YamlLocation]) -> list[str]:
     """Names sorted so that each comes after its inputs; raises PipelineError naming the streams of a cycle."""
     done: list[str] = []
     path: list[str] = []

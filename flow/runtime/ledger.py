@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 _HOUSE = {"flow", "stages", "recordings"}
 
 
-class Reason(StrEnum):
+class LossReason(StrEnum):
     """Why something was lost."""
 
     UNREADABLE = "unreadable"  # the source could not read or decode it
@@ -41,13 +41,13 @@ FLOW = Path(__file__).resolve().parent.parent
 
 
 @dataclass(frozen=True)
-class Entry:
+class Loss:
     """One loss. stamp: ns of the log's clock; stage: the node that noticed; detail: one sentence."""
 
     stream: str
     stamp: int
     stage: str
-    reason: Reason
+    reason: LossReason
     detail: str
 
     def as_dict(self) -> dict[str, str | int]:
@@ -59,7 +59,7 @@ class Entry:
 class Absent:
     """Stands in a frame for the item that was lost, so that nobody downstream waits for it."""
 
-    cause: Entry
+    cause: Loss
 
 
 def failure(error: BaseException) -> str:
@@ -105,16 +105,16 @@ class Ledger:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._entries: list[Entry] = []
+        self._entries: list[Loss] = []
 
-    def add(self, entry: Entry) -> Entry:
+    def add(self, entry: Loss) -> Loss:
         """Record a loss."""
         with self._lock:
             self._entries.append(entry)
         return entry
 
     @property
-    def entries(self) -> tuple[Entry, ...]:
+    def entries(self) -> tuple[Loss, ...]:
         """All entries, sorted by stamp, stage and stream, so that equal runs give equal ledgers."""
         with self._lock:
             return tuple(sorted(self._entries, key=lambda entry: (entry.stamp, entry.stage, entry.stream)))

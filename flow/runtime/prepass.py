@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from flow.runtime.findings import WARNING, Finding, finding, plain
-from flow.runtime.frame_assembler import Feeder
+from flow.runtime.frame_assembler import FrameAssembler
 from flow.runtime.graph import Event, Graph, Node
 from flow.runtime.ledger import Absent, Ledger, failure
 
@@ -72,7 +72,7 @@ def _samples(graph: Graph, excerpts: Excerpts) -> list[dict[str, Any]]:
     """The streams that no stage makes, of the first whole frame of each excerpt."""
     samples = dict[int, dict[str, Any]]()
     for events in excerpts(EXCERPTS, graph.source_streams):
-        for frame in Feeder(graph, Ledger()).frames(events):
+        for frame in FrameAssembler(graph, Ledger()).frames(events):
             if not any(isinstance(value, Absent) for value in frame.values.values()):
                 samples[frame.stamp] = frame.values
                 break

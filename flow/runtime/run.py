@@ -17,7 +17,7 @@ from typing import Any
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.runtime.engine import Engine
 from flow.runtime.findings import NOTE, WARNING, Finding, finding, findings
-from flow.runtime.frame_assembler import Feeder
+from flow.runtime.frame_assembler import FrameAssembler
 from flow.runtime.graph import Event, Graph, Log, Sink
 from flow.runtime.ledger import Ledger, Verdict, failure
 from flow.runtime.prepass import surveyed
@@ -149,7 +149,7 @@ def run(
     used = {use: sink for use, sink in graph.sinks if use in outputs}
     wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
     sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
-    feeder, started, finished = Feeder(graph, ledger), 0.0, False
+    feeder, started, finished = FrameAssembler(graph, ledger), 0.0, False
     engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
     try:
         said = "\n".join(f"{name}: {found['sentence']}" for name, found in surveys.items())
@@ -199,7 +199,7 @@ class _StoppedError(Exception):
     """Leaves the log in the middle; the aligners then draw no conclusion from its end."""
 
 
-def _feed(feeder: Feeder, events: Iterable[Event], engine: Engine, stop: Stop) -> bool:
+def _feed(feeder: FrameAssembler, events: Iterable[Event], engine: Engine, stop: Stop) -> bool:
     """Admit the frames of the log; False if it was stopped, or an output failed, before the log's end."""
     with suppress(_StoppedError):
         for frame in feeder.frames(events):
@@ -237,7 +237,7 @@ def _peak_memory_mb() -> float:
     return round(peak * (1 if sys.platform == "darwin" else 1024) / 1e6, 1)
 
 
-def _counted(feeder: Feeder, engine: Engine, ledger: Ledger, times: dict[str, float]) -> dict[str, Any]:
+def _counted(feeder: FrameAssembler, engine: Engine, ledger: Ledger, times: dict[str, float]) -> dict[str, Any]:
     """Of the summary, what is counted and timed."""
     return {
         "frames_in": engine.admitted,

@@ -28,7 +28,7 @@ from recordings.ros2 import to_msg as ros2
 from recordings.ros2.from_msg import transform_of
 from recordings.scoring.result_log import without_results
 from recordings.sinks.colormaps import hillshade
-from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Source, Tiles, Transform
+from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, PixelOrigin, Tiles, Transform
 
 REGION = ("/nav/regional_map", "/nav/regional_navigation_map")
 FRAME = ("/nav/elevation_map", "/nav/navigation_map")
@@ -67,7 +67,7 @@ def _messages(result: Path, lost: Counter[str] | None, *topics: str) -> Iterator
 
 
 @dataclass(eq=False)
-class _Region:
+class _RegionExport:
     """The regional map in one frame of reference, as far as it has been read."""
 
     terrain: Mosaic
@@ -83,11 +83,11 @@ class _Region:
 
 def _export_region(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
     """The regional map in `out`; where it began anew in further frames of reference, a folder for each in `out`."""
-    regions: dict[str, _Region] = {}
+    regions: dict[str, _RegionExport] = {}
     for stamp, frame in _messages(result, lost, *REGION, POINTS):
         if REGION[0] in frame:
             given = _read(ros2.read_grid_map, frame[REGION[0]], result)
-            region = regions.setdefault(given.frame_id, _Region(_terrain_mosaic(given, RIM)))
+            region = regions.setdefault(given.frame_id, _RegionExport(_terrain_mosaic(given, RIM)))
             region.last = stamp
             _lay_terrain(region.terrain, given)
             if POINTS in frame and "level" in frame:
@@ -252,7 +252,7 @@ def _write_points(path: Path, points: dict[str, Array], about: str) -> None:
 def _colour(colours: Tiles, points: dict[str, Array], level: Transform, resolution: float) -> None:
     """Keep, for every cell, the colour of the point in it whose depth is known best."""
     if "source" in points:  # a guess colours nothing
-        points = {name: values[points["source"] == Source.MEASURED] for name, values in points.items()}
+        points = {name: values[points["source"] == PixelOrigin.MEASURED] for name, values in points.items()}
     if "colors" not in points or "sigma" not in points or not len(points["x"]):
         return
     x, y, _ = level(np.column_stack([points["x"], points["y"], points["z"]])).T

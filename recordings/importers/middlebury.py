@@ -21,7 +21,7 @@ from recordings.importers.images import CAMERA_FRAMES, FIRST_STAMP, read_frame, 
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, image
 from recordings.scoring.stereo_metrics import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns
-from stages.data import Array, Disparity, Source, StereoFrame
+from stages.data import Array, Disparity, PixelOrigin, StereoFrame
 
 IMAGES, CALIBRATION, MASK = ("im0.png", "im1.png"), "calib.txt", "mask0nocc.png"
 TRUTHS = ("disp0GT.pfm", "disp0.pfm")  # the first that is there
@@ -192,7 +192,7 @@ def _write_truth(writer: Ros2Writer, scene: Scene) -> None:
     writer.metadata("middlebury", {"scene": scene.name, **scene.calibration})
     if truth is not None:
         known = np.isfinite(truth)
-        source = np.where(known, np.uint8(Source.MEASURED), np.uint8(Source.UNKNOWN))
+        source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
         disparity = Disparity(stamp, truth, source, known.astype(np.float32), camera=scene.frame.camera)
         message = replace(disparity_image(disparity), min_disparity=0.0, max_disparity=float(scene.ndisp))
         writer.write("/truth/disparity", message, stamp)

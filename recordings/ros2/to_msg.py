@@ -20,12 +20,12 @@ from stages.data import (
     Array,
     CameraModel,
     Cell,
+    CellReason,
     Disparity,
     ElevationMap,
     NavigationMap,
     PointCloud,
     Pose,
-    Reason,
     Transform,
 )
 
@@ -97,8 +97,8 @@ def disparity_image(disparity: Disparity) -> Any:
 
 
 def source_image(disparity: Disparity) -> Any:
-    """sensor_msgs/Image, mono8, of where each pixel of a disparity image comes from: the codes of `Source`, 0 unknown,
-    1 measured, 2 plane, 3 filled."""
+    """sensor_msgs/Image, mono8, of where each pixel of a disparity image comes from: the codes of `PixelOrigin`, 0
+    unknown, 1 measured, 2 plane, 3 filled."""
     return image(disparity.stamp, _frame_of(disparity), disparity.source)
 
 
@@ -118,7 +118,7 @@ def read_disparity(message: Any) -> NDArray[np.float32]:
 
 def point_cloud(cloud: PointCloud) -> Any:
     """sensor_msgs/PointCloud2: x, y, z, rgb (PCL's packing, 0x00RRGGBB in the bits of a float32), sigma, and source
-    (the codes of `Source`, as float32) where not all points are measured."""
+    (the codes of `PixelOrigin`, as float32) where not all points are measured."""
     names = ("x", "y", "z", "rgb", "sigma") + (() if cloud.source is None else ("source",))
     packed = np.zeros((len(cloud.points), len(names)), np.dtype("<f4"))
     for axis in range(3):  # numpy copies column by column faster
@@ -244,8 +244,8 @@ def read_occupancy_grid(message: Any, reasons: Any = None) -> NavigationMap:
     info = message.info
     cells = np.asarray(message.data, np.int8).reshape(info.height, info.width)
     reason = np.full(cells.shape, REASON_UNTOLD, np.uint8)
-    reason[cells == Cell.FREE] = Reason.CLEAR
-    reason[cells == Cell.UNKNOWN] = Reason.UNOBSERVED
+    reason[cells == Cell.FREE] = CellReason.CLEAR
+    reason[cells == Cell.UNKNOWN] = CellReason.UNOBSERVED
     if reasons is not None:
         reason = _layers(reasons)["reason"].astype(np.uint8)
     resolution = float(str(np.float32(info.resolution)))  # the message holds float32: 0.05 stays 0.05

@@ -15,7 +15,7 @@ import numpy as np
 from recordings.simulator import raycast
 from recordings.simulator.compiled import allocating
 from recordings.simulator.simulation import FrameTruth, Simulation
-from stages.data import LEVEL_FRAME, Array, Cell, Disparity, ElevationMap, NavigationMap, Reason, Source
+from stages.data import LEVEL_FRAME, Array, Cell, CellReason, Disparity, ElevationMap, NavigationMap, PixelOrigin
 
 FINE = 3  # points along each side of a cell
 SHORT = 0.002  # m before its end that a line of sight may stop
@@ -29,7 +29,7 @@ def true_disparity(simulation: Simulation, stamp: int, truth: FrameTruth) -> Dis
     camera = simulation.camera
     pixels = np.where(np.isfinite(truth.depth), camera.fx * camera.baseline / truth.depth, np.nan).astype(np.float32)
     known = np.isfinite(pixels)
-    source = np.where(known, np.uint8(Source.MEASURED), np.uint8(Source.UNKNOWN))
+    source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
     return Disparity(stamp, pixels, source, known.astype(np.float32), camera=camera)
 
 
@@ -53,7 +53,9 @@ def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[E
     visible = visible_cells(simulation, truth, count)
     more = _map_layers(simulation, truth, x, y, elevation, visible, surface.reshape(x.shape))
     layers = {"elevation": elevation, "visible": visible, **more}
-    reason = np.where(on_high_rock, Reason.STEP, np.where(hazard, Reason.SLOPE, Reason.CLEAR)).astype(np.uint8)
+    reason = np.where(on_high_rock, CellReason.STEP, np.where(hazard, CellReason.SLOPE, CellReason.CLEAR)).astype(
+        np.uint8
+    )
     return (
         ElevationMap(stamp, layers, step, (-half, -half), LEVEL_FRAME),
         NavigationMap(stamp, cells, reason.reshape(x.shape), step, (-half, -half), LEVEL_FRAME),

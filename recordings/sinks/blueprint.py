@@ -21,7 +21,7 @@ FRAME = "frame"  # the timeline that counts frames
 LEDGER, SUMMARY, SECONDS, QUEUES = "ledger", "summary", "seconds", "queues"
 LEGEND_LINES = 4  # of a plot; the legend of more would hide the plot
 
-Places = tuple["Place", ...]
+Places = tuple["ViewSpec", ...]
 _View = rrb.Spatial2DView | rrb.Spatial3DView | rrb.TimeSeriesView | rrb.TextLogView | rrb.TextDocumentView
 _Part = _View | rrb.Tabs | rrb.Vertical | rrb.Horizontal | rrb.Grid
 
@@ -53,7 +53,7 @@ class Panel(Enum):
 
 
 @dataclass(frozen=True)
-class Place:
+class ViewSpec:
     """Where a picture hangs: its panel, its entity, the title of its view, and for pictures in space their frame."""
 
     panel: Panel
@@ -67,7 +67,7 @@ class Place:
         return self.path.partition("/")[0]
 
 
-def desk(hung: Iterable[Place]) -> rrb.Blueprint:
+def blueprint(hung: Iterable[ViewSpec]) -> rrb.Blueprint:
     """The blueprint for the pictures that hang so far, in the order in which they were first hung."""
     drawn = tuple(hung)
     columns: list[tuple[_Part, float]] = []
@@ -83,7 +83,7 @@ def desk(hung: Iterable[Place]) -> rrb.Blueprint:
     return rrb.Blueprint(body, rrb.TimePanel(state="collapsed", timeline=CLOCK), collapse_panels=True)
 
 
-def _at(drawn: Places, *panels: Panel) -> list[Place]:
+def _at(drawn: Places, *panels: Panel) -> list[ViewSpec]:
     return [place for place in drawn if place.panel in panels]
 
 

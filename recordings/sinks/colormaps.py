@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from recordings.scoring.metrics import cell_centres
-from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason, Source
+from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, PixelOrigin
 
 Rgb = tuple[int, int, int]
 
@@ -24,10 +24,10 @@ BEHIND = 1.0  # m behind the rover that a picture shows where the camera has loo
 
 UNKNOWN_RGB: Rgb = (46, 47, 54)
 SOURCES: Mapping[int, tuple[str, Rgb]] = {
-    Source.UNKNOWN: ("unknown", UNKNOWN_RGB),
-    Source.MEASURED: ("measured", (62, 150, 104)),
-    Source.PLANE: ("plane", (84, 132, 222)),
-    Source.FILLED: ("filled", (232, 164, 60)),
+    PixelOrigin.UNKNOWN: ("unknown", UNKNOWN_RGB),
+    PixelOrigin.MEASURED: ("measured", (62, 150, 104)),
+    PixelOrigin.PLANE: ("plane", (84, 132, 222)),
+    PixelOrigin.FILLED: ("filled", (232, 164, 60)),
 }
 CELLS: Mapping[int, tuple[str, Rgb]] = {
     Cell.UNKNOWN: ("unknown", UNKNOWN_RGB),
@@ -35,16 +35,16 @@ CELLS: Mapping[int, tuple[str, Rgb]] = {
     Cell.HAZARD: ("hazard", (216, 62, 48)),
 }
 REASONS: Mapping[int, tuple[str, Rgb]] = {
-    Reason.CLEAR: ("clear", CELLS[Cell.FREE][1]),
-    Reason.UNOBSERVED: ("unobserved", UNKNOWN_RGB),
-    Reason.ELEVATION: ("elevation", (200, 40, 90)),
-    Reason.STEP: ("step", (240, 140, 40)),
-    Reason.SLOPE: ("slope", (168, 90, 200)),
-    Reason.ROUGHNESS: ("roughness", (90, 140, 230)),
-    Reason.CLEARANCE: ("clearance", (216, 62, 48)),
-    Reason.BESIDE: ("beside", (250, 205, 130)),
-    Reason.OCCLUDED: ("occluded", (96, 84, 110)),
-    Reason.UNSURE: ("unsure", (120, 130, 128)),
+    CellReason.CLEAR: ("clear", CELLS[Cell.FREE][1]),
+    CellReason.UNOBSERVED: ("unobserved", UNKNOWN_RGB),
+    CellReason.ELEVATION: ("elevation", (200, 40, 90)),
+    CellReason.STEP: ("step", (240, 140, 40)),
+    CellReason.SLOPE: ("slope", (168, 90, 200)),
+    CellReason.ROUGHNESS: ("roughness", (90, 140, 230)),
+    CellReason.CLEARANCE: ("clearance", (216, 62, 48)),
+    CellReason.BESIDE: ("beside", (250, 205, 130)),
+    CellReason.OCCLUDED: ("occluded", (96, 84, 110)),
+    CellReason.UNSURE: ("unsure", (120, 130, 128)),
 }
 
 _LIGHT = np.array([1.0, 1.0, np.sqrt(2.0)]) / 2.0  # from ahead on the left, 45 degrees high: the upper left of the map

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from recordings.errors import counted
 from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps as paint
-from recordings.sinks.blueprint import LEDGER, Panel, Place
+from recordings.sinks.blueprint import LEDGER, Panel, ViewSpec
 from recordings.sinks.png16 import png16
 from stages.data import (
     LEVEL_FRAME,
@@ -30,9 +30,9 @@ from stages.data import (
     ElevationMap,
     MatchHealth,
     NavigationMap,
+    PixelOrigin,
     PointCloud,
     Pose,
-    Source,
     StereoCamera,
     StereoFrame,
     Tilt,
@@ -76,7 +76,7 @@ class Canvas:
     recording: rr.RecordingStream
     jpeg_quality: int
     max_points: int
-    hung: dict[tuple[Panel, str], Place] = field(default_factory=dict)
+    hung: dict[tuple[Panel, str], ViewSpec] = field(default_factory=dict)
     camera: StereoCamera | None = None
     _curves: dict[Panel, list[str]] = field(default_factory=dict)
     _said: dict[str, str] = field(default_factory=dict)
@@ -85,14 +85,14 @@ class Canvas:
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
 
-    def log(self, path: str, archetype: Any, *places: Place) -> None:
+    def log(self, path: str, archetype: Any, *places: ViewSpec) -> None:
         """Log at the frame's time; `places` are where the desk shall show it."""
         self.recording.log(path, archetype)
         self._now[path] = type(archetype)
         for place in places:
-            self.hang(place)
+            self.add_view(place)
 
-    def hang(self, place: Place) -> None:
+    def add_view(self, place: ViewSpec) -> None:
         """Have the desk show what is logged there."""
         self.hung.setdefault((place.panel, place.path), place)
 
@@ -104,7 +104,7 @@ class Canvas:
             self._kept[path] = content
             self.log(path, draw())
 
-    def curve(self, path: str, name: str, value: float, place: Place) -> None:
+    def curve(self, path: str, name: str, value: float, place: ViewSpec) -> None:
         """A value over time; the first five curves of a panel differ in colour."""
         at, drawn = f"{path}/{rr.escape_entity_path_part(name)}", self._curves.setdefault(place.panel, [])
         if at not in drawn:
@@ -118,13 +118,13 @@ class Canvas:
             self._said[path] = text
             self.recording.log(f"{LEDGER}/{path}", rr.TextLog(text, level=level))
 
-    def photograph(self, path: str, pixels: Array, place: Place) -> None:
+    def log_image(self, path: str, pixels: Array, place: ViewSpec) -> None:
         """An image (H, W) gray or (H, W, 3) RGB, 8 bit, as JPEG."""
         stored = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
         _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         self.log(path, rr.EncodedImage(contents=blob, media_type="image/jpeg"), place)
 
-    def labels(self, path: str, codes: Array, legend: Mapping[int, tuple[str, paint.Rgb]], place: Place) -> None:
+    def labels(self, path: str, codes: Array, legend: Mapping[int, tuple[str, paint.Rgb]], place: ViewSpec) -> None:
         """A label image (H, W); its names stand above it and appear on hover."""
         if self._legends.get(path) != legend:
             self._legends[path] = legend
@@ -182,8 +182,8 @@ def draw_stereo(canvas: Canvas, path: str, frame: StereoFrame) -> None:
     own = same_view(frame.camera, canvas.camera)
     left, right = (Panel.LEFT, Panel.RIGHT) if own else (Panel.LEFT_DERIVED, Panel.RIGHT_DERIVED)
     pixels = paint.top_eight_bits(frame.left, frame.right)
-    canvas.photograph(f"{path}/left", pixels[0], Place(left, f"{path}/left", f"{path}: left"))
-    canvas.photograph(f"{path}/right", pixels[1], Place(right, f"{path}/right", f"{path}: right"))
+    canvas.log_image(f"{path}/left", pixels[0], ViewSpec(left, f"{path}/left", f"{path}: left"))
+    canvas.log_image(f"{path}/right", pixels[1], ViewSpec(right, f"{path}/right", f"{path}: right"))
 
 
 @draws(Disparity)
@@ -197,19 +197,19 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
         blob, media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
         depth_range=(0.0, limit * DISPARITY_STEPS),
     )  # fmt: skip
-    canvas.log(f"{path}/pixels", image, Place(Panel.DISPARITY, f"{path}/pixels", path))
+    canvas.log(f"{path}/pixels", image, ViewSpec(Panel.DISPARITY, f"{path}/pixels", path))
     canvas.scale(f"{path}/pixels/scale", steps.shape, 0.0, limit, "px", cv2.COLORMAP_TURBO)
     known = _percent(disparity.source)
-    shares = {kind: _percent(disparity.source == kind) for kind in (Source.PLANE, Source.FILLED)}
+    shares = {kind: _percent(disparity.source == kind) for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
     made = {kind: share for kind, share in shares.items() if share}
     if made:  # else it is measured wherever it is known
-        source = Place(Panel.SOURCE, f"{path}/source", f"{path}: source")
+        source = ViewSpec(Panel.SOURCE, f"{path}/source", f"{path}: source")
         canvas.labels(f"{path}/source", disparity.source, paint.SOURCES, source)
     if disparity.segments is not None:
         edges = paint.segment_edges(disparity.segments).astype(np.uint8) * 255
         _, lines = cv2.imencode(".png", edges, [cv2.IMWRITE_PNG_BILEVEL, 1])
         overlay = rr.EncodedImage(contents=lines, media_type="image/png", opacity=0.4, draw_order=10.0)
-        place = Place(Panel.SUPERPIXELS, f"{path}/superpixels", f"{path}: superpixels")
+        place = ViewSpec(Panel.SUPERPIXELS, f"{path}/superpixels", f"{path}: superpixels")
         canvas.log(place.path, overlay, place)
     parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in made.items())
     return f"{path} {', '.join([f'{known:.0f} % known', *parts])}"
@@ -221,11 +221,11 @@ def draw_cloud(canvas: Canvas, path: str, cloud: PointCloud) -> str:
     if cloud.sensor is not None:
         some = slice(None, None, max(1, -(-len(cloud.points) // canvas.max_points)))
         points = rr.Points3D(cloud.points[some], colors=cloud.colors[some], radii=rr.Radius.ui_points(1.5))
-        canvas.log(f"{path}/points", points, Place(Panel.CLOUD, f"{path}/points", path, cloud.frame_id))
+        canvas.log(f"{path}/points", points, ViewSpec(Panel.CLOUD, f"{path}/points", path, cloud.frame_id))
         # An optical axis (z) below the horizon is pitch down, the image's right side (x) below it roll to the right.
         for name, axis in (("camera pitch down", 2), ("camera roll right", 0)):
             angle = float(np.degrees(np.arcsin(np.clip(-cloud.sensor.rotation[2, axis], -1.0, 1.0))))
-            canvas.curve(path, name, angle, Place(Panel.ANGLE, path, path))
+            canvas.curve(path, name, angle, ViewSpec(Panel.ANGLE, path, path))
     return f"{path} {counted(len(cloud.points), 'point')}"
 
 
@@ -237,7 +237,7 @@ def draw_voxels(canvas: Canvas, path: str, voxels: VoxelMap) -> str:
     half = np.full((1, 3), voxels.resolution / 2, np.float32)
     boxes = rr.Boxes3D(centers=centres, half_sizes=np.broadcast_to(half, centres.shape), colors=voxels.colors[some],
                        fill_mode=rr.components.FillMode.Solid)  # fmt: skip
-    canvas.log(f"{path}/voxels", boxes, Place(Panel.VOXELS, f"{path}/voxels", path, voxels.frame_id))
+    canvas.log(f"{path}/voxels", boxes, ViewSpec(Panel.VOXELS, f"{path}/voxels", path, voxels.frame_id))
     return f"{path} {len(voxels.index)} voxels"
 
 
@@ -246,7 +246,7 @@ def draw_tilt(canvas: Canvas, path: str, tilt: Tilt) -> None:
     """The angles of the inclinometer's axes to the horizon, up positive, in degrees."""
     for name, along in (("x axis up", tilt.up[0]), ("y axis up", tilt.up[1])):
         angle = float(np.degrees(np.arcsin(np.clip(along, -1.0, 1.0))))
-        canvas.curve(path, name, angle, Place(Panel.ANGLE, path, path))
+        canvas.curve(path, name, angle, ViewSpec(Panel.ANGLE, path, path))
 
 
 @draws(Pose)
@@ -254,14 +254,14 @@ def draw_pose(canvas: Canvas, path: str, pose: Pose) -> None:
     """An arrow along the rover's heading; the desk shows those of all frames so far."""
     forward = Rotation.from_quat(pose.quaternion).apply([0.4, 0.0, 0.0])
     arrow = rr.Arrows3D(origins=[pose.position], vectors=[forward], colors=[AMBER])
-    place = Place(Panel.TRAJECTORY, f"{path}/trajectory", f"{path} ({pose.frame_id})", pose.frame_id)
+    place = ViewSpec(Panel.TRAJECTORY, f"{path}/trajectory", f"{path} ({pose.frame_id})", pose.frame_id)
     canvas.log(place.path, arrow, place)
 
 
 @draws(CameraMotion)
 def draw_motion(canvas: Canvas, path: str, motion: CameraMotion) -> str:
     """How many features the camera was tracked by."""
-    canvas.curve(path, "features", motion.inliers, Place(Panel.FEATURES, path, path))
+    canvas.curve(path, "features", motion.inliers, ViewSpec(Panel.FEATURES, path, path))
     return f"{path}: {motion.lost}" if motion.lost else f"{path} {counted(motion.inliers, 'feature')}"
 
 
@@ -269,7 +269,7 @@ def draw_motion(canvas: Canvas, path: str, motion: CameraMotion) -> str:
 def draw_matches(canvas: Canvas, path: str, health: MatchHealth) -> None:
     """How much is matched, in percent: of all pixels, and of the nearest ground."""
     for name, part in (("all", health.all), ("near", health.near)):
-        canvas.curve(path, name, 100 * part, Place(Panel.MATCHES, path, path))
+        canvas.curve(path, name, 100 * part, ViewSpec(Panel.MATCHES, path, path))
 
 
 @draws(TiltHealth)
@@ -277,7 +277,7 @@ def draw_health(canvas: Canvas, path: str, health: TiltHealth) -> str:
     """Tilt against the camera's own turns and against the ground in view, in degrees; what is wrong, in words."""
     for name, angle in (("tilt off turn", health.turn), ("ground off level", health.ground)):
         if np.isfinite(angle):
-            canvas.curve(path, name, np.degrees(angle), Place(Panel.HEALTH, path, path))
+            canvas.curve(path, name, np.degrees(angle), ViewSpec(Panel.HEALTH, path, path))
     canvas.say(path, health.judgement, rr.TextLogLevel.WARN if health.fault else rr.TextLogLevel.INFO)
     return f"{path}: {health.fault}" if health.fault else ""
 
@@ -291,7 +291,7 @@ def draw_terrain(canvas: Canvas, path: str, terrain: ElevationMap) -> str:
     low, high = paint.elevation_limits(elevation)
     rgb = paint.paint_elevation(terrain, (low, high))
     relief = f"{path}/relief"
-    canvas.log(relief, rr.Image(paint.birds_eye(rgb)), Place(Panel.RELIEF, relief, f"relief{where}"))
+    canvas.log(relief, rr.Image(paint.birds_eye(rgb)), ViewSpec(Panel.RELIEF, relief, f"relief{where}"))
     canvas.scale(f"{relief}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
     _lines_ahead(canvas, f"{relief}/lines", terrain.shape, terrain)
     for name, layer in terrain.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
@@ -300,13 +300,13 @@ def draw_terrain(canvas: Canvas, path: str, terrain: ElevationMap) -> str:
             paint.birds_eye(layer.astype(np.float16)), meter=1.0, colormap=rr.components.Colormap.Turbo,
             depth_range=(start - 0.1 * (end - start), end),  # the palette's darkest end is left to unknown cells
         )  # fmt: skip
-        place = Place(Panel.LAYER, f"{path}/layers/{rr.escape_entity_path_part(name)}", f"{name}{where}")
+        place = ViewSpec(Panel.LAYER, f"{path}/layers/{rr.escape_entity_path_part(name)}", f"{name}{where}")
         canvas.log(place.path, image, place)
     vertices, triangles = paint.surface(terrain)
     if len(triangles):
         known = np.isfinite(elevation)
         mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_colors=rgb[known])
-        canvas.log(f"{path}/surface", mesh, Place(Panel.TERRAIN, f"{path}/surface", path, terrain.frame_id))
+        canvas.log(f"{path}/surface", mesh, ViewSpec(Panel.TERRAIN, f"{path}/surface", path, terrain.frame_id))
     return f"{path} {counted(len(vertices), 'cell')}"
 
 
@@ -315,9 +315,9 @@ def draw_navigation(canvas: Canvas, path: str, navigation: NavigationMap) -> str
     """The three states of the cells, and their reasons."""
     navigation = paint.navigation_ahead(navigation)
     cells, where = paint.birds_eye(navigation.cells), _frame_suffix(navigation.frame_id)
-    canvas.labels(f"{path}/cells", cells, paint.CELLS, Place(Panel.MAP, f"{path}/cells", f"navigation{where}"))
+    canvas.labels(f"{path}/cells", cells, paint.CELLS, ViewSpec(Panel.MAP, f"{path}/cells", f"navigation{where}"))
     _lines_ahead(canvas, f"{path}/cells/lines", navigation.cells.shape, navigation)
-    place = Place(Panel.REASON, f"{path}/reason", f"reason{where}")
+    place = ViewSpec(Panel.REASON, f"{path}/reason", f"reason{where}")
     canvas.labels(place.path, paint.birds_eye(navigation.reason), paint.REASONS, place)
     free, hazard = (int(np.count_nonzero(cells == state)) for state in (Cell.FREE, Cell.HAZARD))
     return f"{path} {free} free, {hazard} hazard"
@@ -334,7 +334,7 @@ def draw_camera(canvas: Canvas, path: str, frame: StereoFrame, cloud: PointCloud
     )
     height, width = small.shape[:2]
     at, line = f"{path}/camera", f"{path}/plumb"
-    canvas.photograph(f"{at}/image", small, Place(Panel.CAMERA, at, path, cloud.frame_id))
+    canvas.log_image(f"{at}/image", small, ViewSpec(Panel.CAMERA, at, path, cloud.frame_id))
     pinhole = rr.Pinhole(
         focal_length=(camera.fx * THUMBNAIL, camera.fy * THUMBNAIL), width=width, height=height, color=AMBER,
         principal_point=((camera.cx + 0.5) * THUMBNAIL - 0.5, (camera.cy + 0.5) * THUMBNAIL - 0.5),
@@ -344,7 +344,7 @@ def draw_camera(canvas: Canvas, path: str, frame: StereoFrame, cloud: PointCloud
     canvas.recording.log(at, rr.Transform3D(translation=sensor.translation, mat3x3=sensor.rotation), pinhole)
     plumb = [sensor.translation, sensor.translation * (1.0, 1.0, 0.0)]
     strip = rr.LineStrips3D([plumb], colors=[AMBER], radii=rr.Radius.ui_points(1.0))
-    canvas.log(line, strip, Place(Panel.CAMERA, line, path, cloud.frame_id))
+    canvas.log(line, strip, ViewSpec(Panel.CAMERA, line, path, cloud.frame_id))
 
 
 @draws(NavigationMap, ElevationMap)
@@ -358,7 +358,7 @@ def draw_hazards(canvas: Canvas, path: str, navigation: NavigationMap, terrain: 
         x, y = cell_centres(terrain)
         centres = np.column_stack([x[col], y[row], elevation[row, col] + LIFT])
         hazards = rr.Points3D(centres, colors=[paint.CELLS[Cell.HAZARD][1]], radii=0.4 * terrain.resolution)
-        canvas.log(f"{path}/hazards", hazards, Place(Panel.TERRAIN, f"{path}/hazards", path, terrain.frame_id))
+        canvas.log(f"{path}/hazards", hazards, ViewSpec(Panel.TERRAIN, f"{path}/hazards", path, terrain.frame_id))
 
 
 def _percent(layer: Array) -> float:

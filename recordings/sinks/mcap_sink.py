@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from recordings.errors import LogError
-from recordings.frame_record import FrameRecord, LossEntry
+from recordings.frame_record import FrameRecord, Loss
 from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
 from recordings.ros2.to_msg import (
     diagnostics,
@@ -179,7 +179,7 @@ def _health(stream: str, health: TiltHealth) -> tuple[int, str, str, dict[str, s
     return _WARN if health.fault else _OK, stream, health.judgement, values
 
 
-def _statuses(entries: Iterable[LossEntry]) -> list[tuple[int, str, str, dict[str, str]]]:
+def _statuses(entries: Iterable[Loss]) -> list[tuple[int, str, str, dict[str, str]]]:
     """Diagnostic statuses of losses: one each, or that there is none."""
     statuses = [
         (

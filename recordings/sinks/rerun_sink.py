@@ -21,8 +21,8 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
 from recordings.errors import LogError, counted
-from recordings.frame_record import FrameRecord, LossEntry
-from recordings.sinks.blueprint import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, Place, desk
+from recordings.frame_record import FrameRecord, Loss
+from recordings.sinks.blueprint import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, ViewSpec, blueprint
 from recordings.sinks.loggers import PICTURES, Canvas, same_view
 from stages.data import Array, ElevationMap, Pose, StereoFrame
 
@@ -190,7 +190,7 @@ class RerunSink:
                 values[path] = float(number)
                 if root == QUEUES and (Panel.STAGE, path) not in self._canvas.hung:
                     self._recording.log(path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
-                self._canvas.hang(Place(Panel.STAGE, path, stage))
+                self._canvas.add_view(ViewSpec(Panel.STAGE, path, stage))
         self._plots.append((record.stamp, self._frames, values))
         if len(self._plots) == PLOTTED:
             self._send_plots()
@@ -205,7 +205,7 @@ class RerunSink:
             columns = rr.Scalars.columns(scalars=[values.get(path, math.nan) for values in kept])
             self._recording.send_columns(path, indexes=clocks, columns=columns, strict=True)
 
-    def _enter(self, entries: Iterable[LossEntry], frame: int) -> None:
+    def _enter(self, entries: Iterable[Loss], frame: int) -> None:
         """Losses, at their own stamps on the log's clock."""
         losses = sorted(entries, key=lambda entry: entry.stamp)
         if not losses:
@@ -220,7 +220,7 @@ class RerunSink:
         """Lay out the desk again when a picture has come to it."""
         if len(self._canvas.hung) != self._hung:
             self._hung = len(self._canvas.hung)
-            self._recording.send_blueprint(desk(self._canvas.hung.values()))
+            self._recording.send_blueprint(blueprint(self._canvas.hung.values()))
 
 
 def _clocks(stamps: Sequence[int], frames: Sequence[int]) -> list[rr.TimeColumn]:

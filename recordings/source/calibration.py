@@ -33,7 +33,7 @@ _SHRUNK = 0.1  # of the focal length; what rectification makes smaller than that
 
 
 @dataclass
-class Frames:
+class TransformTree:
     """The static transforms of a log, as a graph in which any two connected frames have a transform."""
 
     edges: dict[str, dict[str, Transform]] = field(default_factory=dict)
@@ -103,7 +103,7 @@ class Camera:
 
 
 def calibrated_pair(
-    models: tuple[CameraModel, CameraModel], names: tuple[str, str], topics: tuple[str, str], frames: Frames
+    models: tuple[CameraModel, CameraModel], names: tuple[str, str], topics: tuple[str, str], frames: TransformTree
 ) -> tuple[Camera, Camera]:
     """The two cameras of a stereo pair, left and right.
 
@@ -144,7 +144,10 @@ def calibrated_pair(
 
 
 def baseline_note(
-    cameras: tuple[Camera, Camera], models: tuple[CameraModel, CameraModel], names: tuple[str, str], frames: Frames
+    cameras: tuple[Camera, Camera],
+    models: tuple[CameraModel, CameraModel],
+    names: tuple[str, str],
+    frames: TransformTree,
 ) -> str:
     """What there is to say of the baseline of `cameras`, as `calibrated_pair` made them of the rest: that the static
     transform between them tells it, or tells another; else empty."""
@@ -205,7 +208,7 @@ def _checked(model: CameraModel, topic: str) -> CameraModel:
     return model
 
 
-def _placed(names: tuple[str, str], frames: Frames) -> Transform:
+def _placed(names: tuple[str, str], frames: TransformTree) -> Transform:
     """The right camera in the left's frame. Raises LogError where no transform tells, or it is not beside the left."""
     placed = frames.between(*names)
     if placed is None or not np.any(placed.translation):
@@ -261,7 +264,9 @@ def _rectifying(left: CameraModel, right: CameraModel, placed: Transform) -> tup
     return replace(left, r=made[0], p=made[2]), replace(right, r=made[1], p=made[3])
 
 
-def mounted(camera: Camera, inclinometer: str, base: str, frames: Frames, given: Sequence[float] | None) -> Mount:
+def mounted(
+    camera: Camera, inclinometer: str, base: str, frames: TransformTree, given: Sequence[float] | None
+) -> Mount:
     """How the left camera sits on the rover.
 
     inclinometer, base: their frames; given: quaternion xyzw that turns inclinometer into left rectified camera
@@ -272,7 +277,7 @@ def mounted(camera: Camera, inclinometer: str, base: str, frames: Frames, given:
     return Mount(EVER, _camera_from_inclinometer(camera, inclinometer, frames, given), base_from_camera)
 
 
-def rovers(pose: Pose, camera: Camera, base: str, frames: Frames) -> Pose:
+def rovers(pose: Pose, camera: Camera, base: str, frames: TransformTree) -> Pose:
     """A pose as that of the frame `base`, or where the camera does not sit on that, of the camera's rectified image; as
     it is where no static transform tells how they sit on the frame whose pose it is."""
     told = pose.child_frame_id
@@ -287,7 +292,7 @@ def rovers(pose: Pose, camera: Camera, base: str, frames: Frames) -> Pose:
 
 
 def _camera_from_inclinometer(
-    camera: Camera, inclinometer: str, frames: Frames, given: Sequence[float] | None
+    camera: Camera, inclinometer: str, frames: TransformTree, given: Sequence[float] | None
 ) -> Array:
     if given is not None:
         return np.asarray(Rotation.from_quat(given).as_matrix())

@@ -10,7 +10,7 @@ import numpy as np
 
 from recordings.errors import LogError
 from recordings.ros2.from_msg import camera_model, frame_of, pixels_of, unread_encoding
-from recordings.source.topics import Messages
+from recordings.source.topics import DecodedTopics
 from stages.data import Array, CameraModel
 
 CAMERAS = ("left", "right")
@@ -26,7 +26,7 @@ class Info:
     frame_id: str
 
 
-def first_infos(messages: Messages, chosen: Mapping[str, str]) -> tuple[dict[str, Info], dict[str, str]]:
+def first_infos(messages: DecodedTopics, chosen: Mapping[str, str]) -> tuple[dict[str, Info], dict[str, str]]:
     """Side -> its first CameraInfo, and side -> why that cannot be read; neither where a topic is lacking.
 
     chosen: role (left, right, left_info, right_info) -> topic.
@@ -44,7 +44,7 @@ def first_infos(messages: Messages, chosen: Mapping[str, str]) -> tuple[dict[str
     return infos, unread
 
 
-def unread_images(messages: Messages, topics: Mapping[str, str], sides: Collection[str]) -> dict[str, str]:
+def unread_images(messages: DecodedTopics, topics: Mapping[str, str], sides: Collection[str]) -> dict[str, str]:
     """Which of the sides have a first image in an encoding that cannot be read, and what to do: the others are in it,
     too. topics: side -> topic of its images."""
     unread = dict[str, str]()
@@ -55,7 +55,7 @@ def unread_images(messages: Messages, topics: Mapping[str, str], sides: Collecti
     return unread
 
 
-def unfit_images(messages: Messages, topics: Mapping[str, str], infos: Mapping[str, Info]) -> dict[str, str]:
+def unfit_images(messages: DecodedTopics, topics: Mapping[str, str], infos: Mapping[str, Info]) -> dict[str, str]:
     """Which sides have images that cannot be read wherever one looks, or of which the first and the last do not fit
     their calibration or each other, and why: so hardly any frame could be made."""
     first = _misfits({side: _pixels(messages, topics[side]) for side in CAMERAS}, topics, infos)
@@ -65,7 +65,7 @@ def unfit_images(messages: Messages, topics: Mapping[str, str], infos: Mapping[s
     return {side: why for side, why in first.items() if side in last}
 
 
-def _pixels(messages: Messages, topic: str, last: bool = False) -> Array | LogError | None:
+def _pixels(messages: DecodedTopics, topic: str, last: bool = False) -> Array | LogError | None:
     """The first image that can be decoded, or the last; else why not; None where nothing is known."""
     found = None
     for found in (messages.last if last else messages.some)(topic, pixels_of):

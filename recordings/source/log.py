@@ -23,7 +23,7 @@ from recordings.ros2.from_msg import camera_model, frame_of, pixels_of, pose_of,
 from recordings.source.calibration import Camera, rovers
 from recordings.source.cameras import CAMERAS
 from recordings.source.discovery import BARE_TILT, IMAGES, POSES, TILTS
-from recordings.source.resolution import Opening
+from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.topics import Decoder, peek_stamp
 from stages.data import CameraImage, CameraModel, Pose, Tilt
@@ -76,7 +76,7 @@ def _equal(one: CameraModel, other: CameraModel) -> bool:
 
 
 @dataclass
-class Reading:
+class TopicReader:
     """One topic as it is read: the stream it makes, its decoders by channel, and what makes an item of a message (of a
     message at a log time; None makes none)."""
 
@@ -119,7 +119,7 @@ class McapLog:
     source: LogSettings
     start: float | None = None
     end: float | None = None
-    opening: Opening = field(init=False)
+    opening: SourceResolution = field(init=False)
     missing: Mapping[str, str] = field(init=False)
     refused: Mapping[str, str] = field(init=False)
     topics: Mapping[str, str] = field(init=False)
@@ -129,7 +129,7 @@ class McapLog:
         self.file = McapFile(self.path)
         try:
             self._check_range()
-            self.opening = opening = Opening(self.file, self.source)
+            self.opening = opening = SourceResolution(self.file, self.source)
             self.missing, self.refused, self.topics = opening.missing, opening.refused, opening.topics
             self._check_images()
         except BaseException:
@@ -187,7 +187,7 @@ class McapLog:
                 if item is not None:
                     yield raw.log_time, reading.stream, item
 
-    def _note_last_before(self, log_time: int, infos: Reading) -> None:
+    def _note_last_before(self, log_time: int, infos: TopicReader) -> None:
         """Take note of the calibration that was in force at `log_time`: the last one before it that can be read."""
         channels = set(infos.decoders)
         if infos.topic not in self._info_times:
@@ -257,14 +257,14 @@ class McapLog:
         """The range in log time, ns."""
         return part_of(self.file.start, self.start, self.end)
 
-    def _info_readings(self, calibrations: dict[str, Calibrations], streams: Collection[str]) -> list[Reading]:
+    def _info_readings(self, calibrations: dict[str, Calibrations], streams: Collection[str]) -> list[TopicReader]:
         return [
             self._reading(side, info.topic, calibrations[side].note)
             for side, info in self.opening.infos.items()
             if side in self.topics and side in streams
         ]
 
-    def _item_readings(self, calibrations: dict[str, Calibrations], streams: Collection[str]) -> list[Reading]:
+    def _item_readings(self, calibrations: dict[str, Calibrations], streams: Collection[str]) -> list[TopicReader]:
         tilt, base_frame = self.source.angles() or tilt_of, self.source.base_frame
         made: dict[str, Callable[[Any, int], Any]] = {
             "inclinometer": lambda message, log_time: self._of_the_mount(tilt(message, log_time)),
@@ -288,13 +288,13 @@ class McapLog:
             return pose
         return rovers(pose, cameras[0], self.source.base_frame, self.opening.static)
 
-    def _reading(self, stream: str, topic: str, item: Callable[[Any, int], Any]) -> Reading:
+    def _reading(self, stream: str, topic: str, item: Callable[[Any, int], Any]) -> TopicReader:
         messages = self.opening.messages
         decoders = {number: messages.decoders[number] for number in messages.channels_of(topic)}
-        return Reading(stream, topic, decoders, item)
+        return TopicReader(stream, topic, decoders, item)
 
     @staticmethod
-    def _by_channel(readings: Iterable[Reading]) -> dict[int, Reading]:
+    def _by_channel(readings: Iterable[TopicReader]) -> dict[int, TopicReader]:
         return {channel: reading for reading in readings for channel in reading.decoders}
 
 
@@ -313,7 +313,7 @@ class _Images:
         return CameraImage(stamp, pixels, model, camera.image_frame, camera.rectified)
 
 
-def _ahead(raws: Iterable[Raw | Lost], early: dict[int, Reading]) -> Iterator[tuple[Raw | Lost, Any]]:
+def _ahead(raws: Iterable[Raw | Lost], early: dict[int, TopicReader]) -> Iterator[tuple[Raw | Lost, Any]]:
     """The messages in their order, with what became of those that are read `early`: `AHEAD` before they come."""
     waiting: deque[tuple[Raw | Lost, Any]] = deque()
     for raw in raws:

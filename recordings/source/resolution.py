@@ -9,11 +9,11 @@ from typing import Any
 from recordings.errors import LogError, counted
 from recordings.mcap.file import McapFile
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, tilt_of
-from recordings.source.calibration import Camera, Frames, baseline_note, calibrated_pair, mounted, rovers
+from recordings.source.calibration import Camera, TransformTree, baseline_note, calibrated_pair, mounted, rovers
 from recordings.source.cameras import CAMERAS, first_infos, unfit_images, unread_images
 from recordings.source.discovery import TRANSFORMS, Topic, Topics, discover
 from recordings.source.settings import LogSettings
-from recordings.source.topics import Messages, attempt
+from recordings.source.topics import DecodedTopics, attempt
 from stages.data import LEVEL_FRAME, Mount, Pose
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
@@ -21,7 +21,7 @@ _TRANSFORMS_LOOKED_AT = 100  # messages from the first one of the rover on; othe
 _LISTED = 5  # topics in a sentence
 
 
-class Opening:
+class SourceResolution:
     """What a log offers.
 
     messages: of its topics; topics: stream -> topic; lacking: stream -> why the log does not provide it, and what to
@@ -32,7 +32,7 @@ class Opening:
     """
 
     def __init__(self, file: McapFile, source: LogSettings) -> None:
-        self.file, self.source, self.messages = file, source, Messages(file)
+        self.file, self.source, self.messages = file, source, DecodedTopics(file)
         self.static, self.problems = self._read_static()
         self.undecodable = self._sealed_topics()
         found = self._discovered()
@@ -60,9 +60,9 @@ class Opening:
         aside = "".join(f" ({what})" for what in (self.undecodable, lost) if what)
         return {name: why + aside if name in self._sought else why for name, why in self.lacking.items()}
 
-    def _read_static(self) -> tuple[Frames, list[tuple[str, LogError]]]:
+    def _read_static(self) -> tuple[TransformTree, list[tuple[str, LogError]]]:
         """The static transforms, and what is wrong with those that are not among them."""
-        frames, problems = Frames(), list[tuple[str, LogError]]()
+        frames, problems = TransformTree(), list[tuple[str, LogError]]()
         for topic, schema in sorted(self.messages.schemas.items()):
             if schema == TRANSFORMS and topic.endswith("tf_static"):
                 for transforms in self.messages.each(topic, lambda message: message.transforms, any_order=True):

@@ -32,7 +32,7 @@ class _GoneError(LogError):
     """A message that the file does not hold any more."""
 
 
-class Messages:
+class DecodedTopics:
     """The messages of a file; what is made of them comes as a LogError where nothing can be.
 
     decoders: by channel; sealed: channel -> why it cannot be decoded; schemas: topic that can be -> the full ROS 2 name

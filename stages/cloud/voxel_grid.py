@@ -16,7 +16,7 @@ from stages.stage import Stage, check_cells, check_level, parameter
 
 
 @dataclass(frozen=True)
-class Voxels(Stage):
+class VoxelGrid(Stage):
     """Sorts the measured points of a levelled cloud into cubes; what refinement made up is left out."""
 
     resolution: float = parameter(0.05, "edge of a cube", unit="m", low=0.005, high=2.0)

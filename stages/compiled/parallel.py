@@ -11,7 +11,7 @@ from typing import Any
 from stages.data import Array
 
 BANDS = 8  # of rows: few enough to cost nothing, enough that neither thread waits long for the other
-AtOnce = Callable[[Callable[[], Any], Callable[[], Any]], tuple[Any, Any]]
+Fork = Callable[[Callable[[], Any], Callable[[], Any]], tuple[Any, Any]]
 
 
 class _Others:
@@ -49,12 +49,12 @@ def at_once(one: Callable[[], Any], other: Callable[[], Any]) -> tuple[Any, Any]
             wait([elsewhere])
 
 
-def shared_by(threads: int) -> AtOnce:
+def shared_by(threads: int) -> Fork:
     """What calls two functions and gives both results: at once if there are 2 threads or more, else in turn."""
     return in_turn if threads < 2 else at_once
 
 
-def by_bands(both: AtOnce, rows: int, work: Callable[[int, int], Any]) -> None:
+def by_bands(both: Fork, rows: int, work: Callable[[int, int], Any]) -> None:
     """Call `work(first, end)` for all rows once: in bands, of which a thread that is free takes the next, or all the
     rows in one call where there is one thread."""
     count = 1 if both is in_turn else BANDS

@@ -12,8 +12,8 @@ from __future__ import annotations
 from stages.data.arrays import Array
 from stages.data.camera import CameraImage, CameraModel, StereoCamera, StereoFrame
 from stages.data.cloud import PointCloud, VoxelMap
-from stages.data.disparity import Disparity, MatchHealth, Source
-from stages.data.maps import LEVEL_FRAME, Cell, ElevationMap, NavigationMap, Reason
+from stages.data.disparity import Disparity, MatchHealth, PixelOrigin
+from stages.data.maps import LEVEL_FRAME, Cell, CellReason, ElevationMap, NavigationMap
 from stages.data.motion import CameraMotion, Mount, Pose, Tilt, TiltHealth, Transform
 from stages.data.tiles import Tiles
 
@@ -24,15 +24,15 @@ __all__ = [
     "CameraModel",
     "CameraMotion",
     "Cell",
+    "CellReason",
     "Disparity",
     "ElevationMap",
     "MatchHealth",
     "Mount",
     "NavigationMap",
+    "PixelOrigin",
     "PointCloud",
     "Pose",
-    "Reason",
-    "Source",
     "StereoCamera",
     "StereoFrame",
     "Tiles",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stages.data.arrays import Array, check_resolution, publish, publish_stamp
-from stages.data.disparity import Source
+from stages.data.disparity import PixelOrigin
 from stages.data.motion import Transform
 
 
@@ -18,8 +18,8 @@ class PointCloud:
     points: (N, 3) float32, m, in `frame_id`; colors: (N, 3) uint8 RGB; sigma: (N,) float32, depth standard deviation,
     m; pixel: (N,) int32, index into the flattened left image; sensor: where the camera is in `frame_id`, None where
     the cloud is still in the camera's own frame; shape: (H, W) of the left image that `pixel` indexes, where known;
-    source: (N,) uint8, codes of `Source`, None where all points are measured; tilt_sigma: standard deviation of the
-    direction of up that the cloud was levelled with, about each horizontal axis, rad.
+    source: (N,) uint8, codes of `PixelOrigin`, None where all points are measured; tilt_sigma: standard deviation of
+    the direction of up that the cloud was levelled with, about each horizontal axis, rad.
     """
 
     stamp: int
@@ -46,7 +46,7 @@ class PointCloud:
     @property
     def measured(self) -> Array:
         """Which points were matched at their own pixel, (N,) bool: the evidence."""
-        return np.ones(len(self.points), bool) if self.source is None else np.equal(self.source, Source.MEASURED)
+        return np.ones(len(self.points), bool) if self.source is None else np.equal(self.source, PixelOrigin.MEASURED)
 
     def only(self, kept: Array) -> PointCloud:
         """The points of the indices (n,) int or the mask (N,) bool `kept`, in that order."""

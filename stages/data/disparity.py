@@ -11,7 +11,7 @@ from stages.data.arrays import Array, publish, publish_stamp
 from stages.data.camera import StereoCamera
 
 
-class Source(IntEnum):
+class PixelOrigin(IntEnum):
     """Where a disparity comes from, the codes of `Disparity.source`.
 
     MEASURED: matched at this pixel; PLANE: the surface that the matches about it agree on, be there no match at this
@@ -28,9 +28,9 @@ class Source(IntEnum):
 class Disparity:
     """A disparity image in the left rectified frame.
 
-    pixels: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `Source`; confidence: (H, W) float32 in
-    [0, 1]; segments: (H, W) int32 superpixel labels where refinement made them, else None; camera: the rectified camera
-    it was made for, where known.
+    pixels: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `PixelOrigin`; confidence: (H, W) float32
+    in [0, 1]; segments: (H, W) int32 superpixel labels where refinement made them, else None; camera: the rectified
+    camera it was made for, where known.
     """
 
     stamp: int

@@ -23,7 +23,7 @@ class Cell(IntEnum):
     HAZARD = 100
 
 
-class Reason(IntEnum):
+class CellReason(IntEnum):
     """Why a navigation cell has its state, the codes of `NavigationMap.reason`."""
 
     CLEAR = 0
@@ -75,8 +75,8 @@ class ElevationMap:
 class NavigationMap:
     """Where the rover may drive.
 
-    cells: (rows, cols) int8, codes of `Cell`; reason: (rows, cols) uint8, codes of `Reason`; resolution, m, and origin,
-    m, as in `ElevationMap`.
+    cells: (rows, cols) int8, codes of `Cell`; reason: (rows, cols) uint8, codes of `CellReason`; resolution, m, and
+    origin, m, as in `ElevationMap`.
     """
 
     stamp: int

@@ -52,7 +52,7 @@ class _Memory:
 
 
 @dataclass(frozen=True)
-class Locate(Stage):
+class PoseFilter(Stage):
     """Where the rover is; it remembers, so it takes frames in order."""
 
     tilt_noise: float = parameter(

@@ -14,13 +14,13 @@ import numpy as np
 
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
 from stages.data.covariance import cross_matrix, levered
-from stages.localisation.vo_tracking import Step, View, step_between, view
+from stages.localisation.vo_tracking import Step, VoFrame, step_between, view
 from stages.stage import Finding, Stage, check_joined, parameter
 
 
 @dataclass
 class _Keyframe:
-    view: View
+    view: VoFrame
     camera: Transform
     covariance: Array
 
@@ -67,7 +67,7 @@ class VisualOdometry(Stage):
     def _likely(self, step: Step) -> bool:
         return step.error <= self.worst and float(np.linalg.norm(step.translation)) <= self.fastest
 
-    def _parted(self, before: View, seen: View) -> str:
+    def _parted(self, before: VoFrame, seen: VoFrame) -> str:
         """Why the segment ends."""
         sizes = [f"{width}x{height}" for height, width in (before.gray.shape, seen.gray.shape)]
         why = f"less than {self.least} features agree with the frame before"
@@ -75,7 +75,7 @@ class VisualOdometry(Stage):
             why = f"the images, {sizes[0]} before, are {sizes[1]} now"
         return f"{why}; segment {self._memory.segment + 1} begins"
 
-    def _followed(self, stamp: int, before: _Keyframe, step: Step, seen: View) -> CameraMotion:
+    def _followed(self, stamp: int, before: _Keyframe, step: Step, seen: VoFrame) -> CameraMotion:
         memory = self._memory
         back = Transform(before.camera.child, before.camera.child, step.rotation.T, -step.rotation.T @ step.translation)
         camera = before.camera.after(back)
@@ -87,13 +87,13 @@ class VisualOdometry(Stage):
             memory.keyframe = _Keyframe(seen, camera, covariance)
         return CameraMotion(stamp, memory.segment, camera, covariance, step.inliers)
 
-    def _blind(self, stamp: int, seen: View) -> CameraMotion:
+    def _blind(self, stamp: int, seen: VoFrame) -> CameraMotion:
         """No motion; the keyframe stays, so that the next frame that shows enough goes on from it."""
         self._memory.blind += 1
         lost = f"only {seen.known} features with a disparity are in view, less than {self.least}"
         return CameraMotion(stamp, self._memory.segment, None, np.zeros((6, 6)), lost=lost)
 
-    def _begun(self, frame: StereoFrame, seen: View, lost: str = "") -> CameraMotion:
+    def _begun(self, frame: StereoFrame, seen: VoFrame, lost: str = "") -> CameraMotion:
         """The first frame of a segment; `lost` says why the one before ended."""
         memory = self._memory
         memory.segment += 1

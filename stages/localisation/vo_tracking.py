@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from stages.compiled.hamming import clear_partners
-from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
+from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.robust_weights import tukey_weights
 
@@ -32,7 +32,7 @@ DEEPEST = 30.0  # m
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class VoFrame:
     """What is kept of a stereo frame to track from and to.
 
     gray: (H, W) uint8; places: (N, 2) float32 px of its features, codes: (N, 32) uint8 their descriptors; points:
@@ -67,24 +67,24 @@ class Step:
     covariance: Array
 
 
-def view(frame: StereoFrame, disparity: Disparity) -> View:
+def view(frame: StereoFrame, disparity: Disparity) -> VoFrame:
     """The features of the left image, and where in space those are whose disparity is measured."""
     image = gray(eight_bit(frame.left)[0])
     shrink = max(1, round(image.shape[1] / DETECTION_WIDTH))
     small = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA) if shrink > 1 else image
-    nothing = View(image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty((0, 3)), frame.camera)
+    nothing = VoFrame(image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty((0, 3)), frame.camera)
     if min(small.shape) < PATCH:  # OpenCV fails on the smallest
         return nothing
     found, codes = cv2.ORB.create(FEATURES, scaleFactor=1.3, nlevels=5, fastThreshold=5).detectAndCompute(small, None)
     if not found:
         return nothing
     places = (np.array([point.pt for point in found], np.float32) + 0.5) * shrink - 0.5
-    return View(image, places, codes, _in_space(places, disparity, frame.camera), frame.camera)
+    return VoFrame(image, places, codes, _in_space(places, disparity, frame.camera), frame.camera)
 
 
 def _in_space(places: Array, disparity: Disparity, camera: StereoCamera) -> Array:
     """Places (N, 2) of the left image as points (N, 3); NaN where a disparity about them is unknown or filled."""
-    seen = np.isin(disparity.source, (Source.MEASURED, Source.PLANE))
+    seen = np.isin(disparity.source, (PixelOrigin.MEASURED, PixelOrigin.PLANE))
     pixels = np.where(seen, disparity.pixels, np.float32(np.nan))
     at = cv2.remap(pixels, places[:, 0].copy(), places[:, 1].copy(), cv2.INTER_LINEAR, borderValue=float("nan"))
     shift = at.ravel().astype(np.float64) + (camera.cx_right - camera.cx)
@@ -96,7 +96,7 @@ def _in_space(places: Array, disparity: Disparity, camera: StereoCamera) -> Arra
     return np.stack([x * depth, y * depth, depth], axis=1)
 
 
-def step_between(earlier: View, later: View, least: int) -> Step | None:
+def step_between(earlier: VoFrame, later: VoFrame, least: int) -> Step | None:
     """How the camera moved from one view to another; None where fewer than `least` features agree on it, or where the
     images are not of one size: a patch looks different then."""
     if earlier.gray.shape != later.gray.shape:
@@ -115,14 +115,16 @@ def step_between(earlier: View, later: View, least: int) -> Step | None:
     return _tracked_step(earlier, later, matrix, turn, shift, least)
 
 
-def _pairs(earlier: View, later: View) -> tuple[Array, Array]:
+def _pairs(earlier: VoFrame, later: VoFrame) -> tuple[Array, Array]:
     """Indices of features, those of the earlier view known in space, that have a clearly best partner."""
     known = np.flatnonzero(np.isfinite(earlier.points[:, 2]))
     here, there = clear_partners(earlier.codes[known], later.codes, ALIKE, DISTINCT)
     return known[here], there
 
 
-def _tracked_step(earlier: View, later: View, matrix: Array, turn: Array, shift: Array, least: int) -> Step | None:
+def _tracked_step(
+    earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array, least: int
+) -> Step | None:
     """The pose fitted to patches of the earlier image, tracked from where the given pose puts them."""
     points, start, guess = _ahead(earlier, later, matrix, turn, shift)
     if len(points) < least:
@@ -138,7 +140,7 @@ def _tracked_step(earlier: View, later: View, matrix: Array, turn: Array, shift:
     return _fitted(points[good], start[good], found[good].astype(np.float64), matrix, turn, shift, least)
 
 
-def _ahead(earlier: View, later: View, matrix: Array, turn: Array, shift: Array) -> tuple[Array, Array, Array]:
+def _ahead(earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array) -> tuple[Array, Array, Array]:
     """The earlier view's points that the later image shows, and where the earlier and the later image show them."""
     known = np.isfinite(earlier.points[:, 2])
     points, places = earlier.points[known], earlier.places[known]

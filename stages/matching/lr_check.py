@@ -15,11 +15,12 @@ from stages.stage import Stage, check_same_time, parameter
 
 
 @dataclass(frozen=True)
-class CrossCheck(Stage):
+class LeftRightCheck(Stage):
     """The disparity without the pixels that the right image's disparity contradicts.
 
-    `backward` is the disparity of the swapped frame (stages.Swap). Where it is unknown it contradicts nothing. What it
-    was not searched for it takes for something else: nearer pixels, from a prior, are not asked (`disparities`).
+    `backward` is the disparity of the swapped frame (stages.SwapViews). Where it is unknown it contradicts nothing.
+    What it was not searched for it takes for something else: nearer pixels, from a prior, are not asked
+    (`disparities`).
     """
 
     tolerance: float = parameter(1.0, "largest difference that is no contradiction", unit="px", low=0)

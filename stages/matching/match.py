@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.data import Array, Disparity, Source, StereoCamera, StereoFrame
+from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.matching.kernels.prior_cost import prior_costs
 from stages.matching.kernels.row_ranges import Range, lanes_for, ranges_of, whole_range
 from stages.matching.kernels.semiglobal import match
-from stages.matching.kernels.sgm_local import Windows, windows
-from stages.matching.kernels.sgm_params import Rule
+from stages.matching.kernels.sgm_local import SearchWindows, windows
+from stages.matching.kernels.sgm_params import SgmParams
 from stages.stage import Stage, check_rectified, parameter
 
 SMALLEST_SIDE = 16
@@ -139,17 +139,17 @@ class Match(Stage):
         layers = found.pixels, found.source, found.confidence
         if prior is not None and self.nearer == "prior" and not self.around:
             # The search loses what lies within a pixel or two of its end, too.
-            taken = np.isnan(found.pixels) & (prior.source == Source.MEASURED)
+            taken = np.isnan(found.pixels) & (prior.source == PixelOrigin.MEASURED)
             taken &= (prior.pixels > search.stop - BEYOND) & (prior.pixels < frame.camera.width)
             for layer, known in zip(layers, (prior.pixels, prior.source, prior.confidence), strict=True):
                 np.copyto(layer, known, where=taken)
         if self.farthest:  # what bounds the range reaches a little beyond
             beyond = found.pixels < self._reach(frame.camera)
-            for layer, unknown in zip(layers, (np.nan, Source.UNKNOWN, 0), strict=True):
+            for layer, unknown in zip(layers, (np.nan, PixelOrigin.UNKNOWN, 0), strict=True):
                 layer[beyond] = unknown
         return Disparity(frame.stamp, *layers, camera=frame.camera)
 
-    def _where(self, prior: Disparity | None, search: range, rows: int) -> Windows | list[Range]:
+    def _where(self, prior: Disparity | None, search: range, rows: int) -> SearchWindows | list[Range]:
         """Where to search, and what for."""
         if prior is not None and self.around:
             return windows(prior.pixels, self.around, search.start, self.threads)
@@ -157,9 +157,9 @@ class Match(Stage):
             return ranges_of(prior.pixels, self.band_height, search.start, len(search), self.threads)
         return whole_range(rows, len(search))
 
-    def _excluded(self, prior: Disparity, search: range, where: Windows | list[Range]) -> Array:
+    def _excluded(self, prior: Disparity, search: range, where: SearchWindows | list[Range]) -> Array:
         """Where the prior shows that the match is not in the range, or with `around` none to look for, (H, W) bool."""
-        if isinstance(where, Windows):
+        if isinstance(where, SearchWindows):
             guided: Array = (prior.pixels >= search.start - BEYOND) & (prior.pixels < prior.pixels.shape[1])
             return ~guided
         excluded = np.empty(prior.pixels.shape, bool)
@@ -168,7 +168,7 @@ class Match(Stage):
             excluded[rows] = prior.pixels[rows] > first + min(each.width.lanes, len(search)) + BEYOND
             if first > self.minimum:
                 excluded[rows] |= prior.pixels[rows] < first - BEYOND
-        excluded &= prior.source == Source.MEASURED
+        excluded &= prior.source == PixelOrigin.MEASURED
         return excluded
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
@@ -184,7 +184,7 @@ class Match(Stage):
         if prior is not None and prior.pixels.shape != (height, width):
             raise ValueError(
                 f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; "
-                "stages.Enlarge makes a coarser one fit"
+                "stages.Upsample makes a coarser one fit"
             )
 
     def _penalties(self) -> tuple[int, int]:
@@ -210,19 +210,19 @@ class Match(Stage):
         """The disparity of `farthest`, px."""
         return camera.fx * camera.baseline / self.farthest - (camera.cx_right - camera.cx)
 
-    def _rule(self, search: range) -> Rule:
+    def _rule(self, search: range) -> SgmParams:
         cost, (p1, p2) = COSTS[self.cost], self._penalties()
         falling = np.maximum(p1 + 2, np.round(p2 / (1 + np.arange(256) / self.edge)))
         confidence = np.interp(np.arange(256), LEADS, cost.right).astype(np.float32)
         confidence[0] = 0  # unknown
-        return Rule(
+        return SgmParams(
             self.cost == "census+gradient", self.paths == 8, p1, np.minimum(falling, p2).astype(np.uint8), cost.unseen,
             len(search), search.start, self.uniqueness, self.consistency, self.speckle_range, self.speckle_size,
             confidence,
         )  # fmt: skip
 
-    def _guide(self, prior: Disparity, search: range, where: Windows | list[Range]) -> tuple[Array, Array]:
-        if isinstance(where, Windows):
+    def _guide(self, prior: Disparity, search: range, where: SearchWindows | list[Range]) -> tuple[Array, Array]:
+        if isinstance(where, SearchWindows):
             first, lanes = where.first, where.width.lanes
         else:
             firsts = [np.full((each.end - each.top, 1), search.start + each.first, np.int32) for each in where]

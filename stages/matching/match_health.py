@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from stages.data import Disparity, MatchHealth, Mount, Source, Tilt
+from stages.data import Disparity, MatchHealth, Mount, PixelOrigin, Tilt
 from stages.stage import Finding, Severity, Stage, counted, parameter
 
 
@@ -35,7 +35,7 @@ class CheckMatches(Stage):
         """
         height, width = disparity.pixels.shape
         source = disparity.source[:, width // 2 :]
-        matched = (source == Source.MEASURED) | (source == Source.PLANE)
+        matched = (source == PixelOrigin.MEASURED) | (source == PixelOrigin.PLANE)
         rows = max(1, round(self.lowest * height))
         hangs = tilt is not None and mount is not None and (mount.camera_from_inclinometer @ tilt.up)[1] > 0
         near = float((matched[:rows] if hangs else matched[-rows:]).mean())

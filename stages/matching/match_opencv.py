@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from stages.data import Array, Disparity, Source, StereoFrame
+from stages.data import Array, Disparity, PixelOrigin, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.stage import Stage, check_rectified, parameter
 
@@ -66,7 +66,7 @@ class MatchOpenCV(Stage):
         pixels = self._matched(left, right) if self.color else self._matched(gray(left), gray(right))
         pixels[_texture(gray(left), self.block) <= self.texture] = np.nan
         known = np.isfinite(pixels)
-        source = np.where(known, np.uint8(Source.MEASURED), np.uint8(Source.UNKNOWN))
+        source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
         return Disparity(frame.stamp, pixels, source, _agreement(pixels, known), camera=frame.camera)
 
     def _matched(self, left: Array, right: Array) -> Array:

@@ -40,7 +40,7 @@ class Halve(Stage):
 
 
 @dataclass(frozen=True)
-class Enlarge(Stage):
+class Upsample(Stage):
     """A disparity image of half size at the size of a frame: a prior for matching the frame.
 
     Each value, twice as large, stands for the pixel and, between pixels of one surface, for the line between them.
@@ -64,7 +64,7 @@ class Enlarge(Stage):
 
 
 @dataclass(frozen=True)
-class Swap(Stage):
+class SwapViews(Stage):
     """The pair as the right camera sees it: the images exchanged and mirrored, so that disparities stay positive.
 
     The disparity of a swapped frame, mirrored back, is that of the right image.

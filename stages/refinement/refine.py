@@ -21,7 +21,7 @@ from stages.refinement.kernels.bilateral import joint_bilateral
 from stages.refinement.kernels.correlation import correlation
 from stages.refinement.kernels.depth_edges import sharpen_edges
 from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
-from stages.refinement.kernels.pixel_origin import Trust, name_sources
+from stages.refinement.kernels.pixel_origin import Trust, label_origin
 from stages.refinement.kernels.plane_apply import near_median, pull_to_planes, trusted_matches
 from stages.refinement.kernels.plane_fit import Planes, fit_planes
 from stages.refinement.kernels.region_merging import surfaces
@@ -124,7 +124,7 @@ class Refine(Stage):
         filled, kinds = self._filled(pixels, weights, within, image, guide)
         guessed = kinds != KEPT
         refined = self._sharpened(self._bilateral(filled, guide), guessed, guide)
-        source, confidence = name_sources(
+        source, confidence = label_origin(
             matches, disparity.confidence, agreed, kinds, refined,
             self._borne_out(refined, guessed, guide, right), self.inlier_distance, TRUST, self.threads,
         )  # fmt: skip

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason
+from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap
 from stages.stage import Stage, parameter
 
 LAYERS = ("ground", "step", "slope", "steepness", "roughness", "support")  # that Assess adds
-UNKNOWN = (Reason.UNOBSERVED, Reason.OCCLUDED, Reason.UNSURE)
+UNKNOWN = (CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNSURE)
 # Rounding of float32 heights must not push a slope over its limit.
 _SLOPE_ROUNDING = 1e-3
 
@@ -98,15 +98,15 @@ class Binarise(Stage):
         height = elevation.layers["elevation"]
         observed = np.isfinite(height)
         if self.method == "absolute":
-            reason = np.where(observed & (height > self.max_step), Reason.ELEVATION, Reason.CLEAR)
+            reason = np.where(observed & (height > self.max_step), CellReason.ELEVATION, CellReason.CLEAR)
         else:
             reason = self._rover(elevation, observed)
         if "count" in elevation.layers:
-            reason[(reason == Reason.CLEAR) & (elevation.layers["count"] < self.min_points)] = Reason.UNSURE
+            reason[(reason == CellReason.CLEAR) & (elevation.layers["count"] < self.min_points)] = CellReason.UNSURE
         hidden = elevation.layers.get("occluded", np.zeros_like(height)) == 1
-        reason[~observed] = np.where(hidden, Reason.OCCLUDED, Reason.UNOBSERVED)[~observed]
+        reason[~observed] = np.where(hidden, CellReason.OCCLUDED, CellReason.UNOBSERVED)[~observed]
         cells = np.full(reason.shape, Cell.HAZARD, np.int8)
-        cells[reason == Reason.CLEAR] = Cell.FREE
+        cells[reason == CellReason.CLEAR] = Cell.FREE
         cells[np.isin(reason, UNKNOWN)] = Cell.UNKNOWN
         return NavigationMap(
             elevation.stamp, cells, reason.astype(np.uint8), elevation.resolution, elevation.origin, elevation.frame_id
@@ -116,7 +116,9 @@ class Binarise(Stage):
         """Reasons of the observed cells, (rows, cols); what stands in others says nothing."""
         missing = [name for name in LAYERS if name not in elevation.layers]
         if missing:
-            raise ValueError(f"Binarise: the map has no layer '{missing[0]}'; put stages.Assess before stages.Binarise")
+            raise ValueError(
+                f"Binarise: the map has no layer '{missing[0]}'; put stages.TerrainFeatures before stages.Binarise"
+            )
         ground, step, slope, steepness, roughness, support = (elevation.layers[name] for name in LAYERS)
         above = elevation.layers["elevation"] - ground
         high = observed & (step >= self.max_step - self.margin)
@@ -126,12 +128,12 @@ class Binarise(Stage):
         known = np.isfinite(slope) & np.isfinite(roughness) & (support >= self.least_support) & self._sure(elevation)
         known &= steepness + self.steepness_error * (steepness - slope) <= limit
         known &= ~self._at_brink(elevation) & ~_near(high | belly, self.rim / elevation.resolution)
-        reason = np.where(known, Reason.CLEAR, Reason.UNSURE)
-        reason[_near(high | belly, self.beside / elevation.resolution)] = Reason.BESIDE
-        reason[roughness > self.max_roughness] = Reason.ROUGHNESS
-        reason[(slope > limit) | (steepness > limit)] = Reason.SLOPE
-        reason[belly] = Reason.CLEARANCE
-        reason[high] = Reason.STEP
+        reason = np.where(known, CellReason.CLEAR, CellReason.UNSURE)
+        reason[_near(high | belly, self.beside / elevation.resolution)] = CellReason.BESIDE
+        reason[roughness > self.max_roughness] = CellReason.ROUGHNESS
+        reason[(slope > limit) | (steepness > limit)] = CellReason.SLOPE
+        reason[belly] = CellReason.CLEARANCE
+        reason[high] = CellReason.STEP
         return reason
 
     def _sure(self, elevation: ElevationMap) -> Array:

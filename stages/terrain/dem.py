@@ -14,7 +14,7 @@ from scipy.ndimage import binary_erosion
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
 from stages.stage import Stage, check_cells, check_level, parameter
-from stages.terrain.kernels.cell_gradient import lie_of_cells
+from stages.terrain.kernels.cell_gradient import gradient_and_curvature
 from stages.terrain.kernels.grid import FIGURES, cell_percentile, cell_statistics
 from stages.terrain.kernels.occlusion import lowest_sight
 from stages.terrain.kernels.splat_along_ray import laid_along_sight
@@ -148,7 +148,7 @@ class Voxelise(Stage):
         self, n: Array, mean: Array, scatter: Array, noise: Array, cloud: PointCloud, x: Array, y: Array
     ) -> Array:
         """The random variance of the cells' means. n, mean, scatter, noise (of depth): (rows, cols), NaN = empty."""
-        east, north, bend = lie_of_cells(mean)
+        east, north, bend = gradient_and_curvature(mean)
         rise = east * east + north * north
         noise = noise * _lever(cloud, mean, x, y, east / self.resolution, north / self.resolution) ** 2
         uneven = np.maximum(scatter - rise / 12 - SHOWING * noise, 0.0)

@@ -48,7 +48,7 @@ class _Ground(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Assess(Stage):
+class TerrainFeatures(Stage):
     """Adds to an elevation map, where they can be told:
 
     - ground, m: height of the ground under a cell, its own obstacle not counted, and under small holes too;

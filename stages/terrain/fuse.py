@@ -15,10 +15,10 @@ import numpy as np
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
 from stages.stage import Finding, Severity, Stage, check_cells, counted, parameter
-from stages.terrain.fused_map import Region, Seen, hidden_below, layers_of, merged, variance_of
+from stages.terrain.fused_map import FusedMap, Observation, hidden_below, layers_of, merged, variance_of
 from stages.terrain.height_alignment import fit_plane, rise
-from stages.terrain.kernels.cell_gradient import lie_of_cells
-from stages.terrain.map_registration import Sight, placement, raised, sight_of
+from stages.terrain.kernels.cell_gradient import gradient_and_curvature
+from stages.terrain.map_registration import FrameGrid, placement, raised, sight_of
 
 MARGIN = 1.5  # m; what a cell's slope and step depend on lies within, so that no map ends where they still change
 _TELLING = 100  # cells that a frame and the map must share for their heights to tell of a jump
@@ -77,7 +77,7 @@ class Fuse(Stage):
     shared: float = parameter(0.5, "share of a cell's variance that is the same in all frames", low=0.0, high=1.0)
 
     ordered: ClassVar[bool] = True
-    _map: Region = field(default_factory=Region, init=False, repr=False, compare=False)
+    _map: FusedMap = field(default_factory=FusedMap, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -132,21 +132,21 @@ class Fuse(Stage):
         if cloud.stamp <= self._map.last:
             raise ValueError(f"Fuse: the cloud of {cloud.stamp} ns comes after that of {self._map.last} ns")
 
-    def _seen(self, sight: Sight) -> Seen:
+    def _seen(self, sight: FrameGrid) -> Observation:
         """What a frame shows of the cells that it knows; its errors of place are added to their variance."""
         known, layers = sight.known, sight.terrain.layers
         elevation, minimum, maximum, variance, points = (
             layers[name][known].astype(np.float64) for name in ("elevation", "minimum", "maximum", "variance", "count")
         )
         variance += self._misplaced(sight.terrain)[known]
-        return Seen(*sight.offsets(known), elevation, minimum, maximum, variance, points)
+        return Observation(*sight.offsets(known), elevation, minimum, maximum, variance, points)
 
     def _misplaced(self, terrain: ElevationMap) -> Array:
         """What errors of a frame's place add to the variance of its cells, (rows, cols)."""
-        east, north, _ = lie_of_cells(terrain.layers["elevation"].astype(np.float64)) / self.resolution
+        east, north, _ = gradient_and_curvature(terrain.layers["elevation"].astype(np.float64)) / self.resolution
         return np.asarray(self.alignment**2 + self.position**2 * np.minimum(east**2 + north**2, _STEEPEST**2))
 
-    def _joined(self, sight: Sight, seen: Seen) -> tuple[Array, Array]:
+    def _joined(self, sight: FrameGrid, seen: Observation) -> tuple[Array, Array]:
         """The region's cells (rows, cols) that the frame lies on, and the plane (3,) that joins it to them; where that
         jumped, cells of a map that begins anew."""
         cells = self._map.cells.read(sight.row, sight.col, *sight.terrain.shape)
@@ -158,7 +158,7 @@ class Fuse(Stage):
         self._map.plane, self._map.refused = plane, 0
         return cells, plane
 
-    def _plane(self, cells: Array, seen: Seen) -> Array:
+    def _plane(self, cells: Array, seen: Observation) -> Array:
         """What a frame has to rise to join the map: (3,) height at the rover, m, and slopes along x and y.
 
         cells, seen: (n,), of the cells that the frame knows.

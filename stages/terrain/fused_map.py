@@ -26,7 +26,7 @@ _MS = 1_000_000
 
 
 @dataclass(eq=False)
-class Region:
+class FusedMap:
     """The map so far: its frame, the stamps of its first and last frame, ns, whether those tell what was hidden from
     them, its cells, the plane that joined the last frame, the sum of up as the tilts tell it in the map's frame, how
     many frames in succession did not join, and how often the map began anew for that."""
@@ -51,7 +51,7 @@ class Region:
         return (stamp - self.epoch) // _MS
 
 
-class Seen(NamedTuple):
+class Observation(NamedTuple):
     """What a frame shows of n cells, (n,) float64 each: how far from the rover they lie, m, their heights, m, the
     variance of `elevation`, m^2, and how many points they hold."""
 
@@ -63,14 +63,14 @@ class Seen(NamedTuple):
     variance: Array
     points: Array
 
-    def raised(self, plane: Array) -> Seen:
+    def raised(self, plane: Array) -> Observation:
         """The same, with a plane (3,) added to the heights."""
         up = rise(plane, self.x, self.y)
         return self._replace(elevation=self.elevation + up, minimum=self.minimum + up, maximum=self.maximum + up)
 
-    def only(self, which: Array) -> Seen:
+    def only(self, which: Array) -> Observation:
         """The cells of the mask (n,) bool `which`."""
-        return Seen(*(values[which] for values in self))
+        return Observation(*(values[which] for values in self))
 
 
 def variance_of(cells: Array, shared: float) -> Array:
@@ -78,7 +78,7 @@ def variance_of(cells: Array, shared: float) -> Array:
     return np.asarray(1 / cells["weight"].astype(np.float64) + shared * cells["best"].astype(np.float64) ** 2)
 
 
-def merged(cells: Array, seen: Seen, now: int, contradiction: float, shared: float) -> Array:
+def merged(cells: Array, seen: Observation, now: int, contradiction: float, shared: float) -> Array:
     """The cells (n,) with what a frame saw in them at `now`, ms since the first.
 
     contradiction: standard deviations, beyond which it contradicts a cell; shared: of `variance_of`.
@@ -109,7 +109,7 @@ def _fresh(cells: Array, now: int) -> Array:
     return fresh
 
 
-def _averaged(cells: Array, seen: Seen, now: int, shared: float) -> Array:
+def _averaged(cells: Array, seen: Observation, now: int, shared: float) -> Array:
     """The cells (n,) with what a frame saw in them as one more of their frames, weighted by inverse variance."""
     after, spread = cells.copy(), np.sqrt(seen.variance)
     weight = 1 / ((1 - shared) * seen.variance + 1e-12)
@@ -140,7 +140,7 @@ def hidden_below(cells: Array, ceiling: Array) -> Array:
 
 
 def layers_of(cells: Array, shared: float, hides: bool) -> dict[str, Array]:
-    """What the cells (rows, cols) tell, as layers of an elevation map, float32; hides: of `Region`."""
+    """What the cells (rows, cols) tell, as layers of an elevation map, float32; hides: of `FusedMap`."""
     known = cells["frames"] > 0
     seen = cells[known]
     doubt = seen["doubt"].astype(np.float64)

@@ -20,7 +20,7 @@ _LARGEST_LEAN = np.radians(30.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class FrameGrid:
     """What one frame shows of the region.
 
     placed: frame `level` in the region's; terrain: the elevation map of the frame, whose cells are the region's and
@@ -86,7 +86,7 @@ def _child_from_camera(pose: Pose, sensor: Transform, mount: Mount | None) -> Tr
     return seat
 
 
-def sight_of(cloud: PointCloud, placed: Transform, resolution: float, region: float) -> Sight:
+def sight_of(cloud: PointCloud, placed: Transform, resolution: float, region: float) -> FrameGrid:
     """What the measured points of a cloud show of the region's cells.
 
     cloud: in frame `level`, which is `placed` upright in the region's frame; resolution, region: of `Voxelise`, m.
@@ -102,7 +102,7 @@ def sight_of(cloud: PointCloud, placed: Transform, resolution: float, region: fl
     lifted = {name: terrain.layers[name] + np.float32(placed.translation[2]) for name in heights}
     origin = (col * resolution, row * resolution)
     terrain = replace(terrain, layers={**terrain.layers, **lifted}, origin=origin, frame_id=placed.parent)
-    return Sight(placed, terrain, row, col)
+    return FrameGrid(placed, terrain, row, col)
 
 
 def raised(placed: Transform, plane: Array) -> Transform:

@@ -32,7 +32,7 @@ from recordings.scoring.table import ROWS, terrain_figures, terrain_lines
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
-from stages.data import Array, Cell, Disparity, Mount, Source, StereoFrame, Tilt, Transform
+from stages.data import Array, Cell, Disparity, Mount, PixelOrigin, StereoFrame, Tilt, Transform
 
 SLOPE, TILT_NOISE = np.radians(5.0), np.radians(0.3)
 RUNS = {"rover": "rover", "paper": "paper", "rover, true disparity and tilt": "rover"}
@@ -105,7 +105,7 @@ def seen_by_both(simulation: Simulation, stamp: int, truth: FrameTruth) -> Dispa
     """The true disparity of the pixels that both cameras see, as if measured without error."""
     true = ground_truth.true_disparity(simulation, stamp, truth)
     known = truth.seen == 255
-    source = np.where(known, np.uint8(Source.MEASURED), np.uint8(Source.UNKNOWN))
+    source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
     pixels = np.where(known, true.pixels, np.float32(np.nan))
     return Disparity(stamp, pixels, source, known.astype(np.float32), camera=simulation.camera)
 

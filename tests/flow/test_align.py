@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flow.align import Interpolate, Latest, Nearest, Pair, Token
-from flow.runtime.ledger import Absent, Entry, Reason
+from flow.runtime.ledger import Absent, Loss, LossReason
 from tests.flow.toys import Number
 
 MS = 1_000_000
@@ -47,7 +47,7 @@ def test_a_pair_carries_the_left_stamp():
 def test_partners_further_apart_than_the_slop_are_both_unmatched():
     answers = pairing(("left", 10, 1.0), ("right", 20, 2.0), slop=5)
     assert values(answers) == []
-    assert {(a.stream, a.reason) for a in answers} == {("left", Reason.UNMATCHED), ("right", Reason.UNMATCHED)}
+    assert {(a.stream, a.reason) for a in answers} == {("left", LossReason.UNMATCHED), ("right", LossReason.UNMATCHED)}
 
 
 def test_a_missing_right_costs_one_left_and_nothing_else():
@@ -55,13 +55,13 @@ def test_a_missing_right_costs_one_left_and_nothing_else():
         ("left", 0, 1.0), ("right", 0, 1.0), ("left", 100, 2.0), ("left", 200, 3.0), ("right", 200, 3.0), slop=5
     )
     assert values(answers) == [(0, 2.0), (200, 6.0)]
-    assert [(a.stream, a.stamp) for a in answers if isinstance(a, Entry)] == [("left", 100)]
+    assert [(a.stream, a.stamp) for a in answers if isinstance(a, Loss)] == [("left", 100)]
 
 
 def test_a_partner_that_does_not_come_is_given_up_after_the_patience_of_log_time():
     answers = pairing(("left", 0, 1.0, 0), ("left", 1, 1.0, 2000 * MS), slop=5)
     first = answers[0]
-    assert isinstance(first, Entry)
+    assert isinstance(first, Loss)
     assert first.stamp == 0
     assert "1000.0 ms" in first.detail
 
@@ -92,7 +92,7 @@ def test_a_partner_logged_too_late_is_told_by_how_much_and_which_setting_decides
 def test_items_that_do_not_fit_make_a_frame_that_is_lost_with_its_reason():
     (answer,) = pairing(("left", 10, -1.0), ("right", 10, 2.0))
     assert answer.stamp == 10
-    assert answer.value.cause.reason is Reason.FAILED
+    assert answer.value.cause.reason is LossReason.FAILED
     assert "negative" in answer.value.cause.detail
 
 
@@ -104,7 +104,7 @@ def test_every_message_is_in_a_pair_or_in_the_ledger_but_never_in_both(lefts, ri
     messages = sorted([("left", s, 1.0) for s in lefts] + [("right", s, 1.0) for s in rights], key=lambda m: m[1])
     answers = pairing(*messages, slop=4)
     pairs = [a for a in answers if isinstance(a, Token)]
-    lost = Counter(a.stream for a in answers if isinstance(a, Entry))
+    lost = Counter(a.stream for a in answers if isinstance(a, Loss))
     assert len(pairs) + lost["left"] == len(lefts)
     assert len(pairs) + lost["right"] == len(rights)
     assert [p.stamp for p in pairs] == sorted(p.stamp for p in pairs)
@@ -119,7 +119,7 @@ def test_interpolation_is_exact_at_and_between_samples():
 
 def test_interpolation_refuses_a_gap_and_says_how_long_it_is():
     answers = sampling(Interpolate(max_gap=50 * MS), ("stream", 0, 0.0), ("at", MS, 0.0), ("stream", 80 * MS, 1.0))
-    assert reasons(answers) == [Reason.UNALIGNED]
+    assert reasons(answers) == [LossReason.UNALIGNED]
     assert "80.0 ms" in answers[0].value.cause.detail
 
 
@@ -171,26 +171,26 @@ def test_what_a_sample_falls_short_of_is_named():
 def test_interpolation_never_extrapolates():
     early = sampling(Interpolate(), ("at", 0, 0.0), ("stream", 10, 1.0), ("stream", 20, 1.0))
     late = sampling(Interpolate(), ("stream", 10, 1.0), ("at", 30, 0.0))
-    assert reasons(early) == reasons(late) == [Reason.UNALIGNED]
+    assert reasons(early) == reasons(late) == [LossReason.UNALIGNED]
 
 
 def test_a_sample_logged_late_is_still_used_within_the_patience():
     messages = [("stream", 0, 0.0, 0), ("at", 50, 0.0, 50), ("stream", 100, 1.0, 900 * MS)]
     assert values(sampling(Interpolate(), *messages)) == [(50, 0.5)]
-    assert reasons(sampling(Interpolate(patience=10 * MS), *messages)) == [Reason.UNALIGNED]
+    assert reasons(sampling(Interpolate(patience=10 * MS), *messages)) == [LossReason.UNALIGNED]
 
 
 def test_nearest_takes_the_nearer_neighbour_within_the_slop():
     messages = [("stream", 0, 1.0), ("at", 60, 0.0), ("stream", 100, 2.0), ("at", 400, 0.0)]
     answers = sampling(Nearest(slop=50), *messages)
     assert values(answers) == [(60, 2.0)]
-    assert reasons(answers) == [Reason.UNALIGNED]
+    assert reasons(answers) == [LossReason.UNALIGNED]
 
 
 def test_latest_takes_what_the_log_has_brought_by_then():
     messages = [("stream", 0, 1.0), ("at", 60, 0.0), ("stream", 100, 2.0), ("at", 400, 0.0)]
     assert values(sampling(Latest(), *messages)) == [(60, 1.0), (400, 2.0)]
-    assert reasons(sampling(Latest(max_age=100), *messages)) == [Reason.UNALIGNED]
+    assert reasons(sampling(Latest(max_age=100), *messages)) == [LossReason.UNALIGNED]
 
 
 @given(st.lists(st.integers(0, 1000), min_size=2, unique=True).map(sorted), st.integers(0, 50))
@@ -231,9 +231,9 @@ def test_old_samples_are_forgotten_even_if_nobody_asks():
 
 def test_absence_passes_through_chained_aligners_with_one_entry():
     aligner = Interpolate().start("tilt", {"stream": "level", "at": "stereo"})
-    lost = Absent(Entry("level", 5, "level", Reason.FAILED, "broken"))
+    lost = Absent(Loss("level", 5, "level", LossReason.FAILED, "broken"))
     answers = [*aligner.push("stream", 5, Token(5, lost)), *aligner.push("at", 5, Token(5, None)), *aligner.end()]
-    assert reasons(answers) == [Reason.UNALIGNED]
+    assert reasons(answers) == [LossReason.UNALIGNED]
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,7 @@ def test_smoothing_keeps_the_samples_that_the_next_frame_wants_as_well():
 def test_smoothing_does_not_lag_at_either_end_of_the_stream_and_gaps_are_gaps():
     ramp = [(10 * count, float(count)) for count in range(8)]
     assert values(smoothing(ramp, [5, 12, 65], 50)) == [(5, 0.5), (12, pytest.approx(1.0)), (65, 6.5)]
-    assert reasons(smoothing([(0, 0.0), (10, 1.0), (90, 9.0), (100, 10.0)], [50], 50)) == [Reason.UNALIGNED]
+    assert reasons(smoothing([(0, 0.0), (10, 1.0), (90, 9.0), (100, 10.0)], [50], 50)) == [LossReason.UNALIGNED]
 
 
 def test_a_sample_at_the_very_stamp_counts_though_a_gap_follows_it():

@@ -16,8 +16,8 @@ from stages import (
     Disparity,
     Fuse,
     Level,
-    Locate,
     Mount,
+    PoseFilter,
     Reproject,
     StereoFrame,
     Tilt,
@@ -46,7 +46,7 @@ def inputs():
     tilts = [Tilt(motion.stamp, up) for motion, up in zip(moved, drive.ups(), strict=True)]
     upright = [(motion, tilt, Mount(0, drive.mount)) for motion, tilt in zip(moved, tilts, strict=True)]
     nothing = Disparity(0, *(np.zeros((8, 8), kind) for kind in (np.float32, np.uint8, np.float32)))
-    return given | {Locate: upright, CheckTilt: upright, CheckMatches: [(nothing,)] * FRAMES}
+    return given | {PoseFilter: upright, CheckTilt: upright, CheckMatches: [(nothing,)] * FRAMES}
 
 
 def same(one, other):
@@ -62,7 +62,7 @@ def same(one, other):
     return one == other or (one != one and other != other)
 
 
-@pytest.mark.parametrize("kind", [VisualOdometry, Locate, CheckTilt, CheckMatches, Fuse])
+@pytest.mark.parametrize("kind", [VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse])
 def test_a_run_in_two_parts_is_the_whole_run(inputs, kind):
     frames, whole, first, second = inputs[kind], kind(), kind(), kind()
     half = len(frames) // 2 + 1
@@ -83,9 +83,9 @@ def test_a_run_in_two_parts_is_the_whole_run(inputs, kind):
 
 def test_every_stage_that_remembers_is_tried_above():
     remembering = {kind for name in stages.__all__ if getattr(kind := getattr(stages, name), "ordered", False)}
-    assert remembering == {VisualOdometry, Locate, CheckTilt, CheckMatches, Fuse}
+    assert remembering == {VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse}
 
 
 def test_a_snapshot_of_another_stage_is_refused():
     with pytest.raises(ValueError, match="a snapshot of Locate is not one of CheckTilt"):
-        CheckTilt().restore(Locate().snapshot())
+        CheckTilt().restore(PoseFilter().snapshot())

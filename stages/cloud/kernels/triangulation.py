@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from stages.compiled.jit import kernel
-from stages.data import Array, Source, StereoCamera
+from stages.data import Array, PixelOrigin, StereoCamera
 
-_FILLED = int(Source.FILLED)
-_PLANE = int(Source.PLANE)
-_UNKNOWN = int(Source.UNKNOWN)
+_FILLED = int(PixelOrigin.FILLED)
+_PLANE = int(PixelOrigin.PLANE)
+_UNKNOWN = int(PixelOrigin.UNKNOWN)
 
 
 def triangulate(
@@ -28,8 +28,8 @@ def triangulate(
 ) -> tuple[Array, Array, Array, Array]:
     """The points of a disparity image, in the left optical frame, in raster order.
 
-    disparity: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `Source`; confidence: (H, W) float32;
-    colors: (H, W) or (H, W, 3) uint8; max_depth: m; filled: whether pixels of source FILLED become points;
+    disparity: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `PixelOrigin`; confidence: (H, W)
+    float32; colors: (H, W) or (H, W, 3) uint8; max_depth: m; filled: whether pixels of source FILLED become points;
     sigmas: standard deviation of the disparity, px: at confidence 1, at confidence 0 (between the two it falls
     geometrically), of pixels of source PLANE, and of source FILLED.
 
@@ -104,7 +104,7 @@ def triangulate_reference(
 ) -> tuple[Array, Array, Array, Array]:
     """The same as `triangulate`, in plain numpy."""
     effective = disparity.astype(np.float64) + camera.cx_right - camera.cx
-    wanted = np.isfinite(effective) & (source != Source.UNKNOWN) & (filled | (source != Source.FILLED))
+    wanted = np.isfinite(effective) & (source != PixelOrigin.UNKNOWN) & (filled | (source != PixelOrigin.FILLED))
     wanted &= np.where(wanted, effective, 0) * max_depth >= camera.fx * camera.baseline
     v, u = np.nonzero(wanted)
     z = camera.fx * camera.baseline / effective[v, u]
@@ -112,8 +112,8 @@ def triangulate_reference(
     rgb = colors[v, u] if colors.ndim == 3 else np.repeat(colors[v, u][:, None], 3, axis=1)
     trust = np.clip(np.nan_to_num(confidence[v, u].astype(np.float64)), 0, 1)
     sigma_d = sigmas[1] * (sigmas[0] / sigmas[1]) ** trust
-    sigma_d = np.where(source[v, u] == Source.PLANE, sigmas[2], sigma_d)
-    sigma_d = np.where(source[v, u] == Source.FILLED, sigmas[3], sigma_d)
+    sigma_d = np.where(source[v, u] == PixelOrigin.PLANE, sigmas[2], sigma_d)
+    sigma_d = np.where(source[v, u] == PixelOrigin.FILLED, sigmas[3], sigma_d)
     sigma = z * z / (camera.fx * camera.baseline) * sigma_d
     pixel = v * disparity.shape[1] + u
     return points.astype(np.float32), rgb, sigma.astype(np.float32), pixel.astype(np.int32)

@@ -29,7 +29,7 @@ NOTHING_YET = Diagnosis("", "no frames to judge the tilt by", False)
 
 
 @dataclass(frozen=True, eq=False)
-class _Sight:
+class _TiltSample:
     stamp: int
     segment: int
     camera: Transform
@@ -63,8 +63,8 @@ class _Memory:
     """The frames that count, the last frame of all, how many were kept since they were judged, the verdict, and the
     least angle, rad, by which the ground was off level in any frame that shows it, with the number of these."""
 
-    kept: deque[_Sight] = field(default_factory=deque)
-    last: _Sight | None = None
+    kept: deque[_TiltSample] = field(default_factory=deque)
+    last: _TiltSample | None = None
     since: int = 0
     verdict: _Verdict = field(default_factory=_Verdict)
     least_slope: float = np.inf
@@ -93,7 +93,7 @@ class CheckTilt(Stage):
         turn = np.nan
         if motion.camera is not None:
             drift = max(float(np.trace(motion.covariance[3:, 3:])) / 3, 0.0)
-            sight = _Sight(
+            sight = _TiltSample(
                 motion.stamp, motion.segment, motion.camera, drift, tilt.up, mount.camera_from_inclinometer, ground
             )  # fmt: skip
             turn = self._residual(sight)
@@ -123,7 +123,7 @@ class CheckTilt(Stage):
         steep = off_level(memory.least_slope, memory.slopes) if verdict.clear == 0 and not verdict.last.fault else None
         return steep or verdict.last
 
-    def _residual(self, sight: _Sight) -> float:
+    def _residual(self, sight: _TiltSample) -> float:
         """By how much up differs from the last frame's, carried along by the camera; NaN in a new segment."""
         last = self._memory.last
         if last is None or last.segment != sight.segment:
@@ -131,7 +131,7 @@ class CheckTilt(Stage):
         carried = sight.camera.rotation.T @ last.camera.rotation @ last.mount @ last.up
         return _angle(sight.mount @ sight.up, carried)
 
-    def _keep(self, sight: _Sight) -> None:
+    def _keep(self, sight: _TiltSample) -> None:
         memory = self._memory
         before = memory.kept[-1] if memory.kept else None
         if before is not None and before.segment == sight.segment:

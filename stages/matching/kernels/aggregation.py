@@ -34,7 +34,7 @@ from stages.compiled.simd import (
 )  # fmt: skip
 from stages.data import Array
 from stages.matching.kernels.census import census_costs
-from stages.matching.kernels.sgm_params import Rule
+from stages.matching.kernels.sgm_params import SgmParams
 
 BLOCK = 64
 FAR = 255  # beyond either end of the search range
@@ -63,11 +63,11 @@ def aggregate_row(  # type: ignore[no-untyped-def]
 ):
     """Follow the paths of one sweep from the row before into row y, and add them up.
 
-    pair, rule: `pair.Pair` and `Rule`; first_lane: the disparity of the first lane, less the smallest searched; costs:
-    (W * n,) uint8, C of the row without the prior's costs, with `rule.gradient`; else C is the census cost, made here,
-    which saves writing and reading it; paths: (3 * W * n,) uint8, L of the row before, all 0 at first, updated; step: 1
-    for a sweep down, -1 for a sweep up; sums: uint8, where the sums of the row go, from `place` on (W * n); final:
-    instead, add what the other sweep left there, and put the whole into `total`.
+    pair, rule: `pair.MatchingInputs` and `SgmParams`; first_lane: the disparity of the first lane, less the smallest
+    searched; costs: (W * n,) uint8, C of the row without the prior's costs, with `rule.gradient`; else C is the census
+    cost, made here, which saves writing and reading it; paths: (3 * W * n,) uint8, L of the row before, all 0 at
+    first, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, where the sums of the row go, from
+    `place` on (W * n); final: instead, add what the other sweep left there, and put the whole into `total`.
     """
     n = lanes_in(width)
     columns = costs.size // n
@@ -142,7 +142,7 @@ def _around(place, columns):  # type: ignore[no-untyped-def]
 
 
 def aggregate_reference(
-    steps: Array, rule: Rule, costs: Array, searched: Array, sign: int, beside: bool = True
+    steps: Array, rule: SgmParams, costs: Array, searched: Array, sign: int, beside: bool = True
 ) -> Array:
     """The sums of the sweep down (sign 1) or up (-1) in plain numpy, (H, W, n) int64.
 

@@ -81,8 +81,9 @@ def census_reference(image: Array, mirrored: bool = False) -> Array:
 def census_costs(left, right, pair, unseen, x, i, width):  # type: ignore[no-untyped-def]
     """The costs of pixel x of a row at each disparity.
 
-    left, right: the row's planes in pair, `pair.Pair`, of which the right ones run backwards; i: where they hold
-    the partner at the first disparity, followed by the others; unseen: the cost where a partner is outside the image.
+    left, right: the row's planes in pair, `pair.MatchingInputs`, of which the right ones run backwards; i: where they
+    hold the partner at the first disparity, followed by the others; unseen: the cost where a partner is outside the
+    image.
     """
     return seen_costs(differing_bits(left, right, x, i, width), pair, unseen, i, width)
 

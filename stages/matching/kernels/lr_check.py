@@ -6,10 +6,10 @@ import numpy as np
 
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by
-from stages.data import Array, Source
+from stages.data import Array, PixelOrigin
 
 F32 = np.float32
-UNKNOWN = int(Source.UNKNOWN)
+UNKNOWN = int(PixelOrigin.UNKNOWN)
 Layers = tuple[Array, Array, Array]
 
 

@@ -7,18 +7,18 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from stages.compiled.parallel import AtOnce, in_turn
+from stages.compiled.parallel import Fork, in_turn
 from stages.compiled.simd import Width
 from stages.data import Array
 from stages.matching.kernels.aggregation import brightness_steps
 from stages.matching.kernels.census import census
 from stages.matching.kernels.gradient import gradients
-from stages.matching.kernels.sgm_params import Rule
+from stages.matching.kernels.sgm_params import SgmParams
 
 NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)
 
 
-class Pair(NamedTuple):
+class MatchingInputs(NamedTuple):
     """What the searches read of the images, with n lanes."""
 
     left: Array  # (H, planes, >= W) uint8: bits of census, gradients
@@ -34,11 +34,11 @@ class Pair(NamedTuple):
 def describe(
     left: Array,
     right: Array,
-    rule: Rule,
+    rule: SgmParams,
     width: Width,
     prior: tuple[Array, Array] | None = None,
-    both: AtOnce = in_turn,
-) -> Pair:
+    both: Fork = in_turn,
+) -> MatchingInputs:
     """What the searches read of gray images, (H, W) uint8. prior: of `prior.prior_costs`, or None."""
     columns = left.shape[1]
     (left_planes, steps), right_planes = both(
@@ -47,10 +47,10 @@ def describe(
     place = np.arange(columns + width.lanes) + rule.minimum
     outside = np.where((place < 0) | (place > columns - 1), np.uint8(255), np.uint8(0))
     whole_from, whole_to = max(0, -rule.minimum), columns + 1 - rule.minimum - width.lanes
-    return Pair(left_planes, right_planes, steps, outside, whole_from, whole_to, *(prior or NO_PRIOR))
+    return MatchingInputs(left_planes, right_planes, steps, outside, whole_from, whole_to, *(prior or NO_PRIOR))
 
 
-def _described(image: Array, rule: Rule, width: Width | None = None) -> Array:
+def _described(image: Array, rule: SgmParams, width: Width | None = None) -> Array:
     """The planes of an image; with `width` those of the right image: backwards, moved to the smallest disparity."""
     backwards, after = width is not None, 0
     if width is not None:

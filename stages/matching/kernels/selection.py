@@ -29,7 +29,7 @@ from stages.compiled.simd import (
     where_less,
 )  # fmt: skip
 from stages.data import Array
-from stages.matching.kernels.sgm_params import Rule
+from stages.matching.kernels.sgm_params import SgmParams
 
 
 @part
@@ -88,7 +88,7 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):  # typ
     """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
 
     winner, votes, partners: of `find_winners` and `find_partners`; first: (W,) int32, disparity of the first lane;
-    top: the last lane that is a disparity; rule: `Rule`; into pixels (W,) float32, px, NaN = unknown, and
+    top: the last lane that is a disparity; rule: `SgmParams`; into pixels (W,) float32, px, NaN = unknown, and
     evidence (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown.
 
     A winner at an end of the search range, or with a neighbour outside the right image, is none: its lines would lean
@@ -111,7 +111,7 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):  # typ
         evidence[x] = np.uint8(lead) if sound else np.uint8(0)
 
 
-def select_reference(total: Array, first: Array, lowest: int, n: int, rule: Rule) -> tuple[Array, Array]:
+def select_reference(total: Array, first: Array, lowest: int, n: int, rule: SgmParams) -> tuple[Array, Array]:
     """Disparities and evidence of a row in plain numpy.
 
     total: (W, m) the sums of all paths, from disparity `lowest` on, 255 where not searched; first: (W,) the disparity

@@ -22,18 +22,18 @@ import cv2
 import numpy as np
 
 from stages.compiled.jit import kernel
-from stages.compiled.parallel import AtOnce, by_bands, shared_by
+from stages.compiled.parallel import Fork, by_bands, shared_by
 from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace, Workspaces
 from stages.data import Array
 from stages.matching.kernels.aggregation import aggregate_row
 from stages.matching.kernels.blank_windows import blank_windows, drop_blank
 from stages.matching.kernels.gradient import smoothed_costs
-from stages.matching.kernels.matching_inputs import Pair, describe
+from stages.matching.kernels.matching_inputs import MatchingInputs, describe
 from stages.matching.kernels.row_ranges import Range, lanes_for, move_paths, within
 from stages.matching.kernels.selection import find_partners, find_winners, fit_row
-from stages.matching.kernels.sgm_local import Windows, search_around
-from stages.matching.kernels.sgm_params import Rule
+from stages.matching.kernels.sgm_local import SearchWindows, search_around
+from stages.matching.kernels.sgm_params import SgmParams
 from stages.matching.kernels.speckles import drop_speckles
 
 _workspaces = Workspaces()
@@ -63,7 +63,7 @@ class Scratch(NamedTuple):
 
 
 def match(
-    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, search: Windows | list[Range],
+    left: Array, right: Array, rule: SgmParams, prior: tuple[Array, Array] | None, search: SearchWindows | list[Range],
     excluded: Array | None, threads: int, memory: int,
 ) -> Matches:  # fmt: skip
     """Disparities of a rectified pair of gray images.
@@ -75,7 +75,7 @@ def match(
     pixels, evidence = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
     both = shared_by(threads)
     with _workspaces.one() as space:
-        if isinstance(search, Windows):
+        if isinstance(search, SearchWindows):
             seen = rule._replace(minimum=0)
             search_around(
                 describe(left, right, seen, search.width, prior, both), rule, search, pixels, evidence, space, both
@@ -95,8 +95,8 @@ def match(
 
 
 def _search_rows(
-    left: Array, right: Array, rule: Rule, prior: tuple[Array, Array] | None, ranges: list[Range], memory: int,
-    pixels: Array, evidence: Array, space: Workspace, both: AtOnce,
+    left: Array, right: Array, rule: SgmParams, prior: tuple[Array, Array] | None, ranges: list[Range], memory: int,
+    pixels: Array, evidence: Array, space: Workspace, both: Fork,
 ) -> None:  # fmt: skip
     """Fill in disparities and evidence; what that takes but the workspace is given back."""
     pair = describe(left, right, rule, Width(lanes_for(rule.disparities)), prior, both)
@@ -132,7 +132,13 @@ def _sweep(  # type: ignore[no-untyped-def]
 
 
 def _halves(
-    pair: Pair, rule: Rule, space: Workspace, ranges: list[Range], memory: int, pixels: Array, evidence: Array
+    pair: MatchingInputs,
+    rule: SgmParams,
+    space: Workspace,
+    ranges: list[Range],
+    memory: int,
+    pixels: Array,
+    evidence: Array,
 ) -> list[_Half]:
     """Both halves of the image, in stripes whose sums take no more than `memory` bytes together."""
     height, columns = pixels.shape
@@ -180,7 +186,7 @@ class _Half:
 
     def __init__(
         self, rows: range, stripe: int, striped: bool, space: Workspace, sweep: Callable[..., None],
-        ranges: list[Range], columns: int, rule: Rule,
+        ranges: list[Range], columns: int, rule: SgmParams,
     ) -> None:  # fmt: skip
         """rows: from the end inwards; stripe: how many at a time; striped: one of the halves does not fit into a
         stripe, so that either has its sums made again, in the memory of the sweep that crosses it."""

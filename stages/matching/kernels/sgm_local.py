@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.compiled.jit import kernel, part
-from stages.compiled.parallel import AtOnce, by_bands, shared_by
+from stages.compiled.parallel import Fork, by_bands, shared_by
 from stages.compiled.simd import (
     Width,
     average,
@@ -35,9 +35,9 @@ from stages.data import Array
 from stages.matching.kernels.aggregation import FAR, aggregate_reference, next_path
 from stages.matching.kernels.census import PLANES, census_costs
 from stages.matching.kernels.gradient import LARGEST, raw_costs
-from stages.matching.kernels.matching_inputs import Pair
+from stages.matching.kernels.matching_inputs import MatchingInputs
 from stages.matching.kernels.selection import find_winner, fit_row, select_reference
-from stages.matching.kernels.sgm_params import Rule
+from stages.matching.kernels.sgm_params import SgmParams
 
 STEP = 4  # windows begin at multiples of it, so that those of neighbours mostly begin together
 EDGE = 1  # lanes at either end of a window that cannot win
@@ -45,14 +45,14 @@ FARTHEST = np.float32(1e6)  # px; beyond any image, and still a whole number
 GAP = 16  # by how much the stretch between two slots is longer than the lanes
 
 
-class Windows(NamedTuple):
+class SearchWindows(NamedTuple):
     """Where the search of every pixel begins, and how far it goes."""
 
     first: Array  # (H, W) int32, px, disparity of the first lane
     width: Width
 
 
-def windows(prior: Array, reach: int, least: int, threads: int = 1) -> Windows:
+def windows(prior: Array, reach: int, least: int, threads: int = 1) -> SearchWindows:
     """Windows that reach `reach` px from the prior to either side, where the image and `least` allow.
 
     prior: (H, W) float32, px, NaN = none: the window is then that of the pixel to the left; least: px, the smallest
@@ -65,7 +65,7 @@ def windows(prior: Array, reach: int, least: int, threads: int = 1) -> Windows:
         _begin(prior[top:end], lanes, least, first[top:end])
 
     by_bands(shared_by(threads), len(prior), work)
-    return Windows(first, Width(lanes))
+    return SearchWindows(first, Width(lanes))
 
 
 @kernel
@@ -83,7 +83,13 @@ def _begin(prior, lanes, least, first):  # type: ignore[no-untyped-def]
 
 
 def search_around(
-    pair: Pair, rule: Rule, windows: Windows, pixels: Array, evidence: Array, space: Workspace, both: AtOnce
+    pair: MatchingInputs,
+    rule: SgmParams,
+    windows: SearchWindows,
+    pixels: Array,
+    evidence: Array,
+    space: Workspace,
+    both: Fork,
 ) -> None:
     """Fill in disparities (H, W) float32, px, NaN = unknown, and the evidence for them, (H, W) uint8.
 
@@ -271,7 +277,7 @@ def _cross(  # type: ignore[no-untyped-def]
         fit_row(winner, votes, partners, begin, n - 1, rule, pixels[y], evidence[y])
 
 
-def search_around_reference(pair: Pair, rule: Rule, windows: Windows) -> tuple[Array, Array]:
+def search_around_reference(pair: MatchingInputs, rule: SgmParams, windows: SearchWindows) -> tuple[Array, Array]:
     """Disparities and evidence as of `search_around`, in plain numpy: in volumes of all disparities of any window, with
     255 for those that are not in the pixel's own."""
     first, n = windows.first, windows.width.lanes
@@ -292,7 +298,7 @@ def search_around_reference(pair: Pair, rule: Rule, windows: Windows) -> tuple[A
     return pixels, evidence
 
 
-def _raw_costs_reference(pair: Pair, rule: Rule, first: Array, n: int) -> Array:
+def _raw_costs_reference(pair: MatchingInputs, rule: SgmParams, first: Array, n: int) -> Array:
     """The costs in the windows, not smoothed, (H, W, n) int64."""
     height, columns = first.shape
     partner = columns - 1 - np.arange(columns)[:, np.newaxis] + first[..., np.newaxis] + np.arange(n)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from stages.data import Array
 
 
-class Rule(NamedTuple):
+class SgmParams(NamedTuple):
     """How to match: see `stages.Match` for the meaning of each."""
 
     gradient: bool  # census and gradient, or census alone

@@ -14,14 +14,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from stages.compiled.jit import kernel
-from stages.compiled.parallel import AtOnce, by_bands, in_turn
+from stages.compiled.parallel import Fork, by_bands, in_turn
 from stages.compiled.union_find import join, root
 from stages.compiled.workspace import Workspace
 from stages.data import Array
 
 
 def drop_speckles(
-    disparity: Array, evidence: Array, step: float, largest: int, space: Workspace, both: AtOnce = in_turn
+    disparity: Array, evidence: Array, step: float, largest: int, space: Workspace, both: Fork = in_turn
 ) -> None:
     """Set patches of at most `largest` pixels to NaN, and their evidence to 0, in place.
 

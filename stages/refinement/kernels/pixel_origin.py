@@ -8,12 +8,12 @@ import numpy as np
 
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by
-from stages.data import Array, Source
+from stages.data import Array, PixelOrigin
 from stages.refinement.kernels.holes import KEPT, MISMATCH
 
 F32 = np.float32
 OWN = 0.5, 0.75, 1.0
-UNKNOWN, MEASURED, PLANE, FILLED = (int(code) for code in Source)
+UNKNOWN, MEASURED, PLANE, FILLED = (int(code) for code in PixelOrigin)
 
 
 class Trust(NamedTuple):
@@ -27,11 +27,11 @@ class Trust(NamedTuple):
     occlusion: float  # and one that is hidden from the right camera
 
 
-def name_sources(
+def label_origin(
     matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, borne_out: Array, moved: float,
     trust: Trust, threads: int = 1,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Source and confidence of each pixel, (H, W) uint8 codes of `Source` and float32.
+    """Source and confidence of each pixel, (H, W) uint8 codes of `PixelOrigin` and float32.
 
     matches: (H, W) float32, px, NaN = none, before refinement; confidence: (H, W) float32, theirs; agreed: (H, W) bool,
     where a plane had its say; kinds: (H, W) uint8 of `holes.fill_holes`; refined: (H, W) float32, the result;
@@ -80,7 +80,7 @@ def name_sources_reference(
     matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, borne_out: Array, moved: float,
     trust: Trust,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """`name_sources` in plain numpy."""
+    """`label_origin` in plain numpy."""
     own = np.rint(np.clip(confidence, 0, 1) * F32(255)).astype(np.float64) / 255
     stayed = np.abs(refined - matches) <= F32(moved)
     conditions = [

@@ -10,12 +10,12 @@ import numpy as np
 
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by, with_margin
-from stages.data import Array, Source
+from stages.data import Array, PixelOrigin
 from stages.refinement.kernels.holes import APART
 from stages.refinement.kernels.valid_extent import Extent
 
 F32 = np.float32
-MEASURED = int(Source.MEASURED)
+MEASURED = int(PixelOrigin.MEASURED)
 
 
 def trusted_matches(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.compiled.jit import fast_part, kernel
-from stages.compiled.parallel import AtOnce, by_bands, in_turn, shared_by
+from stages.compiled.parallel import Fork, by_bands, in_turn, shared_by
 from stages.data import Array
 
 F32 = np.float32
@@ -60,7 +60,7 @@ def fit_planes(
 
 
 def known_points(
-    disparity: Array, labels: Array, count: int, weights: Array, both: AtOnce = in_turn
+    disparity: Array, labels: Array, count: int, weights: Array, both: Fork = in_turn
 ) -> tuple[Array, Array, Array]:
     """The known pixels, segment by segment, in scan order each.
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from stages.compiled.jit import fast_kernel, fast_part, kernel
-from stages.compiled.parallel import AtOnce, by_bands, in_turn, shared_by
+from stages.compiled.parallel import Fork, by_bands, in_turn, shared_by
 from stages.compiled.union_find import join, root
 from stages.compiled.workspace import Workspaces
 from stages.data import Array
@@ -55,7 +55,7 @@ def superpixels(image: Array, count: int, compactness: float = 10.0, threads: in
     return labels, total
 
 
-def _colours(image: Array, both: AtOnce = in_turn) -> Array:
+def _colours(image: Array, both: Fork = in_turn) -> Array:
     """The image in CIELAB with 8 bits each, (H, W, 3) uint8; a gray one as it is, (H, W, 1)."""
     if image.ndim == 2:
         return image[..., None].copy()
@@ -79,7 +79,7 @@ def _grid_centres(colour: Array, rows: int, cols: int) -> Array:
     return centres
 
 
-def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: AtOnce) -> None:
+def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Fork) -> None:
     """One k-means step: `centres` becomes the means of what is nearest to each."""
     labels = _assigned(colour, centres, grid, weight, both)
     upper, lower = np.zeros((2, len(centres), 6))
@@ -93,7 +93,7 @@ def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, b
     centres[seen] = sums[seen, :5] / sums[seen, 5:]
 
 
-def _assigned(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: AtOnce = in_turn) -> Array:
+def _assigned(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Fork = in_turn) -> Array:
     """The nearest centre of each pixel, (H, W) int32."""
     rows, cols = grid
     labels = np.empty(colour.shape[:2], np.int32)
@@ -174,7 +174,7 @@ def _lay_out(centres, rows, cols, row, beside, position_weight, laid):  # type: 
             laid[4, start:stop] = FAR
 
 
-def connect(labels: Array, smallest: int, scratch: Array, both: AtOnce = in_turn) -> int:
+def connect(labels: Array, smallest: int, scratch: Array, both: Fork = in_turn) -> int:
     """Number the 4-connected components of `labels` (H, W) int32 in scan order, in place; returns how many.
 
     scratch: (3, H * W) int32, to work in. One of fewer than `smallest` pixels joins the component left of its first

@@ -11,7 +11,7 @@ from stages.compiled.jit import kernel
 from stages.data import Array
 
 
-def lie_of_cells(heights: Array) -> Array:
+def gradient_and_curvature(heights: Array) -> Array:
     """Slopes and bend at every cell.
 
     heights: (rows, cols) float64, NaN = unknown.
@@ -48,7 +48,7 @@ def _lie_of_cells(heights):  # type: ignore[no-untyped-def]
 
 
 def lie_of_cells_reference(heights: Array) -> Array:
-    """The same as `lie_of_cells`, in plain numpy."""
+    """The same as `gradient_and_curvature`, in plain numpy."""
     around = np.pad(heights, 1, constant_values=np.nan)
     west, east, south, north = around[1:-1, :-2], around[1:-1, 2:], around[:-2, 1:-1], around[2:, 1:-1]
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flow.runtime.engine import Engine
-from flow.runtime.graph import Node, Place
-from flow.runtime.ledger import Absent, Entry, Ledger, Reason
+from flow.runtime.graph import Node, YamlLocation
+from flow.runtime.ledger import Absent, Ledger, Loss, LossReason
 from tests.flow.toys import MS, PIPELINE, Couple, Keep, Number, graph, replayed, traverse
 
 
@@ -131,7 +131,7 @@ sinks: [{use: tests.flow.toys.Keep}]
 def test_a_frame_that_has_nothing_to_work_on_is_through_at_once(tmp_path):
     told, ledger = [], Ledger()
     engine = Engine(graph(tmp_path).stages, {}, ledger, on_frame=told.append)
-    lost = Absent(ledger.add(Entry("both", 0, "both", Reason.FAILED, "lost")))
+    lost = Absent(ledger.add(Loss("both", 0, "both", LossReason.FAILED, "lost")))
     assert engine.admit(0, {"both": lost, "height": Number(0, 0.0)}, [])
     engine.finish()
     assert told == [False]
@@ -169,7 +169,7 @@ def test_what_a_frame_lost_before_it_was_abandoned_is_told_and_what_becomes_of_i
 
     monkeypatch.setattr("tests.flow.toys.Scale.__call__", hang)
     engine = Engine(stages, {}, ledger, workers=1, on_frame=told.append)
-    lost = ledger.add(Entry("level", 0, "source", Reason.UNREADABLE, "chunk 7 is damaged"))
+    lost = ledger.add(Loss("level", 0, "source", LossReason.UNREADABLE, "chunk 7 is damaged"))
     engine.admit(0, frame(0), [lost])
     inside.wait(5)
     engine.finish(lambda: True)
@@ -177,7 +177,7 @@ def test_what_a_frame_lost_before_it_was_abandoned_is_told_and_what_becomes_of_i
     for thread in threading.enumerate():
         if thread.name.startswith("worker-"):
             thread.join(5)
-    abandoned = Entry("frame", 0, "engine", Reason.ABANDONED, "the run ended before it was through")
+    abandoned = Loss("frame", 0, "engine", LossReason.ABANDONED, "the run ended before it was through")
     assert engine.late_entries == [lost, abandoned]
     assert set(ledger.entries) == {lost, abandoned}
     assert (told, engine.through) == ([], 0)
@@ -217,7 +217,7 @@ def test_whatever_the_graph_and_whatever_fails_every_frame_arrives_as_computed_b
     flow, lost, workers, capacity, sinks
 ):
     names = {-1: "entry", **{i: f"s{i}" for i in range(len(flow))}}
-    place = Place("random", 1)
+    place = YamlLocation("random", 1)
     nodes = [
         Node(names[i], "Sum", Sum(bad, ordered), {names[j]: names[j] for j in inputs}, Couple, "entry", False, place)
         for i, (inputs, ordered, bad) in enumerate(flow)
@@ -226,7 +226,9 @@ def test_whatever_the_graph_and_whatever_fails_every_frame_arrives_as_computed_b
     ledger = Ledger()
     engine = Engine(nodes, keeps, ledger, workers=workers, capacity=capacity)
     for frame in range(12):
-        entry = Absent(ledger.add(Entry("entry", frame, "source", Reason.UNALIGNED, "lost"))) if frame in lost else None
+        entry = (
+            Absent(ledger.add(Loss("entry", frame, "source", LossReason.UNALIGNED, "lost"))) if frame in lost else None
+        )
         assert engine.admit(frame, {"entry": entry or Couple(frame, 0.0)}, [])
     engine.finish()
     expected = [({}, 1) if frame in lost else by_hand(flow, frame) for frame in range(12)]

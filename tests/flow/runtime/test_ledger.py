@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from flow.runtime.ledger import Entry, Ledger, Reason, failure
+from flow.runtime.ledger import Ledger, Loss, LossReason, failure
 from stages import Match
 
 
@@ -44,7 +44,7 @@ def test_an_operation_that_breaks_down_is_named_with_file_and_line(call, said):
 
 def test_equal_runs_give_equal_ledgers_whatever_fails_first():
     where = [(0, "match", "right"), (1, "match", "left"), (1, "match", "right"), (1, "refine", "left")]
-    entries = [Entry(stream, stamp, stage, Reason.FAILED, "no") for stamp, stage, stream in where]
+    entries = [Loss(stream, stamp, stage, LossReason.FAILED, "no") for stamp, stage, stream in where]
     for order in permutations(entries):
         ledger = Ledger()
         for entry in order:

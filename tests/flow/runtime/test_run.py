@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flow.errors import SinkError, UsageError
-from flow.runtime.frame_assembler import Feeder
+from flow.runtime.frame_assembler import FrameAssembler
 from flow.runtime.ledger import Ledger
 from flow.runtime.run import Stop, interrupts, run
 from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, Text, graph, replayed, replayed_log, traverse
@@ -308,7 +308,7 @@ def test_a_log_that_was_written_in_bursts_loses_nothing(tmp_path_factory, stalls
         return max(ends, default=at)
 
     events = [(logged(at), stream, item) for at, stream, item in traverse(100)]
-    feeder = Feeder(graph(tmp_path_factory.mktemp("burst")), ledger := Ledger())
+    feeder = FrameAssembler(graph(tmp_path_factory.mktemp("burst")), ledger := Ledger())
     assert len(list(feeder.frames(sorted(events, key=lambda event: event[0])))) == 100
     assert not [entry for entry in ledger.entries if entry.reason == "out of order"]
 
@@ -324,7 +324,7 @@ def test_a_stamp_in_doubt_does_not_hold_up_the_log(tmp_path):
 
     alone = [(0, "words", Text(3_600_000 * MS, "alone"))]
     text = PIPELINE.replace("sinks:", "  said: {use: flow.align.latest, stream: words, at: both}\nsinks:")
-    feeder = Feeder(graph(tmp_path, text=text), Ledger())
+    feeder = FrameAssembler(graph(tmp_path, text=text), Ledger())
     next(feeder.frames(counted(alone + traverse(1000)[1:])))
     assert read["left"] < 110
 
@@ -334,7 +334,7 @@ def test_what_is_read_ahead_of_a_stamp_in_doubt_is_bounded_however_much_the_log_
     often = [(at, "level", Number(at, at / 1e9)) for at in range(MS, 5000 * MS, MS)]
     text = PIPELINE.replace("sinks:", "  said: {use: flow.align.latest, stream: words, at: both}\nsinks:")
     read = iter(alone + traverse(1)[:3] + often)
-    next(Feeder(graph(tmp_path, text=text), Ledger()).frames(read))
+    next(FrameAssembler(graph(tmp_path, text=text), Ledger()).frames(read))
     assert len(often) - len(list(read)) < 130
 
 

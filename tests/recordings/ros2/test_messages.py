@@ -45,9 +45,9 @@ from stages.data import (
     Disparity,
     ElevationMap,
     NavigationMap,
+    PixelOrigin,
     PointCloud,
     Pose,
-    Source,
     StereoCamera,
     Transform,
 )  # fmt: skip
@@ -390,7 +390,7 @@ def test_a_point_cloud_reads_back_as_it_was_whatever_its_padding_and_byte_order(
 
 def test_a_point_cloud_tells_which_points_are_filled() -> None:
     points = np.arange(9, dtype=np.float32).reshape(3, 3)
-    source = np.array([Source.MEASURED, Source.FILLED, Source.PLANE], np.uint8)
+    source = np.array([PixelOrigin.MEASURED, PixelOrigin.FILLED, PixelOrigin.PLANE], np.uint8)
     black, index = np.zeros((3, 3), np.uint8), np.arange(3, dtype=np.int32)
     cloud = PointCloud(1, points, black, np.ones(3, np.float32), index, "level", source=source)
     assert read_point_cloud(point_cloud(cloud))["source"].tolist() == source.tolist()

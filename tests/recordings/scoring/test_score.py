@@ -21,7 +21,7 @@ from recordings.ros2 import to_msg as ros2
 from recordings.scoring import score as scoring
 from recordings.scoring.table import ROWS, format_brief, format_score, terrain_lines
 from recordings.simulator import Simulation, ground_truth, write_log
-from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Reason, Transform
+from stages.data import Cell, CellReason, Disparity, ElevationMap, NavigationMap, Transform
 from tests.recordings.sample_log import rewritten
 
 SMALL = Simulation(
@@ -245,7 +245,7 @@ def test_cells_called_free_on_rocks_or_out_of_view_are_a_share_of_all_free_cells
     maps = [ground_truth.truth_maps(SMALL, 0, frame) for frame in frames]
     found = scored(tmp_path, truth, frames, cells=np.zeros_like).terrain["hazards"]
     assert found["free_hazard"] == np.mean([navigation.cells == Cell.HAZARD for _, navigation in maps])
-    assert found["free_on_rock"] == np.mean([navigation.reason == Reason.STEP for _, navigation in maps])
+    assert found["free_on_rock"] == np.mean([navigation.reason == CellReason.STEP for _, navigation in maps])
     assert found["free_unseen"] == np.mean([terrain.layers["in_view"] < 0.5 for terrain, _ in maps])
 
 

@@ -18,13 +18,13 @@ from stages.data import (
     Array,
     CameraMotion,
     Cell,
+    CellReason,
     Disparity,
     ElevationMap,
     NavigationMap,
+    PixelOrigin,
     PointCloud,
     Pose,
-    Reason,
-    Source,
     StereoCamera,
     StereoFrame,
     Tilt,
@@ -67,8 +67,8 @@ def scene(stamp: int = START) -> dict[str, Any]:
     left, right = (cv2.GaussianBlur(random.integers(0, 256, (HEIGHT, WIDTH), np.uint8), (5, 5), 0) for _ in "lr")
     pixels = np.tile(np.linspace(2.0, 30.0, HEIGHT, dtype=np.float32)[:, None], (1, WIDTH))
     pixels[:4] = np.nan
-    source = np.where(np.isnan(pixels), Source.UNKNOWN, Source.MEASURED).astype(np.uint8)
-    source[40:] = Source.PLANE
+    source = np.where(np.isnan(pixels), PixelOrigin.UNKNOWN, PixelOrigin.MEASURED).astype(np.uint8)
+    source[40:] = PixelOrigin.PLANE
     segments = (np.arange(HEIGHT)[:, None] // 8 * 8 + np.arange(WIDTH) // 8).astype(np.int32)
     matched = Disparity(stamp, pixels, source, np.ones_like(pixels), camera=camera)
     sensor = Transform(LEVEL_FRAME, "camera", [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.0, 0.0, 0.9])
@@ -81,7 +81,7 @@ def scene(stamp: int = START) -> dict[str, Any]:
     terrain = ElevationMap(stamp, {"elevation": elevation, "slope": elevation * 2}, 0.1, (0.0, -1.5), LEVEL_FRAME)
     cells = np.where(np.isnan(elevation), Cell.UNKNOWN, Cell.FREE).astype(np.int8)
     cells[2, 3] = Cell.HAZARD
-    reason = np.where(cells == Cell.HAZARD, Reason.STEP, Reason.CLEAR).astype(np.uint8)
+    reason = np.where(cells == Cell.HAZARD, CellReason.STEP, CellReason.CLEAR).astype(np.uint8)
     frame = StereoFrame(stamp, left, right, camera)
     return {
         "stereo": frame, "tilt": Tilt(stamp, [np.sin(0.1), 0.0, np.cos(0.1)]),

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from recordings import McapSource
 from recordings.errors import LogError
 from recordings.ros2.to_msg import transform_message
-from recordings.source.calibration import Frames, calibrated_pair
+from recordings.source.calibration import TransformTree, calibrated_pair
 from stages.data import CameraModel, Transform
 from tests.recordings.sample_log import FRAMES, LEFT, START, TRANSFORMS, model, tilt_quaternion, write_sample
 
@@ -173,7 +173,7 @@ def test_lenses_that_leave_no_image_are_refused() -> None:
     k = np.array([[300.0, 0, 320], [0, 300, 240], [0, 0, 1]])
     folding = np.array([0.0005, -0.0118, -0.0077, -0.0217])  # has no inverse at the corners
     lens = CameraModel(640, 480, k, folding, np.eye(3), np.hstack([k, np.zeros((3, 1))]), "equidistant")
-    frames = Frames()
+    frames = TransformTree()
     for item in transform_message([(Transform("l", "r", np.eye(3), [0.25, 0.003, 0]), START)]).transforms:
         frames.add(item)
     with pytest.raises(LogError, match="no image of 640x480 px can be rectified with these lenses"):
@@ -266,7 +266,7 @@ def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:
             message.header.frame_id = ""
         return None if topic == "/tf_static" else message
 
-    assert Frames().between("", "") is None
+    assert TransformTree().between("", "") is None
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.opening.mount is None
         assert "joins the camera (whose frame_id is empty) and the inclinometer (whose frame_id" in log.missing["mount"]
@@ -330,7 +330,7 @@ def test_a_translation_that_is_not_finite_is_told_and_not_used(tmp_path: Path) -
 
 
 def test_a_long_chain_of_transforms_is_followed_either_way():
-    frames, message = Frames(), TRANSFORMS[0]
+    frames, message = TransformTree(), TRANSFORMS[0]
     links = [Transform(f"link{i}", f"link{i + 1}", np.eye(3), np.array([0.1, 0.0, 0.0])) for i in range(2000)]
     for _ in range(3):
         for link in links:

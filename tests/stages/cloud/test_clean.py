@@ -14,7 +14,7 @@ from stages.cloud.kernels.depth_order import out_of_order, out_of_order_referenc
 from stages.cloud.kernels.outliers import supported, supported_reference
 from stages.cloud.kernels.patches import patches, patches_reference
 from stages.cloud.reproject import Reproject
-from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Transform
+from stages.data import LEVEL_FRAME, Array, PixelOrigin, PointCloud, Transform
 from tests.stages.terrain.terrain_scene import (
     CAMERA,
     HEIGHT,
@@ -103,14 +103,14 @@ def test_a_mismatch_of_a_hundred_pixels_that_supports_itself_goes() -> None:
     assert np.isin(patch[20:70], Clean(patch=0.0)(cloud).pixel).any()
 
 
-@pytest.mark.parametrize("made_up", [Source.PLANE, Source.FILLED])
-def test_what_refinement_made_up_supports_nobody_and_is_kept_within_the_crop(made_up: Source) -> None:
+@pytest.mark.parametrize("made_up", [PixelOrigin.PLANE, PixelOrigin.FILLED])
+def test_what_refinement_made_up_supports_nobody_and_is_kept_within_the_crop(made_up: PixelOrigin) -> None:
     d = seen_disparity()
     d[300:303, 100:103] *= 2
     disparity = as_disparity(d)
     source = disparity.source.copy()
     source[290:312, 90:112][source[290:312, 90:112] > 0] = made_up
-    source[300:303, 100:103] = Source.MEASURED
+    source[300:303, 100:103] = PixelOrigin.MEASURED
     pixels = np.where(source == made_up, np.float32(d[301, 101]), disparity.pixels)
     cloud = Reproject(filled=True)(blank_frame(), replace(disparity, pixels=pixels, source=source))
     clean = Clean()(cloud)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stages.cloud.kernels.rigid import transform_points, transform_points_reference
 from stages.cloud.level import Level, level_transform
-from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Source, Tilt, Transform
+from stages.data import LEVEL_FRAME, Array, Mount, PixelOrigin, PointCloud, Tilt, Transform
 from tests.stages.terrain.terrain_scene import HEIGHT, UP, level_from_camera
 
 BARE = Mount(0, np.eye(3))
@@ -128,7 +128,7 @@ def test_only_place_changes() -> None:
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), scattered()])
 def test_a_frame_that_measured_nothing_is_no_whole_frame(points: Array) -> None:
-    cloud = replace(cloud_of(points), source=np.full(len(points), Source.FILLED, np.uint8))
+    cloud = replace(cloud_of(points), source=np.full(len(points), PixelOrigin.FILLED, np.uint8))
     with pytest.raises(ValueError, match="no measured point of the frame is left"):
         Level()(cloud, Tilt(0, UP), BARE)
 

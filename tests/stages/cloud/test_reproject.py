@@ -9,7 +9,7 @@ import pytest
 
 from stages.cloud.kernels.triangulation import triangulate, triangulate_reference
 from stages.cloud.reproject import Reproject
-from stages.data import CameraModel, Disparity, Source, StereoCamera, StereoFrame
+from stages.data import CameraModel, Disparity, PixelOrigin, StereoCamera, StereoFrame
 from tests.stages.terrain.terrain_scene import CAMERA, as_disparity, blank_frame, seen_disparity
 
 SMALL = StereoCamera(100.0, 110.0, 7.5, 5.25, 0.2, 16, 12, cx_right=9.0)
@@ -51,7 +51,7 @@ def test_kernel_equals_the_plain_reference() -> None:
 
 
 def test_a_filled_disparity_is_left_out_or_marked_as_uncertain_and_a_plane_is_kept() -> None:
-    source = np.array([[Source.MEASURED, Source.PLANE, Source.FILLED, Source.UNKNOWN]], np.uint8)
+    source = np.array([[PixelOrigin.MEASURED, PixelOrigin.PLANE, PixelOrigin.FILLED, PixelOrigin.UNKNOWN]], np.uint8)
     camera = StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 4, 1)
     disparity = Disparity(0, np.full((1, 4), 5, np.float32), source, np.ones((1, 4), np.float32))
     frame = blank_frame(camera)
@@ -60,7 +60,7 @@ def test_a_filled_disparity_is_left_out_or_marked_as_uncertain_and_a_plane_is_ke
     assert cloud.pixel.tolist() == [0, 1, 2]
     assert cloud.sigma == pytest.approx(np.array([0.2, 0.7, 3.0]) * 4.0**2 / (100 * 0.2))
     assert cloud.source is not None
-    assert cloud.source.tolist() == [Source.MEASURED, Source.PLANE, Source.FILLED]
+    assert cloud.source.tolist() == [PixelOrigin.MEASURED, PixelOrigin.PLANE, PixelOrigin.FILLED]
 
 
 def test_depth_uncertainty_predicts_the_scatter_of_noisy_disparities() -> None:

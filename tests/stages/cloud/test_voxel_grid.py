@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.cloud.kernels.voxels import voxel_means, voxel_means_reference
-from stages.cloud.voxel_grid import Voxels
-from stages.data import LEVEL_FRAME, Array, PointCloud, Source
+from stages.cloud.voxel_grid import VoxelGrid
+from stages.data import LEVEL_FRAME, Array, PixelOrigin, PointCloud
 
 
 def cloud_of(points: Array, colors: Array) -> PointCloud:
@@ -38,8 +38,8 @@ def test_kernel_equals_the_plain_reference(seed: int, edge: float) -> None:
 def test_every_measured_point_within_the_region_is_in_its_cube_and_in_one_only() -> None:
     cloud = some(1)
     filled = np.arange(len(cloud.points)) % 4 == 0
-    source = np.where(filled, Source.FILLED, Source.MEASURED).astype(np.uint8)
-    voxels = Voxels(region=0.6, resolution=0.1)(replace(cloud, source=source))
+    source = np.where(filled, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8)
+    voxels = VoxelGrid(region=0.6, resolution=0.1)(replace(cloud, source=source))
     inside = ~filled & (np.hypot(cloud.points[:, 0], cloud.points[:, 1]) <= 0.6)
     assert voxels.count.sum() == inside.sum()
     cubes = {tuple(cube) for cube in np.floor(cloud.points[inside] / np.float64(0.1)).astype(int)}
@@ -50,23 +50,23 @@ def test_every_measured_point_within_the_region_is_in_its_cube_and_in_one_only()
 def test_a_wall_and_what_hangs_over_it_are_cubes_of_their_own_colour() -> None:
     points = np.array([[1.01, 1.01, 0.01], [1.02, 1.02, 0.02], [1.01, 1.01, 1.01]])
     colors = np.array([[10, 20, 30], [20, 30, 41], [200, 0, 0]], np.uint8)
-    voxels = Voxels()(cloud_of(points, colors))
+    voxels = VoxelGrid()(cloud_of(points, colors))
     assert voxels.index.tolist() == [[20, 20, 0], [20, 20, 20]]
     assert voxels.colors.tolist() == [[15, 25, 35], [200, 0, 0]]
     assert voxels.count.tolist() == [2, 1]
-    assert Voxels(least=2)(cloud_of(points, colors)).count.tolist() == [2]
+    assert VoxelGrid(least=2)(cloud_of(points, colors)).count.tolist() == [2]
 
 
 def test_a_map_of_more_cubes_than_memory_has_room_for_is_refused() -> None:
     with pytest.raises(ValueError, match=r"Voxels\.region = 100 m makes a map 40000 cells of 0\.005 m wide, and 4000"):
-        Voxels(resolution=0.005, region=100.0)
+        VoxelGrid(resolution=0.005, region=100.0)
     corners = cloud_of(np.array([[9.902, 0, 0], [0, 9.902, 0], [0, -9.902, 0]]), np.zeros((3, 3), np.uint8))
-    widest = Voxels(resolution=0.005, region=10.0)(corners)
+    widest = VoxelGrid(resolution=0.005, region=10.0)(corners)
     assert widest.index.tolist() == [[0, -1981, 0], [1980, 0, 0], [0, 1980, 0]]
 
 
 def test_no_points_make_no_cubes_and_a_cloud_that_is_not_level_is_refused() -> None:
     empty = cloud_of(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    assert Voxels()(empty).index.shape == (0, 3)
+    assert VoxelGrid()(empty).index.shape == (0, 3)
     with pytest.raises(ValueError, match="'cam', not 'level'"):
-        Voxels()(replace(empty, frame_id="cam"))
+        VoxelGrid()(replace(empty, frame_id="cam"))

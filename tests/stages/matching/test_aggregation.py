@@ -7,7 +7,7 @@ from numba import njit
 from stages.compiled.simd import Width
 from stages.matching.kernels.aggregation import aggregate_reference, aggregate_row, brightness_steps
 from stages.matching.kernels.census import census_costs_reference, census_reference
-from stages.matching.kernels.matching_inputs import NO_PRIOR, Pair, describe
+from stages.matching.kernels.matching_inputs import NO_PRIOR, MatchingInputs, describe
 from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
 from tests.stages.matching.test_census import rule_of
 from tests.stages.matching.test_match_opencv import textured
@@ -37,7 +37,7 @@ def test_sums_are_those_of_the_reference(lanes, paths, height, columns, pull):
         prior = prior_costs(near, 0, lanes, *pull)
         expected = np.minimum(costs.astype(int) + prior_costs_reference(near, 0, lanes, *pull), 255).astype(np.uint8)
     planes = np.zeros((height, 3, columns), np.uint8)
-    pair = Pair(planes, planes, brightness_steps(image), np.zeros(1, np.uint8), 0, columns, *prior)
+    pair = MatchingInputs(planes, planes, brightness_steps(image), np.zeros(1, np.uint8), 0, columns, *prior)
     rule = rule_of(True, lanes, 0)._replace(p1=9, diagonals=paths == 8, table=table)
     everything = np.ones(costs.shape, bool)
     down, up = (aggregate_reference(pair.steps, rule, expected, everything, sign) for sign in (1, -1))

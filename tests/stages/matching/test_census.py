@@ -9,7 +9,7 @@ from stages.matching.kernels.census import census, census_costs, census_costs_re
 from stages.matching.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
 from stages.matching.kernels.matching_inputs import describe
 from stages.matching.kernels.row_ranges import lanes_for
-from stages.matching.kernels.sgm_params import Rule
+from stages.matching.kernels.sgm_params import SgmParams
 from tests.stages.matching.test_match_opencv import textured
 
 
@@ -35,7 +35,7 @@ def rows_smoothed(pair, unseen, costs, sums, step, width):
 
 def rule_of(gradient, disparities, minimum):
     nothing = np.zeros(256, np.uint8)
-    return Rule(gradient, True, 9, nothing, 11, disparities, minimum, 0, 1, 1.0, 0, nothing.astype(np.float32))
+    return SgmParams(gradient, True, 9, nothing, 11, disparities, minimum, 0, 1, 1.0, 0, nothing.astype(np.float32))
 
 
 @pytest.fixture(scope="module")

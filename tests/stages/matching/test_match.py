@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
-from stages.data import Disparity, Source, StereoFrame
+from stages.data import Disparity, PixelOrigin, StereoFrame
 from stages.matching.match import COSTS, Match
 from tests.bench.stereo_scores import load_scene, rows_filled
 from tests.stages.matching.test_match_opencv import frame_of, slanted_pair, textured
@@ -108,7 +108,7 @@ def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
     frame, truth = slope
     known = np.arange(320) >= truth + 2
     prior = Disparity(
-        0, np.where(known, truth, np.nan).astype(np.float32), np.full(truth.shape, Source.MEASURED, np.uint8),
+        0, np.where(known, truth, np.nan).astype(np.float32), np.full(truth.shape, PixelOrigin.MEASURED, np.uint8),
         np.full(truth.shape, 0.7, np.float32),
     )  # fmt: skip
     bare, joined = Match(disparities=24)(frame, prior), Match(disparities=24, nearer="prior")(frame, prior)
@@ -119,10 +119,10 @@ def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
     assert np.isfinite(joined.pixels[nearer]).all()  # the end of the range, where the search loses some, too
     assert np.abs(joined.pixels - truth)[nearer].max() < 1
     taken = nearer & np.isnan(bare.pixels)
-    assert (joined.source[taken] == Source.MEASURED).all()
+    assert (joined.source[taken] == PixelOrigin.MEASURED).all()
     assert (joined.confidence[taken] == np.float32(0.7)).all()
     np.testing.assert_array_equal(joined.pixels[~taken & (truth < 22)], bare.pixels[~taken & (truth < 22)])
-    guess = replace(prior, source=np.full(truth.shape, Source.FILLED, np.uint8))  # is no measurement
+    guess = replace(prior, source=np.full(truth.shape, PixelOrigin.FILLED, np.uint8))  # is no measurement
     assert np.nanmax(Match(disparities=24, nearer="prior")(frame, guess).pixels) < 24.5
 
 
@@ -144,7 +144,7 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
     for minimum in (-9, 0, 7):
         result = Match(disparities=32, minimum=minimum)(frame_of(image, image))
         assert np.isnan(result.pixels).all()
-        assert (result.source == Source.UNKNOWN).all()
+        assert (result.source == PixelOrigin.UNKNOWN).all()
         assert (result.confidence == 0).all()
 
 
@@ -163,7 +163,7 @@ def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, dispariti
     assert ((partner >= 0) & (partner <= w - 1)).all()
     assert (result.pixels[known] >= minimum).all()
     assert (result.pixels[known] <= minimum + disparities - 1).all()
-    assert np.array_equal(result.source == Source.MEASURED, known)
+    assert np.array_equal(result.source == PixelOrigin.MEASURED, known)
     assert (result.confidence[known] > 0).all()
     assert (result.confidence[~known] == 0).all()
     assert same(result, replace(match, threads=2)(frame_of(left, right)))
@@ -175,7 +175,7 @@ def known(slope):
     _, truth = slope
     rough = truth + np.random.default_rng(4).uniform(-2, 2, truth.shape).astype(np.float32)
     rough[:, :50][truth[:, :50] > np.arange(50) - 3] = np.nan
-    return Disparity(0, rough, np.full(truth.shape, Source.FILLED, np.uint8), np.ones(truth.shape, np.float32))
+    return Disparity(0, rough, np.full(truth.shape, PixelOrigin.FILLED, np.uint8), np.ones(truth.shape, np.float32))
 
 
 @pytest.mark.parametrize("cost", COSTS)

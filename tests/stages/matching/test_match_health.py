@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from recordings.simulator import Simulation
-from stages import CheckMatches, Disparity, Mount, Source, StereoFrame, Tilt
+from stages import CheckMatches, Disparity, Mount, PixelOrigin, StereoFrame, Tilt
 from stages.stage import Severity
 from tests.bench.refining import stereo_part
 
 
 def disparity_with(matched: np.ndarray) -> Disparity:
-    source = np.where(matched, np.uint8(Source.MEASURED), np.uint8(Source.FILLED))
+    source = np.where(matched, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.FILLED))
     return Disparity(0, np.ones(matched.shape, np.float32), source, np.ones(matched.shape, np.float32))
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.data import Source, StereoCamera, StereoFrame
+from stages.data import PixelOrigin, StereoCamera, StereoFrame
 from stages.matching.match_opencv import MatchOpenCV
 
 
@@ -87,7 +87,7 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
     image = np.full((64, 96), level, dtype)
     result = MatchOpenCV(disparities=32)(frame_of(image, image))
     assert np.isnan(result.pixels).all()
-    assert (result.source == Source.UNKNOWN).all()
+    assert (result.source == PixelOrigin.UNKNOWN).all()
     assert (result.confidence == 0).all()
 
 
@@ -105,7 +105,7 @@ def test_any_size_gives_disparities_within_range_and_within_the_right_image(h, w
     assert ((partner >= 0) & (partner <= w - 1)).all()
     assert (result.pixels[known] >= minimum).all()
     assert (result.pixels[known] <= minimum + -(-disparities // 16) * 16).all()
-    assert np.array_equal(result.source == Source.MEASURED, known)
+    assert np.array_equal(result.source == PixelOrigin.MEASURED, known)
     assert (result.confidence[~known] == 0).all()
     assert ((result.confidence >= 0) & (result.confidence <= 1)).all()
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages import CrossCheck, Disparity, Enlarge, Halve, Match, Source, StereoCamera, StereoFrame, Swap
+from stages import Disparity, Halve, LeftRightCheck, Match, PixelOrigin, StereoCamera, StereoFrame, SwapViews, Upsample
 from stages.matching.kernels.lr_check import drop_contradicted, drop_contradicted_reference
 from stages.matching.kernels.resample import doubled, doubled_reference, halved
 
@@ -46,8 +46,8 @@ def test_enlarging_doubles_disparities_between_pixels_of_one_surface_only():
     pixels = ((8 + 0.1 * (2 * y + 0.5)) / 2).astype(np.float32)
     pixels[:, 40:] += 20
     pixels[10:20, 10:20] = np.nan
-    source = np.where(np.isnan(pixels), Source.UNKNOWN, Source.PLANE).astype(np.uint8)
-    large = Enlarge()(frame, Disparity(7, pixels, source, np.full(pixels.shape, 0.7, np.float32)))
+    source = np.where(np.isnan(pixels), PixelOrigin.UNKNOWN, PixelOrigin.PLANE).astype(np.uint8)
+    large = Upsample()(frame, Disparity(7, pixels, source, np.full(pixels.shape, 0.7, np.float32)))
     assert large.pixels.shape == truth.shape
     known = np.isfinite(large.pixels)
     assert not known[20:40, 20:40].any()
@@ -55,13 +55,13 @@ def test_enlarging_doubles_disparities_between_pixels_of_one_surface_only():
     far, near = np.s_[2:95, :80], np.s_[2:95, 80:]
     assert np.nanmax(np.abs(large.pixels - truth)[far]) < 0.11
     assert np.nanmax(np.abs(large.pixels - truth - 40)[near]) < 0.11
-    assert (large.source[known] == Source.PLANE).all()
+    assert (large.source[known] == PixelOrigin.PLANE).all()
 
 
 def test_swapping_twice_is_the_frame_itself_and_disparities_stay():
     frame, truth = slope_frame()
-    swapped = Swap()(frame)
-    again = Swap()(swapped)
+    swapped = SwapViews()(frame)
+    again = SwapViews()(swapped)
     assert np.array_equal(again.left, frame.left)
     assert vars(again.camera) == vars(frame.camera)
     right = Match(disparities=32, speckle_size=0)(swapped).pixels[:, ::-1]  # of the right image's pixels
@@ -91,10 +91,10 @@ def test_what_the_right_image_sees_otherwise_is_unknown():
     backward[0, 39 - (20 - 5)] = 9
     backward[1, 39 - (20 - 5)] = np.nan
     given = Disparity(1, pixels, np.ones((2, 40), np.uint8), np.full((2, 40), 0.9, np.float32))
-    checked = CrossCheck()(given, Disparity(1, backward, given.source, given.confidence))
+    checked = LeftRightCheck()(given, Disparity(1, backward, given.source, given.confidence))
     assert np.argwhere(np.isnan(checked.pixels)).tolist() == [[0, 20]]
-    assert (checked.source[0, 20], checked.confidence[0, 20]) == (Source.UNKNOWN, 0)
-    beyond = CrossCheck(disparities=4)(given, Disparity(1, backward, given.source, given.confidence))
+    assert (checked.source[0, 20], checked.confidence[0, 20]) == (PixelOrigin.UNKNOWN, 0)
+    beyond = LeftRightCheck(disparities=4)(given, Disparity(1, backward, given.source, given.confidence))
     assert np.isfinite(beyond.pixels).all()  # 5 px was not searched for from the right
 
 
@@ -103,9 +103,9 @@ def test_sizes_that_do_not_fit_are_refused():
     small = np.zeros((40, 66), np.float32)
     wrong = Disparity(7, small, small.astype(np.uint8), small)
     with pytest.raises(ValueError, match=r"Enlarge: .*\(40, 66\)"):
-        Enlarge()(frame, wrong)
+        Upsample()(frame, wrong)
     with pytest.raises(ValueError, match=r"CrossCheck: .* at the same size"):
-        CrossCheck()(wrong, Disparity(7, small[:30], small[:30].astype(np.uint8), small[:30]))
+        LeftRightCheck()(wrong, Disparity(7, small[:30], small[:30].astype(np.uint8), small[:30]))
 
 
 def test_half_an_image_is_the_mean_of_four_and_repeats_an_odd_border():
@@ -122,9 +122,9 @@ def test_data_of_different_times_are_refused():
     early = Disparity(7, small, small.astype(np.uint8), small)
     late = Disparity(8, small, small.astype(np.uint8), small)
     with pytest.raises(ValueError, match="Enlarge: frame of 7 ns, disparity of 8 ns: join data"):
-        Enlarge()(frame, late)
+        Upsample()(frame, late)
     with pytest.raises(ValueError, match="CrossCheck: disparity of 7 ns, backward of 8 ns: join data"):
-        CrossCheck()(early, late)
+        LeftRightCheck()(early, late)
 
 
 def test_a_frame_too_small_to_halve_names_its_own_size_and_the_way_out():

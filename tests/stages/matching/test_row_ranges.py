@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.compiled.simd import Width
-from stages.data import Disparity, Source
+from stages.data import Disparity, PixelOrigin
 from stages.matching.kernels.aggregation import aggregate_reference
 from stages.matching.kernels.blank_windows import blank_windows, drop_blank
 from stages.matching.kernels.census import census_costs_reference
@@ -147,7 +147,7 @@ def slope():
     return slanted_pair()
 
 
-def known(truth, source=Source.FILLED):
+def known(truth, source=PixelOrigin.FILLED):
     return Disparity(0, truth, np.full(truth.shape, source, np.uint8), np.ones(truth.shape, np.float32))
 
 
@@ -170,7 +170,7 @@ def test_a_match_that_the_prior_has_outside_its_bands_range_is_unknown(slope):
     frame, truth = slope
     moved = truth.copy()
     moved[40, 100:115] = 150  # 15 of 64 rows of 320 pixels: a speck
-    found = Match(disparities=192, band_height=64)(frame, known(moved, Source.MEASURED))
+    found = Match(disparities=192, band_height=64)(frame, known(moved, PixelOrigin.MEASURED))
     assert np.isnan(found.pixels[40, 100:115]).all()
     assert np.isfinite(found.pixels[41, 100:115]).all()
 

@@ -10,7 +10,7 @@ from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace
 from stages.matching.kernels.matching_inputs import describe
 from stages.matching.kernels.prior_cost import prior_costs
-from stages.matching.kernels.sgm_local import EDGE, Windows, search_around, search_around_reference, windows
+from stages.matching.kernels.sgm_local import EDGE, SearchWindows, search_around, search_around_reference, windows
 from tests.stages.matching.test_census import rule_of
 from tests.stages.matching.test_match_opencv import textured
 
@@ -44,7 +44,7 @@ def test_disparities_and_evidence_are_those_of_the_reference(gradient, diagonals
     prior[rng.random(prior.shape) < 0.1] += 40  # windows that share nothing with their neighbours'
     begin = np.rint(prior - lanes / 2).astype(np.int32)
     first = np.minimum(np.maximum(begin, np.arange(columns) - columns + 1), np.arange(columns)).astype(np.int32)
-    found = Windows(first, Width(lanes))
+    found = SearchWindows(first, Width(lanes))
     guide = prior_costs((prior - first).astype(np.float32), 0, lanes, 0.5, 4.0)
     table = np.round(12 + 90 / (1 + np.arange(256) / 10)).astype(np.uint8)
     rule = rule_of(gradient, 64, 0)._replace(diagonals=diagonals, table=table, uniqueness=1)

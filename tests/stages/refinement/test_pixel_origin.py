@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.data import Source
+from stages.data import PixelOrigin
 from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN
-from stages.refinement.kernels.pixel_origin import Trust, name_sources, name_sources_reference
+from stages.refinement.kernels.pixel_origin import Trust, label_origin, name_sources_reference
 
 TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.83, 0.84, 0.58, 0.56)
 
@@ -22,7 +22,7 @@ def test_names_are_those_of_the_reference(height, width, seed, threads):
     kinds = np.where(np.isnan(matches), rng.integers(0, 4, shape), KEPT).astype(np.uint8)
     confidence = rng.uniform(-0.1, 1.1, shape).astype(np.float32)
     given = matches, confidence, rng.random(shape) < 0.5, kinds, refined, rng.random(shape) < 0.8, 0.5, TRUST
-    source, worth = name_sources(*given, threads)
+    source, worth = label_origin(*given, threads)
     expected, expected_worth = name_sources_reference(*given)
     assert np.array_equal(source, expected)
     assert np.array_equal(worth, expected_worth)
@@ -36,7 +36,7 @@ def test_every_origin_has_its_own_worth():
     agreed = np.array([[True, False, False, True, True, False, False, False]])
     borne_out = np.array([[True, True, False, True, True, True, True, True]])
     own = np.full((1, 8), 0.75, np.float32)
-    source, worth = name_sources(matches, own, agreed, kinds, refined, borne_out, 0.5, TRUST)
-    names = [Source(code).name for code in source[0]]
+    source, worth = label_origin(matches, own, agreed, kinds, refined, borne_out, 0.5, TRUST)
+    names = [PixelOrigin(code).name for code in source[0]]
     assert names == ["MEASURED", "MEASURED", "FILLED", "PLANE", "PLANE", "FILLED", "FILLED", "UNKNOWN"]
     assert np.allclose(worth[0], [0.98, 0.86, 0.58, 0.83, 0.84, 0.58, 0.56, 0], atol=1e-3)

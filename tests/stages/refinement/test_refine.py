@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.data import Disparity, Source, StereoCamera, StereoFrame
+from stages.data import Disparity, PixelOrigin, StereoCamera, StereoFrame
 from stages.refinement.refine import EVEN, Refine, _burnt_out
 from tests.bench.stereo_scores import paper_stages
 
@@ -27,7 +27,7 @@ def box():
     pixels[rng.random(SHAPE) < 0.15] = np.nan
     pixels[30:90, 35:61] = np.nan  # hidden from the right camera, left of the box
     pixels[:, :15] = np.nan  # outside the right image
-    source = np.where(np.isfinite(pixels), Source.MEASURED, Source.UNKNOWN).astype(np.uint8)
+    source = np.where(np.isfinite(pixels), PixelOrigin.MEASURED, PixelOrigin.UNKNOWN).astype(np.uint8)
     confidence = np.where(np.isfinite(pixels), 0.8, 0).astype(np.float32)
     camera = StereoCamera(300, 300, 80, 60, 0.1, WIDTH, HEIGHT)
     frame = StereoFrame(5, image, image, camera)
@@ -52,23 +52,23 @@ def test_every_pixel_says_where_it_comes_from(box):
     known, matched = np.isfinite(refined.pixels), np.isfinite(matches.pixels)
     near = np.abs(refined.pixels - matches.pixels) <= 0.5
     assert near[matched].mean() > 0.9
-    assert np.array_equal(refined.source == Source.MEASURED, near)
-    assert (refined.source[matched & ~near] == Source.PLANE).all()
-    assert np.array_equal(refined.source == Source.UNKNOWN, ~known)
-    confidence = {code: refined.confidence[refined.source == code] for code in Source}
+    assert np.array_equal(refined.source == PixelOrigin.MEASURED, near)
+    assert (refined.source[matched & ~near] == PixelOrigin.PLANE).all()
+    assert np.array_equal(refined.source == PixelOrigin.UNKNOWN, ~known)
+    confidence = {code: refined.confidence[refined.source == code] for code in PixelOrigin}
     # as calibrated: of matches by their own confidence, 0.8, and by whether a plane agrees
-    assert np.unique(confidence[Source.MEASURED]) == pytest.approx([0.882, 0.984], abs=0.002)
-    assert np.unique(confidence[Source.PLANE]) == pytest.approx([0.79, 0.81])
-    assert set(np.unique(confidence[Source.FILLED])) <= {np.float32(0.72), np.float32(0.66)}
-    assert (confidence[Source.UNKNOWN] == 0).all()
+    assert np.unique(confidence[PixelOrigin.MEASURED]) == pytest.approx([0.882, 0.984], abs=0.002)
+    assert np.unique(confidence[PixelOrigin.PLANE]) == pytest.approx([0.79, 0.81])
+    assert set(np.unique(confidence[PixelOrigin.FILLED])) <= {np.float32(0.72), np.float32(0.66)}
+    assert (confidence[PixelOrigin.UNKNOWN] == 0).all()
     assert all(part.size for part in confidence.values())
 
 
-@pytest.mark.parametrize("code", [Source.UNKNOWN, Source.PLANE, Source.FILLED])
+@pytest.mark.parametrize("code", [PixelOrigin.UNKNOWN, PixelOrigin.PLANE, PixelOrigin.FILLED])
 def test_what_was_not_measured_is_no_match_whatever_its_pixels_say(box, code):
     frame, matches, _ = box
     nowhere = Refine()(frame, replace(matches, source=np.full(SHAPE, code, np.uint8)))
-    assert (nowhere.source == Source.UNKNOWN).all()
+    assert (nowhere.source == PixelOrigin.UNKNOWN).all()
     assert np.isnan(nowhere.pixels).all()
     source, pixels, confidence = matches.source.copy(), matches.pixels.copy(), matches.confidence.copy()
     source[10:40, 20:60], pixels[10:40, 20:60], confidence[10:40, 20:60] = code, 35, 1
@@ -92,11 +92,11 @@ def test_a_match_that_is_replaced_is_called_plane_and_loses_its_confidence(media
     matches = Disparity(5, pixels, source, confidence)
     replaced = Refine(near=1000, plane_weight=1, inlier_share=0, median=median, correlation=0)(frame, matches)
     assert replaced.pixels[60, 80] == pytest.approx(8, abs=0.01)
-    assert replaced.source[60, 80] == Source.PLANE
+    assert replaced.source[60, 80] == PixelOrigin.PLANE
     assert replaced.confidence[60, 80] < 0.85
-    assert (replaced.source == Source.MEASURED).sum() == HEIGHT * WIDTH - 1
+    assert (replaced.source == PixelOrigin.MEASURED).sum() == HEIGHT * WIDTH - 1
     kept = Refine(median=median, bilateral_radius=0, edge_radius=0, correlation=0)(frame, matches)
-    assert (kept.pixels[60, 80], kept.source[60, 80]) == (30, Source.MEASURED)
+    assert (kept.pixels[60, 80], kept.source[60, 80]) == (30, PixelOrigin.MEASURED)
     assert kept.confidence[60, 80] == np.float32(0.97)
 
 
@@ -126,7 +126,7 @@ def test_a_plane_steeper_than_allowed_fills_nothing():
     pixels[hole], source[hole] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
     filled = Refine(superpixels=60, smallest=1, fill="none", slope=0.45)(frame, matches)
-    assert (filled.source[hole] == Source.PLANE).all()
+    assert (filled.source[hole] == PixelOrigin.PLANE).all()
     assert np.abs(filled.pixels[hole] - (8 + 0.4 * np.arange(70, 75))).max() < 0.1
     assert np.isnan(Refine(superpixels=60, smallest=1, fill="none", slope=0.35)(frame, matches).pixels[hole]).all()
 
@@ -163,7 +163,7 @@ def test_a_match_far_from_its_plane_is_not_overwritten(box):
     frame, matches, truth = box
     pixels, source, confidence = (np.copy(a) for a in (matches.pixels, matches.source, matches.confidence))
     stone = np.s_[100:106, 120:126]
-    pixels[stone], source[stone], confidence[stone] = truth[stone] + 6, Source.MEASURED, 0.8
+    pixels[stone], source[stone], confidence[stone] = truth[stone] + 6, PixelOrigin.MEASURED, 0.8
     matches = replace(matches, pixels=pixels, source=source, confidence=confidence)
     refined = Refine(superpixels=60, smallest=1)(frame, matches)
     assert np.abs(refined.pixels[101:105, 121:125] - truth[101:105, 121:125] - 6).max() < 1
@@ -220,7 +220,7 @@ def test_planes_of_surfaces_reach_where_superpixels_have_no_match():
     bare = Refine(superpixels=200, smallest=1, fill="none", surface=0)(frame, matches)
     assert np.isnan(bare.pixels[hole]).mean() > 0.5
     wide = Refine(superpixels=200, smallest=1, fill="none", surface=50)(frame, matches)
-    assert (wide.source[hole] == Source.PLANE).all()
+    assert (wide.source[hole] == PixelOrigin.PLANE).all()
     assert np.abs(wide.pixels[hole] - truth).max() < 0.05
 
 
@@ -258,7 +258,7 @@ def test_edges_of_depth_go_where_the_image_has_them(box):
         wrong.append(np.count_nonzero(error[known] > 1))
         assert np.array_equal(np.isfinite(refined.pixels), known)
         replaced = np.abs(refined.pixels - moved.pixels) > 0.5
-        assert (refined.source[replaced] == Source.PLANE).all()
+        assert (refined.source[replaced] == PixelOrigin.PLANE).all()
     assert wrong[0] > 80
     assert wrong[1] < 0.1 * wrong[0]
 
@@ -291,7 +291,7 @@ def test_a_surface_draws_half_as_far_as_a_superpixel_and_what_it_agrees_with_is_
     assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert drawn.pixels[60, 90] == np.float32(8.7)
     assert drawn.confidence[60, 70] > drawn.confidence[60, 90] > 0.9
-    assert (drawn.source[60, 70], drawn.source[60, 90]) == (Source.MEASURED, Source.MEASURED)
+    assert (drawn.source[60, 70], drawn.source[60, 90]) == (PixelOrigin.MEASURED, PixelOrigin.MEASURED)
 
 
 def test_what_a_superpixel_filled_is_no_evidence_for_a_surface():
@@ -349,7 +349,7 @@ def test_no_match_at_all_stays_no_disparity(box, refine):
     nothing = replace(matches, pixels=empty, source=np.zeros(SHAPE, np.uint8), confidence=np.zeros(SHAPE, np.float32))
     refined = refine(frame, nothing)
     assert np.isnan(refined.pixels).all()
-    assert (refined.source == Source.UNKNOWN).all()
+    assert (refined.source == PixelOrigin.UNKNOWN).all()
 
 
 def test_a_disparity_of_another_size_is_refused(box):
@@ -421,10 +421,10 @@ def test_a_match_that_the_images_do_not_bear_out_is_a_guess():
     frame = StereoFrame(5, left, right, StereoCamera(300, 300, 80, 60, 0.1, WIDTH, HEIGHT))
     _, pixels, source, confidence = flat_scene()
     refined, fitted = (Refine(fit_radius=r)(frame, Disparity(5, pixels, source, confidence)) for r in (0, 2))
-    assert (refined.source[:50] == Source.FILLED).all()
+    assert (refined.source[:50] == PixelOrigin.FILLED).all()
     assert refined.confidence[:50].max() < 0.75
-    assert (refined.source[70:, 15:] == Source.MEASURED).all()
+    assert (refined.source[70:, 15:] == PixelOrigin.MEASURED).all()
     assert refined.pixels == pytest.approx(np.full(SHAPE, 8.0), abs=1e-4)
     # Nor when brightness has moved it. (In the first columns so little is compared that chance may bear it out.)
-    assert (fitted.source[:50, 3:] == Source.FILLED).all()
-    assert (fitted.source[70:, 15:] == Source.MEASURED).all()
+    assert (fitted.source[:50, 3:] == PixelOrigin.FILLED).all()
+    assert (fitted.source[70:, 15:] == PixelOrigin.MEASURED).all()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recordings.simulator import Simulation
-from stages.data import Source, StereoFrame
+from stages.data import PixelOrigin, StereoFrame
 from stages.matching.match import Match
 from tests.bench.refining import RELEASED, stereo_part
 from tests.bench.stereo_scores import errors, rows_filled
@@ -67,7 +67,7 @@ def test_ground_nearly_four_times_as_near_as_the_range_is_known(pipeline):
     assert (truth[near] > 3 * 13).mean() > 0.1
     if pipeline == "rover":  # the right view reaches as near
         assert np.isfinite(streams["backward"].pixels).mean() > 0.75
-    measured = near & (refined.source == Source.MEASURED)
+    measured = near & (refined.source == PixelOrigin.MEASURED)
     assert measured.sum() > 0.95 * near.sum()
     error = np.abs(refined.pixels - truth)[measured]
     assert (error > 2).mean() < 0.03

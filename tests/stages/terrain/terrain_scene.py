@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.data import Array, Disparity, ElevationMap, Source, StereoCamera, StereoFrame
+from stages.data import Array, Disparity, ElevationMap, PixelOrigin, StereoCamera, StereoFrame
 
 # The Devon Island camera at half size.
 CAMERA = StereoCamera(484.5, 484.5, 317.3, 231.5, 0.24, 640, 480)
@@ -58,7 +58,7 @@ def blank_frame(camera: StereoCamera = CAMERA, stamp: int = 7) -> StereoFrame:
 
 def as_disparity(pixels: Array, camera: StereoCamera = CAMERA, stamp: int = 7) -> Disparity:
     known = np.isfinite(pixels)
-    source = np.where(known, Source.MEASURED, Source.UNKNOWN).astype(np.uint8)
+    source = np.where(known, PixelOrigin.MEASURED, PixelOrigin.UNKNOWN).astype(np.uint8)
     return Disparity(stamp, pixels.astype(np.float32), source, known.astype(np.float32), camera=camera)
 
 

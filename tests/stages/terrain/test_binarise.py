@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import binary_dilation
 
-from stages.data import Array, Cell, ElevationMap, NavigationMap, Reason
+from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap
 from stages.terrain.binarise import Binarise
-from stages.terrain.features import Assess
+from stages.terrain.features import TerrainFeatures
 from tests.stages.terrain.terrain_scene import Terrain, map_of, rolling_terrain
 
 TEN_DEGREES = float(np.deg2rad(10))
@@ -26,7 +26,7 @@ def grid(cells: int = 80) -> tuple[Array, Array]:
 
 
 def decided(elevation: ElevationMap, **parameters: Any) -> NavigationMap:
-    return Binarise(**parameters)(Assess()(elevation))
+    return Binarise(**parameters)(TerrainFeatures()(elevation))
 
 
 def with_plane(elevation: ElevationMap, gx: float, gy: float, offset: float = 0.0) -> ElevationMap:
@@ -98,13 +98,13 @@ def test_the_slope_within_a_cell_is_no_step(resolution: float, heading: float) -
     blocked = z.copy()
     blocked[10, 10] += 0.25
     rock = replace(map_of(blocked, minimum=z - half, maximum=np.maximum(z + half, blocked)), resolution=resolution)
-    assert decided(rock).reason[10, 10] == Reason.STEP
+    assert decided(rock).reason[10, 10] == CellReason.STEP
 
 
 @pytest.mark.parametrize(("resolution", "wheel"), [(0.05, 0.14), (0.1, 0.3), (0.2, 0.3)])
 def test_level_ground_is_free_under_a_wheel_that_spans_three_cells(resolution: float, wheel: float) -> None:
     level = replace(map_of(np.zeros_like(grid()[0])), resolution=resolution)
-    result = Binarise(wheel=wheel)(Assess(wheel=wheel)(level))
+    result = Binarise(wheel=wheel)(TerrainFeatures(wheel=wheel)(level))
     assert (result.cells[10:-10, 10:-10] == Cell.FREE).all()
 
 
@@ -119,7 +119,7 @@ def test_a_limit_that_level_ground_would_reach_is_refused(limit: str) -> None:
 def test_a_plane_beyond_the_slope_limit_is_a_hazard_for_its_slope() -> None:
     x, _ = grid()
     result = decided(map_of(np.tan(np.deg2rad(21)) * x))
-    assert (result.reason == Reason.SLOPE).all()
+    assert (result.reason == CellReason.SLOPE).all()
     assert (result.cells == Cell.HAZARD).all()
 
 
@@ -128,8 +128,8 @@ def test_a_ridge_that_may_be_too_steep_under_a_wheel_is_unknown_and_a_gentle_one
     ridge = np.exp(-(((x - 2) / 0.24) ** 2))
     steep, doubtful, gentle = (map_of(height * ridge) for height in (0.14, 0.12, 0.1))
     flanks = np.abs(np.abs(x - 2) - 0.17) < 0.03
-    assert (decided(steep).reason[flanks] == Reason.SLOPE).all()
-    assert (decided(doubtful).reason[flanks] == Reason.UNSURE).all()
+    assert (decided(steep).reason[flanks] == CellReason.SLOPE).all()
+    assert (decided(doubtful).reason[flanks] == CellReason.UNSURE).all()
     assert (decided(doubtful, steepness_error=0.0).cells == Cell.FREE).all()
     assert (decided(gentle).cells == Cell.FREE).all()
 
@@ -141,7 +141,7 @@ def test_tilting_and_raising_the_scene_changes_no_step_and_no_roughness(
 ) -> None:
     terrain = rolling_terrain(seed, rocks=5, cells=80)
     plain, moved = (
-        Binarise(max_slope=1.3)(Assess(max_slope=1.0)(elevation))
+        Binarise(max_slope=1.3)(TerrainFeatures(max_slope=1.0)(elevation))
         for elevation in (terrain.elevation, with_plane(terrain.elevation, gx, gy, offset))
     )
     # float32 heights round; a cell that lies on a threshold may fall to the other side, and its neighbours with it.
@@ -162,7 +162,7 @@ def test_a_rock_on_a_slope_is_a_hazard_and_the_slope_beside_it_is_free() -> None
     distance = np.hypot(x - 2, y - 2)
     z = np.tan(TEN_DEGREES) * x + np.where(distance < 0.3, np.sqrt(np.maximum(0.09 - distance**2, 0)), 0)
     result = decided(map_of(z))
-    assert (result.reason[distance < 0.18] == Reason.STEP).all()
+    assert (result.reason[distance < 0.18] == CellReason.STEP).all()
     assert (result.cells[distance > 0.45] == Cell.FREE).all()
     assert (result.cells[distance > 0.35] == Cell.FREE).mean() > 0.98
 
@@ -176,9 +176,11 @@ def test_an_edge_is_a_step_if_and_only_if_it_is_higher_than_the_limit(
     """A terrace across a slope, seen from below or above: its edge is a step, the rest of it is not."""
     x, y = grid()
     scene = map_of(np.tan(np.deg2rad(degrees)) * x + np.where(y > 2, step, 0.0))
-    result = Binarise(max_step=limit, margin=0.0, max_slope=1.5, max_roughness=1.0)(Assess(max_step=limit)(scene))
-    assert (result.reason[np.abs(y - 2.05) < 0.05] == Reason.STEP).all() == (step > limit)
-    assert not (result.reason[np.abs(y - 2) > 0.6] == Reason.STEP).any()
+    result = Binarise(max_step=limit, margin=0.0, max_slope=1.5, max_roughness=1.0)(
+        TerrainFeatures(max_step=limit)(scene)
+    )
+    assert (result.reason[np.abs(y - 2.05) < 0.05] == CellReason.STEP).all() == (step > limit)
+    assert not (result.reason[np.abs(y - 2) > 0.6] == CellReason.STEP).any()
 
 
 def test_a_rock_in_a_hollow_behind_a_rise_is_found_by_the_face_that_shows() -> None:
@@ -197,7 +199,7 @@ def test_a_ditch_is_a_hazard_and_so_are_its_edges() -> None:
     x, y = grid()
     ditch = np.abs(x - 2) < 0.2
     result = decided(map_of(np.where(ditch, -0.3, 0.02 * np.sin(3 * y))))
-    assert (result.reason[ditch] == Reason.STEP).all()
+    assert (result.reason[ditch] == CellReason.STEP).all()
     assert (result.cells[np.abs(x - 2) < 0.3] == Cell.HAZARD).all()
     assert (result.cells[np.abs(x - 2) > 0.7] == Cell.FREE).all()
 
@@ -206,7 +208,7 @@ def test_what_would_touch_the_belly_is_a_hazard_below_the_limit_of_a_step() -> N
     x, y = grid()
     bump = 0.15 * np.exp(-((x - 2) ** 2 + (y - 2) ** 2) / 0.3**2)
     low, high = (decided(map_of(bump), ground_clearance=clearance) for clearance in (0.1, 0.25))
-    assert (low.reason == Reason.CLEARANCE).sum() > 20
+    assert (low.reason == CellReason.CLEARANCE).sum() > 20
     assert (low.cells[np.hypot(x - 2, y - 2) > 1] == Cell.FREE).all()
     assert (high.cells == Cell.FREE).mean() > 0.9
 
@@ -215,10 +217,10 @@ def test_the_cells_beside_an_obstacle_are_hazards_as_far_as_told() -> None:
     x, y = grid()
     rock = (np.abs(x - 2) < 0.2) & (np.abs(y - 2) < 0.2)
     for beside in (0.0, 0.05, 0.1):
-        result = Binarise(beside=beside, max_slope=1.5)(Assess()(map_of(np.where(rock, 0.4, 0.0))))
+        result = Binarise(beside=beside, max_slope=1.5)(TerrainFeatures()(map_of(np.where(rock, 0.4, 0.0))))
         around = (np.abs(x - 2) < 0.2 + beside) & (np.abs(y - 2) < 0.2 + beside) & ~rock
         assert (result.cells[around] == Cell.HAZARD).all()
-        np.testing.assert_array_equal(result.reason == Reason.BESIDE, around)
+        np.testing.assert_array_equal(result.reason == CellReason.BESIDE, around)
 
 
 def test_an_empty_cell_says_whether_it_was_hidden_and_a_lonely_one_is_unsure() -> None:
@@ -228,9 +230,9 @@ def test_an_empty_cell_says_whether_it_was_hidden_and_a_lonely_one_is_unsure() -
     flat[30, 31] = 0.0
     occluded[30, 31] = 0
     result = decided(map_of(flat, occluded=occluded))
-    assert (result.reason[occluded == 1] == Reason.OCCLUDED).all()
-    assert (result.reason[np.isnan(occluded)] == Reason.UNOBSERVED).all()
-    assert result.reason[30, 31] == Reason.UNSURE
+    assert (result.reason[occluded == 1] == CellReason.OCCLUDED).all()
+    assert (result.reason[np.isnan(occluded)] == CellReason.UNOBSERVED).all()
+    assert result.reason[30, 31] == CellReason.UNSURE
     assert (result.cells[20:40, 20:40] == Cell.UNKNOWN).all()
 
 
@@ -243,7 +245,7 @@ def test_a_pit_is_a_hazard_too() -> None:
     x, y = grid()
     pit = np.hypot(x - 2, y - 2) < 0.25
     result = decided(map_of(np.where(pit, -0.4, 0.0)))
-    assert (result.reason[pit] == Reason.STEP).all()
+    assert (result.reason[pit] == CellReason.STEP).all()
 
 
 def test_noise_of_two_centimetres_is_no_hazard() -> None:
@@ -261,13 +263,15 @@ def test_the_low_back_of_a_rock_belongs_to_it_and_bumps_apart_from_it_do_not() -
     touching = ~rock & (np.abs(x - 1.9) < 0.1) & (y > 2.4) & (y < 2.7)
     scene = map_of(height + 0.08 * far + 0.04 * touching)
     back = rock & (height > 0.1) & (height < 0.15)
-    whole = Binarise(beside=0.0)(Assess()(scene))
-    peaks_only = Binarise(beside=0.0, max_slope=1.0)(Assess(skirt=1.0)(scene))
-    assert (whole.reason[back] == Reason.STEP).all()
+    whole = Binarise(beside=0.0)(TerrainFeatures()(scene))
+    peaks_only = Binarise(beside=0.0, max_slope=1.0)(TerrainFeatures(skirt=1.0)(scene))
+    assert (whole.reason[back] == CellReason.STEP).all()
     assert (whole.cells[rock & (height < 0.03)] == Cell.FREE).mean() > 0.9
-    assert not (whole.reason[~rock] == Reason.STEP).any()  # the high bump far off, the low one that touches the rock
-    assert (peaks_only.reason[back] != Reason.STEP).mean() > 0.4
-    assert (peaks_only.reason[rock & (height > 0.2)] == Reason.STEP).all()
+    assert not (
+        whole.reason[~rock] == CellReason.STEP
+    ).any()  # the high bump far off, the low one that touches the rock
+    assert (peaks_only.reason[back] != CellReason.STEP).mean() > 0.4
+    assert (peaks_only.reason[rock & (height > 0.2)] == CellReason.STEP).all()
 
 
 def test_a_cell_whose_height_is_not_known_to_a_step_is_not_free_and_a_hazard_stays_one() -> None:
@@ -278,7 +282,7 @@ def test_a_cell_whose_height_is_not_known_to_a_step_is_not_free_and_a_hazard_sta
     apart = ~binary_dilation(flat > 0, np.ones((5, 5)))
     doubtful, level = ~(sigma <= 0.05) & apart, (sigma <= 0.05) & apart
     result = decided(map_of(flat, variance=sigma**2))
-    assert (result.reason[doubtful] == Reason.UNSURE).all()
+    assert (result.reason[doubtful] == CellReason.UNSURE).all()
     assert (result.cells[doubtful] == Cell.UNKNOWN).all()
     assert (result.cells[level] == Cell.FREE).all()
     assert (result.cells[flat > 0] == Cell.HAZARD).all()
@@ -310,7 +314,7 @@ def test_rubble_too_low_to_be_a_step_is_too_rough() -> None:
     random = np.random.default_rng(5)
     rubble = np.where(random.random((80, 80)) < 0.4, 0.15, 0.0)
     result = decided(map_of(rubble))
-    assert (result.reason == Reason.ROUGHNESS).mean() > 0.95
+    assert (result.reason == CellReason.ROUGHNESS).mean() > 0.95
 
 
 def test_what_was_not_seen_is_unknown_never_free() -> None:
@@ -322,9 +326,9 @@ def test_what_was_not_seen_is_unknown_never_free() -> None:
     for method in ("rover", "absolute"):
         result = decided(replace(terrain.elevation, layers=layers), method=method)
         assert (result.cells[~seen] == Cell.UNKNOWN).all()
-        assert (result.reason[~seen] == Reason.UNOBSERVED).all()
-        np.testing.assert_array_equal(result.cells == Cell.FREE, result.reason == Reason.CLEAR)
-        unknown = np.isin(result.reason, (Reason.UNOBSERVED, Reason.UNSURE))
+        assert (result.reason[~seen] == CellReason.UNOBSERVED).all()
+        np.testing.assert_array_equal(result.cells == Cell.FREE, result.reason == CellReason.CLEAR)
+        unknown = np.isin(result.reason, (CellReason.UNOBSERVED, CellReason.UNSURE))
         np.testing.assert_array_equal(result.cells == Cell.UNKNOWN, unknown)
 
 
@@ -335,7 +339,7 @@ def test_ground_that_nothing_surrounds_is_unknown_and_a_high_face_alone_is_a_haz
     assert (decided(map_of(lone)).cells == Cell.UNKNOWN).all()
     face = decided(map_of(lone, minimum=lone - 0.3, maximum=lone + 0.3))
     assert face.cells[40, 40] == Cell.HAZARD
-    assert face.reason[40, 40] == Reason.STEP
+    assert face.reason[40, 40] == CellReason.STEP
 
 
 def test_cells_of_fewer_points_than_wanted_and_empty_maps_are_unknown() -> None:
@@ -352,7 +356,7 @@ def test_the_papers_rule_calls_a_gentle_slope_a_hazard_and_the_default_does_not(
     x, _ = grid(160)
     gentle = map_of(np.tan(np.deg2rad(3)) * x)
     absolute = Binarise(method="absolute")(gentle)
-    np.testing.assert_array_equal(absolute.reason == Reason.ELEVATION, gentle.layers["elevation"] > 0.2)
+    np.testing.assert_array_equal(absolute.reason == CellReason.ELEVATION, gentle.layers["elevation"] > 0.2)
     assert (absolute.cells == Cell.HAZARD).mean() > 0.5
     assert (decided(gentle).cells == Cell.FREE).all()
 
@@ -369,7 +373,7 @@ def test_a_height_on_too_few_points_is_never_free_but_may_be_a_hazard() -> None:
     height[20:23, 20:23] = 0.4
     count[20:23, 20:23] = count[40, 40] = 0.5
     navigation = decided(map_of(height, count=count))
-    assert (navigation.cells[40, 40], navigation.reason[40, 40]) == (Cell.UNKNOWN, Reason.UNSURE)
+    assert (navigation.cells[40, 40], navigation.reason[40, 40]) == (Cell.UNKNOWN, CellReason.UNSURE)
     assert (navigation.cells[20:23, 20:23] == Cell.HAZARD).all()
     assert (navigation.cells[19, 19:24] == Cell.HAZARD).all()
 
@@ -379,7 +383,7 @@ def test_about_an_obstacle_lie_hazards_then_cells_that_are_not_free() -> None:
     height[40, 40] = 0.4
     navigation = decided(map_of(height))
     assert navigation.reason[40, 39:44].tolist() == [
-        Reason.BESIDE, Reason.STEP, Reason.BESIDE, Reason.UNSURE, Reason.CLEAR
+        CellReason.BESIDE, CellReason.STEP, CellReason.BESIDE, CellReason.UNSURE, CellReason.CLEAR
     ]  # fmt: skip
     assert navigation.cells[40, 39:44].tolist() == [Cell.HAZARD] * 3 + [Cell.UNKNOWN, Cell.FREE]
 

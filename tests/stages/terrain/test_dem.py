@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from stages.cloud.clean import Clean
 from stages.cloud.level import Level
 from stages.cloud.reproject import Reproject
-from stages.data import LEVEL_FRAME, Array, PointCloud, Source, Tilt, Transform
+from stages.data import LEVEL_FRAME, Array, PixelOrigin, PointCloud, Tilt, Transform
 from stages.terrain.dem import Voxelise
-from stages.terrain.kernels.cell_gradient import lie_of_cells, lie_of_cells_reference
+from stages.terrain.kernels.cell_gradient import gradient_and_curvature, lie_of_cells_reference
 from stages.terrain.kernels.grid import cell_statistics, cell_statistics_reference
 from stages.terrain.kernels.occlusion import lowest_sight, lowest_sight_reference
 from stages.terrain.kernels.splat_along_ray import laid_along_sight, laid_along_sight_reference
@@ -108,10 +108,10 @@ def test_the_tilts_uncertainty_is_the_common_variance_and_not_part_of_the_random
     np.testing.assert_allclose(ratio, 1.0, atol=0.05)
 
 
-@pytest.mark.parametrize("made_up", [Source.PLANE, Source.FILLED])
-def test_what_refinement_made_up_is_a_layer_of_its_own_unless_it_is_to_count(made_up: Source) -> None:
+@pytest.mark.parametrize("made_up", [PixelOrigin.PLANE, PixelOrigin.FILLED])
+def test_what_refinement_made_up_is_a_layer_of_its_own_unless_it_is_to_count(made_up: PixelOrigin) -> None:
     points = np.array([[2.01, 0.01, 0.1], [2.01, 0.01, 0.9], [3.01, 0.01, 0.5]])
-    cloud = replace(cloud_of(points), source=np.array([Source.MEASURED, made_up, made_up], np.uint8))
+    cloud = replace(cloud_of(points), source=np.array([PixelOrigin.MEASURED, made_up, made_up], np.uint8))
     apart, counted = Voxelise()(cloud), Voxelise(filled="counted")(cloud)
     known = np.isfinite(apart.layers["elevation"])
     assert apart.layers["elevation"][known] == pytest.approx([0.1])
@@ -200,7 +200,7 @@ def test_neighbour_kernel_equals_the_plain_reference() -> None:
     random = np.random.default_rng(2)
     heights = random.normal(0, 1, (20, 30))
     heights[random.random(heights.shape) < 0.4] = np.nan
-    np.testing.assert_allclose(lie_of_cells(heights), lie_of_cells_reference(heights), atol=1e-12)
+    np.testing.assert_allclose(gradient_and_curvature(heights), lie_of_cells_reference(heights), atol=1e-12)
 
 
 def test_occlusion_kernel_equals_the_plain_reference() -> None:
@@ -289,6 +289,6 @@ def test_a_cell_is_reached_by_two_places_of_points_that_reach_half_a_cell(
 
 def test_only_measured_points_reach_beyond_their_cell() -> None:
     cloud = rows_apart(sigma=0.06)
-    plane = replace(cloud, source=np.full(len(cloud.points), Source.PLANE, np.uint8))
+    plane = replace(cloud, source=np.full(len(cloud.points), PixelOrigin.PLANE, np.uint8))
     for name, layer in Voxelise()(plane).layers.items():
         np.testing.assert_array_equal(Voxelise(reach=2.0)(plane).layers[name], layer)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from stages.data import Array, Cell
 from stages.terrain.binarise import Binarise
-from stages.terrain.features import Assess
+from stages.terrain.features import TerrainFeatures
 from stages.terrain.kernels.local_minimum import lowest_around, lowest_around_reference
 from stages.terrain.kernels.plane_window import window_planes, window_planes_reference
 from tests.stages.terrain.terrain_scene import map_of, rolling_terrain
@@ -50,12 +50,12 @@ def test_the_size_of_the_grid_about_known_ground_changes_nothing() -> None:
         return wide
 
     large = replace(small, layers={name: widened(layer) for name, layer in small.layers.items()})
-    expected, found = Assess()(small).layers, Assess()(large).layers
+    expected, found = TerrainFeatures()(small).layers, TerrainFeatures()(large).layers
     for name, layer in expected.items():
         np.testing.assert_allclose(found[name][patch], layer, atol=1e-6, err_msg=name)
 
 
 def test_a_map_of_which_nothing_is_known_is_assessed_as_unknown() -> None:
-    nothing = Assess()(map_of(np.full((60, 60), np.nan)))
+    nothing = TerrainFeatures()(map_of(np.full((60, 60), np.nan)))
     assert all(np.isnan(layer).all() for layer in nothing.layers.values())
     assert (Binarise()(nothing).cells == Cell.UNKNOWN).all()

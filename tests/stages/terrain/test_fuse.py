@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages import Assess, Binarise, Cell, Fuse, Source
+from stages import Binarise, Cell, Fuse, PixelOrigin, TerrainFeatures
 from stages.data.tiles import Tiles
 from stages.terrain.map_registration import placement, sight_of
 from tests.stages.terrain.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
@@ -127,7 +127,7 @@ def test_a_height_that_drifts_by_and_by_joins_after_a_gap_and_makes_no_step(gap)
         terrain = fuse(part(cloud, np.s_[::8]), pose, MOUNT)
     assert fuse.finding() is None
     known = np.isfinite(terrain.layers["elevation"])
-    assert not (Binarise()(Assess()(terrain)).cells[known] == Cell.HAZARD).any()
+    assert not (Binarise()(TerrainFeatures()(terrain)).cells[known] == Cell.HAZARD).any()
 
 
 def test_a_clock_that_jumps_by_years_leaves_the_map_as_it_is():
@@ -243,7 +243,7 @@ def test_points_whose_error_is_not_known_do_not_enter_the_map():
 def test_what_refinement_made_up_is_no_evidence_for_the_map():
     cloud, pose = drive(0)
     guessed = cloud.points[:, 1] > 0
-    made_up = replace(cloud, source=np.where(guessed, Source.FILLED, Source.MEASURED).astype(np.uint8))
+    made_up = replace(cloud, source=np.where(guessed, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8))
     terrain, expected = Fuse()(made_up, pose, MOUNT), Fuse()(part(cloud, ~guessed), pose, MOUNT)
     assert np.isfinite(terrain.layers["elevation"]).any()
     for name, layer in expected.layers.items():
