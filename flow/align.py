@@ -16,8 +16,9 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
 
+from flow.contracts import Absent, Loss, LossReason
 from flow.runtime.graph import hints_of
-from flow.runtime.ledger import Absent, Loss, LossReason, failure
+from flow.runtime.ledger import failure
 
 
 @dataclass(frozen=True)

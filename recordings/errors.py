@@ -11,11 +11,6 @@ class UnwritableError(LogError):
     """A place that cannot be written, or is full."""
 
 
-def counted(number: int, what: str) -> str:
-    """A number of things in words: "1 frame", "2 frames"."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
-
-
 def said(error: BaseException) -> str:
     """The first line of what an exception says."""
     return str(error).split("\n")[0] or type(error).__name__

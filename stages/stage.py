@@ -7,7 +7,6 @@ import numbers
 import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from enum import StrEnum
 from typing import Any
 
 from stages.data import LEVEL_FRAME, Disparity, PointCloud, StereoFrame
@@ -71,26 +70,6 @@ class Stage:
             raise ValueError(f"a snapshot of {name} is not one of {type(self).__qualname__}; restore each into its own")
         for field_name, value in memory.items():
             object.__setattr__(self, field_name, value)
-
-
-class Severity(StrEnum):
-    """How much a finding matters: a WARNING is printed last and stands out, for results may be wrong."""
-
-    NOTE = "note"
-    WARNING = "warning"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What a stage's `finding()` says of a whole run, or its `survey` of a log, in one sentence."""
-
-    sentence: str
-    severity: Severity = Severity.NOTE
-
-
-def counted(number: int, what: str) -> str:
-    """A number of things in words: "1 frame", "2 frames"."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def check_cells(what: str, width: float, resolution: float, times: int = 1) -> None:

@@ -126,7 +126,7 @@ def test_a_bad_frame_is_named_and_skipped_and_the_map_stays_sound(
 
 
 def test_a_run_whose_every_cloud_is_empty_leaves_no_map_and_says_so(traverse: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
-    out, nothing = tmp_path / "out.mcap", ("--set", "cleaned.region=0.1 m", "--set", "cleaned.margin=0 m")
+    out, nothing = tmp_path / "out.mcap", ("--set", "cleaned.max_range=0.1 m", "--set", "cleaned.margin=0 m")
     assert roverflow("run", traverse, "--set", "disparities=64", *nothing, "-o", out, "--no-rrd") == 3
     said = capsys.readouterr()
     assert "INCOMPLETE: 0 of" in said.out

@@ -62,8 +62,8 @@ def test_a_file_that_is_no_log_is_refused_in_one_sentence(tmp_path, capsys, cont
 
 
 def test_what_a_stage_cannot_do_without_is_asked_for_before_anything_runs(traverse, tmp_path, capsys):
-    assert roverflow("run", traverse, "--set", "rough.around=4", "-o", tmp_path / "out.mcap") == 2
-    assert "stream 'rough': Match.around = 4 px needs a `prior`" in capsys.readouterr().err
+    assert roverflow("run", traverse, "--set", "rough.search_radius=4", "-o", tmp_path / "out.mcap") == 2
+    assert "stream 'rough': Match.search_radius = 4 px needs a `prior`" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
@@ -422,9 +422,9 @@ def test_a_pipeline_whose_aliases_hold_each_other_is_refused_at_once(tmp_path, c
 
 
 @pytest.mark.parametrize(("settings", "said"), [
-    (["region=1km"], "stages.Clean.region: must be at most 200 m, not 1km"),
+    (["max_range=1km"], "stages.Clean.max_range: must be at most 200 m, not 1km"),
     (["wheel=1km"], "stages.TerrainFeatures.wheel: must be at most 5 m, not 1km"),
-    (["cells.region=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
+    (["cells.max_range=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
     (["regional_cells.window=400m"], "makes a map 8000 cells of 0.05 m wide, and 4000 is the most"),
 ])  # fmt: skip
 def test_maps_that_no_memory_holds_are_refused_before_the_run(settings, said, capsys):

@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from flow.cli.arguments import check_demo, check_outputs, count, seconds, size, workers
-from flow.cli.report import counted, headline, report, say
+from flow.cli.report import headline, report, say
+from flow.contracts import counted
 from flow.errors import (
     COMPLETE,
     FAILED,

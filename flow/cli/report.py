@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from flow.contracts import LossReason, Verdict, counted
 from flow.runtime.findings import NOTE, WARNING, lines
-from flow.runtime.ledger import LossReason, Verdict
 
 
 def say(text: str) -> None:
@@ -36,11 +36,6 @@ def headline(summary: dict[str, Any]) -> str:
     lost = ", ".join(f"{number} {reason}" for reason, number in losses.items())
     count = f", {counted(sum(losses.values()), 'loss', 'losses')}: {lost}" if losses else ""
     return f"{summary['verdict']}: {said}{abandoned}{count}; {summary['frames_per_second']:.2f} frames/s"
-
-
-def counted(number: int, what: str, many: str = "") -> str:
-    """A number of things in words: "1 frame", "2 frames"; many: what several are called if not so."""
-    return f"{number} {what if number == 1 else many or what + 's'}"
 
 
 def report(summary: dict[str, Any]) -> None:

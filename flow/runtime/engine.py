@@ -19,25 +19,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from flow.runtime.graph import Node, Sink
-from flow.runtime.ledger import Absent, Ledger, Loss, LossReason, failure
-
-
-@dataclass(frozen=True)
-class FrameRecord:
-    """What a sink is given for one frame.
-
-    index: 0, 1, ... in stamp order; items: stream -> item, without those that were lost; entries: the losses of this
-    frame, and those of the log between the frame before and this one; seconds: wall time per stage; queues: frames in
-    each stage's inbox as this one was delivered.
-    """
-
-    index: int
-    stamp: int
-    items: Mapping[str, Any]
-    entries: tuple[Loss, ...]
-    seconds: Mapping[str, float]
-    queues: Mapping[str, int]
+from flow.contracts import Absent, FrameRecord, Loss, LossReason, Sink
+from flow.runtime.graph import Node
+from flow.runtime.ledger import Ledger, failure
 
 
 @dataclass(eq=False)

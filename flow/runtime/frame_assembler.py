@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from flow.align import Answers, Token
-from flow.runtime.graph import Event, Graph
-from flow.runtime.ledger import Absent, Ledger, Loss, LossReason
+from flow.contracts import Absent, Event, Loss, LossReason
+from flow.runtime.graph import Graph
+from flow.runtime.ledger import Ledger
 
 # ns; a stamp that runs ahead of the log's clock by this much more than the one before it is in doubt
 DOUBT = 1_000_000_000

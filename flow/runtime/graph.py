@@ -7,74 +7,14 @@ graph share one clock; joining others is the aligners' work.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
 from types import UnionType
-from typing import Any, Protocol, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
+from flow.contracts import Sink
 from flow.errors import PipelineError
-
-Event = tuple[int, str, Any]  # of a log: log time in ns, stream, item; an exception stands for an item that was lost
-
-
-class Source(Protocol):
-    """Where a log comes from. streams: stream -> the type of its items, of all that a log may provide."""
-
-    @property
-    def streams(self) -> Mapping[str, type]:
-        """See above."""
-
-    def open(self, path: Any, *, start: float | None, end: float | None) -> AbstractContextManager[Log]:
-        """The log at `path`, from `start` to before `end`, s after its first message."""
-
-
-class Log(Protocol):
-    """What a source opens: its events in the order of log time, and what it says of itself before any is read.
-
-    missing: stream -> why the log cannot provide it; refused: setting of the source -> why the log cannot be read so,
-    whatever the graph needs; frames: how many are to come, where that is known.
-    """
-
-    missing: Mapping[str, str]
-    refused: Mapping[str, str]
-
-    @property
-    def frames(self) -> int | None:
-        """See above."""
-
-    def events(self, streams: Collection[str]) -> Iterator[Event]:
-        """The events of these streams, from the first one on, and losses of which it is not known of which stream."""
-
-    def notes(self) -> Mapping[str, str]:
-        """What there is to say of a stream, as a note of the run; asked at its end."""
-
-    def excerpts(self, count: int, streams: Collection[str]) -> Iterable[Iterable[Event]]:
-        """So many stretches of these streams, spread over the whole log; asked for where a stage surveys it."""
-
-
-class Sink(Protocol):
-    """Where frames go. `write` is called once for every frame, in stamp order, by one thread at a time.
-
-    A sink whose parameters name streams says which do, in `names_streams`, for pipeline files to be checked. With a
-    method `discard` it gives up what `open` began, where another output of the run could not be opened, or no frame
-    got through; by an attribute `empty` it says that it was given nothing worth keeping, and is to give up then, too.
-    """
-
-    suffix: str
-
-    def wants(self, stream: str, kind: type) -> bool:
-        """Whether the sink has a use for a stream of this name and type."""
-
-    def open(self, path: Any, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
-        """Begin an output; nothing stands under `path` itself until `close`."""
-
-    def write(self, record: Any) -> None:
-        """Take one `flow.runtime.engine.FrameRecord`."""
-
-    def close(self, summary: Mapping[str, Any]) -> None:
-        """Finish the output and give it its name."""
 
 
 @dataclass(frozen=True)

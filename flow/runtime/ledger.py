@@ -9,57 +9,17 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
-from dataclasses import asdict, dataclass
-from enum import StrEnum
 from opcode import opmap
 from pathlib import Path
 from types import TracebackType
+
+from flow.contracts import Loss
 
 log = logging.getLogger(__name__)
 _HOUSE = {"flow", "stages", "recordings"}
 
 
-class LossReason(StrEnum):
-    """Why something was lost."""
-
-    UNREADABLE = "unreadable"  # the source could not read or decode it
-    OUT_OF_ORDER = "out of order"  # its stamp does not follow the one before it
-    UNMATCHED = "unmatched"  # no partner for a pair
-    UNALIGNED = "unaligned"  # another clock's stream had nothing for the frame
-    FAILED = "failed"  # a stage raised
-    ABANDONED = "abandoned"  # the run was stopped, or broke off, before the frame was through
-
-
-class Verdict(StrEnum):
-    """How a run ended."""
-
-    COMPLETE = "COMPLETE"
-    INCOMPLETE = "INCOMPLETE"
-
-
 FLOW = Path(__file__).resolve().parent.parent
-
-
-@dataclass(frozen=True)
-class Loss:
-    """One loss. stamp: ns of the log's clock; stage: the node that noticed; detail: one sentence."""
-
-    stream: str
-    stamp: int
-    stage: str
-    reason: LossReason
-    detail: str
-
-    def as_dict(self) -> dict[str, str | int]:
-        """The entry as plain JSON values."""
-        return {**asdict(self), "reason": str(self.reason)}
-
-
-@dataclass(frozen=True)
-class Absent:
-    """Stands in a frame for the item that was lost, so that nobody downstream waits for it."""
-
-    cause: Loss
 
 
 def failure(error: BaseException) -> str:

@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from flow.contracts import Absent, Event
 from flow.runtime.findings import WARNING, Finding, finding, plain
 from flow.runtime.frame_assembler import FrameAssembler
-from flow.runtime.graph import Event, Graph, Node
-from flow.runtime.ledger import Absent, Ledger, failure
+from flow.runtime.graph import Graph, Node
+from flow.runtime.ledger import Ledger, failure
 
 EXCERPTS = 9
 

@@ -14,12 +14,13 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from flow.contracts import Event, Log, Sink, Verdict
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.runtime.engine import Engine
 from flow.runtime.findings import NOTE, WARNING, Finding, finding, findings
 from flow.runtime.frame_assembler import FrameAssembler
-from flow.runtime.graph import Event, Graph, Log, Sink
-from flow.runtime.ledger import Ledger, Verdict, failure
+from flow.runtime.graph import Graph
+from flow.runtime.ledger import Ledger, failure
 from flow.runtime.prepass import surveyed
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from recordings.errors import LogError, counted
+from flow.contracts import counted
+from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.from_msg import unpacked_pixels

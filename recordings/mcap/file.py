@@ -23,7 +23,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
-from recordings.errors import LogError, counted, said
+from flow.contracts import counted
+from recordings.errors import LogError, said
 from recordings.mcap.chunk import LARGEST, unpacked
 from recordings.mcap.index import (
     BROKEN,

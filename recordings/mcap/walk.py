@@ -15,7 +15,8 @@ from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
-from recordings.errors import counted, said
+from flow.contracts import counted
+from recordings.errors import said
 from recordings.mcap.chunk import HEAD, LARGEST, is_chunk, next_chunk, start_time, unpacked, unpacked_start
 from recordings.mcap.index import (
     BROKEN,

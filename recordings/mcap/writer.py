@@ -13,8 +13,9 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
+from flow.contracts import counted
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
-from recordings.errors import LogError, counted
+from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 from recordings.ros2.cdr import LAST_STAMP, TYPES
 

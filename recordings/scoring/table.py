@@ -6,7 +6,7 @@ import math
 from textwrap import wrap
 from typing import Any
 
-from recordings.errors import counted
+from flow.contracts import counted
 from recordings.scoring.metrics import share
 from recordings.scoring.score import Score
 from recordings.scoring.stereo_metrics import CROP_STEP, REGIONS, THRESHOLDS

@@ -16,7 +16,7 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from recordings.errors import counted
+from flow.contracts import counted
 from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps as paint
 from recordings.sinks.blueprint import LEDGER, Panel, ViewSpec

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+from flow.contracts import FrameRecord, Loss
 from recordings.errors import LogError
-from recordings.frame_record import FrameRecord, Loss
 from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
 from recordings.ros2.to_msg import (
     diagnostics,

@@ -19,9 +19,9 @@ import numpy as np
 import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
+from flow.contracts import FrameRecord, Loss, counted
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
-from recordings.errors import LogError, counted
-from recordings.frame_record import FrameRecord, Loss
+from recordings.errors import LogError
 from recordings.sinks.blueprint import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, ViewSpec, blueprint
 from recordings.sinks.loggers import PICTURES, Canvas, same_view
 from stages.data import Array, ElevationMap, Pose, StereoFrame

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.errors import counted
+from flow.contracts import counted
 from recordings.mcap.index import Lost
 from recordings.source.cameras import CAMERAS
 from recordings.source.log import McapLog

@@ -6,7 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from recordings.errors import LogError, counted
+from flow.contracts import counted
+from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, tilt_of
 from recordings.source.calibration import Camera, TransformTree, baseline_note, calibrated_pair, mounted, rovers

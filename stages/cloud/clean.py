@@ -26,27 +26,33 @@ class Clean(Stage):
     """Crops a cloud about its camera, then removes outliers.
 
     The crop comes first, so that the far field has no say in what is an outlier near by. It is a ball about the camera
-    of `region` + `margin`: before levelling nobody knows what is horizontal, and with the margin it holds all ground
+    of `max_range` + `margin`: before levelling nobody knows what is horizontal, and with the margin it holds all ground
     within the region for any camera up to 4 m above it. Voxelise cuts the exact circle.
 
     method "organised" needs at least every 4th pixel of a row and of a column; sparser clouds have no neighbours.
     """
 
     method: str = parameter("organised", "outlier removal", choices=("organised", "knn"))
-    region: float = parameter(8.0, "horizontal range wanted in the map", unit="m", low=0.1, high=200.0)
+    max_range: float = parameter(8.0, "horizontal range wanted in the map", unit="m", low=0.1, high=200.0)
     margin: float = parameter(1.0, "added to region to crop by distance from the camera", unit="m", low=0.0)
-    deviations: float = parameter(
+    max_deviations: float = parameter(
         3.0, "organised: difference of neighbours that noise may explain, in standard deviations; knn: threshold above "
         "the mean distance, in standard deviations of it", low=0.0,
     )  # fmt: skip
-    spread: float = parameter(2.0, "organised: steepest slope of a surface, in multiples of the ground's", low=0.0)
-    share: float = parameter(0.3, "organised: part of the 32 neighbours that must agree", low=0.0, high=1.0)
-    least: int = parameter(4, "organised: neighbours without which a point cannot be judged, and goes", low=1, high=32)
-    patch: float = parameter(
+    max_slope_ratio: float = parameter(
+        2.0, "organised: steepest slope of a surface, in multiples of the ground's", low=0.0
+    )
+    min_agreeing_share: float = parameter(
+        0.3, "organised: part of the 32 neighbours that must agree", low=0.0, high=1.0
+    )
+    min_neighbours: int = parameter(
+        4, "organised: neighbours without which a point cannot be judged, and goes", low=1, high=32
+    )
+    min_patch_share: float = parameter(
         5e-4, "organised: part of the cloud below which a patch with nothing around it at its depth goes",
         low=0.0, high=1.0,
     )  # fmt: skip
-    neighbours: int = parameter(20, "knn: number of nearest neighbours", low=1)
+    knn_neighbours: int = parameter(20, "knn: number of nearest neighbours", low=1)
 
     def __call__(self, cloud: PointCloud) -> PointCloud:
         """The points of `cloud`, in their order, that are near and no outliers; there may be none."""
@@ -64,7 +70,7 @@ class Clean(Stage):
             raise ValueError("Clean: the cloud does not say its image's shape; set it, or use method: knn")
         measured = np.flatnonzero(cloud.measured)
         square = np.einsum("ij,ij->i", cloud.points, cloud.points)
-        kept = ~cloud.measured & (cloud.points[:, 2] > 0) & (square <= (self.region + self.margin) ** 2)
+        kept = ~cloud.measured & (cloud.points[:, 2] > 0) & (square <= (self.max_range + self.margin) ** 2)
         kept[measured[self._supported(cloud.only(measured), cloud.shape)]] = True
         return np.flatnonzero(kept)
 
@@ -78,11 +84,11 @@ class Clean(Stage):
                 cloud.sigma,
                 cloud.pixel,
                 shape,
-                self.region + self.margin,
-                self.deviations,
-                self.spread,
-                self.share,
-                self.least,
+                self.max_range + self.margin,
+                self.max_deviations,
+                self.max_slope_ratio,
+                self.min_agreeing_share,
+                self.min_neighbours,
             )
         )
         return kept[self._whole(cloud, kept, shape)]
@@ -92,22 +98,22 @@ class Clean(Stage):
 
         What lies beyond the crop bears witness: the sky begins above it.
         """
-        far = np.flatnonzero(cloud.points[:, 2] > self.region + self.margin)
+        far = np.flatnonzero(cloud.points[:, 2] > self.max_range + self.margin)
         seen = np.concatenate([kept, far])
-        inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, seen, shape, self.deviations)
-        patch = patches(inverse, tolerance, self.spread * usual_slope(inverse))
+        inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, seen, shape, self.max_deviations)
+        patch = patches(inverse, tolerance, self.max_slope_ratio * usual_slope(inverse))
         sizes = np.bincount(patch.ravel() + 1, minlength=patch.size + 1)
         place = cloud.pixel.take(kept)
-        large = sizes.take(patch.ravel().take(place) + 1) >= self.patch * len(kept)
+        large = sizes.take(patch.ravel().take(place) + 1) >= self.min_patch_share * len(kept)
         return np.asarray(large & ~out_of_order(inverse, patch).ravel().take(place))
 
     def _knn(self, cloud: PointCloud) -> Array:
         """Indices of the points that stay, by the mean distance to their nearest neighbours in space."""
         points = cloud.points.astype(np.float64)
-        near = np.flatnonzero(np.einsum("ij,ij->i", points, points) <= (self.region + self.margin) ** 2)
-        if len(near) <= self.neighbours:
+        near = np.flatnonzero(np.einsum("ij,ij->i", points, points) <= (self.max_range + self.margin) ** 2)
+        if len(near) <= self.knn_neighbours:
             return near
-        distance, _ = cKDTree(points[near]).query(points[near], k=self.neighbours + 1, workers=1)
+        distance, _ = cKDTree(points[near]).query(points[near], k=self.knn_neighbours + 1, workers=1)
         mean = distance[:, 1:].mean(axis=1)
-        kept: Array = near[mean <= mean.mean() + self.deviations * mean.std()]
+        kept: Array = near[mean <= mean.mean() + self.max_deviations * mean.std()]
         return kept

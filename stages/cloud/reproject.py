@@ -26,7 +26,7 @@ class Reproject(Stage):
     """
 
     max_depth: float = parameter(20.0, "points deeper than this are left out", unit="m", low=0.1)
-    filled: bool = parameter(False, "whether filled disparities, which no camera measured, become points")
+    include_filled: bool = parameter(False, "whether filled disparities, which no camera measured, become points")
     sigma_best: float = parameter(0.086, "disparity standard deviation at confidence 1", unit="px", low=1e-3)
     sigma_worst: float = parameter(42.0, "disparity standard deviation at confidence 0", unit="px", low=1e-3)
     sigma_plane: float = parameter(0.75, "disparity standard deviation where only a plane knows", unit="px", low=0.0)
@@ -50,7 +50,7 @@ class Reproject(Stage):
             eight_bit(frame.left)[0],
             camera,
             self.max_depth,
-            self.filled,
+            self.include_filled,
             (self.sigma_best, self.sigma_worst, self.sigma_plane, self.sigma_filled),
         )
         shape = (int(disparity.pixels.shape[0]), int(disparity.pixels.shape[1]))

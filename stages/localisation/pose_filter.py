@@ -1,4 +1,4 @@
-"""Locate: the rover's pose as its log tells it, or else by visual odometry with gravity as a constraint.
+"""PoseFilter: the rover's pose as its log tells it, or else by visual odometry with gravity as a constraint.
 
 The images turn and move the camera from frame to frame, the tilt says where up is. A tilt of some tenths of a degree is
 noisier than a step of the images, but it does not drift: so the pose is carried along by the images and drawn towards
@@ -14,11 +14,12 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import Finding, Severity, counted
 from stages.cloud.level import level_transform
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.data.covariance import levered
 from stages.localisation.pose_check import PoseCheck
-from stages.stage import Finding, Severity, Stage, counted, parameter
+from stages.stage import Stage, parameter
 
 VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once
 
@@ -80,7 +81,7 @@ class PoseFilter(Stage):
             self._memory.check.add(motion, logged, mount)
             return logged
         if motion.camera is None:
-            raise ValueError(f"Locate: no pose can be told from the images: {motion.lost}")
+            raise ValueError(f"PoseFilter: no pose can be told from the images: {motion.lost}")
         before = self._memory.state
         if before is None or before.segment != motion.segment:
             state = self._begun(motion, motion.camera, tilt, mount)

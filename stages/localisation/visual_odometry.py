@@ -12,10 +12,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from flow.contracts import Finding
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
 from stages.data.covariance import cross_matrix, levered
 from stages.localisation.vo_tracking import Step, VoFrame, step_between, view
-from stages.stage import Finding, Stage, check_joined, parameter
+from stages.stage import Stage, check_joined, parameter
 
 
 @dataclass
@@ -36,11 +37,17 @@ class _Memory:
 class VisualOdometry(Stage):
     """Tracks the camera through the frames; it remembers, so it takes them in order."""
 
-    least: int = parameter(40, "features that must agree on a motion", low=6)
-    worst: float = parameter(2.0, "root mean square reprojection error beyond which they do not", unit="px", low=0.1)
-    fastest: float = parameter(5.0, "a motion between two frames beyond it is taken for a mistake", unit="m", low=0.0)
-    keep: float = parameter(0.03, "a keyframe stays while features move less, in widths of the image", low=0.0)
-    share: float = parameter(0.5, "and while this share of its features is still tracked", low=0.0, high=1.0)
+    min_features: int = parameter(40, "features that must agree on a motion", low=6)
+    max_rms: float = parameter(2.0, "root mean square reprojection error beyond which they do not", unit="px", low=0.1)
+    max_motion: float = parameter(
+        5.0, "a motion between two frames beyond it is taken for a mistake", unit="m", low=0.0
+    )
+    max_keyframe_flow: float = parameter(
+        0.03, "a keyframe stays while features move less, in widths of the image", low=0.0
+    )
+    min_keyframe_share: float = parameter(
+        0.5, "and while this share of its features is still tracked", low=0.0, high=1.0
+    )
     _memory: _Memory = field(default_factory=_Memory, init=False, repr=False, compare=False)
 
     ordered: ClassVar[bool] = True
@@ -49,28 +56,28 @@ class VisualOdometry(Stage):
         """The camera's motion since its segment began; without `camera` where the frame shows too little to track."""
         check_joined(self, frame, disparity)
         before, seen = self._memory.keyframe, view(frame, disparity)
-        step = step_between(before.view, seen, self.least) if before is not None else None
+        step = step_between(before.view, seen, self.min_features) if before is not None else None
         if before is not None and step is not None and self._likely(step):
             return self._followed(frame.stamp, before, step, seen)
         # What all is counted from needs no more than to show something: it may be the only frame.
-        if seen.known < (1 if before is None else self.least):
+        if seen.known < (1 if before is None else self.min_features):
             return self._blind(frame.stamp, seen)
         return self._begun(frame, seen, self._parted(before.view, seen) if before is not None else "")
 
     def finding(self) -> Finding | None:
-        """How many frames show too little; None where all show enough. That tracking was lost is for Locate to tell,
-        which knows what that does to the poses."""
+        """How many frames show too little; None where all show enough. That tracking was lost is for PoseFilter to
+        tell, which knows what that does to the poses."""
         blind = self._memory.blind
         shows = "frame shows" if blind == 1 else "frames show"
         return Finding(f"{blind} {shows} too little to track") if blind else None
 
     def _likely(self, step: Step) -> bool:
-        return step.error <= self.worst and float(np.linalg.norm(step.translation)) <= self.fastest
+        return step.error <= self.max_rms and float(np.linalg.norm(step.translation)) <= self.max_motion
 
     def _parted(self, before: VoFrame, seen: VoFrame) -> str:
         """Why the segment ends."""
         sizes = [f"{width}x{height}" for height, width in (before.gray.shape, seen.gray.shape)]
-        why = f"less than {self.least} features agree with the frame before"
+        why = f"less than {self.min_features} features agree with the frame before"
         if sizes[0] != sizes[1]:
             why = f"the images, {sizes[0]} before, are {sizes[1]} now"
         return f"{why}; segment {self._memory.segment + 1} begins"
@@ -80,17 +87,17 @@ class VisualOdometry(Stage):
         back = Transform(before.camera.child, before.camera.child, step.rotation.T, -step.rotation.T @ step.translation)
         camera = before.camera.after(back)
         covariance = _grown(before, step, camera)
-        far = step.flow > self.keep * seen.gray.shape[1]
-        few = step.inliers < self.share * before.view.known
+        far = step.flow > self.max_keyframe_flow * seen.gray.shape[1]
+        few = step.inliers < self.min_keyframe_share * before.view.known
         # A keyframe that shows too little to go on from is no better than the old one.
-        if (far or few) and seen.known >= self.least:
+        if (far or few) and seen.known >= self.min_features:
             memory.keyframe = _Keyframe(seen, camera, covariance)
         return CameraMotion(stamp, memory.segment, camera, covariance, step.inliers)
 
     def _blind(self, stamp: int, seen: VoFrame) -> CameraMotion:
         """No motion; the keyframe stays, so that the next frame that shows enough goes on from it."""
         self._memory.blind += 1
-        lost = f"only {seen.known} features with a disparity are in view, less than {self.least}"
+        lost = f"only {seen.known} features with a disparity are in view, less than {self.min_features}"
         return CameraMotion(stamp, self._memory.segment, None, np.zeros((6, 6)), lost=lost)
 
     def _begun(self, frame: StereoFrame, seen: VoFrame, lost: str = "") -> CameraMotion:

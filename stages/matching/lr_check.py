@@ -23,19 +23,19 @@ class LeftRightCheck(Stage):
     (`disparities`).
     """
 
-    tolerance: float = parameter(1.0, "largest difference that is no contradiction", unit="px", low=0)
+    lr_tolerance: float = parameter(1.0, "largest difference that is no contradiction", unit="px", low=0)
     disparities: int = parameter(0, "search range of `backward`; 0: that of `disparity`", unit="px", low=0)
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
     def __call__(self, disparity: Disparity, backward: Disparity) -> Disparity:
         if disparity.pixels.shape != backward.pixels.shape:
             raise ValueError(
-                f"CrossCheck: the disparities have shapes {disparity.pixels.shape} and {backward.pixels.shape}; "
+                f"LeftRightCheck: the disparities have shapes {disparity.pixels.shape} and {backward.pixels.shape}; "
                 "match the swapped frame at the same size"
             )
         check_same_time(self, disparity=disparity.stamp, backward=backward.stamp)
         found, theirs = ((layer.pixels, layer.source, layer.confidence) for layer in (disparity, backward))
         pixels, source, confidence = drop_contradicted(
-            found, theirs, self.tolerance, self.disparities or math.inf, self.threads
+            found, theirs, self.lr_tolerance, self.disparities or math.inf, self.threads
         )
         return replace(disparity, pixels=pixels, source=source, confidence=confidence)

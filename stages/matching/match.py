@@ -58,13 +58,13 @@ class Match(Stage):
     Penalties count in units of the matching cost: census bits that differ, or with the gradient 1.5 units for each.
     Colour is converted to gray. `prior`, an earlier or coarser result of the same size, draws the search towards it; it
     is no evidence, and where it is unknown it says nothing. What it measured nearer than the search range stays
-    unknown, or with `nearer` prior as the prior has it: a coarse search reaches nearer, and so near that is no loss.
-    With `farthest`, what it measured beyond stays unknown, too. Without a prior some of both is taken for something
-    within the range.
+    unknown, or with `out_of_range` prior as the prior has it: a coarse search reaches nearer, and so near that is no
+    loss. With `max_depth`, what it measured beyond stays unknown, too. Without a prior some of both is taken for
+    something within the range.
 
-    With `around` only what is near to the prior is searched: in a fraction of the time, beyond the range, too, and not
-    at all where the prior is unknown or beyond `farthest`. Of each pixel `2 around + 7` disparities, rounded up to 16,
-    are searched, which take 2 bytes each, whatever `memory` is.
+    With `search_radius` only what is near to the prior is searched: in a fraction of the time, beyond the range, too,
+    and not at all where the prior is unknown or beyond `max_depth`. Of each pixel `2 search_radius + 7` disparities,
+    rounded up to 16, are searched, which take 2 bytes each, whatever `max_memory` is.
 
     With a `band_height` each band of rows is searched for what the prior has in it, but for a thousandth at either end,
     and for 8 px more to either side, in all for 64 or 128 disparities or, where that is not enough or the prior knows
@@ -79,22 +79,24 @@ class Match(Stage):
         192, "size of the search range, of which the first and the last only bound the others and are not found",
         unit="px", low=1, high=1024,
     )  # fmt: skip
-    minimum: int = parameter(0, "smallest disparity searched", unit="px", low=-1024, high=1024)
-    farthest: float = parameter(
+    min_disparity: int = parameter(0, "smallest disparity searched", unit="px", low=-1024, high=1024)
+    max_depth: float = parameter(
         0.0, "depth beyond which nothing is of interest and disparities are not searched; 0: no limit", unit="m", low=0
     )
     cost: str = parameter("census+gradient", "what is compared", choices=tuple(COSTS))
     paths: int = parameter(8, "directions of aggregation", choices=(4, 8))
     p1: int = parameter(0, "penalty of a step of 1 px; 0: the one that suits the cost", low=0, high=100)
     p2: int = parameter(0, "penalty of a larger step where the image is even; 0: the one that suits", low=0, high=230)
-    edge: float = parameter(10.0, "step of brightness that halves p2", unit="gray levels", low=0.1)
+    p2_edge_scale: float = parameter(10.0, "step of brightness that halves p2", unit="gray levels", low=0.1)
     uniqueness: int = parameter(0, "by how much the best sum of paths must beat the next", low=0, high=254)
-    consistency: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
-    speckle_size: int = parameter(40, "largest isolated patch that is dropped, in pixels", low=0)
+    lr_tolerance: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
+    max_speckle_size: int = parameter(40, "largest isolated patch that is dropped, in pixels", low=0)
     speckle_range: float = parameter(1.0, "disparity step that separates patches", unit="px", low=0)
     prior_weight: float = parameter(0.5, "cost of each pixel of distance from the prior", low=0, high=16)
-    prior_reach: float = parameter(4.0, "distance from which the prior's cost grows no more", unit="px", low=0, high=64)
-    around: int = parameter(
+    max_prior_distance: float = parameter(
+        4.0, "distance from which the prior's cost grows no more", unit="px", low=0, high=64
+    )
+    search_radius: int = parameter(
         0, "how far about the prior, at least, and nowhere else is searched; 0: the whole range",
         unit="px", low=0, high=64,
     )  # fmt: skip
@@ -102,19 +104,19 @@ class Match(Stage):
         0, "of bands of rows, each of which is searched only for what the prior has in it; 0: the whole range",
         unit="px", low=0,
     )  # fmt: skip
-    nearer: str = parameter(
+    out_of_range: str = parameter(
         "unknown", "what becomes of matches that the prior has nearer than the range", choices=("unknown", "prior")
     )
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
-    memory: int = parameter(
+    max_memory: int = parameter(
         400, "for the sums of paths; larger frames are swept in parts, to the same result", unit="MB", low=1
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.around and self.band_height:
+        if self.search_radius and self.band_height:
             raise ValueError(
-                "Match.band_height means nothing with Match.around, which searches less; let one of them be 0"
+                "Match.band_height means nothing with Match.search_radius, which searches less; let one of them be 0"
             )
         largest, (p1, p2) = COSTS[self.cost].largest, self._penalties()
         if not p2 > p1:
@@ -124,7 +126,7 @@ class Match(Stage):
 
     def check_inputs(self, inputs: Collection[str]) -> None:
         """Refuse to search about a prior where none is among the `inputs`, names of ports."""
-        for name, value in (("around", self.around), ("band_height", self.band_height)):
+        for name, value in (("search_radius", self.search_radius), ("band_height", self.band_height)):
             if value and "prior" not in inputs:
                 raise ValueError(f"Match.{name} = {value} px needs a `prior` to search about; name one, or let it be 0")
 
@@ -135,15 +137,15 @@ class Match(Stage):
         where = self._where(prior, search, len(left))
         guide = None if prior is None else self._guide(prior, search, where)
         excluded = None if prior is None else self._excluded(prior, search, where)
-        found = match(left, right, self._rule(search), guide, where, excluded, self.threads, self.memory << 20)
+        found = match(left, right, self._rule(search), guide, where, excluded, self.threads, self.max_memory << 20)
         layers = found.pixels, found.source, found.confidence
-        if prior is not None and self.nearer == "prior" and not self.around:
+        if prior is not None and self.out_of_range == "prior" and not self.search_radius:
             # The search loses what lies within a pixel or two of its end, too.
             taken = np.isnan(found.pixels) & (prior.source == PixelOrigin.MEASURED)
             taken &= (prior.pixels > search.stop - BEYOND) & (prior.pixels < frame.camera.width)
             for layer, known in zip(layers, (prior.pixels, prior.source, prior.confidence), strict=True):
                 np.copyto(layer, known, where=taken)
-        if self.farthest:  # what bounds the range reaches a little beyond
+        if self.max_depth:  # what bounds the range reaches a little beyond
             beyond = found.pixels < self._reach(frame.camera)
             for layer, unknown in zip(layers, (np.nan, PixelOrigin.UNKNOWN, 0), strict=True):
                 layer[beyond] = unknown
@@ -151,14 +153,15 @@ class Match(Stage):
 
     def _where(self, prior: Disparity | None, search: range, rows: int) -> SearchWindows | list[Range]:
         """Where to search, and what for."""
-        if prior is not None and self.around:
-            return windows(prior.pixels, self.around, search.start, self.threads)
+        if prior is not None and self.search_radius:
+            return windows(prior.pixels, self.search_radius, search.start, self.threads)
         if prior is not None and self.band_height:
             return ranges_of(prior.pixels, self.band_height, search.start, len(search), self.threads)
         return whole_range(rows, len(search))
 
     def _excluded(self, prior: Disparity, search: range, where: SearchWindows | list[Range]) -> Array:
-        """Where the prior shows that the match is not in the range, or with `around` none to look for, (H, W) bool."""
+        """Where the prior shows that the match is not in the range, or with `search_radius` none to look for, (H, W)
+        bool."""
         if isinstance(where, SearchWindows):
             guided: Array = (prior.pixels >= search.start - BEYOND) & (prior.pixels < prior.pixels.shape[1])
             return ~guided
@@ -166,7 +169,7 @@ class Match(Stage):
         for each in where:
             rows, first = slice(each.top, each.end), search.start + each.first
             excluded[rows] = prior.pixels[rows] > first + min(each.width.lanes, len(search)) + BEYOND
-            if first > self.minimum:
+            if first > self.min_disparity:
                 excluded[rows] |= prior.pixels[rows] < first - BEYOND
         excluded &= prior.source == PixelOrigin.MEASURED
         return excluded
@@ -176,8 +179,10 @@ class Match(Stage):
         check_rectified(self, frame)
         if min(height, width) < SMALLEST_SIDE:
             raise ValueError(f"Match: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
-        if not -width < self.minimum < width:
-            raise ValueError(f"Match.minimum = {self.minimum} px leaves nothing to compare in images {width} px wide")
+        if not -width < self.min_disparity < width:
+            raise ValueError(
+                f"Match.min_disparity = {self.min_disparity} px leaves nothing to compare in images {width} px wide"
+            )
         self.check_inputs({"frame"} if prior is None else {"frame", "prior"})
         if prior is not None and not isinstance(prior, Disparity):
             raise ValueError(f"Match: the prior must be a stages.Disparity, not a {type(prior).__name__}")
@@ -192,32 +197,32 @@ class Match(Stage):
         return self.p1 or cost.p1, self.p2 or cost.p2
 
     def _search(self, camera: StereoCamera) -> range:
-        """The disparities that are searched; with `around` the first of them counts."""
-        search = range(self.minimum, self.minimum + self.disparities)
-        if not self.farthest:
+        """The disparities that are searched; with `search_radius` the first of them counts."""
+        search = range(self.min_disparity, self.min_disparity + self.disparities)
+        if not self.max_depth:
             return search
-        largest = camera.width if self.around else search.stop - 1
+        largest = camera.width if self.search_radius else search.stop - 1
         reach = self._reach(camera)
         if reach >= largest:
             raise ValueError(
-                f"Match.farthest = {self.farthest} m leaves nothing to search: a depth of {self.farthest} m is a "
+                f"Match.max_depth = {self.max_depth} m leaves nothing to search: a depth of {self.max_depth} m is a "
                 f"disparity of {reach:.0f} px, and {largest} px is the largest searched"
             )
         limit = math.floor(reach) - 1  # the first that is searched is not found
         return range(max(search.start, limit), max(search.stop, limit + 1))
 
     def _reach(self, camera: StereoCamera) -> float:
-        """The disparity of `farthest`, px."""
-        return camera.fx * camera.baseline / self.farthest - (camera.cx_right - camera.cx)
+        """The disparity of `max_depth`, px."""
+        return camera.fx * camera.baseline / self.max_depth - (camera.cx_right - camera.cx)
 
     def _rule(self, search: range) -> SgmParams:
         cost, (p1, p2) = COSTS[self.cost], self._penalties()
-        falling = np.maximum(p1 + 2, np.round(p2 / (1 + np.arange(256) / self.edge)))
+        falling = np.maximum(p1 + 2, np.round(p2 / (1 + np.arange(256) / self.p2_edge_scale)))
         confidence = np.interp(np.arange(256), LEADS, cost.right).astype(np.float32)
         confidence[0] = 0  # unknown
         return SgmParams(
             self.cost == "census+gradient", self.paths == 8, p1, np.minimum(falling, p2).astype(np.uint8), cost.unseen,
-            len(search), search.start, self.uniqueness, self.consistency, self.speckle_range, self.speckle_size,
+            len(search), search.start, self.uniqueness, self.lr_tolerance, self.speckle_range, self.max_speckle_size,
             confidence,
         )  # fmt: skip
 
@@ -227,4 +232,4 @@ class Match(Stage):
         else:
             firsts = [np.full((each.end - each.top, 1), search.start + each.first, np.int32) for each in where]
             first, lanes = np.concatenate(firsts), lanes_for(len(search))
-        return prior_costs(prior.pixels, first, lanes, self.prior_weight, self.prior_reach, self.threads)
+        return prior_costs(prior.pixels, first, lanes, self.prior_weight, self.max_prior_distance, self.threads)

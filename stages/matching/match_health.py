@@ -11,19 +11,20 @@ from typing import ClassVar
 
 import numpy as np
 
+from flow.contracts import Finding, Severity, counted
 from stages.data import Disparity, MatchHealth, Mount, PixelOrigin, Tilt
-from stages.stage import Finding, Severity, Stage, counted, parameter
+from stages.stage import Stage, parameter
 
 
 @dataclass(frozen=True)
 class CheckMatches(Stage):
     """Counts matches, and warns at the end if in most frames the ground before the rover had few; it remembers."""
 
-    lowest: float = parameter(
+    near_rows: float = parameter(
         0.125, "share of the rows that show that ground: the lowest, of a camera that hangs the highest",
         low=0.01, high=1.0,
     )  # fmt: skip
-    least: float = parameter(0.7, "share of it that must be matched", low=0.0, high=1.0)
+    min_matched: float = parameter(0.7, "share of it that must be matched", low=0.0, high=1.0)
     _near: list[float] = field(default_factory=list, init=False, repr=False, compare=False)
 
     ordered: ClassVar[bool] = True
@@ -36,15 +37,15 @@ class CheckMatches(Stage):
         height, width = disparity.pixels.shape
         source = disparity.source[:, width // 2 :]
         matched = (source == PixelOrigin.MEASURED) | (source == PixelOrigin.PLANE)
-        rows = max(1, round(self.lowest * height))
+        rows = max(1, round(self.near_rows * height))
         hangs = tilt is not None and mount is not None and (mount.camera_from_inclinometer @ tilt.up)[1] > 0
         near = float((matched[:rows] if hangs else matched[-rows:]).mean())
         self._near.append(near)
         return MatchHealth(disparity.stamp, float(matched.mean()), near)
 
     def finding(self) -> Finding | None:
-        """A warning where that is less than `least` in the median of the frames."""
-        if not self._near or np.median(self._near) >= self.least:
+        """A warning where that is less than `min_matched` in the median of the frames."""
+        if not self._near or np.median(self._near) >= self.min_matched:
             return None
         return Finding(
             f"of the nearest ground in view {100 * np.median(self._near):.0f} % is matched (median of "

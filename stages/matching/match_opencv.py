@@ -33,38 +33,40 @@ class MatchOpenCV(Stage):
     """
 
     disparities: int = parameter(192, "size of the search range", unit="px", low=16, high=1024)
-    minimum: int = parameter(0, "smallest disparity searched", unit="px", low=-512, high=512)
+    min_disparity: int = parameter(0, "smallest disparity searched", unit="px", low=-512, high=512)
     paths: int = parameter(5, "directions of aggregation", choices=(3, 5, 8))
-    block: int = parameter(3, "side of the block that a matching cost is summed over, odd", unit="px", low=1, high=9)
+    block_size: int = parameter(
+        3, "side of the block that a matching cost is summed over, odd", unit="px", low=1, high=9
+    )
     p1: float = parameter(2.0, "penalty of a step of 1 px, times channels * block^2 (as the paper's authors)", low=0.1)
     p2: float = parameter(24.0, "penalty of a larger step, times channels * block^2; above p1", low=0)
-    prefilter: int = parameter(
+    prefilter_cap: int = parameter(
         63, "largest horizontal gradient that the matching cost tells apart, gray levels", low=1, high=63
     )
     uniqueness: int = parameter(1, "percent by which the best cost must beat the next", low=0, high=100)
-    consistency: int = parameter(1, "largest left-right difference", unit="px", low=1, high=64)
-    speckle_size: int = parameter(100, "largest isolated patch that is dropped, in pixels", low=0)
+    lr_tolerance: int = parameter(1, "largest left-right difference", unit="px", low=1, high=64)
+    max_speckle_size: int = parameter(100, "largest isolated patch that is dropped, in pixels", low=0)
     speckle_range: int = parameter(1, "disparity step that separates patches", unit="px", low=1)
-    texture: float = parameter(
+    min_texture: float = parameter(
         0.0, "mean horizontal gradient of a block, in gray levels, that a match must exceed", low=0, high=255
     )
     color: bool = parameter(False, "match on RGB instead of gray")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.block % 2 == 0:
-            raise ValueError(f"MatchOpenCV.block must be odd, not {self.block}")
+        if self.block_size % 2 == 0:
+            raise ValueError(f"MatchOpenCV.block_size must be odd, not {self.block_size}")
         if not self.p2 > self.p1:
             raise ValueError(f"MatchOpenCV.p2 must be above MatchOpenCV.p1 = {self.p1}, not {self.p2}")
-        scale = (3 if self.color else 1) * self.block**2
-        if scale * (2 * self.prefilter + 63 + self.p2) > np.iinfo(np.int16).max:
+        scale = (3 if self.color else 1) * self.block_size**2
+        if scale * (2 * self.prefilter_cap + 63 + self.p2) > np.iinfo(np.int16).max:
             raise ValueError("MatchOpenCV: block costs could exceed 16 bits; use a smaller block, p2 or prefilter")
 
     def __call__(self, frame: StereoFrame) -> Disparity:
         check_rectified(self, frame)
         left, right = eight_bit(frame.left, frame.right)
         pixels = self._matched(left, right) if self.color else self._matched(gray(left), gray(right))
-        pixels[_texture(gray(left), self.block) <= self.texture] = np.nan
+        pixels[_texture(gray(left), self.block_size) <= self.min_texture] = np.nan
         known = np.isfinite(pixels)
         source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
         return Disparity(frame.stamp, pixels, source, _agreement(pixels, known), camera=frame.camera)
@@ -75,22 +77,22 @@ class MatchOpenCV(Stage):
         if min(height, width) < SMALLEST_SIDE:
             raise ValueError(f"MatchOpenCV: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
         levels = -(-self.disparities // 16) * 16
-        before, after = max(0, self.minimum + levels), max(0, -self.minimum)
+        before, after = max(0, self.min_disparity + levels), max(0, -self.min_disparity)
         left, right = (
             cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right)
         )  # fmt: skip
-        scale = (1 if left.ndim == 2 else 3) * self.block**2
+        scale = (1 if left.ndim == 2 else 3) * self.block_size**2
         # A matcher keeps its buffers and is not re-entrant; a new one per frame costs little and leaves nothing behind.
         matcher = cv2.StereoSGBM.create(
-            minDisparity=self.minimum, numDisparities=levels, blockSize=self.block,
-            P1=max(1, round(self.p1 * scale)), P2=round(self.p2 * scale), disp12MaxDiff=self.consistency,
-            preFilterCap=self.prefilter, uniquenessRatio=self.uniqueness,
-            speckleWindowSize=self.speckle_size, speckleRange=self.speckle_range, mode=MODES[self.paths],
+            minDisparity=self.min_disparity, numDisparities=levels, blockSize=self.block_size,
+            P1=max(1, round(self.p1 * scale)), P2=round(self.p2 * scale), disp12MaxDiff=self.lr_tolerance,
+            preFilterCap=self.prefilter_cap, uniquenessRatio=self.uniqueness,
+            speckleWindowSize=self.max_speckle_size, speckleRange=self.speckle_range, mode=MODES[self.paths],
         )  # fmt: skip
         sixteenths = matcher.compute(left, right)[:, before : before + width]
         pixels: Array = sixteenths.astype(np.float32) / F32(16)
         partner = np.arange(width, dtype=np.float32) - pixels
-        pixels[(sixteenths < 16 * self.minimum) | (partner < 0) | (partner > width - 1)] = np.nan
+        pixels[(sixteenths < 16 * self.min_disparity) | (partner < 0) | (partner > width - 1)] = np.nan
         return pixels
 
 

@@ -53,7 +53,7 @@ class Upsample(Stage):
         height, width = frame.left.shape[:2]
         small = disparity.pixels.shape
         if small != ((height + 1) // 2, (width + 1) // 2):
-            raise ValueError(f"Enlarge: the disparity has shape {small}, which is not half of {(height, width)}")
+            raise ValueError(f"Upsample: the disparity has shape {small}, which is not half of {(height, width)}")
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         pixels = doubled(disparity.pixels, height, width, self.threads)
         source, confidence = (

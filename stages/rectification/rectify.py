@@ -21,10 +21,11 @@ from typing import cast
 import cv2
 import numpy as np
 
+from flow.contracts import Finding, Severity, counted
 from stages.data import Array, CameraModel, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.rectification.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
-from stages.stage import Finding, Severity, Stage, counted, parameter
+from stages.stage import Stage, parameter
 
 LARGEST_OFFSET = 64.0  # px
 UNUSUAL = 8.0  # px, more than a calibration leaves

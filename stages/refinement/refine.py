@@ -59,38 +59,38 @@ class Refine(Stage):
     that origin that were right within 1 px.
     """
 
-    trusted: float = parameter(0.5, "confidence below which a match is treated as unknown", low=0, high=1)
-    burnt_out: int = parameter(
+    min_confidence: float = parameter(0.5, "confidence below which a match is treated as unknown", low=0, high=1)
+    saturation_level: int = parameter(
         250, "level of a colour from which an even patch is burnt out, a sky say, and matches nothing; 256 = never",
         low=0, high=256,
     )  # fmt: skip
-    fit_radius: int = parameter(
+    subpixel_radius: int = parameter(
         2, "radius of the windows by which brightness tells the fraction of a pixel of a match, 0 = not asked",
         unit="px", low=0, high=16,
     )  # fmt: skip
-    median: int = parameter(5, "side of the median filter over matches, 0 = none", unit="px", choices=(0, 3, 5))
-    near: float = parameter(
+    median_size: int = parameter(5, "side of the median filter over matches, 0 = none", unit="px", choices=(0, 3, 5))
+    max_correction: float = parameter(
         1.0, "distance up to which a match moves to its median or plane; a farther one stays", unit="px", low=0
     )
     superpixels: int = parameter(4000, "number of superpixels aimed at", low=1)
-    smallest: int = parameter(
+    min_superpixel_size: int = parameter(
         300, "pixels that a superpixel shall have on average; a small image gets fewer", unit="px", low=1
     )
-    surface: int = parameter(16, "superpixels in a surface, the larger support of planes; 0 = none", low=0)
+    surface_size: int = parameter(16, "superpixels in a surface, the larger support of planes; 0 = none", low=0)
     inlier_distance: float = parameter(0.5, "deviation from a plane that makes an outlier", unit="px", low=0.01)
     hypotheses: int = parameter(16, "planes tried per segment", low=1)
-    inlier_share: float = parameter(0.8, "least share of inliers for a plane to be accepted", low=0, high=1)
-    valid_share: float = parameter(
+    min_inlier_share: float = parameter(0.8, "least share of inliers for a plane to be accepted", low=0, high=1)
+    min_valid_share: float = parameter(
         0.6, "least share of matched pixels for a plane to be accepted, in a surface half of it", low=0, high=1
     )
-    slope: float = parameter(0.5, "steepest disparity gradient of an accepted plane", unit="px/px", low=0)
+    max_gradient: float = parameter(0.5, "steepest disparity gradient of an accepted plane", unit="px/px", low=0)
     plane_weight: float = parameter(0.5, "weight of the plane against a match near to it", low=0, high=1)
     plane_fill: bool = parameter(True, "whether an accepted plane also fills the holes of its segment")
     fill: str = parameter("background", "how the other holes are filled", choices=("background", "wls", "none"))
-    fill_reach: float = parameter(
+    max_fill_distance: float = parameter(
         64.0, "distance from which a hole is still filled; what is hidden here, from any", unit="px", low=0
     )
-    fill_margin: int = parameter(
+    max_extrapolation: int = parameter(
         16, "how far beyond the last match, at the image's border or towards the sky", unit="px", low=0
     )
     bilateral_radius: int = parameter(
@@ -100,7 +100,7 @@ class Refine(Stage):
         3, "radius of the weighted median that puts depth edges where the image has them, 0 = none", unit="px", low=0,
         high=16,
     )  # fmt: skip
-    correlation: float = parameter(
+    min_correlation: float = parameter(
         0.5, "of the images about a match, below which it counts as a guess, 0 = not asked", low=0, high=1
     )
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
@@ -111,12 +111,14 @@ class Refine(Stage):
         image, other = eight_bit(frame.left, frame.right)
         guide, right = gray(image), gray(other)
         matches, weights = trusted_matches(
-            disparity.pixels, disparity.source, disparity.confidence, self.trusted,
-            _burnt_out(frame.left, guide, self.burnt_out, self.threads), self.threads,
+            disparity.pixels, disparity.source, disparity.confidence, self.min_confidence,
+            _burnt_out(frame.left, guide, self.saturation_level, self.threads), self.threads,
         )  # fmt: skip
-        if self.fit_radius:
-            matches = fit_brightness(guide, right, matches, self.fit_radius, self.threads)
-        pixels = near_median(matches, self.median, self.near, self.threads) if self.median else matches
+        if self.subpixel_radius:
+            matches = fit_brightness(guide, right, matches, self.subpixel_radius, self.threads)
+        pixels = (
+            near_median(matches, self.median_size, self.max_correction, self.threads) if self.median_size else matches
+        )
         within, labels, agreed = extent(pixels, self.threads), None, np.zeros(pixels.shape, bool)
         if self.plane_weight or self.plane_fill:
             labels, count = superpixels(image, self._count(pixels.size), COMPACTNESS, threads=self.threads)
@@ -131,21 +133,23 @@ class Refine(Stage):
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
 
     def _count(self, pixels: int) -> int:
-        return max(1, min(self.superpixels, pixels // self.smallest))
+        return max(1, min(self.superpixels, pixels // self.min_superpixel_size))
 
     def _with_planes(
         self, pixels: Array, weights: Array, within: Extent, image: Array, labels: Array, count: int, seed: int
     ) -> tuple[Array, Array]:
         """Matches near their planes drawn towards them, holes filled from them, (H, W) float32; where, (H, W) bool."""
-        margin = self.fill_margin if self.plane_fill else -1
+        margin = self.max_extrapolation if self.plane_fill else -1
         planes = fit_planes(pixels, labels, count, weights, self.hypotheses, self.inlier_distance, seed, self.threads)
-        accepted = self._accepted(planes, self.valid_share)
+        accepted = self._accepted(planes, self.min_valid_share)
         pixels, agreed = pull_to_planes(
-            pixels, accepted, labels, within, self.near, self.plane_weight, margin, self.threads
+            pixels, accepted, labels, within, self.max_correction, self.plane_weight, margin, self.threads
         )
-        if not self.surface:
+        if not self.surface_size:
             return pixels, agreed
-        group, groups = surfaces(image, labels, count, max(1, count // self.surface), COMPACTNESS, threads=self.threads)
+        group, groups = surfaces(
+            image, labels, count, max(1, count // self.surface_size), COMPACTNESS, threads=self.threads
+        )
         # Every other pixel of every other row is plenty for a surface.
         few = np.s_[::2, ::2]
         sparse, regions = (layer[few].copy() for layer in (pixels, labels))
@@ -154,9 +158,9 @@ class Refine(Stage):
             sparse, group.take(regions), groups, np.ascontiguousarray(weights[few]), self.hypotheses,
             self.inlier_distance, seed + 1, self.threads,
         )  # fmt: skip
-        accepted = (self._accepted(planes, self.valid_share / 2, 2) * [0.5, 0.5, 1])[group]
+        accepted = (self._accepted(planes, self.min_valid_share / 2, 2) * [0.5, 0.5, 1])[group]
         pixels, again = pull_to_planes(
-            pixels, accepted, labels, within, self.near / 2, self.plane_weight, margin, self.threads
+            pixels, accepted, labels, within, self.max_correction / 2, self.plane_weight, margin, self.threads
         )
         return pixels, agreed | again
 
@@ -164,22 +168,22 @@ class Refine(Stage):
         """The coefficients (n, 3) of the planes that the evidence supports, of pixels `spacing` px apart; NaN for the
         others."""
         slope = np.hypot(planes.coefficients[:, 0], planes.coefficients[:, 1])
-        supported = (planes.inlier_share >= self.inlier_share) & (planes.valid_share >= valid_share)
-        return np.where((supported & (slope <= self.slope * spacing))[:, None], planes.coefficients, np.nan)
+        supported = (planes.inlier_share >= self.min_inlier_share) & (planes.valid_share >= valid_share)
+        return np.where((supported & (slope <= self.max_gradient * spacing))[:, None], planes.coefficients, np.nan)
 
     def _filled(
         self, pixels: Array, confidence: Array, within: Extent, image: Array, guide: Array
     ) -> tuple[Array, Array]:
         """The remaining holes filled as far as evidence reaches, (H, W) float32, and their kinds of `holes`."""
         if self.fill == "background":
-            return fill_holes(pixels, image, within, self.fill_reach, self.fill_margin, self.threads)
+            return fill_holes(pixels, image, within, self.max_fill_distance, self.max_extrapolation, self.threads)
         hole = np.isnan(pixels)
         kinds = np.where(hole, np.uint8(OCCLUSION), np.uint8(0))
         if self.fill == "none":
             return pixels, kinds
         weights = np.where(hole, F32(0), np.maximum(confidence, F32(LEAST_WEIGHT)))
         smoothed = smooth(pixels, weights, guide, SMOOTHING, EDGE)
-        smoothed[~within_reach(pixels, within, self.fill_reach, self.fill_margin)] = np.nan
+        smoothed[~within_reach(pixels, within, self.max_fill_distance, self.max_extrapolation)] = np.nan
         return np.where(hole, smoothed, pixels), kinds
 
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
@@ -189,9 +193,9 @@ class Refine(Stage):
 
     def _borne_out(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> Array:
         """Where the images vary alike, so shifted, (H, W) bool."""
-        if self.correlation == 0:
+        if self.min_correlation == 0:
             return np.ones(pixels.shape, bool)
-        return correlation(pixels, guessed, guide, right, self.threads) >= F32(self.correlation)
+        return correlation(pixels, guessed, guide, right, self.threads) >= F32(self.min_correlation)
 
     def _sharpened(self, pixels: Array, guessed: Array, guide: Array) -> Array:
         if self.edge_radius == 0:

@@ -1,8 +1,8 @@
 """Binarise: from an elevation map to free, hazard and unknown (paper section 4, "Binary Navigation Map").
 
 The paper compares the elevation itself with 0.2 m, so that a slope of 1.4 degrees, or as much error in the tilt, makes
-a hazard of flat ground 8 m away. The default here asks the layers of Assess, which are measured against the ground, and
-calls free only what is known well enough to be no hazard.
+a hazard of flat ground 8 m away. The default here asks the layers of `TerrainFeatures`, which are measured against the
+ground, and calls free only what is known well enough to be no hazard.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.ndimage import binary_dilation
 from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap
 from stages.stage import Stage, parameter
 
-LAYERS = ("ground", "step", "slope", "steepness", "roughness", "support")  # that Assess adds
+LAYERS = ("ground", "step", "slope", "steepness", "roughness", "support")  # that TerrainFeatures adds
 UNKNOWN = (CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNSURE)
 # Rounding of float32 heights must not push a slope over its limit.
 _SLOPE_ROUNDING = 1e-3
@@ -31,7 +31,8 @@ class Binarise(Stage):
     - CLEARANCE: stands `ground_clearance` above the ground between the wheels;
     - SLOPE: lies on ground steeper than `max_slope` under the footprint, or under a wheel;
     - ROUGHNESS: has heights about it whose root mean square off their plane exceeds `max_roughness`;
-    - BESIDE: is measured, and within `beside` of a cell that is a hazard for STEP or CLEARANCE: to a cell or two nobody
+    - BESIDE: is measured, and within `hazard_margin` of a cell that is a hazard for STEP or CLEARANCE: to a cell or
+    two nobody
       knows where a rock ends (0.25 px of disparity are 7 cm at 8 m).
     Other cells are unknown where they have no height (OCCLUDED where the map says so, else UNOBSERVED), and UNSURE
     where they have fewer points than `min_points`, where so few cells lie about them that the ground is not determined
@@ -39,16 +40,16 @@ class Binarise(Stage):
     `max_sigma`, within `rim` of an obstacle, at a brink, or where a wheel might stand too steeply. The rest is free
     (CLEAR).
 
-    A brink is a cell within half a `wheel` of hidden ground that falls away: that lies, within `fall_reach` through
-    what is hidden, at least `fall` below the ground about it (layer `drop`, if the map has it). Behind a bump one sees
-    the ground go on where it was; behind the edge of a cliff or ditch, lower, or not at all.
+    A brink is a cell within half a `wheel` of hidden ground that falls away: that lies, within `max_drop_distance`
+    through what is hidden, at least `min_drop` below the ground about it (layer `drop`, if the map has it). Behind a
+    bump one sees the ground go on where it was; behind the edge of a cliff or ditch, lower, or not at all.
 
     The plane under a wheel rests on few cells: near the limit, steepness is off by 2 degrees (RMS, simulated ground).
     So a spot is UNSURE if it would be too steep were the difference of its steepness from the footprint's slope larger
     by `steepness_error` of it; on a plane there is no difference.
 
-    Ground wider than Assess.surroundings is terrain, not an obstacle: its edge is a hazard, its top is judged as
-    ground.
+    Ground wider than TerrainFeatures.surroundings is terrain, not an obstacle: its edge is a hazard, its top is judged
+    as ground.
 
     method "absolute", the paper's: a hazard is a cell whose elevation exceeds `max_step` (ELEVATION); all others with
     points are free, however little is known of their height.
@@ -61,22 +62,22 @@ class Binarise(Stage):
         0.349, "steepest slope that is free (20 degrees)", unit="rad", low=0.0, high=float(np.deg2rad(89))
     )
     max_roughness: float = parameter(0.06, "root mean square of heights off their plane", unit="m", low=0.0)
-    margin: float = parameter(
+    height_margin: float = parameter(
         0.03, "a height this close to its limit counts as reaching it: cells blunt a peak", unit="m", low=0.0
     )
-    beside: float = parameter(0.05, "cells this near to an obstacle are hazards too", unit="m", low=0.0)
+    hazard_margin: float = parameter(0.05, "cells this near to an obstacle are hazards too", unit="m", low=0.0)
     rim: float = parameter(0.1, "cells this near to one are not free", unit="m", low=0.0)
     max_sigma: float = parameter(
         0.067, "standard deviation of a cell's height beyond which it is not free (3 are a step)", unit="m", low=0.0
     )
-    least_support: float = parameter(
+    min_support: float = parameter(
         0.3, "share of the cells within a wheel's reach that must be known for a cell to be free", low=0.0, high=1.0
     )
-    fall: float = parameter(
+    min_drop: float = parameter(
         0.1, "how far below the ground about it hidden ground lies that may be a drop: a part of its depth is all that "
         "shows of a ditch", unit="m", low=0.0,
     )  # fmt: skip
-    fall_reach: float = parameter(1.0, "how far from there it may begin to fall", unit="m", low=0.0)
+    max_drop_distance: float = parameter(1.0, "how far from there it may begin to fall", unit="m", low=0.0)
     wheel: float = parameter(0.3, "diameter of a wheel: half of it from where it may fall nothing is free", unit="m",
                              low=0.0)  # fmt: skip
     steepness_error: float = parameter(
@@ -87,10 +88,10 @@ class Binarise(Stage):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("max_step", "ground_clearance"):
-            if self.method == "rover" and not getattr(self, name) > self.margin:
+            if self.method == "rover" and not getattr(self, name) > self.height_margin:
                 raise ValueError(
-                    f"Binarise.{name} must be above Binarise.margin, {self.margin:g} m, not {getattr(self, name):g} m: "
-                    "level ground would reach it"
+                    f"Binarise.{name} must be above Binarise.height_margin, {self.height_margin:g} m, not "
+                    f"{getattr(self, name):g} m: level ground would reach it"
                 )
 
     def __call__(self, elevation: ElevationMap) -> NavigationMap:
@@ -121,15 +122,15 @@ class Binarise(Stage):
             )
         ground, step, slope, steepness, roughness, support = (elevation.layers[name] for name in LAYERS)
         above = elevation.layers["elevation"] - ground
-        high = observed & (step >= self.max_step - self.margin)
-        belly = observed & (above >= self.ground_clearance - self.margin)
+        high = observed & (step >= self.max_step - self.height_margin)
+        belly = observed & (above >= self.ground_clearance - self.height_margin)
         limit = self.max_slope + _SLOPE_ROUNDING
 
-        known = np.isfinite(slope) & np.isfinite(roughness) & (support >= self.least_support) & self._sure(elevation)
+        known = np.isfinite(slope) & np.isfinite(roughness) & (support >= self.min_support) & self._sure(elevation)
         known &= steepness + self.steepness_error * (steepness - slope) <= limit
         known &= ~self._at_brink(elevation) & ~_near(high | belly, self.rim / elevation.resolution)
         reason = np.where(known, CellReason.CLEAR, CellReason.UNSURE)
-        reason[_near(high | belly, self.beside / elevation.resolution)] = CellReason.BESIDE
+        reason[_near(high | belly, self.hazard_margin / elevation.resolution)] = CellReason.BESIDE
         reason[roughness > self.max_roughness] = CellReason.ROUGHNESS
         reason[(slope > limit) | (steepness > limit)] = CellReason.SLOPE
         reason[belly] = CellReason.CLEARANCE
@@ -147,8 +148,8 @@ class Binarise(Stage):
         if "drop" not in elevation.layers:
             return np.zeros(elevation.shape, bool)
         hidden = elevation.layers["occluded"] == 1
-        falls = hidden & (elevation.layers["drop"] >= self.fall)
-        reach = int(self.fall_reach / elevation.resolution + 1e-6)
+        falls = hidden & (elevation.layers["drop"] >= self.min_drop)
+        reach = int(self.max_drop_distance / elevation.resolution + 1e-6)
         if reach and falls.any():
             falls = binary_dilation(falls, np.ones((3, 3)), iterations=reach, mask=hidden)
         return _near(falls, np.ceil(self.wheel / 2 / elevation.resolution - 1e-6))

@@ -33,8 +33,8 @@ class Voxelise(Stage):
 
     Layers:
     - elevation (mean), minimum, maximum, m, and count, of the measured points; without any, count is 0, the others NaN.
-      With `reach`, an empty cell into which at least 2 places fall where measured points might lie as well, 4 of them
-      along each line of sight, has the mean of these, and a count of 0.5: it is known, but no point says so;
+      With `splat_sigmas`, an empty cell into which at least 2 places fall where measured points might lie as well, 4
+      of them along each line of sight, has the mean of these, and a count of 0.5: it is known, but no point says so;
     - variance, m^2: of the mean against the cell's true mean height, from what is random within a frame;
     - common_variance, m^2: from the tilt's uncertainty, which moves a whole frame at once, so that neither many points
       nor many cells average it out: (tilt_sigma * range)^2;
@@ -49,27 +49,33 @@ class Voxelise(Stage):
     the mean square of what the points' depth sigmas do to a height, on a slope more or less than on the level, and the
     mean of points that share one error is as sure as one of them; shape is what the mean of some points misses of an
     uneven cell, by its scatter beyond the slope's and the noise's and by its height off its neighbours; a cell beside
-    an empty one, of which they may show one side, misses more (`rim`). Errors have longer tails than a Gaussian's:
-    where 92 to 94 % are within two such sigmas, 69 to 73 % are within one.
+    an empty one, of which they may show one side, misses more (`rim_share`). Errors have longer tails than a
+    Gaussian's: where 92 to 94 % are within two such sigmas, 69 to 73 % are within one.
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
-    region: float = parameter(
+    max_range: float = parameter(
         8.0, "horizontal range from the level frame's origin kept in the map", unit="m", low=0.1, high=200.0
     )
-    tails: float = parameter(1.2, "variance of a point over the square of its sigma, within which 68 % are", low=0.0)
-    correlated: float = parameter(12.0, "neighbouring points that share one matching error", low=1.0)
-    systematic: float = parameter(0.06, "share of the points' variance that no averaging removes", low=0.0, high=1.0)
-    scatter: float = parameter(0.15, "share of the scatter beyond slope and noise in the variance", low=0.0)
-    bend: float = parameter(0.4, "share of the square of the height off the neighbours in the variance", low=0.0)
-    rim: float = parameter(
+    tail_factor: float = parameter(
+        1.2, "variance of a point over the square of its sigma, within which 68 % are", low=0.0
+    )
+    correlated_points: float = parameter(12.0, "neighbouring points that share one matching error", low=1.0)
+    systematic_share: float = parameter(
+        0.06, "share of the points' variance that no averaging removes", low=0.0, high=1.0
+    )
+    scatter_share: float = parameter(0.15, "share of the scatter beyond slope and noise in the variance", low=0.0)
+    curvature_share: float = parameter(
+        0.4, "share of the square of the height off the neighbours in the variance", low=0.0
+    )
+    rim_share: float = parameter(
         0.12, "share of the square of its rise in the variance of a cell beside an empty one", low=0.0
     )
-    reach: float = parameter(
+    splat_sigmas: float = parameter(
         0.0, "how far along its line of sight, in standard deviations of its depth, a measured point speaks for cells "
         "that no point falls into; 0 = it does not", low=0.0,
     )  # fmt: skip
-    reach_limit: float = parameter(
+    max_splat: float = parameter(
         0.08, "how far at most, in depth: at edges, where depth is least sure, what lies behind is hidden", unit="m",
         low=0.0,
     )  # fmt: skip
@@ -80,17 +86,17 @@ class Voxelise(Stage):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_cells("Voxelise.region", self.region, self.resolution, 2)
+        check_cells("Voxelise.max_range", self.max_range, self.resolution, 2)
         if not all(0 <= value <= 100 for value in self.percentiles):
             raise ValueError(f"Voxelise.percentiles must be between 0 and 100, not {self.percentiles}")
 
     def __call__(self, cloud: PointCloud) -> ElevationMap:
         """The elevation map of a cloud in frame `level`."""
         check_level(self, cloud)
-        half = int(np.ceil(self.region / self.resolution - 1e-9))
+        half = int(np.ceil(self.max_range / self.resolution - 1e-9))
         origin = (-half * self.resolution, -half * self.resolution)
         measured, guessed = self._parted(cloud)
-        grid = self.resolution, origin, 2 * half, self.region
+        grid = self.resolution, origin, 2 * half, self.max_range
         figures = self._reached(cell_statistics(measured.points, measured.sigma, *grid), measured, grid)
         layers = self._layers(figures, measured, origin)
         if cloud.sensor is not None and cloud.shape is not None:
@@ -117,9 +123,9 @@ class Voxelise(Stage):
         """The figures of `cell_statistics`, those of empty cells that lie within the reach of points filled in."""
         sensor = cloud.sensor
         least = FINEST * self.resolution
-        if sensor is None or self.reach == 0 or self.reach_limit < least:
+        if sensor is None or self.splat_sigmas == 0 or self.max_splat < least:
             return figures
-        points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.reach, least, self.reach_limit)
+        points, sigma = laid_along_sight(cloud.points, cloud.sigma, sensor, self.splat_sigmas, least, self.max_splat)
         near = cell_statistics(points, sigma, *grid)
         reached = (figures[:, :, 0] == 0) & (near[:, :, 0] >= WITNESSES)
         spoken_for = near[reached]
@@ -154,10 +160,10 @@ class Voxelise(Stage):
         uneven = np.maximum(scatter - rise / 12 - SHOWING * noise, 0.0)
         beside = ~binary_erosion(np.isfinite(mean), np.ones((3, 3)))
         return np.asarray(
-            self.tails * noise * (self.systematic + np.minimum(1.0, self.correlated / n))
-            + self.scatter * uneven
-            + self.bend * bend * bend
-            + np.where(beside, self.rim * rise, 0.0)
+            self.tail_factor * noise * (self.systematic_share + np.minimum(1.0, self.correlated_points / n))
+            + self.scatter_share * uneven
+            + self.curvature_share * bend * bend
+            + np.where(beside, self.rim_share * rise, 0.0)
         )
 
 

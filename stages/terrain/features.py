@@ -1,4 +1,5 @@
-"""Assess: what the terrain would do to a rover, as layers of the elevation map (paper section 4, "slope filtering").
+"""TerrainFeatures: what terrain would do to a rover, as layers of the elevation map (paper section 4, slope filtering).
+filtering").
 
 The trick is to measure everything against the ground and not against gravity: a rise against what lies within a wheel's
 reach, a height against the plane between the wheels, roughness off the footprint's plane. The ground is found by

@@ -13,8 +13,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from flow.contracts import Finding, Severity, counted
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
-from stages.stage import Finding, Severity, Stage, check_cells, counted, parameter
+from stages.stage import Stage, check_cells, parameter
 from stages.terrain.fused_map import FusedMap, Observation, hidden_below, layers_of, merged, variance_of
 from stages.terrain.height_alignment import fit_plane, rise
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
@@ -35,18 +36,18 @@ class Fuse(Stage):
     The map that a frame gives is a square of `window` about the rover, its sides along the axes of the pose's frame. It
     holds all that the frame changed, so the maps of a run, each laid over those before, are the whole region. Layers:
     - elevation, minimum, maximum, m: means over frames, weighted by inverse variance;
-    - variance, m^2: of the elevation against what lies about it. A frame that is misplaced by `position` is off by that
-      times the slope, where its cell has one, and by `alignment` anywhere. Frames see a cell alike and err alike: the
-      share `shared` of the smallest variance stays, however many frames there are;
+    - variance, m^2: of the elevation against what lies about it. A frame that is misplaced by `position_sigma` is off
+      by that times the slope, where its cell has one, and by `alignment_sigma` anywhere. Frames see a cell alike and
+      err alike: the share `shared_share` of the smallest variance stays, however many frames there are;
     - count (points); first, last: when the evidence in the cell was gathered, s since the map's first frame,
       whose stamp is the map's `epoch` (float32 holds no stamps), another once the map began anew; frames: how many it
       is from (at most 65535); contradictions: how often the height was contradicted;
     - occluded, where the frames tell it: 1 in cells hidden from all that looked, 0 in known ones, NaN elsewhere; and
       ceiling, m: the lowest line of sight over the hidden ones.
 
-    A frame contradicts a cell if it is off by more than `contradiction` standard deviations. Then the cell's evidence
-    loses half its weight, and as soon as the newer is as sure, the newer takes its place; until then the cell is stated
-    to be as unsure as the two differ.
+    A frame contradicts a cell if it is off by more than `max_contradiction` standard deviations. Then the cell's
+    evidence loses half its weight, and as soon as the newer is as sure, the newer takes its place; until then the cell
+    is stated to be as unsure as the two differ.
 
     Where the pose is in another frame than before, as after visual odometry lost its way, the map begins anew.
 
@@ -57,24 +58,24 @@ class Fuse(Stage):
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
-    region: float = parameter(
+    max_range: float = parameter(
         8.0, "horizontal range from the rover that a frame adds to the map", unit="m", low=0.1, high=200.0
     )
     window: float = parameter(20.0, "width of the map that is given with each frame", unit="m", low=0.5, high=400.0)
     tilt_sigma: float = parameter(0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0)
     height_sigma: float = parameter(0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0)
-    position: float = parameter(
+    position_sigma: float = parameter(
         0.012, "standard deviation of a frame's horizontal place against those it is merged with", unit="m", low=0.0
     )
-    alignment: float = parameter(
+    alignment_sigma: float = parameter(
         0.002, "standard deviation that is left in a cell's height by joining its frame", unit="m", low=1e-4
     )
     follow_tilt: float = parameter(0.05, "share of a frame's own tilt that the map takes over", low=0.0, high=1.0)
     follow_height: float = parameter(
         0.003, "share of its own height; much less, for heights that are pulled lean the map", low=0.0, high=1.0
     )
-    contradiction: float = parameter(3.0, "standard deviations that two heights of a cell may differ", low=1.0)
-    shared: float = parameter(0.5, "share of a cell's variance that is the same in all frames", low=0.0, high=1.0)
+    max_contradiction: float = parameter(3.0, "standard deviations that two heights of a cell may differ", low=1.0)
+    shared_share: float = parameter(0.5, "share of a cell's variance that is the same in all frames", low=0.0, high=1.0)
 
     ordered: ClassVar[bool] = True
     _map: FusedMap = field(default_factory=FusedMap, init=False, repr=False, compare=False)
@@ -82,11 +83,11 @@ class Fuse(Stage):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_cells("Fuse.window", self.window, self.resolution)
-        least = 2 * (self.region + MARGIN)
+        least = 2 * (self.max_range + MARGIN)
         if self.window < least:
             raise ValueError(
                 f"Fuse.window must be at least {least:g} m, not {self.window:g} m: it holds all that a frame changed "
-                f"(region, {self.region:g} m) and {MARGIN:g} m about it"
+                f"(region, {self.max_range:g} m) and {MARGIN:g} m about it"
             )
 
     def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> ElevationMap:
@@ -96,14 +97,14 @@ class Fuse(Stage):
         """
         self._check(cloud)
         placed, up = placement(cloud, pose, mount)
-        sight = sight_of(cloud, placed, self.resolution, self.region)
+        sight = sight_of(cloud, placed, self.resolution, self.max_range)
         if pose.frame_id != self._map.frame_id:
             self._map.begin(pose.frame_id, cloud.stamp)
         known, seen = sight.known, self._seen(sight)
         cells, plane = self._joined(sight, seen)
         self._map.ups += up
         now = self._map.age(cloud.stamp)
-        cells[known] = merged(cells[known], seen.raised(plane), now, self.contradiction, self.shared)
+        cells[known] = merged(cells[known], seen.raised(plane), now, self.max_contradiction, self.shared_share)
         hidden = ~known & np.isfinite(sight.ceiling) & (cells["frames"] == 0)
         cells[hidden] = hidden_below(cells[hidden], sight.ceiling[hidden] + rise(plane, *sight.offsets(hidden)))
         self._map.cells.write(sight.row, sight.col, cells, known | hidden)
@@ -144,7 +145,9 @@ class Fuse(Stage):
     def _misplaced(self, terrain: ElevationMap) -> Array:
         """What errors of a frame's place add to the variance of its cells, (rows, cols)."""
         east, north, _ = gradient_and_curvature(terrain.layers["elevation"].astype(np.float64)) / self.resolution
-        return np.asarray(self.alignment**2 + self.position**2 * np.minimum(east**2 + north**2, _STEEPEST**2))
+        return np.asarray(
+            self.alignment_sigma**2 + self.position_sigma**2 * np.minimum(east**2 + north**2, _STEEPEST**2)
+        )
 
     def _joined(self, sight: FrameGrid, seen: Observation) -> tuple[Array, Array]:
         """The region's cells (rows, cols) that the frame lies on, and the plane (3,) that joins it to them; where that
@@ -166,7 +169,7 @@ class Fuse(Stage):
         both = cells["frames"] > 0
         cells, seen = cells[both], seen.only(both)
         off = cells["height"].astype(np.float64) - seen.elevation
-        variance = variance_of(cells, self.shared) + seen.variance
+        variance = variance_of(cells, self.shared_share) + seen.variance
         expected = np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])
         # What joined the frame before tells what to expect: a pose whose height drifts is off by much, but by and by.
         before = np.array([self._map.plane[0], 0.0, 0.0])
@@ -195,6 +198,6 @@ class Fuse(Stage):
         """The map around the rover."""
         half = int(np.ceil(self.window / 2 / self.resolution - 1e-9))
         col, row = (int(np.floor(place / self.resolution)) - half for place in placed.translation[:2])
-        layers = layers_of(self._map.cells.read(row, col, 2 * half, 2 * half), self.shared, self._map.hides)
+        layers = layers_of(self._map.cells.read(row, col, 2 * half, 2 * half), self.shared_share, self._map.hides)
         origin = (col * self.resolution, row * self.resolution)
         return ElevationMap(stamp, layers, self.resolution, origin, placed.parent, placed, self._map.epoch)

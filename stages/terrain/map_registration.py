@@ -96,7 +96,7 @@ def sight_of(cloud: PointCloud, placed: Transform, resolution: float, region: fl
     rest = replace(placed, translation=np.append(placed.translation[:2] - cell * resolution, 0.0))
     points = transform_points(cloud.points, rest.rotation, rest.translation)
     sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
-    terrain = Voxelise(resolution=resolution, region=region)(replace(cloud, points=points, sensor=sensor))
+    terrain = Voxelise(resolution=resolution, max_range=region)(replace(cloud, points=points, sensor=sensor))
     col, row = (int(number) - extent // 2 for number, extent in zip(cell, terrain.shape[::-1], strict=True))
     heights = [name for name in ("elevation", "minimum", "maximum", "ceiling") if name in terrain.layers]
     lifted = {name: terrain.layers[name] + np.float32(placed.translation[2]) for name in heights}

@@ -87,7 +87,7 @@ def speed() -> None:
             )
     prior = Match(disparities=192)(frame)
     for threads in (1, 2):
-        match = Match(around=4, paths=4, threads=threads)
+        match = Match(search_radius=4, paths=4, threads=threads)
         contestants[f"4 px around a prior, 4 paths x{threads}"] = lambda match=match: match(frame, prior)
     seconds = medians(contestants)
     print(f"{'1280x960, median of ' + str(ROUNDS):52} {'ms':>8}  / HH   / 3WAY")
@@ -203,7 +203,7 @@ def rows(folder: Path) -> None:
         frame = StereoFrame(0, left[..., ::-1], right[..., ::-1], camera)
         for name, stage in (("as calibrated", Rectify(row_offset=0.0)), ("rows corrected", Rectify())):
             rectified = stage(frame)
-            found, strict = Match()(rectified), Match(consistency=0)(rectified)
+            found, strict = Match()(rectified), Match(lr_tolerance=0)(rectified)
             known, agreed = (np.isfinite(each.pixels[300:, 192:]) for each in (found, strict))
             confidence = found.confidence[300:, 192:][known].mean()
             print(

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flow.align import Interpolate, Latest, Nearest, Pair, Token
-from flow.runtime.ledger import Absent, Loss, LossReason
+from flow.contracts import Absent, Loss, LossReason
 from tests.flow.toys import Number
 
 MS = 1_000_000

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from flow.config.loader import load
+from flow.contracts import Finding, Severity
 from flow.runtime.run import run
-from stages.stage import Finding, Severity
 
 
 @dataclass(frozen=True)

@@ -87,5 +87,5 @@ def test_every_stage_that_remembers_is_tried_above():
 
 
 def test_a_snapshot_of_another_stage_is_refused():
-    with pytest.raises(ValueError, match="a snapshot of Locate is not one of CheckTilt"):
+    with pytest.raises(ValueError, match="a snapshot of PoseFilter is not one of CheckTilt"):
         CheckTilt().restore(PoseFilter().snapshot())

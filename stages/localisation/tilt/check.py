@@ -13,11 +13,12 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import Finding, Severity
 from stages.data import Array, CameraMotion, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.localisation.tilt.causes import Evidence
 from stages.localisation.tilt.diagnosis import INCONSISTENT, Diagnosis, diagnose, off_level
 from stages.robust_weights import NORMAL, tukey_weights
-from stages.stage import Finding, Severity, Stage, parameter
+from stages.stage import Stage, parameter
 
 MOVED = 0.05  # m, or
 TURNED = float(np.deg2rad(0.3))  # rad, by which a frame must differ from the one kept before
@@ -77,10 +78,10 @@ class CheckTilt(Stage):
 
     window: int = parameter(50, "frames that a judgement rests on at most", low=10)
     interval: int = parameter(5, "frames after which the tilt is judged again", low=1)
-    least_angle: float = parameter(
+    min_angle: float = parameter(
         np.deg2rad(2.0), "least error of the mount that is called a fault", unit="rad", low=1e-3, high=0.5
     )
-    least_offset: float = parameter(0.08, "least error of the tilt's stamps that is", unit="s", low=0.01, high=1.0)
+    min_offset: float = parameter(0.08, "least error of the tilt's stamps that is", unit="s", low=0.01, high=1.0)
     _memory: _Memory = field(default_factory=_Memory, init=False, repr=False, compare=False)
 
     ordered: ClassVar[bool] = True
@@ -155,7 +156,7 @@ class CheckTilt(Stage):
             np.array([sight.camera.rotation for sight in kept]), np.array([sight.drift for sight in kept]),
             np.array([sight.up for sight in kept]), kept[-1].mount, np.array([sight.ground for sight in kept]),
         )  # fmt: skip
-        return diagnose(evidence, self.least_angle, self.least_offset)
+        return diagnose(evidence, self.min_angle, self.min_offset)
 
 
 def _ground_normal(cloud: PointCloud) -> Array:

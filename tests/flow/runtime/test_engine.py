@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flow.contracts import Absent, Loss, LossReason
 from flow.runtime.engine import Engine
 from flow.runtime.graph import Node, YamlLocation
-from flow.runtime.ledger import Absent, Ledger, Loss, LossReason
+from flow.runtime.ledger import Ledger
 from tests.flow.toys import MS, PIPELINE, Couple, Keep, Number, graph, replayed, traverse
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from flow.cli.report import headline, report
+from flow.contracts import Finding
 from flow.runtime.findings import plain
 from flow.runtime.run import run
-from stages.stage import Finding
 from tests.flow.toys import Log, graph, replayed, traverse
 
 

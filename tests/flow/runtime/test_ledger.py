@@ -5,7 +5,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from flow.runtime.ledger import Ledger, Loss, LossReason, failure
+from flow.contracts import Loss, LossReason
+from flow.runtime.ledger import Ledger, failure
 from stages import Match
 
 

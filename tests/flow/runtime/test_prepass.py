@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import pytest
 
 from flow.config.loader import load
+from flow.contracts import Finding
 from flow.errors import PipelineError
 from flow.runtime.run import Stop, run
-from stages.stage import Finding
 from tests.flow.toys import Couple, Keep, Log, Number
 
 PIPELINE = """

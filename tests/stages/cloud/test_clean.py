@@ -100,7 +100,7 @@ def test_a_mismatch_of_a_hundred_pixels_that_supports_itself_goes() -> None:
     cloud = Reproject()(blank_frame(), as_disparity(d))
     patch = (np.arange(300, 308)[:, None] * 640 + np.arange(100, 112)).ravel()
     assert not np.isin(patch, Clean()(cloud).pixel).any()
-    assert np.isin(patch[20:70], Clean(patch=0.0)(cloud).pixel).any()
+    assert np.isin(patch[20:70], Clean(min_patch_share=0.0)(cloud).pixel).any()
 
 
 @pytest.mark.parametrize("made_up", [PixelOrigin.PLANE, PixelOrigin.FILLED])
@@ -112,14 +112,14 @@ def test_what_refinement_made_up_supports_nobody_and_is_kept_within_the_crop(mad
     source[290:312, 90:112][source[290:312, 90:112] > 0] = made_up
     source[300:303, 100:103] = PixelOrigin.MEASURED
     pixels = np.where(source == made_up, np.float32(d[301, 101]), disparity.pixels)
-    cloud = Reproject(filled=True)(blank_frame(), replace(disparity, pixels=pixels, source=source))
+    cloud = Reproject(include_filled=True)(blank_frame(), replace(disparity, pixels=pixels, source=source))
     clean = Clean()(cloud)
     assert clean.source is not None
     assert cloud.source is not None
     assert 301 * 640 + 101 not in clean.pixel  # a speck, though all the filled pixels about it agree
     assert (clean.source == made_up).sum() == (cloud.source == made_up).sum() > 400
     far = replace(disparity, pixels=np.where(source == made_up, np.float32(12.0), pixels), source=source)
-    assert (Clean()(Reproject(filled=True)(blank_frame(), far)).source == made_up).sum() == 0
+    assert (Clean()(Reproject(include_filled=True)(blank_frame(), far)).source == made_up).sum() == 0
 
 
 def test_patch_kernel_equals_scipys_connected_components() -> None:
@@ -177,13 +177,13 @@ def test_kernel_equals_the_plain_reference() -> None:
 def test_a_scene_twice_as_large_seen_with_twice_the_baseline_is_judged_alike(scale: float) -> None:
     cloud, _ = with_floaters(cloud_with_noise(), 0.02)
     larger = replace(cloud, points=cloud.points * np.float32(scale), sigma=cloud.sigma * np.float32(scale))
-    once, again = Clean(margin=0)(cloud), Clean(region=8 * scale, margin=0)(larger)
+    once, again = Clean(margin=0)(cloud), Clean(max_range=8 * scale, margin=0)(larger)
     np.testing.assert_array_equal(once.pixel, again.pixel)
 
 
 def test_crops_about_the_camera_before_it_judges() -> None:
     cloud = cloud_with_noise()
-    kept = Clean(region=5.0, margin=0.5)(cloud)
+    kept = Clean(max_range=5.0, margin=0.5)(cloud)
     assert 5.4 < np.linalg.norm(kept.points, axis=1).max() <= 5.5
     assert np.all(np.diff(kept.pixel) > 0)
     on_the_ground = horizontal_range(cloud) < 5.0

@@ -56,7 +56,7 @@ def test_a_filled_disparity_is_left_out_or_marked_as_uncertain_and_a_plane_is_ke
     disparity = Disparity(0, np.full((1, 4), 5, np.float32), source, np.ones((1, 4), np.float32))
     frame = blank_frame(camera)
     assert Reproject()(frame, disparity).pixel.tolist() == [0, 1]
-    cloud = Reproject(filled=True, sigma_best=0.2, sigma_plane=0.7, sigma_filled=3.0)(frame, disparity)
+    cloud = Reproject(include_filled=True, sigma_best=0.2, sigma_plane=0.7, sigma_filled=3.0)(frame, disparity)
     assert cloud.pixel.tolist() == [0, 1, 2]
     assert cloud.sigma == pytest.approx(np.array([0.2, 0.7, 3.0]) * 4.0**2 / (100 * 0.2))
     assert cloud.source is not None

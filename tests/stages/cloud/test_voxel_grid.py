@@ -1,4 +1,4 @@
-"""Voxels holds every measured point once, in the cube it is in."""
+"""VoxelGrid holds every measured point once, in the cube it is in."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_every_measured_point_within_the_region_is_in_its_cube_and_in_one_only()
     cloud = some(1)
     filled = np.arange(len(cloud.points)) % 4 == 0
     source = np.where(filled, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8)
-    voxels = VoxelGrid(region=0.6, resolution=0.1)(replace(cloud, source=source))
+    voxels = VoxelGrid(max_range=0.6, resolution=0.1)(replace(cloud, source=source))
     inside = ~filled & (np.hypot(cloud.points[:, 0], cloud.points[:, 1]) <= 0.6)
     assert voxels.count.sum() == inside.sum()
     cubes = {tuple(cube) for cube in np.floor(cloud.points[inside] / np.float64(0.1)).astype(int)}
@@ -54,14 +54,16 @@ def test_a_wall_and_what_hangs_over_it_are_cubes_of_their_own_colour() -> None:
     assert voxels.index.tolist() == [[20, 20, 0], [20, 20, 20]]
     assert voxels.colors.tolist() == [[15, 25, 35], [200, 0, 0]]
     assert voxels.count.tolist() == [2, 1]
-    assert VoxelGrid(least=2)(cloud_of(points, colors)).count.tolist() == [2]
+    assert VoxelGrid(min_points=2)(cloud_of(points, colors)).count.tolist() == [2]
 
 
 def test_a_map_of_more_cubes_than_memory_has_room_for_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"Voxels\.region = 100 m makes a map 40000 cells of 0\.005 m wide, and 4000"):
-        VoxelGrid(resolution=0.005, region=100.0)
+    with pytest.raises(
+        ValueError, match=r"VoxelGrid\.max_range = 100 m makes a map 40000 cells of 0\.005 m wide, and 4000"
+    ):
+        VoxelGrid(resolution=0.005, max_range=100.0)
     corners = cloud_of(np.array([[9.902, 0, 0], [0, 9.902, 0], [0, -9.902, 0]]), np.zeros((3, 3), np.uint8))
-    widest = VoxelGrid(resolution=0.005, region=10.0)(corners)
+    widest = VoxelGrid(resolution=0.005, max_range=10.0)(corners)
     assert widest.index.tolist() == [[0, -1981, 0], [1980, 0, 0], [0, 1980, 0]]
 
 

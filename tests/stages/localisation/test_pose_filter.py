@@ -1,4 +1,4 @@
-"""Locate makes poses that stand upright by the tilt and go by the images, and labels them as visual."""
+"""PoseFilter makes poses that stand upright by the tilt and go by the images, and labels them as visual."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import Finding, Severity
 from recordings.simulator.traverse import level_pose
 from stages import Mount, Pose, PoseFilter, Tilt, Transform
 from stages.data import Array
-from stages.stage import Finding, Severity
 from tests.stages.localisation.drive import FRAMES, Drive, motions
 
 DRIVE = Drive(2, 6.0)

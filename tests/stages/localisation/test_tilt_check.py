@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import Severity
 from stages import CheckTilt, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.data import Array
-from stages.stage import Severity
 from tests.stages.localisation.drive import FRAMES, Drive, motions
 from tests.tilt_faults import flipped
 

@@ -92,7 +92,7 @@ def test_tracking_that_is_lost_begins_a_segment_and_says_so(drive):
     assert motion.segment == 2
     assert "segment 2 begins" in motion.lost
     np.testing.assert_array_equal(camera_of(motion).translation, 0)
-    assert odometry.finding() is None  # Locate tells it, once
+    assert odometry.finding() is None  # PoseFilter reports it, once
 
 
 def test_images_of_another_size_begin_a_segment_and_say_so(drive):
@@ -162,7 +162,7 @@ def test_what_everything_is_counted_from_needs_few_features(drive):
     patch = np.zeros_like(disparity.source)
     patch[180:210, 150:190] = disparity.source[180:210, 150:190]
     few = replace(disparity, source=patch)
-    assert 0 < view(frame, few).known < VisualOdometry().least
+    assert 0 < view(frame, few).known < VisualOdometry().min_features
     np.testing.assert_array_equal(camera_of(VisualOdometry()(frame, few)).rotation, np.eye(3))
 
 

@@ -69,7 +69,7 @@ def test_a_range_that_starts_elsewhere_finds_the_same(slope):
     frame, truth = slope
     inside = (truth > 14) & (truth < 30) & (np.arange(320) > 60)
     for minimum, disparities in ((12, 50), (-20, 70)):
-        pixels = Match(disparities=disparities, minimum=minimum)(frame).pixels[inside]
+        pixels = Match(disparities=disparities, min_disparity=minimum)(frame).pixels[inside]
         known = np.isfinite(pixels)
         assert known.mean() > 0.95
         assert np.median(np.abs(pixels - truth[inside])[known]) < 0.12
@@ -78,7 +78,7 @@ def test_a_range_that_starts_elsewhere_finds_the_same(slope):
 def test_a_negative_range_finds_points_beyond_infinity(slope):
     frame, truth = slope
     crossed = frame_of(frame.left[:, ::-1].copy(), frame.right[:, ::-1].copy())
-    pixels = Match(disparities=48, minimum=-47)(crossed).pixels
+    pixels = Match(disparities=48, min_disparity=-47)(crossed).pixels
     known = np.isfinite(pixels)
     assert known.mean() > 0.85
     assert np.median(np.abs(pixels + truth[:, ::-1])[known]) < 0.12
@@ -86,7 +86,7 @@ def test_a_negative_range_finds_points_beyond_infinity(slope):
 
 def test_what_lies_beyond_the_farthest_of_interest_is_neither_searched_nor_made_up(slope):
     frame, truth = slope
-    match = Match(disparities=48, farthest=1.5)  # 20 px: fx * baseline is 30 px m
+    match = Match(disparities=48, max_depth=1.5)  # 20 px: fx * baseline is 30 px m
     coarse = np.where(np.arange(320) >= truth, truth, np.nan).astype(np.float32)
     prior = Disparity(0, coarse, np.ones(truth.shape, np.uint8), np.ones(truth.shape, np.float32))
     whole, near = (Match(disparities=48)(frame, prior).pixels, match(frame, prior).pixels)
@@ -111,7 +111,7 @@ def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
         0, np.where(known, truth, np.nan).astype(np.float32), np.full(truth.shape, PixelOrigin.MEASURED, np.uint8),
         np.full(truth.shape, 0.7, np.float32),
     )  # fmt: skip
-    bare, joined = Match(disparities=24)(frame, prior), Match(disparities=24, nearer="prior")(frame, prior)
+    bare, joined = Match(disparities=24)(frame, prior), Match(disparities=24, out_of_range="prior")(frame, prior)
     nearer = known & (truth > 22.5)
     assert nearer.sum() > 1000
     assert np.isnan(bare.pixels[known & (truth > 26.5)]).all()
@@ -123,7 +123,7 @@ def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
     assert (joined.confidence[taken] == np.float32(0.7)).all()
     np.testing.assert_array_equal(joined.pixels[~taken & (truth < 22)], bare.pixels[~taken & (truth < 22)])
     guess = replace(prior, source=np.full(truth.shape, PixelOrigin.FILLED, np.uint8))  # is no measurement
-    assert np.nanmax(Match(disparities=24, nearer="prior")(frame, guess).pixels) < 24.5
+    assert np.nanmax(Match(disparities=24, out_of_range="prior")(frame, guess).pixels) < 24.5
 
 
 def test_sixteen_bits_and_colour_match_like_eight_bits_and_gray(slope):
@@ -142,7 +142,7 @@ def test_sixteen_bits_and_colour_match_like_eight_bits_and_gray(slope):
 def test_a_uniform_image_has_no_disparity(dtype, level):
     image = np.full((64, 96), level, dtype)
     for minimum in (-9, 0, 7):
-        result = Match(disparities=32, minimum=minimum)(frame_of(image, image))
+        result = Match(disparities=32, min_disparity=minimum)(frame_of(image, image))
         assert np.isnan(result.pixels).all()
         assert (result.source == PixelOrigin.UNKNOWN).all()
         assert (result.confidence == 0).all()
@@ -156,7 +156,7 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
 def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, disparities, minimum, cost, seed):
     left = textured(h, w, seed).astype(np.uint8)
     right = np.roll(left, -5, axis=1)
-    match = Match(disparities=disparities, minimum=minimum, paths=paths, cost=cost)
+    match = Match(disparities=disparities, min_disparity=minimum, paths=paths, cost=cost)
     result = match(frame_of(left, right))
     known = np.isfinite(result.pixels)
     partner = (np.arange(w) - result.pixels)[known]
@@ -182,7 +182,7 @@ def known(slope):
 @pytest.mark.parametrize("paths", [4, 8])
 def test_around_a_prior_disparities_are_found_beyond_the_range_too_and_nowhere_else(slope, known, cost, paths):
     frame, truth = slope
-    near = Match(disparities=10, around=4, cost=cost, paths=paths, prior_weight=0.0)
+    near = Match(disparities=10, search_radius=4, cost=cost, paths=paths, prior_weight=0.0)
     found = near(frame, known)
     guided = np.isfinite(known.pixels)
     assert np.isnan(found.pixels[~guided]).all()
@@ -191,12 +191,12 @@ def test_around_a_prior_disparities_are_found_beyond_the_range_too_and_nowhere_e
     assert np.median(error) < 0.11
     assert (error > 1).mean() < 0.01
     assert same(found, replace(near, threads=2)(frame, known))
-    assert same(found, replace(near, disparities=48, nearer="prior")(frame, known))
+    assert same(found, replace(near, disparities=48, out_of_range="prior")(frame, known))
 
 
 def test_around_a_prior_nothing_is_found_beyond_the_farthest_of_interest(slope, known):
     frame, truth = slope
-    pixels = Match(around=4, farthest=1.5)(frame, known).pixels  # 20 px
+    pixels = Match(search_radius=4, max_depth=1.5)(frame, known).pixels  # 20 px
     assert np.nanmin(pixels) >= 20
     assert np.isnan(pixels[truth < 15]).all()
     assert np.isfinite(pixels)[(truth > 24) & np.isfinite(known.pixels)].mean() > 0.95
@@ -286,12 +286,12 @@ def test_frames_that_cannot_be_matched_are_refused(slope):
     with pytest.raises(ValueError, match="64x15"):
         Match()(frame_of(image, image))
     with pytest.raises(ValueError, match="320 px wide"):
-        Match(minimum=400)(frame)
+        Match(min_disparity=400)(frame)
     with pytest.raises(ValueError, match=r"farthest = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"):
-        Match(disparities=48, farthest=0.5)(frame)
+        Match(disparities=48, max_depth=0.5)(frame)
     small = Disparity(0, truth[:50], np.ones((50, 320), np.uint8), np.ones((50, 320), np.float32))
     with pytest.raises(ValueError, match=r"around = 4 px needs a `prior`"):
-        Match(around=4)(frame)
+        Match(search_radius=4)(frame)
     with pytest.raises(ValueError, match=r"prior must be a stages\.Disparity, not a ndarray"):
         Match()(frame, truth)
     with pytest.raises(ValueError, match=r"prior has shape \(50, 320\)"):
@@ -309,7 +309,7 @@ from stages import Match
 from tests.stages.matching.test_match_opencv import slanted_pair
 frame, _ = slanted_pair(height=64, width=100)
 results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
-results += [Match(around=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
+results += [Match(search_radius=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
 print(hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).hexdigest())
 """
 
@@ -318,7 +318,7 @@ print(hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).he
 def test_processors_without_avx512_give_the_same_bits(processor):
     frame, _ = slanted_pair(height=64, width=100)
     results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
-    results += [Match(around=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
+    results += [Match(search_radius=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
     expected = b"".join(result.pixels.tobytes() for result in results)
     command = [sys.executable, "-c", DIGEST.format(root=str(ROOT))]
     environment = {**os.environ, "NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": FEATURES[processor]}
@@ -352,13 +352,13 @@ def test_real_scenes_are_matched_better_than_by_opencv():
 @pytest.mark.parametrize("height", [24, 25, 26, 27])  # a stripe: 12 rows of 640 * 64 bytes: one half, both, none
 def test_stripes_give_the_same_bits_when_the_halves_differ(height, threads):
     frame, _ = slanted_pair(height=height, width=640)
-    whole, stripes = (Match(disparities=64, memory=memory, threads=threads)(frame) for memory in (400, 1))
+    whole, stripes = (Match(disparities=64, max_memory=memory, threads=threads)(frame) for memory in (400, 1))
     assert same(stripes, whole)
 
 
 def test_a_frame_larger_than_the_memory_is_matched_in_stripes():
     frame, truth = slanted_pair(height=256, width=1024, near=500.0, far=450.0)
-    result = Match(disparities=512, memory=20)(StereoFrame(0, frame.left, frame.right, frame.camera))
+    result = Match(disparities=512, max_memory=20)(StereoFrame(0, frame.left, frame.right, frame.camera))
     visible = np.arange(1024) >= truth + 2
     error = np.abs(result.pixels - truth)[visible]
     assert (error <= 1).mean() > 0.9

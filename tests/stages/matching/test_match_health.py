@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from flow.contracts import Severity
 from recordings.simulator import Simulation
 from stages import CheckMatches, Disparity, Mount, PixelOrigin, StereoFrame, Tilt
-from stages.stage import Severity
 from tests.bench.refining import stereo_part
 
 

@@ -66,7 +66,7 @@ def test_the_left_margin_is_matched_where_the_right_image_sees_it_and_only_there
 def test_a_negative_range_finds_points_beyond_infinity():
     frame, truth = slanted_pair()
     crossed = frame_of(frame.left[:, ::-1].copy(), frame.right[:, ::-1].copy())
-    pixels = MatchOpenCV(disparities=48, minimum=-47)(crossed).pixels
+    pixels = MatchOpenCV(disparities=48, min_disparity=-47)(crossed).pixels
     known = np.isfinite(pixels)
     assert known.mean() > 0.85
     assert np.median(np.abs(pixels + truth[:, ::-1])[known]) < 0.15
@@ -99,7 +99,7 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
 def test_any_size_gives_disparities_within_range_and_within_the_right_image(h, w, paths, disparities, minimum, seed):
     left = textured(h, w, seed).astype(np.uint8)
     right = np.roll(left, -5, axis=1)
-    result = MatchOpenCV(disparities=disparities, minimum=minimum, paths=paths)(frame_of(left, right))
+    result = MatchOpenCV(disparities=disparities, min_disparity=minimum, paths=paths)(frame_of(left, right))
     known = np.isfinite(result.pixels)
     partner = (np.arange(w) - result.pixels)[known]
     assert ((partner >= 0) & (partner <= w - 1)).all()
@@ -131,7 +131,7 @@ def test_confident_matches_are_right_more_often():
     frame, truth = slanted_pair()
     spoiled = frame.right.copy()
     spoiled[60:120, 100:200] = textured(60, 100, seed=5).astype(np.uint8)
-    result = MatchOpenCV(disparities=48, p1=0.5, p2=1, speckle_size=0)(frame_of(frame.left, spoiled))
+    result = MatchOpenCV(disparities=48, p1=0.5, p2=1, max_speckle_size=0)(frame_of(frame.left, spoiled))
     known = np.isfinite(result.pixels)
     wrong = (np.abs(result.pixels - truth) > 1)[known]
     sure = result.confidence[known] > np.median(result.confidence[known])

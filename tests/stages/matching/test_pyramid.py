@@ -31,7 +31,7 @@ def test_a_halved_frame_sees_the_same_depth():
     assert small.left.shape == (49, 66)
     camera = small.camera  # pixel 0 of the half lies between 0 and 1 of the whole
     assert (camera.fx, camera.cx, camera.cy, camera.cx_right) == (100, 29.75, 24.75, 31.25)
-    disparity = Match(disparities=16, speckle_size=0)(small)
+    disparity = Match(disparities=16, max_speckle_size=0)(small)
     depth = camera.fx * camera.baseline / (disparity.pixels + camera.cx_right - camera.cx)
     full = frame.camera
     expected = full.fx * full.baseline / (truth[:96:2, :130:2] + 0.05 + full.cx_right - full.cx)
@@ -64,7 +64,7 @@ def test_swapping_twice_is_the_frame_itself_and_disparities_stay():
     again = SwapViews()(swapped)
     assert np.array_equal(again.left, frame.left)
     assert vars(again.camera) == vars(frame.camera)
-    right = Match(disparities=32, speckle_size=0)(swapped).pixels[:, ::-1]  # of the right image's pixels
+    right = Match(disparities=32, max_speckle_size=0)(swapped).pixels[:, ::-1]  # of the right image's pixels
     assert np.nanmedian(np.abs(right - truth)[:, :100]) < 0.1
     camera = swapped.camera
     assert camera.cx_right - camera.cx == pytest.approx(frame.camera.cx_right - frame.camera.cx)
@@ -102,9 +102,9 @@ def test_sizes_that_do_not_fit_are_refused():
     frame, _ = slope_frame()
     small = np.zeros((40, 66), np.float32)
     wrong = Disparity(7, small, small.astype(np.uint8), small)
-    with pytest.raises(ValueError, match=r"Enlarge: .*\(40, 66\)"):
+    with pytest.raises(ValueError, match=r"Upsample: .*\(40, 66\)"):
         Upsample()(frame, wrong)
-    with pytest.raises(ValueError, match=r"CrossCheck: .* at the same size"):
+    with pytest.raises(ValueError, match=r"LeftRightCheck: .* at the same size"):
         LeftRightCheck()(wrong, Disparity(7, small[:30], small[:30].astype(np.uint8), small[:30]))
 
 
@@ -121,9 +121,9 @@ def test_data_of_different_times_are_refused():
     small = np.zeros((49, 66), np.float32)
     early = Disparity(7, small, small.astype(np.uint8), small)
     late = Disparity(8, small, small.astype(np.uint8), small)
-    with pytest.raises(ValueError, match="Enlarge: frame of 7 ns, disparity of 8 ns: join data"):
+    with pytest.raises(ValueError, match="Upsample: frame of 7 ns, disparity of 8 ns: join data"):
         Upsample()(frame, late)
-    with pytest.raises(ValueError, match="CrossCheck: disparity of 7 ns, backward of 8 ns: join data"):
+    with pytest.raises(ValueError, match="LeftRightCheck: disparity of 7 ns, backward of 8 ns: join data"):
         LeftRightCheck()(early, late)
 
 
@@ -140,7 +140,7 @@ def test_a_frame_too_small_to_halve_names_its_own_size_and_the_way_out():
 def test_what_the_prior_shows_nearer_than_the_range_is_unknown():
     frame, truth = slope_frame()
     prior = Disparity(7, truth, np.ones(truth.shape, np.uint8), np.ones(truth.shape, np.float32))
-    found = Match(disparities=13, speckle_size=0)(frame, prior)
+    found = Match(disparities=13, max_speckle_size=0)(frame, prior)
     assert np.isnan(found.pixels[truth > 15.5]).all()
     assert np.isfinite(found.pixels[(truth < 11) & (np.arange(131) > 30)]).mean() > 0.9
 

@@ -161,7 +161,8 @@ def test_bands_find_what_the_whole_range_finds(slope, paths):
     either = np.isfinite(one.pixels) | np.isfinite(other.pixels)
     assert (np.abs(one.pixels - other.pixels) < 0.3)[visible & either].mean() > 0.98
     others = [
-        Match(disparities=192, paths=paths, band_height=16, threads=t, memory=m) for t, m in ((2, 400), (1, 1), (2, 1))
+        Match(disparities=192, paths=paths, band_height=16, threads=t, max_memory=m)
+        for t, m in ((2, 400), (1, 1), (2, 1))
     ]
     assert all(same(each(frame, known(truth)), other) for each in others)
 
@@ -178,5 +179,5 @@ def test_a_match_that_the_prior_has_outside_its_bands_range_is_unknown(slope):
 def test_bands_need_a_prior(slope):
     with pytest.raises(ValueError, match=r"Match.band_height = 16 px needs a `prior`"):
         Match(band_height=16)(slope[0])
-    with pytest.raises(ValueError, match=r"band_height means nothing with Match.around"):
-        Match(band_height=16, around=4)
+    with pytest.raises(ValueError, match=r"band_height means nothing with Match.search_radius"):
+        Match(band_height=16, search_radius=4)

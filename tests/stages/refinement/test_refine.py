@@ -37,7 +37,7 @@ def box():
 @pytest.mark.parametrize("parameters", [{}, {"fill": "wls"}])
 def test_noise_falls_and_holes_close_on_the_right_side_of_edges(box, parameters):
     frame, matches, truth = box
-    refined = Refine(superpixels=200, smallest=1, **parameters)(frame, matches)
+    refined = Refine(superpixels=200, min_superpixel_size=1, **parameters)(frame, matches)
     error = np.abs(refined.pixels - truth)
     measured = np.isfinite(matches.pixels)
     assert np.sqrt(np.mean(error[measured] ** 2)) < 0.5 * np.sqrt(np.mean((matches.pixels - truth)[measured] ** 2))
@@ -48,7 +48,7 @@ def test_noise_falls_and_holes_close_on_the_right_side_of_edges(box, parameters)
 
 def test_every_pixel_says_where_it_comes_from(box):
     frame, matches, _ = box
-    refined = Refine(superpixels=200, smallest=1, fit_radius=0, correlation=0)(frame, matches)
+    refined = Refine(superpixels=200, min_superpixel_size=1, subpixel_radius=0, min_correlation=0)(frame, matches)
     known, matched = np.isfinite(refined.pixels), np.isfinite(matches.pixels)
     near = np.abs(refined.pixels - matches.pixels) <= 0.5
     assert near[matched].mean() > 0.9
@@ -90,12 +90,14 @@ def test_a_match_that_is_replaced_is_called_plane_and_loses_its_confidence(media
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80] = 30
     matches = Disparity(5, pixels, source, confidence)
-    replaced = Refine(near=1000, plane_weight=1, inlier_share=0, median=median, correlation=0)(frame, matches)
+    replaced = Refine(max_correction=1000, plane_weight=1, min_inlier_share=0, median_size=median, min_correlation=0)(
+        frame, matches
+    )
     assert replaced.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert replaced.source[60, 80] == PixelOrigin.PLANE
     assert replaced.confidence[60, 80] < 0.85
     assert (replaced.source == PixelOrigin.MEASURED).sum() == HEIGHT * WIDTH - 1
-    kept = Refine(median=median, bilateral_radius=0, edge_radius=0, correlation=0)(frame, matches)
+    kept = Refine(median_size=median, bilateral_radius=0, edge_radius=0, min_correlation=0)(frame, matches)
     assert (kept.pixels[60, 80], kept.source[60, 80]) == (30, PixelOrigin.MEASURED)
     assert kept.confidence[60, 80] == np.float32(0.97)
 
@@ -104,7 +106,9 @@ def test_a_lone_match_has_no_median_and_stays():
     frame, pixels, source, confidence = flat_scene(5.0)
     pixels[50:70, 60:100], source[50:70, 60:100] = np.nan, 0
     pixels[60, 80], source[60, 80] = 20, 1
-    refine = Refine(near=1000, fill="none", plane_fill=False, superpixels=1, smallest=1, inlier_share=1)
+    refine = Refine(
+        max_correction=1000, fill="none", plane_fill=False, superpixels=1, min_superpixel_size=1, min_inlier_share=1
+    )
     refined = refine(frame, Disparity(5, pixels, source, confidence))
     assert refined.pixels[60, 80] == pytest.approx(20, abs=0.01)
 
@@ -114,9 +118,9 @@ def test_a_match_of_little_confidence_counts_as_unknown():
     pixels[30:60, 40:80], confidence[30:60, 40:80] = 40, 0.3
     matches = Disparity(5, pixels, source, confidence)
     bare = {"fill": "none", "plane_fill": False}
-    doubted = Refine(trusted=0.31, **bare)(frame, matches)
+    doubted = Refine(min_confidence=0.31, **bare)(frame, matches)
     assert np.array_equal(np.isnan(doubted.pixels), confidence < 0.31)
-    assert np.isfinite(Refine(trusted=0.3, **bare)(frame, matches).pixels).all()
+    assert np.isfinite(Refine(min_confidence=0.3, **bare)(frame, matches).pixels).all()
 
 
 def test_a_plane_steeper_than_allowed_fills_nothing():
@@ -125,10 +129,12 @@ def test_a_plane_steeper_than_allowed_fills_nothing():
     hole = np.s_[50:55, 70:75]
     pixels[hole], source[hole] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
-    filled = Refine(superpixels=60, smallest=1, fill="none", slope=0.45)(frame, matches)
+    filled = Refine(superpixels=60, min_superpixel_size=1, fill="none", max_gradient=0.45)(frame, matches)
     assert (filled.source[hole] == PixelOrigin.PLANE).all()
     assert np.abs(filled.pixels[hole] - (8 + 0.4 * np.arange(70, 75))).max() < 0.1
-    assert np.isnan(Refine(superpixels=60, smallest=1, fill="none", slope=0.35)(frame, matches).pixels[hole]).all()
+    assert np.isnan(
+        Refine(superpixels=60, min_superpixel_size=1, fill="none", max_gradient=0.35)(frame, matches).pixels[hole]
+    ).all()
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -138,7 +144,7 @@ def test_a_plane_is_not_followed_beyond_the_range_of_all_matches(side):
     pixels[:, 150:], source[:, 150:] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
     # One superpixel: its plane would go on to the image's right border.
-    filled = Refine(superpixels=1, smallest=1, fill="none", median=0)(frame, matches)
+    filled = Refine(superpixels=1, min_superpixel_size=1, fill="none", median_size=0)(frame, matches)
     assert np.isfinite(filled.pixels[:, :149]).all()
     assert np.isnan(filled.pixels[:, 151:]).all()
 
@@ -155,7 +161,7 @@ def test_a_disparity_beyond_the_image_is_no_match(box, bad):
 
 def test_nothing_is_invented_outside_the_right_image(box):
     frame, matches, _ = box
-    refined = Refine(superpixels=200, smallest=1, fill_margin=3)(frame, matches)
+    refined = Refine(superpixels=200, min_superpixel_size=1, max_extrapolation=3)(frame, matches)
     assert np.isnan(refined.pixels[:, :12]).all()
 
 
@@ -165,7 +171,7 @@ def test_a_match_far_from_its_plane_is_not_overwritten(box):
     stone = np.s_[100:106, 120:126]
     pixels[stone], source[stone], confidence[stone] = truth[stone] + 6, PixelOrigin.MEASURED, 0.8
     matches = replace(matches, pixels=pixels, source=source, confidence=confidence)
-    refined = Refine(superpixels=60, smallest=1)(frame, matches)
+    refined = Refine(superpixels=60, min_superpixel_size=1)(frame, matches)
     assert np.abs(refined.pixels[101:105, 121:125] - truth[101:105, 121:125] - 6).max() < 1
 
 
@@ -180,7 +186,7 @@ def bits(disparity):
 def test_the_stamp_decides_every_bit(box, parameters):
     frame, matches, _ = box
     # Of one draw another seed makes another plane; so sure of matches, only those of surfaces are accepted.
-    refine = Refine(smallest=1, hypotheses=1, **parameters)
+    refine = Refine(min_superpixel_size=1, hypotheses=1, **parameters)
     again, other = (refine(replace(frame, stamp=n), replace(matches, stamp=n)) for n in (5, 6))
     first = refine(frame, matches)
     assert bits(again) == bits(first)
@@ -196,7 +202,7 @@ def test_two_frames_at_once_give_the_bits_of_one_after_the_other(box):
     upside_down = replace(frame, left=frame.left[::-1].copy(), right=frame.right[::-1].copy())
     jobs = [(frame, matches), (upside_down, turned)] * 6
     for parameters in ({"threads": 1}, {"threads": 2}, {"fill": "wls"}):
-        refine = Refine(superpixels=200, smallest=1, **parameters)
+        refine = Refine(superpixels=200, min_superpixel_size=1, **parameters)
         alone = [bits(refine(*job)) for job in jobs[:2]]
         with ThreadPoolExecutor(2) as workers:
             together = [bits(result) for result in workers.map(lambda job, stage=refine: stage(*job), jobs)]
@@ -217,9 +223,9 @@ def test_planes_of_surfaces_reach_where_superpixels_have_no_match():
     truth = pixels[hole].copy()
     pixels[hole], source[hole] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
-    bare = Refine(superpixels=200, smallest=1, fill="none", surface=0)(frame, matches)
+    bare = Refine(superpixels=200, min_superpixel_size=1, fill="none", surface_size=0)(frame, matches)
     assert np.isnan(bare.pixels[hole]).mean() > 0.5
-    wide = Refine(superpixels=200, smallest=1, fill="none", surface=50)(frame, matches)
+    wide = Refine(superpixels=200, min_superpixel_size=1, fill="none", surface_size=50)(frame, matches)
     assert (wide.source[hole] == PixelOrigin.PLANE).all()
     assert np.abs(wide.pixels[hole] - truth).max() < 0.05
 
@@ -274,7 +280,7 @@ def test_a_plane_counts_matches_by_their_confidence(parameters):
     pixels[doubted], confidence[doubted] = 8.4, 0.5
     hole = np.s_[50:55, 70:75]
     pixels[hole], source[hole], confidence[hole] = np.nan, 0, 0
-    refine = Refine(median=0, bilateral_radius=0, edge_radius=0, **parameters)
+    refine = Refine(median_size=0, bilateral_radius=0, edge_radius=0, **parameters)
     filled = refine(frame, Disparity(5, pixels, source, confidence))
     half = doubted[np.isfinite(pixels)].mean()
     mean = (8 * (1 - half) + 8.4 * half * 0.5) / (1 - half + half * 0.5)
@@ -287,7 +293,7 @@ def test_a_surface_draws_half_as_far_as_a_superpixel_and_what_it_agrees_with_is_
     pixels[30, 30], source[30, 30] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
     steps = {"median": 0, "bilateral_radius": 0, "edge_radius": 0, "correlation": 0}
-    drawn = Refine(plane_weight=1, near=1, **steps, **SURFACES_ONLY)(frame, matches)
+    drawn = Refine(plane_weight=1, max_correction=1, **steps, **SURFACES_ONLY)(frame, matches)
     assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert drawn.pixels[60, 90] == np.float32(8.7)
     assert drawn.confidence[60, 70] > drawn.confidence[60, 90] > 0.9
@@ -299,7 +305,9 @@ def test_what_a_superpixel_filled_is_no_evidence_for_a_surface():
     holes = np.random.default_rng(6).random(SHAPE) < 0.3
     holes[:, 60:] = True  # the rest is three eighths of the image, and matched by seven tenths
     pixels[holes], source[holes] = np.nan, 0
-    refine = Refine(superpixels=48, smallest=1, surface=48, fill="none", bilateral_radius=0, edge_radius=0)
+    refine = Refine(
+        superpixels=48, min_superpixel_size=1, surface_size=48, fill="none", bilateral_radius=0, edge_radius=0
+    )
     filled = refine(frame, Disparity(5, pixels, source, confidence))
     assert np.isfinite(filled.pixels[:, :59]).mean() > 0.95
     assert np.isnan(filled.pixels[:, 62:]).all()
@@ -309,7 +317,7 @@ def test_a_match_moves_to_its_median_where_that_is_near():
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80], pixels[60, 100] = 8.9, 11
     bare = {"plane_weight": 0, "surface": 0, "bilateral_radius": 0, "edge_radius": 0}
-    moved = Refine(median=5, near=1, **bare)(frame, Disparity(5, pixels, source, confidence))
+    moved = Refine(median_size=5, max_correction=1, **bare)(frame, Disparity(5, pixels, source, confidence))
     assert (moved.pixels[60, 80], moved.pixels[60, 100]) == (8, 11)
 
 
@@ -319,7 +327,7 @@ def test_wls_counts_matches_by_their_confidence():
     pixels[hole], source[hole], confidence[hole] = np.nan, 0, 0
     pixels[:, 90:], confidence[:, 90:] = 9, 0.5
     doubted = Refine(
-        fill="wls", plane_weight=0, plane_fill=False, surface=0, median=0, bilateral_radius=0, edge_radius=0
+        fill="wls", plane_weight=0, plane_fill=False, surface_size=0, median_size=0, bilateral_radius=0, edge_radius=0
     )
     middle = doubted(frame, Disparity(5, pixels, source, confidence)).pixels[60, 79:81]
     equal = np.where(confidence > 0, np.float32(1), np.float32(0))
@@ -333,7 +341,9 @@ def test_wls_fills_no_farther_than_evidence_reaches():
     hole = np.s_[30:, 60:150]
     pixels[hole], source[hole] = np.nan, 0
     pixels[:20, 10:150], source[:20, 10:150] = np.nan, 0
-    refine = Refine(fill="wls", fill_reach=20, fill_margin=6, plane_fill=False, bilateral_radius=0, edge_radius=0)
+    refine = Refine(
+        fill="wls", max_fill_distance=20, max_extrapolation=6, plane_fill=False, bilateral_radius=0, edge_radius=0
+    )
     known = np.isfinite(refine(frame, Disparity(5, pixels, source, confidence)).pixels)
     row = known[70].nonzero()[0]
     assert row.tolist() == [*range(80), *range(130, 160)]
@@ -341,7 +351,7 @@ def test_wls_fills_no_farther_than_evidence_reaches():
 
 
 @pytest.mark.parametrize(
-    "refine", [Refine(), paper_stages()[1], Refine(fill="none", bilateral_radius=0, edge_radius=0, median=0)]
+    "refine", [Refine(), paper_stages()[1], Refine(fill="none", bilateral_radius=0, edge_radius=0, median_size=0)]
 )
 def test_no_match_at_all_stays_no_disparity(box, refine):
     frame, matches, _ = box
@@ -362,7 +372,7 @@ def test_a_disparity_of_another_size_is_refused(box):
 @pytest.mark.parametrize("parameters", [{}, {"fill": "wls"}, {"surface": 0, "median": 3}])
 def test_two_threads_give_the_same_bits(box, parameters):
     frame, matches, _ = box
-    one, two = (Refine(smallest=30, threads=n, **parameters)(frame, matches) for n in (1, 2))
+    one, two = (Refine(min_superpixel_size=30, threads=n, **parameters)(frame, matches) for n in (1, 2))
     assert bits(one) == bits(two)
 
 
@@ -370,13 +380,13 @@ def test_without_planes_no_superpixels_are_made(box):
     frame, matches, _ = box
     assert Refine(plane_weight=0, plane_fill=False)(frame, matches).segments is None
     for parameters in ({"plane_weight": 0.0}, {"plane_fill": False}):
-        assert Refine(superpixels=200, smallest=1, **parameters)(frame, matches).segments.max() > 100
+        assert Refine(superpixels=200, min_superpixel_size=1, **parameters)(frame, matches).segments.max() > 100
 
 
 def test_what_an_object_hides_is_never_given_the_object(box):
     frame, matches, truth = box
     # one superpixel over all: its plane would be that of the box or of the ground, wherever there is no match
-    refined = Refine(superpixels=12, smallest=1, inlier_share=0, valid_share=0)(frame, matches)
+    refined = Refine(superpixels=12, min_superpixel_size=1, min_inlier_share=0, min_valid_share=0)(frame, matches)
     hidden = np.s_[32:88, 36:58]
     assert (refined.pixels[hidden] < 0.5 * (40 + truth[hidden])).all()
 
@@ -384,7 +394,7 @@ def test_what_an_object_hides_is_never_given_the_object(box):
 def test_nothing_is_filled_above_all_that_is_known():
     frame, pixels, source, confidence = flat_scene()
     pixels[:60, 30:130], source[:60, 30:130] = np.nan, 0  # a sky between two hills
-    refined = Refine(fill_margin=5)(frame, Disparity(5, pixels, source, confidence))
+    refined = Refine(max_extrapolation=5)(frame, Disparity(5, pixels, source, confidence))
     assert np.isnan(refined.pixels[:54, 46:114]).all()
     assert np.isfinite(refined.pixels[56:, 30:130]).all()
 
@@ -397,10 +407,10 @@ def test_matches_of_a_burnt_out_sky_do_not_count():
     image[:50] += noise
     pixels[:50] = 60
     sky = StereoFrame(5, image, image, frame.camera)
-    refined = Refine(fill_margin=5)(sky, Disparity(5, pixels, source, confidence))
+    refined = Refine(max_extrapolation=5)(sky, Disparity(5, pixels, source, confidence))
     assert np.isnan(refined.pixels[:42]).all()  # the last rows show the ground in their windows, and 5 px are margin
     assert (refined.pixels[50:] < 9).all()
-    assert (Refine(burnt_out=256)(sky, Disparity(5, pixels, source, confidence)).pixels[:40] > 50).all()
+    assert (Refine(saturation_level=256)(sky, Disparity(5, pixels, source, confidence)).pixels[:40] > 50).all()
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -420,7 +430,7 @@ def test_a_match_that_the_images_do_not_bear_out_is_a_guess():
     left[:60], right[:60] = rng.integers(98, 103, (2, 60, WIDTH))
     frame = StereoFrame(5, left, right, StereoCamera(300, 300, 80, 60, 0.1, WIDTH, HEIGHT))
     _, pixels, source, confidence = flat_scene()
-    refined, fitted = (Refine(fit_radius=r)(frame, Disparity(5, pixels, source, confidence)) for r in (0, 2))
+    refined, fitted = (Refine(subpixel_radius=r)(frame, Disparity(5, pixels, source, confidence)) for r in (0, 2))
     assert (refined.source[:50] == PixelOrigin.FILLED).all()
     assert refined.confidence[:50].max() < 0.75
     assert (refined.source[70:, 15:] == PixelOrigin.MEASURED).all()

@@ -41,7 +41,7 @@ def test_a_surface_that_faces_the_camera_is_not_drawn_to_whole_pixels(fraction):
     left, right = shifted(true)
     frame = StereoFrame(0, left, right, StereoCamera(500, 500, WIDTH / 2, HEIGHT / 2, 0.2, WIDTH, HEIGHT))
     matched = Match(disparities=48)(frame)
-    refined, unfitted = (Refine(fit_radius=radius)(frame, matched) for radius in (2, 0))
+    refined, unfitted = (Refine(subpixel_radius=radius)(frame, matched) for radius in (2, 0))
     inner = np.s_[10:-10, 60:-10]
     off = [float(np.median(each.pixels[inner])) - true for each in (refined, unfitted)]
     assert abs(off[0]) < 0.05

@@ -176,7 +176,7 @@ def test_an_edge_is_a_step_if_and_only_if_it_is_higher_than_the_limit(
     """A terrace across a slope, seen from below or above: its edge is a step, the rest of it is not."""
     x, y = grid()
     scene = map_of(np.tan(np.deg2rad(degrees)) * x + np.where(y > 2, step, 0.0))
-    result = Binarise(max_step=limit, margin=0.0, max_slope=1.5, max_roughness=1.0)(
+    result = Binarise(max_step=limit, height_margin=0.0, max_slope=1.5, max_roughness=1.0)(
         TerrainFeatures(max_step=limit)(scene)
     )
     assert (result.reason[np.abs(y - 2.05) < 0.05] == CellReason.STEP).all() == (step > limit)
@@ -217,7 +217,7 @@ def test_the_cells_beside_an_obstacle_are_hazards_as_far_as_told() -> None:
     x, y = grid()
     rock = (np.abs(x - 2) < 0.2) & (np.abs(y - 2) < 0.2)
     for beside in (0.0, 0.05, 0.1):
-        result = Binarise(beside=beside, max_slope=1.5)(TerrainFeatures()(map_of(np.where(rock, 0.4, 0.0))))
+        result = Binarise(hazard_margin=beside, max_slope=1.5)(TerrainFeatures()(map_of(np.where(rock, 0.4, 0.0))))
         around = (np.abs(x - 2) < 0.2 + beside) & (np.abs(y - 2) < 0.2 + beside) & ~rock
         assert (result.cells[around] == Cell.HAZARD).all()
         np.testing.assert_array_equal(result.reason == CellReason.BESIDE, around)
@@ -263,8 +263,8 @@ def test_the_low_back_of_a_rock_belongs_to_it_and_bumps_apart_from_it_do_not() -
     touching = ~rock & (np.abs(x - 1.9) < 0.1) & (y > 2.4) & (y < 2.7)
     scene = map_of(height + 0.08 * far + 0.04 * touching)
     back = rock & (height > 0.1) & (height < 0.15)
-    whole = Binarise(beside=0.0)(TerrainFeatures()(scene))
-    peaks_only = Binarise(beside=0.0, max_slope=1.0)(TerrainFeatures(skirt=1.0)(scene))
+    whole = Binarise(hazard_margin=0.0)(TerrainFeatures()(scene))
+    peaks_only = Binarise(hazard_margin=0.0, max_slope=1.0)(TerrainFeatures(skirt=1.0)(scene))
     assert (whole.reason[back] == CellReason.STEP).all()
     assert (whole.cells[rock & (height < 0.03)] == Cell.FREE).mean() > 0.9
     assert not (

@@ -48,7 +48,7 @@ def scattered(seed: int, n: int = 3000, extent: float = 9.0) -> Array:
 @given(seed=st.integers(0, 2**32 - 1), resolution=st.sampled_from([0.05, 0.1, 0.3]), region=st.sampled_from([4.0, 8.0]))
 def test_every_point_within_the_region_is_counted_once(seed: int, resolution: float, region: float) -> None:
     cloud = cloud_of(scattered(seed))
-    grid = Voxelise(resolution=resolution, region=region)(cloud)
+    grid = Voxelise(resolution=resolution, max_range=region)(cloud)
     within = np.hypot(*cloud.points[:, :2].T.astype(np.float64)) <= region
     assert grid.layers["count"].sum() == within.sum()
     heights = np.nansum(grid.layers["elevation"].astype(np.float64) * grid.layers["count"])
@@ -80,7 +80,7 @@ def test_the_order_of_points_moves_at_most_the_last_bits_and_one_order_gives_the
 def test_the_layers_of_one_cell_are_those_of_its_points() -> None:
     heights = np.array([0.1, 0.2, 0.6])
     points = np.column_stack([np.full(3, 2.01), np.full(3, -1.02), heights])
-    grid = Voxelise(percentiles=(50.0, 75.0), scatter=1.0)(cloud_of(points, sigma=0.0))
+    grid = Voxelise(percentiles=(50.0, 75.0), scatter_share=1.0)(cloud_of(points, sigma=0.0))
     row, col = int((-1.02 - grid.origin[1]) / 0.05), int((2.01 - grid.origin[0]) / 0.05)
     value = {name: float(layer[row, col]) for name, layer in grid.layers.items()}
     assert value == pytest.approx(
@@ -150,7 +150,9 @@ def test_a_hole_stays_a_hole_and_an_empty_cloud_is_an_empty_map_of_the_usual_sha
         np.testing.assert_array_equal(np.isnan(full.layers[name]), full.layers["count"] == 0)
 
 
-PURE = Voxelise(tails=1.0, correlated=1.0, systematic=0.0, scatter=0.0, bend=0.0, rim=0.0)
+PURE = Voxelise(
+    tail_factor=1.0, correlated_points=1.0, systematic_share=0.0, scatter_share=0.0, curvature_share=0.0, rim_share=0.0
+)
 
 
 @pytest.mark.parametrize("slope", [-0.1, 0.0, 0.3])
@@ -260,7 +262,7 @@ def rows_apart(sigma: float) -> PointCloud:
 
 def test_a_cell_that_points_missed_by_their_own_uncertainty_is_known_by_them() -> None:
     cloud = rows_apart(sigma=0.06)
-    bare, reached = Voxelise()(cloud).layers, Voxelise(reach=2.0)(cloud).layers
+    bare, reached = Voxelise()(cloud).layers, Voxelise(splat_sigmas=2.0)(cloud).layers
     own = bare["count"] > 0
     gained = (reached["count"] > 0) & ~own
     assert own.sum() == 5
@@ -271,7 +273,7 @@ def test_a_cell_that_points_missed_by_their_own_uncertainty_is_known_by_them() -
     assert (reached["count"][gained] == 0.5).all()
     assert np.abs(reached["elevation"][gained]).max() < 0.05
     assert reached["variance"][gained].min() > 0
-    near = Voxelise(reach=2.0, reach_limit=0.05)(cloud).layers["count"] > 0
+    near = Voxelise(splat_sigmas=2.0, max_splat=0.05)(cloud).layers["count"] > 0
     assert gained[near & ~own].all()
     assert own.sum() < near.sum() < own.sum() + gained.sum()
 
@@ -284,11 +286,11 @@ def test_a_cell_is_reached_by_two_places_of_points_that_reach_half_a_cell(
     points: int, x: float, reach: float, known: int
 ) -> None:
     cloud = cloud_of(np.tile([x, 0.02, 0.0], (points, 1)), reach / 2)
-    assert (Voxelise(reach=2.0)(cloud).layers["count"] > 0).sum() == known
+    assert (Voxelise(splat_sigmas=2.0)(cloud).layers["count"] > 0).sum() == known
 
 
 def test_only_measured_points_reach_beyond_their_cell() -> None:
     cloud = rows_apart(sigma=0.06)
     plane = replace(cloud, source=np.full(len(cloud.points), PixelOrigin.PLANE, np.uint8))
     for name, layer in Voxelise()(plane).layers.items():
-        np.testing.assert_array_equal(Voxelise(reach=2.0)(plane).layers[name], layer)
+        np.testing.assert_array_equal(Voxelise(splat_sigmas=2.0)(plane).layers[name], layer)

@@ -1,4 +1,4 @@
-"""Assess measures what stands above the ground, the same whatever grid it lies in; its kernels equal plain NumPy."""
+"""TerrainFeatures measures what stands above the ground, the same whatever grid it lies in; kernels equal NumPy."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(
 
 
 def test_a_mean_over_frames_is_weighted_by_inverse_variance():
-    fuse = Fuse(tilt_sigma=0.0, height_sigma=0.0, position=0.0)
+    fuse = Fuse(tilt_sigma=0.0, height_sigma=0.0, position_sigma=0.0)
     clouds = [
         drive(0, flat, at=(0.0, 0.0, 0.0)),
         drive(1, lambda x, y: flat(x, y) + 0.01, sigma=0.04, at=(0.0, 0.0, 0.0)),
@@ -80,14 +80,14 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance():
     both = np.isfinite(one) & np.isfinite(other)
     assert both.sum() > 10_000
     np.testing.assert_allclose(elevation[both], (0.01 * share)[both], atol=1e-6)
-    variance = (1 - fuse.shared) / (1 / one + 1 / other) + fuse.shared * np.minimum(one, other)
+    variance = (1 - fuse.shared_share) / (1 / one + 1 / other) + fuse.shared_share * np.minimum(one, other)
     np.testing.assert_allclose(terrain.layers["variance"][40:360, 40:360][both], variance[both], rtol=2e-3)
 
 
 def test_a_frame_is_surer_of_level_cells_than_of_steep_ones_for_its_place_is_not_sure():
     spread, steep = {}, 0.2
     for position in (0.0, 0.05):
-        terrain = Fuse(position=position)(*drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0)), MOUNT)
+        terrain = Fuse(position_sigma=position)(*drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0)), MOUNT)
         spread[position] = terrain.layers["variance"]
     known = np.isfinite(spread[0.0])
     added = float(np.mean((spread[0.05] - spread[0.0])[known]))
@@ -95,14 +95,14 @@ def test_a_frame_is_surer_of_level_cells_than_of_steep_ones_for_its_place_is_not
 
 
 def test_many_frames_of_one_place_do_not_make_it_known_beyond_what_they_share():
-    fuse = Fuse(alignment=0.01, position=0.0)
+    fuse = Fuse(alignment_sigma=0.01, position_sigma=0.0)
     for frame in range(40):
         cloud, pose = drive(frame, at=(0.0, 0.0, 0.3))
         terrain = fuse(cloud, pose, MOUNT)
         if frame == 0:
             single = terrain.layers["variance"]
     known = (terrain.layers["frames"] > 35) & np.isfinite(single)
-    assert np.all(terrain.layers["variance"][known] >= 0.99 * fuse.shared * np.nanmin(single))
+    assert np.all(terrain.layers["variance"][known] >= 0.99 * fuse.shared_share * np.nanmin(single))
     assert np.all(terrain.layers["variance"][known] <= single[known])
 
 
@@ -182,7 +182,7 @@ def test_one_uncertain_frame_does_not_overturn_what_many_saw():
 
 
 def test_the_windows_laid_over_each_other_are_the_whole_map():
-    fuse, whole = Fuse(region=7.0, window=17.0), {}
+    fuse, whole = Fuse(max_range=7.0, window=17.0), {}
     for frame in range(12):
         cloud, pose = drive(frame, at=(1.5 * frame - 9, 0.3 * frame, 0.2))
         terrain = fuse(cloud, pose, MOUNT)
@@ -252,7 +252,7 @@ def test_what_refinement_made_up_is_no_evidence_for_the_map():
 
 def test_a_window_that_cannot_hold_what_a_frame_changes_is_refused():
     with pytest.raises(ValueError, match=r"Fuse\.window must be at least 19 m, not 15 m"):
-        Fuse(region=8.0, window=15.0)
+        Fuse(max_range=8.0, window=15.0)
 
 
 TRACK = """
@@ -262,7 +262,7 @@ from stages import Fuse, PointCloud, Pose, Transform
 def peak():
     with open("/proc/self/status") as status:
         return next(int(line.split()[1]) / 1024 for line in status if line.startswith("VmHWM"))
-before, fuse, step = peak(), Fuse(region=11.0, window=25.0), 8.0
+before, fuse, step = peak(), Fuse(max_range=11.0, window=25.0), 8.0
 x, y = (axis.ravel() + 0.025 for axis in np.meshgrid(np.arange(-4, 4, 0.05), np.arange(-10, 10, 0.05)))
 points = np.column_stack([x, y, 0.1 * np.sin(x)]).astype(np.float32)
 n = len(points)

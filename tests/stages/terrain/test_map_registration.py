@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import Severity
 from stages import Fuse, Pose, Transform
-from stages.stage import Severity
 from stages.terrain.map_registration import placement
 from tests.stages.terrain.region_scene import MOUNT, START, drive, flat, part
 

@@ -45,7 +45,7 @@ def mapped(
     frame: StereoFrame, disparity: Disparity, tilt: Tilt, camera_height: float, reach: float = 0.0
 ) -> tuple[ElevationMap, NavigationMap]:
     cloud = Level(camera_height=camera_height)(Clean()(Reproject()(frame, disparity)), tilt, Mount(7, np.eye(3)))
-    elevation = TerrainFeatures()(Voxelise(reach=reach)(cloud))
+    elevation = TerrainFeatures()(Voxelise(splat_sigmas=reach)(cloud))
     return elevation, Binarise()(elevation)
 
 
