@@ -1,5 +1,4 @@
 """TerrainFeatures: what terrain would do to a rover, as layers of the elevation map (paper section 4, slope filtering).
-filtering").
 
 The trick is to measure everything against the ground and not against gravity: a rise against what lies within a wheel's
 reach, a height against the plane between the wheels, roughness off the footprint's plane. The ground is found by
