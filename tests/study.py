@@ -26,8 +26,8 @@ from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stage, stereo_p
 from tests.bench.stereo_scores import errors, rows_filled
 
 PLAIN: dict[str, Any] = {
-    "median": 0, "plane_weight": 0, "plane_fill": False, "surface": 0, "bilateral_radius": 0, "edge_radius": 0,
-    "trusted": 0, "fit_radius": 0,
+    "median_size": 0, "plane_weight": 0, "plane_fill": False, "surface_size": 0, "bilateral_radius": 0, "edge_radius": 0,
+    "min_confidence": 0, "subpixel_radius": 0,
 }  # fmt: skip
 SEEDS = (1, 2, 3)
 ABUNDANCES = (0.05, 0.15, 0.10)
@@ -152,11 +152,13 @@ STEPS: dict[str, Chain] = {
     "coarse to fine, filled": refined("matched", **PLAIN),
     "+ view from the right": refined("checked", **PLAIN),
     "+ matched again about that": refined("checked_again", **PLAIN),
-    "+ doubtful matches dropped": refined("checked_again", **{**PLAIN, "trusted": 0.5}),
-    "+ fractions from brightness": refined("checked_again", **{**PLAIN, "trusted": 0.5, "fit_radius": 2}),
-    "+ median": refined("checked_again", **{**PLAIN, "trusted": 0.5, "fit_radius": 2, "median": 3}),
-    "+ planes of superpixels": refined("checked_again", surface=0, plane_fill=False, bilateral_radius=0, edge_radius=0),
-    "+ they fill holes": refined("checked_again", surface=0, bilateral_radius=0, edge_radius=0),
+    "+ doubtful matches dropped": refined("checked_again", **{**PLAIN, "min_confidence": 0.5}),
+    "+ fractions from brightness": refined("checked_again", **{**PLAIN, "min_confidence": 0.5, "subpixel_radius": 2}),
+    "+ median": refined("checked_again", **{**PLAIN, "min_confidence": 0.5, "subpixel_radius": 2, "median_size": 3}),
+    "+ planes of superpixels": refined(
+        "checked_again", surface_size=0, plane_fill=False, bilateral_radius=0, edge_radius=0
+    ),
+    "+ they fill holes": refined("checked_again", surface_size=0, bilateral_radius=0, edge_radius=0),
     "+ planes of surfaces": refined("checked_again", bilateral_radius=0, edge_radius=0),
     "+ bilateral filter": refined("checked_again", edge_radius=0),
     "+ edges as in the image: rover": lambda streams, _: streams["disparity"],
@@ -172,12 +174,12 @@ VARIANTS: dict[str, Chain] = {
     "rover, matched a third time": remade(matched_again=thrice),
     "rover with half the range": part_of_range(2),
     "rover with a third of the range": part_of_range(3),
-    "rover, fractions from matching": refined("checked_again", fit_radius=0),
-    "rover without planes": refined("checked_again", plane_weight=0, plane_fill=False, surface=0),
-    "rover without surfaces": refined("checked_again", surface=0),
+    "rover, fractions from matching": refined("checked_again", subpixel_radius=0),
+    "rover without planes": refined("checked_again", plane_weight=0, plane_fill=False, surface_size=0),
+    "rover without surfaces": refined("checked_again", surface_size=0),
     "rover, planes draw more: 0.7": refined("checked_again", plane_weight=0.7),
     "rover, planes draw less: 0.3": refined("checked_again", plane_weight=0.3),
-    "rover, planes replace matches": refined("checked_again", near=1000, plane_weight=1, inlier_share=0),
+    "rover, planes replace matches": refined("checked_again", max_correction=1000, plane_weight=1, min_inlier_share=0),
     "rover, holes filled along rows": by_rows,
     "rover, holes filled by WLS": refined("checked_again", fill="wls"),
     "rover, bilateral radius 6": refined("checked_again", bilateral_radius=6),
@@ -235,7 +237,10 @@ def print_skies(cases: list[Case]) -> None:
     shares: dict[str, list[tuple[float, float]]] = {}
     for case in cases:
         streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
-        for name, chain in (("asked", refined("checked_again")), ("not", refined("checked_again", correlation=0.0))):
+        for name, chain in (
+            ("asked", refined("checked_again")),
+            ("not", refined("checked_again", min_correlation=0.0)),
+        ):
             measured = chain(streams, case).source == PixelOrigin.MEASURED
             known = np.isfinite(case.truth) & (case.mask == 255)
             shares.setdefault(name, []).append((measured[case.mask == 0].mean(), measured[known].mean()))

@@ -330,7 +330,8 @@ def test_every_real_log_is_described_or_refused_in_a_sentence() -> None:
             continue
         assert "missing: left" in text
         assert not [item for _, _, item in items_of(path) if isinstance(item, Exception)], path
-    assert (len(paths), len(refused)) == (232, 22)
+    assert len(paths) >= 232
+    assert len(refused) <= len(paths) // 10
     assert all("holds no messages" in text or "is a ROS 1 bag" in text or "is empty" in text for text in refused)
 
 

@@ -210,7 +210,7 @@ def test_the_bits_depend_neither_on_threads_nor_on_memory_nor_on_company(slope, 
     with ThreadPoolExecutor(3) as workers:
         others = list(workers.map(lambda stage: stage(frame), [replace(match, threads=t) for t in (1, 2, 3, 2)]))
     # 200 rows of 320 * 64 bytes are 4 MB: stripes of 25 rows
-    others += [replace(match, memory=1, threads=threads)(frame) for threads in (1, 2)]
+    others += [replace(match, max_memory=1, threads=threads)(frame) for threads in (1, 2)]
     assert all(same(other, alone) for other in others)
 
 
@@ -272,7 +272,7 @@ def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
         ({"p2": 220}, "at most 196 with cost census\\+gradient"),
         ({"paths": 5}, "must be one of 4, 8"),
         ({"cost": "sad"}, "must be one of census, census\\+gradient"),
-        ({"farthest": "12m"}, "farthest must be a number of m, not '12m'"),
+        ({"max_depth": "12m"}, "max_depth must be a number of m, not '12m'"),
     ],
 )
 def test_parameters_that_cannot_work_are_refused(parameters, message):
@@ -287,7 +287,7 @@ def test_frames_that_cannot_be_matched_are_refused(slope):
         Match()(frame_of(image, image))
     with pytest.raises(ValueError, match="320 px wide"):
         Match(min_disparity=400)(frame)
-    with pytest.raises(ValueError, match=r"farthest = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"):
+    with pytest.raises(ValueError, match=r"max_depth = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"):
         Match(disparities=48, max_depth=0.5)(frame)
     small = Disparity(0, truth[:50], np.ones((50, 320), np.uint8), np.ones((50, 320), np.float32))
     with pytest.raises(ValueError, match=r"around = 4 px needs a `prior`"):

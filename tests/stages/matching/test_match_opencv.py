@@ -142,10 +142,10 @@ def test_confident_matches_are_right_more_often():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"block": 4}, "block must be odd"),
+        ({"block_size": 4}, "block_size must be odd"),
         ({"p1": 30.0}, "p2 must be above"),
         ({"paths": 4}, "must be one of 3, 5, 8"),
-        ({"block": 9, "color": True}, "16 bits"),
+        ({"block_size": 9, "color": True}, "16 bits"),
     ],
 )
 def test_parameters_that_cannot_work_are_refused(parameters, message):

@@ -182,7 +182,9 @@ def bits(disparity):
     return [getattr(disparity, field).tobytes() for field in FIELDS]
 
 
-@pytest.mark.parametrize("parameters", [{"surface": 0, "superpixels": 200}, {"superpixels": 40, "valid_share": 0.95}])
+@pytest.mark.parametrize(
+    "parameters", [{"surface_size": 0, "superpixels": 200}, {"superpixels": 40, "min_valid_share": 0.95}]
+)
 def test_the_stamp_decides_every_bit(box, parameters):
     frame, matches, _ = box
     # Of one draw another seed makes another plane; so sure of matches, only those of surfaces are accepted.
@@ -233,9 +235,9 @@ def test_planes_of_surfaces_reach_where_superpixels_have_no_match():
 # No fit, no median and no plane: nothing else smooths.
 BARE = {
     "superpixels": 200,
-    "smallest": 1,
-    "fit_radius": 0,
-    "median": 0,
+    "min_superpixel_size": 1,
+    "subpixel_radius": 0,
+    "median_size": 0,
     "plane_weight": 0,
     "plane_fill": False,
     "fill": "none",
@@ -270,10 +272,10 @@ def test_edges_of_depth_go_where_the_image_has_them(box):
 
 
 # No superpixel with a hole has a plane then, a surface may have: half of it is to be matched.
-SURFACES_ONLY = {"superpixels": 1, "smallest": 1, "surface": 1, "valid_share": 1.0}
+SURFACES_ONLY = {"superpixels": 1, "min_superpixel_size": 1, "surface_size": 1, "min_valid_share": 1.0}
 
 
-@pytest.mark.parametrize("parameters", [{**SURFACES_ONLY, "surface": 0, "valid_share": 0.6}, SURFACES_ONLY])
+@pytest.mark.parametrize("parameters", [{**SURFACES_ONLY, "surface_size": 0, "min_valid_share": 0.6}, SURFACES_ONLY])
 def test_a_plane_counts_matches_by_their_confidence(parameters):
     frame, pixels, source, confidence = flat_scene()
     doubted = np.random.default_rng(4).random(SHAPE) < 0.5
@@ -292,7 +294,7 @@ def test_a_surface_draws_half_as_far_as_a_superpixel_and_what_it_agrees_with_is_
     pixels[60, 80], pixels[60, 90] = 8.4, 8.7
     pixels[30, 30], source[30, 30] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
-    steps = {"median": 0, "bilateral_radius": 0, "edge_radius": 0, "correlation": 0}
+    steps = {"median_size": 0, "bilateral_radius": 0, "edge_radius": 0, "min_correlation": 0}
     drawn = Refine(plane_weight=1, max_correction=1, **steps, **SURFACES_ONLY)(frame, matches)
     assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert drawn.pixels[60, 90] == np.float32(8.7)
@@ -316,7 +318,7 @@ def test_what_a_superpixel_filled_is_no_evidence_for_a_surface():
 def test_a_match_moves_to_its_median_where_that_is_near():
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80], pixels[60, 100] = 8.9, 11
-    bare = {"plane_weight": 0, "surface": 0, "bilateral_radius": 0, "edge_radius": 0}
+    bare = {"plane_weight": 0, "surface_size": 0, "bilateral_radius": 0, "edge_radius": 0}
     moved = Refine(median_size=5, max_correction=1, **bare)(frame, Disparity(5, pixels, source, confidence))
     assert (moved.pixels[60, 80], moved.pixels[60, 100]) == (8, 11)
 
@@ -369,7 +371,7 @@ def test_a_disparity_of_another_size_is_refused(box):
         Refine()(frame, small)
 
 
-@pytest.mark.parametrize("parameters", [{}, {"fill": "wls"}, {"surface": 0, "median": 3}])
+@pytest.mark.parametrize("parameters", [{}, {"fill": "wls"}, {"surface_size": 0, "median_size": 3}])
 def test_two_threads_give_the_same_bits(box, parameters):
     frame, matches, _ = box
     one, two = (Refine(min_superpixel_size=30, threads=n, **parameters)(frame, matches) for n in (1, 2))

@@ -111,7 +111,7 @@ def test_level_ground_is_free_under_a_wheel_that_spans_three_cells(resolution: f
 @pytest.mark.parametrize("limit", ["max_step", "ground_clearance"])
 def test_a_limit_that_level_ground_would_reach_is_refused(limit: str) -> None:
     parameters: dict[str, Any] = {limit: 0.03}
-    with pytest.raises(ValueError, match=rf"Binarise.{limit} must be above Binarise.margin, 0.03 m, not 0.03 m"):
+    with pytest.raises(ValueError, match=rf"Binarise.{limit} must be above Binarise.height_margin, 0.03 m, not 0.03 m"):
         Binarise(**parameters)
     Binarise(method="absolute", **parameters)
 

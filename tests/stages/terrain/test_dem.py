@@ -174,12 +174,12 @@ def test_variance_is_that_of_the_mean_when_errors_are_independent(slope: float) 
     unevenness = slope**2 * 0.05**2 / 12 / grid.layers["count"][full]
     ratio = (error**2 - unevenness) / grid.layers["variance"][full]
     assert 0.85 < ratio.mean() < 1.25
-    correlated = replace(PURE, correlated=25.0)(cloud_of(seen, sigma=0.02)).layers["variance"][full]
+    correlated = replace(PURE, correlated_points=25.0)(cloud_of(seen, sigma=0.02)).layers["variance"][full]
     np.testing.assert_allclose(correlated, grid.layers["variance"][full] * 25, rtol=1e-4)
 
 
 def test_a_few_points_that_share_one_error_are_as_sure_as_one_of_them_and_no_less() -> None:
-    shared = replace(PURE, correlated=10.0)
+    shared = replace(PURE, correlated_points=10.0)
     stated = []
     for n in (1, 5, 10, 40):
         places = np.linspace(-0.02, 0.02, n)[:, None] + np.array([[4.025, 0.025, 0.0]])

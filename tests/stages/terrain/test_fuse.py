@@ -74,7 +74,7 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance():
     local = [sight_of(cloud, placement(cloud, pose, MOUNT)[0], 0.05, 8.0).terrain.layers for cloud, pose in clouds]
     for cloud, pose in clouds:
         terrain = fuse(cloud, pose, MOUNT)
-    one, other = (layers["variance"].astype(float) + fuse.alignment**2 for layers in local)
+    one, other = (layers["variance"].astype(float) + fuse.alignment_sigma**2 for layers in local)
     share = (1 / other) / (1 / one + 1 / other)
     elevation = terrain.layers["elevation"][40:360, 40:360]
     both = np.isfinite(one) & np.isfinite(other)

@@ -80,7 +80,7 @@ def profiled(profile: Callable[[Array], Array], seed: int = 1, **limits: float) 
     return np.broadcast_to(ahead, cells["cells"].shape), replace(navigation, **cells)
 
 
-BLIND = {"fall": 100.0}  # as if no drop were ever suspected
+BLIND = {"min_drop": 100.0}  # as if no drop were ever suspected
 
 
 @pytest.mark.parametrize("edge", [3.0, 4.5, 6.5])
