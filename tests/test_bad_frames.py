@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from recordings.mcap.file import iter_decoded
-from recordings.ros2 import to_msg as ros2
-from recordings.ros2.cdr import TYPES
+from recordings.ros2 import from_msg as ros2
+from recordings.ros2.cdr import TYPES, make
 from tests.conftest import FRAMES, rewrite, roverflow
 
 BAD = 1  # the frame that is made bad
@@ -60,7 +60,7 @@ def no_tilt(stamp: int, log: Path) -> Change:
 
 
 def senseless_tilt(stamp: int, log: Path) -> Change:
-    gone, nothing = tilts_about(stamp, log), ros2.make("geometry_msgs/msg/Quaternion", x=np.nan, y=0.0, z=0.0, w=1.0)
+    gone, nothing = tilts_about(stamp, log), make("geometry_msgs/msg/Quaternion", x=np.nan, y=0.0, z=0.0, w=1.0)
 
     def change(topic: str, index: int, data: bytes) -> bytes:
         if topic != "/imu/inclinometer" or index not in gone:

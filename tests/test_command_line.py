@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.mcap.index import Raw
-from recordings.ros2.to_msg import read_disparity, stamp_of
+from recordings.ros2.from_msg import read_disparity, stamp_of
 from recordings.simulator import Simulation
 from recordings.simulator.traverse import level_pose
 from recordings.sinks.mcap_sink import McapSink

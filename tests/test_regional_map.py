@@ -10,7 +10,7 @@ import pytest
 import rasterio
 
 from recordings.mcap.file import iter_decoded
-from recordings.ros2 import to_msg as ros2
+from recordings.ros2 import from_msg as ros2
 from stages.data import Cell, CellReason
 from tests.bench.regional import RUNS, region, shares_within, traverse_of
 from tests.conftest import FRAMES, SMALL, rewrite, roverflow

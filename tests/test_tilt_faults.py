@@ -15,7 +15,7 @@ import pytest
 
 from flow.cli.main import main
 from recordings.mcap.file import iter_decoded
-from recordings.ros2.to_msg import stamp_of
+from recordings.ros2.from_msg import stamp_of
 from recordings.simulator import Simulation, write_log
 from recordings.simulator.traverse import level_pose
 from tests.tilt_faults import FAULTS, PIPELINE

@@ -24,7 +24,7 @@ from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM, STRIP, Mosaic
 from recordings.export.ply import COLOURS, write_ply
 from recordings.mcap.file import iter_decoded
-from recordings.ros2 import to_msg as ros2
+from recordings.ros2 import from_msg as ros2
 from recordings.ros2.from_msg import transform_of
 from recordings.scoring.result_log import without_results
 from recordings.sinks.colormaps import hillshade

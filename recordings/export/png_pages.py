@@ -15,7 +15,7 @@ import numpy as np
 
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile, iter_decoded
-from recordings.ros2.to_msg import read_disparity, read_grid_map, read_occupancy_grid
+from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from recordings.sinks import colormaps as paint
 from stages.data import Array, ElevationMap, NavigationMap
 

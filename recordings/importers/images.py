@@ -21,10 +21,11 @@ from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import LAST_STAMP
-from recordings.ros2.from_msg import unpacked_pixels
+from recordings.ros2.image_from_msg import unpacked_pixels
 from recordings.ros2.to_msg import camera_info, image, imu, transform_message
-from recordings.source.calibration import BODY_FROM_OPTICAL, pinhole
+from recordings.source.calibration import pinhole
 from recordings.source.discovery import SIDES
+from recordings.source.transforms import BODY_FROM_OPTICAL
 from stages.data import Array, StereoCamera, StereoFrame, Transform
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}

@@ -1,7 +1,7 @@
-"""Our data as ROS 2 messages and back, the one home of their conventions.
+"""Our data as ROS 2 messages.
 
-Each builder takes a type of `stages.data` (or plain numbers) and returns a message object of the rosbags type store,
-each reader undoes its builder. The grids are where bugs live: ours grow with y (rows) and x (columns) from the
+Each builder takes a type of `stages.data` (or plain numbers) and returns a message object of the rosbags type store;
+`from_msg` reads them back. The grids are where bugs live: ours grow with y (rows) and x (columns) from the
 lower-left corner; `nav_msgs/OccupancyGrid` has the same order, `grid_map_msgs/GridMap` starts at the corner of largest
 x and y, runs its first index along -x, and stores column-major.
 """
@@ -12,15 +12,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recordings.ros2.cdr import make
 from stages.data import (
     Array,
     CameraModel,
-    Cell,
-    CellReason,
     Disparity,
     ElevationMap,
     NavigationMap,
@@ -29,7 +26,6 @@ from stages.data import (
     Transform,
 )
 
-REASON_UNTOLD = 255  # in a map read back: a hazard, of which an OccupancyGrid alone cannot say why
 FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32
 
 _IMAGE_ENCODINGS = {
@@ -44,11 +40,6 @@ _IMAGE_ENCODINGS = {
 def header(stamp: int, frame_id: str) -> Any:
     """std_msgs/Header; `stamp` in ns."""
     return make("std_msgs/msg/Header", stamp=_time(stamp), frame_id=frame_id)
-
-
-def stamp_of(message_header: Any) -> int:
-    """The stamp of a std_msgs/Header in ns."""
-    return int(message_header.stamp.sec) * 1_000_000_000 + int(message_header.stamp.nanosec)
 
 
 def image(stamp: int, frame_id: str, pixels: Array) -> Any:
@@ -106,16 +97,6 @@ def _frame_of(disparity: Disparity) -> str:
     return disparity.camera.frame_id if disparity.camera is not None else "camera"
 
 
-def read_disparity(message: Any) -> NDArray[np.float32]:
-    """The (H, W) float32 pixels of a stereo_msgs/DisparityImage, NaN = unknown, as `disparity_image` wrote them."""
-    picture = message.image
-    if picture.encoding != "32FC1":
-        raise ValueError(f"a disparity image must be 32FC1, not {picture.encoding}")
-    order = ">" if picture.is_bigendian else "<"
-    rows = np.asarray(picture.data, dtype=np.uint8).reshape(picture.height, picture.step)
-    return np.ascontiguousarray(rows[:, : 4 * picture.width]).view(f"{order}f4").astype(np.float32)
-
-
 def point_cloud(cloud: PointCloud) -> Any:
     """sensor_msgs/PointCloud2: x, y, z, rgb (PCL's packing, 0x00RRGGBB in the bits of a float32), sigma, and source
     (the codes of `PixelOrigin`, as float32) where not all points are measured."""
@@ -141,24 +122,6 @@ def float_cloud(stamp: int, frame_id: str, names: Sequence[str], points: Array) 
         is_bigendian=False, point_step=4 * len(names), row_step=points.nbytes, data=points.view(np.uint8).reshape(-1),
         is_dense=bool(np.isfinite(points[:, :3]).all()),
     )  # fmt: skip
-
-
-def read_point_cloud(message: Any) -> dict[str, Array]:
-    """The fields of a sensor_msgs/PointCloud2 of float32 fields, name -> (N,); "rgb" comes as (N, 3) uint8 "colors"."""
-    if any(known.datatype != FLOAT32 or known.count != 1 for known in message.fields):
-        raise ValueError("a point cloud with other fields than single float32 is not read")
-    order, names = ">" if message.is_bigendian else "<", [known.name for known in message.fields]
-    layout = {
-        "names": names, "formats": [f"{order}f4"] * len(names), "offsets": [known.offset for known in message.fields],
-        "itemsize": message.point_step,
-    }  # fmt: skip
-    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.row_step)
-    packed = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(np.dtype(layout)).reshape(-1)  # type: ignore[call-overload]
-    fields: dict[str, Array] = {name: packed[name].astype(np.float32) for name in names if name != "rgb"}
-    if "rgb" in names:
-        bits = np.ascontiguousarray(packed["rgb"]).view(f"{order}u4")
-        fields["colors"] = np.stack([bits >> shift & 0xFF for shift in (16, 8, 0)], axis=1).astype(np.uint8)
-    return fields
 
 
 def grid_map(terrain: ElevationMap) -> Any:
@@ -200,32 +163,6 @@ def _grid_map(grid: ElevationMap | NavigationMap, layers: Mapping[str, Array], b
     )  # fmt: skip
 
 
-def read_grid_map(message: Any) -> ElevationMap:
-    """The ElevationMap that `grid_map` wrote, or any axis-aligned GridMap with a layer "elevation".
-
-    A map that was moved in its circular buffer (start indices) is unrolled.
-    """
-    info, centre = message.info, message.info.pose.position
-    return ElevationMap(
-        stamp_of(message.header), _layers(message), float(info.resolution),
-        (centre.x - info.length_x / 2, centre.y - info.length_y / 2), message.header.frame_id,
-    )  # fmt: skip
-
-
-def _layers(message: Any) -> dict[str, Array]:
-    """The layers of a GridMap, (rows, cols) float32 each."""
-    layers = {}
-    for name, array in zip(message.layers, message.data, strict=True):
-        outer, inner = array.layout.dim
-        if outer.label != "column_index":
-            raise ValueError(f"grid map layer '{name}' is stored by {outer.label}; only column-major maps are read")
-        stored = np.asarray(array.data, np.float32)[array.layout.data_offset :].reshape(outer.size, inner.size)
-        # outer_start_index counts along the matrix' first index (-x), inner_start_index along its second (-y).
-        unrolled = np.roll(stored, (-message.inner_start_index, -message.outer_start_index), axis=(0, 1))
-        layers[name] = np.ascontiguousarray(unrolled[::-1, ::-1])
-    return layers
-
-
 def occupancy_grid(navigation: NavigationMap) -> Any:
     """nav_msgs/OccupancyGrid: row-major from the lower-left cell, 0 free, 100 hazard, -1 unknown."""
     rows, cols = navigation.cells.shape
@@ -236,21 +173,6 @@ def occupancy_grid(navigation: NavigationMap) -> Any:
     data = np.ascontiguousarray(navigation.cells).reshape(-1)
     stamped = header(navigation.stamp, navigation.frame_id)
     return make("nav_msgs/msg/OccupancyGrid", header=stamped, info=info, data=data)
-
-
-def read_occupancy_grid(message: Any, reasons: Any = None) -> NavigationMap:
-    """The NavigationMap of an OccupancyGrid and, where given, of its `reason_map`; an OccupancyGrid alone cannot say
-    why a cell is a hazard: `REASON_UNTOLD`."""
-    info = message.info
-    cells = np.asarray(message.data, np.int8).reshape(info.height, info.width)
-    reason = np.full(cells.shape, REASON_UNTOLD, np.uint8)
-    reason[cells == Cell.FREE] = CellReason.CLEAR
-    reason[cells == Cell.UNKNOWN] = CellReason.UNOBSERVED
-    if reasons is not None:
-        reason = _layers(reasons)["reason"].astype(np.uint8)
-    resolution = float(str(np.float32(info.resolution)))  # the message holds float32: 0.05 stays 0.05
-    origin = (float(info.origin.position.x), float(info.origin.position.y))
-    return NavigationMap(stamp_of(message.header), cells, reason, resolution, origin, message.header.frame_id)
 
 
 def transform_message(transforms: Iterable[tuple[Transform, int]]) -> Any:

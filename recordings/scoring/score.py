@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError, said
 from recordings.mcap.file import McapFile, iter_decoded
-from recordings.ros2 import to_msg as ros2
+from recordings.ros2 import from_msg as ros2
 from recordings.scoring import metrics as measures
 from recordings.scoring import terrain_metrics as terrain_measures
 from recordings.scoring.pose_metrics import PoseTally

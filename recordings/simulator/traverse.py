@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.simulator.terrain import Terrain
-from recordings.source.calibration import BODY_FROM_OPTICAL
+from recordings.source.transforms import BODY_FROM_OPTICAL
 from stages.data import LEVEL_FRAME, Array, Transform
 
 BODY_LENGTH, BODY_WIDTH = 1.0, 0.8

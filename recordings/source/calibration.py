@@ -6,9 +6,7 @@ log speak of the camera's own frame, so R is applied where they meet the rectifi
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -16,70 +14,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
-from recordings.ros2.from_msg import transform_of
 from recordings.source.discovery import looks_rectified
-from stages.data import Array, CameraModel, Mount, Pose, StereoCamera, Transform
+from recordings.source.transforms import TransformTree
+from stages.data import CameraModel, StereoCamera, Transform
 
-# A camera's axes (x right, y down, z forward) in the rover's (x forward, y left, z up), when it looks straight ahead.
-BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-
-EVER = 0  # ns, the stamp of what holds throughout: frames may be before the log's first message, or of another clock
 _SAME = 1e-6  # m and matrix elements; two transforms of the same frames that differ by more contradict each other
 _PARALLEL = 1e-3  # rad; cameras turned against each other by less need no rectification: a pixel at 1000 px
 _BESIDE = 0.01  # of the baseline; and so for cameras that are shifted against each other by less in y and z
 _AGREEING = 0.05  # of a baseline; what tells it twice tells the same where it differs by less
 SHORTEST, LONGEST = 1.0, 1e6  # px, focal lengths
 _SHRUNK = 0.1  # of the focal length; what rectification makes smaller than that is no image
-
-
-@dataclass
-class TransformTree:
-    """The static transforms of a log, as a graph in which any two connected frames have a transform."""
-
-    edges: dict[str, dict[str, Transform]] = field(default_factory=dict)
-    parents: dict[str, str] = field(default_factory=dict)
-
-    def add(self, message: Any) -> None:
-        """Add a geometry_msgs/TransformStamped. Raises LogError, and keeps what is there, where it contradicts that."""
-        transform = transform_of(message)
-        parent, child = transform.parent, transform.child
-        known = self.between(parent, child)
-        if known is None:
-            if child in self.parents:
-                raise LogError(f"'{child}' has two parents, '{self.parents[child]}' and '{parent}'; the first is used")
-            self.edges.setdefault(parent, {})[child] = transform
-            self.edges.setdefault(child, {})[parent] = transform.inverse()
-            self.parents[child] = parent
-        elif not _same(known, transform):
-            raise LogError(f"the transform '{parent}' <- '{child}' contradicts an earlier one; the earlier one is used")
-
-    def between(self, parent: str, child: str) -> Transform | None:
-        """The transform from `child` to `parent`, along the fewest steps; None where nothing connects them, or one has
-        no name."""
-        if not parent or not child:
-            return None
-        before, queue = {child: child}, deque([child] if parent in self.edges else [])
-        while queue and parent not in before:
-            frame = queue.popleft()
-            for name in self.edges.get(frame, {}):
-                if name not in before:
-                    before[name] = frame
-                    queue.append(name)
-        if parent not in before:
-            return None
-        whole, frame = Transform(parent, parent, np.eye(3), np.zeros(3)), parent
-        while frame != child:
-            whole, frame = whole.after(self.edges[frame][before[frame]]), before[frame]
-        return whole
-
-    def listed(self) -> list[str]:
-        """Each transform of the log as "parent <- child", sorted."""
-        return sorted(f"{parent} <- {child}" for child, parent in self.parents.items())
-
-
-def _same(one: Transform, other: Transform) -> bool:
-    off = max(np.abs(one.rotation - other.rotation).max(), np.abs(one.translation - other.translation).max())
-    return bool(off <= _SAME)
 
 
 @dataclass(frozen=True)
@@ -262,49 +206,3 @@ def _rectifying(left: CameraModel, right: CameraModel, placed: Transform) -> tup
             "inverse at the corners; check the calibration"
         )
     return replace(left, r=made[0], p=made[2]), replace(right, r=made[1], p=made[3])
-
-
-def mounted(
-    camera: Camera, inclinometer: str, base: str, frames: TransformTree, given: Sequence[float] | None
-) -> Mount:
-    """How the left camera sits on the rover.
-
-    inclinometer, base: their frames; given: quaternion xyzw that turns inclinometer into left rectified camera
-    coordinates, where the user gave it. Raises LogError where nothing tells that rotation.
-    """
-    based = frames.between(base, camera.frame_id)
-    base_from_camera = based.after(camera.image) if based is not None else None
-    return Mount(EVER, _camera_from_inclinometer(camera, inclinometer, frames, given), base_from_camera)
-
-
-def rovers(pose: Pose, camera: Camera, base: str, frames: TransformTree) -> Pose:
-    """A pose as that of the frame `base`, or where the camera does not sit on that, of the camera's rectified image; as
-    it is where no static transform tells how they sit on the frame whose pose it is."""
-    told = pose.child_frame_id
-    if told in (base, camera.image_frame):
-        return pose
-    if told != camera.frame_id and frames.between(base, camera.frame_id) is not None:
-        part = frames.between(told, base)
-    else:
-        on_camera = frames.between(told, camera.frame_id)
-        part = None if on_camera is None else on_camera.after(camera.image)
-    return pose if part is None else pose.of(part)
-
-
-def _camera_from_inclinometer(
-    camera: Camera, inclinometer: str, frames: TransformTree, given: Sequence[float] | None
-) -> Array:
-    if given is not None:
-        return np.asarray(Rotation.from_quat(given).as_matrix())
-    placed = frames.between(camera.frame_id, inclinometer)
-    if placed is None:
-        raise LogError(
-            f"no static transform joins the camera ({_frame(camera.frame_id)}) and the inclinometer "
-            f"({_frame(inclinometer)}); "
-            "record /tf_static, or set 'camera_from_inclinometer' (quaternion x, y, z, w) of the source"
-        )
-    return np.asarray(camera.model.r @ placed.rotation)
-
-
-def _frame(name: str) -> str:
-    return f"'{name}'" if name else "whose frame_id is empty"

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.ros2.from_msg import camera_model, frame_of, pixels_of, unread_encoding
+from recordings.ros2.from_msg import camera_model, frame_of
+from recordings.ros2.image_from_msg import pixels_of, unread_encoding
 from recordings.source.topics import DecodedTopics
 from stages.data import Array, CameraModel
 

@@ -19,10 +19,13 @@ from numpy.typing import NDArray
 from recordings.errors import LogError, said
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import Lost, Raw
-from recordings.ros2.from_msg import camera_model, frame_of, pixels_of, pose_of, stamp_or, tilt_of
-from recordings.source.calibration import Camera, rovers
+from recordings.ros2.from_msg import camera_model, frame_of, pose_of, stamp_or
+from recordings.ros2.image_from_msg import pixels_of
+from recordings.ros2.tilt_from_msg import tilt_of
+from recordings.source.calibration import Camera
 from recordings.source.cameras import CAMERAS
 from recordings.source.discovery import BARE_TILT, IMAGES, POSES, TILTS
+from recordings.source.mount import rovers
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.topics import Decoder, peek_stamp

@@ -9,12 +9,15 @@ from typing import Any
 from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile
-from recordings.ros2.from_msg import frame_name, frame_of, pose_of, tilt_of
-from recordings.source.calibration import Camera, TransformTree, baseline_note, calibrated_pair, mounted, rovers
+from recordings.ros2.from_msg import frame_name, frame_of, pose_of
+from recordings.ros2.tilt_from_msg import tilt_of
+from recordings.source.calibration import Camera, baseline_note, calibrated_pair
 from recordings.source.cameras import CAMERAS, first_infos, unfit_images, unread_images
 from recordings.source.discovery import TRANSFORMS, Topic, Topics, discover
+from recordings.source.mount import mounted, rovers
 from recordings.source.settings import LogSettings
 from recordings.source.topics import DecodedTopics, attempt
+from recordings.source.transforms import TransformTree
 from stages.data import LEVEL_FRAME, Mount, Pose
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from recordings.ros2.from_msg import Angle, Angles, frame_name
+from recordings.ros2.from_msg import frame_name
+from recordings.ros2.tilt_from_msg import Angle, Angles
 
 
 @dataclass(frozen=True)

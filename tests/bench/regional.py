@@ -22,7 +22,7 @@ import numpy as np
 
 from recordings import McapSource
 from recordings.mcap.file import iter_decoded
-from recordings.ros2 import to_msg as ros2
+from recordings.ros2 import from_msg as ros2
 from recordings.ros2.from_msg import transform_of
 from recordings.scoring.metrics import without_plane
 from recordings.simulator import Simulation, raycast, traverse, write_log

@@ -17,7 +17,8 @@ from recordings.importers.images import FIRST_STAMP
 from recordings.importers.middlebury import import_scene, logs_of, read_pfm, read_scene
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2 import to_msg as ros2
+from recordings.ros2 import from_msg as ros2
+from recordings.ros2.to_msg import disparity_image
 from recordings.scoring import score as scoring
 from recordings.scoring.table import format_score
 from stages.data import Disparity, StereoFrame
@@ -48,7 +49,7 @@ def result(log: Path, frame: StereoFrame, pixels: np.ndarray) -> Path:
     disparity = Disparity(frame.stamp, pixels, nothing, nothing.astype(np.float32), camera=frame.camera)
     out = log.with_name(f"{log.stem}-nav.mcap")
     with Ros2Writer(out) as writer:
-        writer.write("/nav/disparity", ros2.disparity_image(disparity), frame.stamp)
+        writer.write("/nav/disparity", disparity_image(disparity), frame.stamp)
     return out
 
 

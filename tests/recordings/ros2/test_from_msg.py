@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
 from recordings.ros2.cdr import make
-from recordings.ros2.from_msg import camera_model, pixels_of, pose_of, up_of
+from recordings.ros2.from_msg import camera_model, pose_of
+from recordings.ros2.image_from_msg import pixels_of
+from recordings.ros2.tilt_from_msg import up_of
 from recordings.ros2.to_msg import camera_info, header, image
 from stages.data import CameraModel
 from tests.recordings.sample_log import HEIGHT, WIDTH, picture

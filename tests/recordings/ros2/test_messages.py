@@ -24,6 +24,13 @@ from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import TYPES, decoder_for, make
+from recordings.ros2.from_msg import (
+    read_disparity,
+    read_grid_map,
+    read_occupancy_grid,
+    read_point_cloud,
+    stamp_of,
+)
 from recordings.ros2.to_msg import (
     camera_info,
     diagnostics,
@@ -34,11 +41,6 @@ from recordings.ros2.to_msg import (
     occupancy_grid,
     odometry,
     point_cloud,
-    read_disparity,
-    read_grid_map,
-    read_occupancy_grid,
-    read_point_cloud,
-    stamp_of,
     transform_message,
 )  # fmt: skip
 from stages.data import (

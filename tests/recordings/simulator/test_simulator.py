@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from recordings.mcap.file import iter_decoded
-from recordings.ros2 import to_msg as ros2
+from recordings.ros2 import from_msg as ros2
 from recordings.simulator import Simulation, ground_truth, raycast, terrain, traverse, write_log
 from recordings.simulator.odometry import dead_reckoning
 from stages.data import Cell, Transform

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from recordings import McapSink
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
-from recordings.ros2.to_msg import read_disparity, read_grid_map, read_occupancy_grid, stamp_of
+from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid, stamp_of
 from stages import Fuse
 from stages.data import (
     CameraImage,

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from recordings import McapSource
 from recordings.errors import LogError
 from recordings.ros2.to_msg import transform_message
-from recordings.source.calibration import TransformTree, calibrated_pair
+from recordings.source.calibration import calibrated_pair
+from recordings.source.transforms import TransformTree
 from stages.data import CameraModel, Transform
 from tests.recordings.sample_log import FRAMES, LEFT, START, TRANSFORMS, model, tilt_quaternion, write_sample
 

@@ -1,0 +1,131 @@
+"""The pixels of ROS 2 images, whatever encoding they came in: gray or RGB, 8 or 16 bit."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recordings.errors import LogError
+from stages.data import Array
+
+# Encoding -> (dtype, channels in the message, conversion to gray or RGB)
+_PLAIN: dict[str, tuple[str, int, int | None]] = {
+    "mono8": ("u1", 1, None),
+    "8UC1": ("u1", 1, None),
+    "mono16": ("u2", 1, None),
+    "16UC1": ("u2", 1, None),
+    "rgb8": ("u1", 3, None),
+    "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
+    "8UC3": ("u1", 3, cv2.COLOR_BGR2RGB),  # OpenCV's own name for its own order
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB),
+    "8UC4": ("u1", 4, cv2.COLOR_BGRA2RGB),
+    "rgb16": ("u2", 3, None),
+    "bgr16": ("u2", 3, cv2.COLOR_BGR2RGB),
+}
+# OpenCV's short names say what is at (1, 1), ROS names say what is at (0, 0): the long names of OpenCV agree with ROS.
+_BAYER = {
+    "bayer_rggb": cv2.COLOR_BayerRGGB2RGB,
+    "bayer_bggr": cv2.COLOR_BayerBGGR2RGB,
+    "bayer_gbrg": cv2.COLOR_BayerGBRG2RGB,
+    "bayer_grbg": cv2.COLOR_BayerGRBG2RGB,
+}
+_PADDING = 1024  # bytes that may follow the end of a compressed image
+_ENCODINGS = _PLAIN | {f"{name}{bits}": (f"u{bits // 8}", 1, code) for name, code in _BAYER.items() for bits in (8, 16)}
+
+
+def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
+    """Gray (H, W) or RGB (H, W, 3) pixels, uint8 or uint16, of a sensor_msgs Image or CompressedImage.
+
+    size: (width, height) of the calibration; an image of another one is refused before it is unpacked.
+    """
+    return _raw_pixels(message, size) if hasattr(message, "encoding") else _compressed_pixels(message, size)
+
+
+def unread_encoding(message: Any) -> str:
+    """What to say of an Image in an encoding that `pixels_of` does not read; empty for any other message."""
+    encoding = getattr(message, "encoding", None)
+    if encoding is None or encoding in _ENCODINGS:
+        return ""
+    return f"image encoding '{encoding}' is not one of those that can be read ({', '.join(_ENCODINGS)})"
+
+
+def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
+    if width == 0 or height == 0:
+        raise LogError(f"the image is empty ({width}x{height})")
+    if size is not None and size != (width, height):
+        raise LogError(f"the image is {width}x{height}, its calibration is for {size[0]}x{size[1]}")
+
+
+def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
+    if unread := unread_encoding(message):
+        raise LogError(unread)
+    kind, channels, conversion = _ENCODINGS[message.encoding]
+    height, width, data = int(message.height), int(message.width), np.asarray(message.data, np.uint8)
+    row = width * channels * int(kind[1])
+    step = int(message.step) or row
+    _check_size(width, height, size)
+    if step < row:
+        raise LogError(f"the image's step of {step} bytes is shorter than a row of {width} {message.encoding} pixels")
+    needed = (height - 1) * step + row  # the last row need not be padded
+    if data.size < needed:
+        raise LogError(f"the image is cut: {data.size} of {needed} bytes are there")
+    rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
+    order = ">" if message.is_bigendian else "<"
+    pixels = np.ascontiguousarray(rows).view(f"{order}{kind}").astype(kind, copy=False)
+    pixels = pixels.reshape((height, width) if channels == 1 else (height, width, channels))
+    return _converted(pixels, conversion)
+
+
+def _compressed_pixels(message: Any, size: tuple[int, int] | None) -> Array:
+    data = np.ascontiguousarray(message.data, np.uint8)
+    content = data.tobytes()
+    # Of a JPEG that lacks a little of its end, OpenCV may say nothing and make a picture that is wrong there, if zeros
+    # follow: the rest of a camera's buffer. Behind a whole picture these, or other padding, do no harm.
+    end = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(content[:2], b"")
+    if end not in content.rstrip(b"\0")[-_PADDING:]:
+        raise LogError(f"the compressed image is cut after {data.size} bytes")
+    stated = _stated_size(content)
+    if stated is not None:
+        _check_size(*stated, size)
+    encoding = message.format.split(";")[0].strip()
+    pixels = unpacked_pixels(data, _BAYER.get(encoding.rstrip("0123456789"))) if stated else None
+    if pixels is None:
+        raise LogError(f"the compressed image (format '{message.format}') cannot be decoded; it should be JPEG or PNG")
+    return pixels
+
+
+def unpacked_pixels(data: Array, mosaic: int | None = None) -> Array | None:
+    """Gray (H, W) or RGB (H, W, 3) pixels, uint8 or uint16, of an image file's bytes (n,); None where OpenCV makes none
+    such of them. mosaic: its conversion of a Bayer pattern, where a single channel is one."""
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        return None
+    if pixels.ndim == 2:
+        return _converted(pixels, mosaic)
+    return _converted(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
+
+
+def _stated_size(content: bytes) -> tuple[int, int] | None:
+    """(width, height) as the head of a PNG or JPEG file states it, None where it is neither."""
+    if content.startswith(b"\x89PNG") and len(content) >= 24:
+        width, height = struct.unpack_from(">II", content, 16)
+        return width, height
+    position = 2
+    while content.startswith(b"\xff\xd8") and position + 9 <= len(content) and content[position] == 0xFF:
+        kind, length = content[position + 1], struct.unpack_from(">H", content, position + 2)[0]
+        if kind == 0xFF:  # filling before a marker
+            position += 1
+        elif 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):  # a start of frame; those are tables
+            height, width = struct.unpack_from(">HH", content, position + 5)
+            return width, height
+        else:
+            position += 2 + length
+    return None
+
+
+def _converted(pixels: Array, conversion: int | None) -> Array:
+    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))

@@ -1,0 +1,110 @@
+"""Tilts from ROS 2 messages.
+
+A tilt is a direction, never angles: a quaternion turns the world's z axis into the sensor's frame; bare pitch and roll
+become a direction by the model that the pipeline file names.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from recordings.errors import LogError
+from recordings.ros2.from_msg import frame_of, rotation_of, stamp_or
+from stages.data import Array, Tilt
+
+
+def tilt_of(message: Any, log_time: int) -> Tilt:
+    """The tilt of a sensor_msgs/Imu, geometry_msgs/QuaternionStamped or Quaternion.
+
+    The quaternion turns the sensor's frame into a world whose z is up (REP 145), so up in the sensor's frame is the
+    third row of its matrix.
+    """
+    if hasattr(message, "orientation_covariance") and message.orientation_covariance[0] == -1:
+        raise LogError("the Imu says that it has no orientation (orientation_covariance[0] is -1)")
+    quaternion = next((q for name in ("orientation", "quaternion") if (q := getattr(message, name, None))), message)
+    up = rotation_of(quaternion, "the inclinometer").as_matrix()[2]
+    return _tilt(message, log_time, up)
+
+
+def _tilt(message: Any, log_time: int, up: Array) -> Tilt:
+    header = getattr(message, "header", None)
+    stamp = stamp_or(header, log_time) if header is not None else log_time
+    return Tilt(stamp, up / np.linalg.norm(up), frame_of(message) or "inclinometer")
+
+
+@dataclass(frozen=True)
+class Angle:
+    """Where an angle stands in a message and what it means: field path ("vector.x"), unit, and sign (+1 or -1)."""
+
+    field: str
+    unit: Literal["deg", "rad"]
+    sign: int
+
+    def __call__(self, message: Any) -> float:
+        """The angle in radians, in our sense of sign."""
+        value = self.number(message)
+        if not np.isfinite(value):
+            raise LogError(f"field '{self.field}' holds {value}, which is not an angle")
+        return self.sign * float(np.deg2rad(value) if self.unit == "deg" else value)
+
+    def number(self, message: Any) -> float:
+        """What the field holds, a number, NaN perhaps. Raises LogError where the message's type has no such field."""
+        value: Any = message
+        for name in self.field.split("."):
+            names = list(getattr(value, "__dataclass_fields__", ()))
+            if name not in names:
+                known = ", ".join(known for known in names if not known.startswith("_"))
+                where = f"{_kind(value)} (it has {known})" if known else _kind(value)
+                raise LogError(f"the message has no field '{self.field}': no '{name}' in its {where}")
+            value = getattr(value, name)
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            raise LogError(f"field '{self.field}' holds a {_kind(value)}, which is not an angle")
+        return float(value)
+
+
+def _kind(value: Any) -> str:
+    """The type of what a message holds: a message's own, or that of a number or a text."""
+    return str(getattr(value, "__msgtype__", type(value).__name__))
+
+
+@dataclass(frozen=True)
+class Angles:
+    """How bare pitch and roll make a direction, in a sensor frame x forward, y left, z up.
+
+    A positive pitch has the nose up, a positive roll the left side up (both after `sign`). model "axis": the angles of
+    the x and the y axis to the horizon, what an inclinometer measures. model "euler": pitch is that of the x axis, roll
+    turns about the pitched x axis.
+    """
+
+    pitch: Angle
+    roll: Angle
+    model: Literal["axis", "euler"]
+
+    def check(self, message: Any) -> None:
+        """Raise LogError where the message has no numbers in the two fields."""
+        self.pitch.number(message)
+        self.roll.number(message)
+
+    def __call__(self, message: Any, log_time: int) -> Tilt:
+        """The tilt that a message's two angles tell."""
+        return _tilt(message, log_time, up_of(self.pitch(message), self.roll(message), self.model))
+
+
+def up_of(pitch: float, roll: float, model: Literal["axis", "euler"]) -> Array:
+    """The unit vector up, in x forward, y left, z up, of a pitch (nose up) and a roll (left side up), rad."""
+    for name, angle in (("pitch", pitch), ("roll", roll)):
+        if not abs(angle) <= np.pi / 2:
+            raise LogError(f"a {name} of {np.rad2deg(angle):.1f} degrees is no tilt; check the field and its unit")
+    if model == "euler":
+        return np.array([np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
+    forward, left = np.sin(pitch), np.sin(roll)
+    rest = 1 - forward * forward - left * left
+    if rest < 0:
+        angles = f"pitch {np.rad2deg(pitch):.1f} and roll {np.rad2deg(roll):.1f} degrees"
+        raise LogError(
+            f"{angles} cannot both be angles of perpendicular axes to the horizon; check unit and tilt_model"
+        )
+    return np.array([forward, left, np.sqrt(rest)])
