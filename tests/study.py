@@ -26,8 +26,8 @@ from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stage, stereo_p
 from tests.bench.stereo_scores import errors, rows_filled
 
 PLAIN: dict[str, Any] = {
-    "median_size": 0, "plane_weight": 0, "plane_fill": False, "surface_size": 0, "bilateral_radius": 0, "edge_radius": 0,
-    "min_confidence": 0, "subpixel_radius": 0,
+    "median_size": 0, "plane_weight": 0, "plane_fill": False, "surface_size": 0, "bilateral_radius": 0,
+    "edge_radius": 0, "min_confidence": 0, "subpixel_radius": 0,
 }  # fmt: skip
 SEEDS = (1, 2, 3)
 ABUNDANCES = (0.05, 0.15, 0.10)
