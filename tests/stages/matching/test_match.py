@@ -290,7 +290,7 @@ def test_frames_that_cannot_be_matched_are_refused(slope):
     with pytest.raises(ValueError, match=r"max_depth = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"):
         Match(disparities=48, max_depth=0.5)(frame)
     small = Disparity(0, truth[:50], np.ones((50, 320), np.uint8), np.ones((50, 320), np.float32))
-    with pytest.raises(ValueError, match=r"around = 4 px needs a `prior`"):
+    with pytest.raises(ValueError, match=r"search_radius = 4 px needs a `prior`"):
         Match(search_radius=4)(frame)
     with pytest.raises(ValueError, match=r"prior must be a stages\.Disparity, not a ndarray"):
         Match()(frame, truth)
