@@ -24,6 +24,7 @@ from stages.data import (
     TiltHealth,
     Transform,
     VoxelMap,
+    known,
 )
 from stages.localisation.pose_filter import PoseFilter
 from stages.localisation.tilt.check import CheckTilt
@@ -80,4 +81,5 @@ __all__ = [
     "VoxelGrid",
     "VoxelMap",
     "Voxelise",
+    "known",
 ]

@@ -32,7 +32,8 @@ PLAIN: dict[str, Any] = {
 SEEDS = (1, 2, 3)
 ABUNDANCES = (0.05, 0.15, 0.10)
 EDGE_STEP, EDGE_REACH = 2.0, 3  # px of disparity that make an edge of depth, px from it that count as near
-SOURCE_COLOURS = np.array([[40, 40, 40], [70, 160, 70], [70, 110, 210], [230, 150, 50]], np.uint8)  # as Source
+SOURCE_COLOURS = np.full((len(PixelOrigin), 3), 40, np.uint8)
+SOURCE_COLOURS[1:4] = [70, 160, 70], [70, 110, 210], [230, 150, 50]
 
 
 class Case(NamedTuple):
@@ -345,7 +346,7 @@ def main(folder: Path) -> None:
 
 
 def _legend() -> Iterator[str]:
-    for code, colour in zip(PixelOrigin, ("black", "green", "blue", "orange"), strict=True):
+    for code, colour in zip(PixelOrigin, ("black", "green", "blue", "orange"), strict=False):
         yield f"{code.name.lower()} {colour}"
 
 

@@ -38,6 +38,7 @@ from stages.data import (
     Tilt,
     TiltHealth,
     VoxelMap,
+    known,
 )
 
 DISPARITY_STEPS = 8  # disparities are kept to 1/8 px: four fifths of the size that 1/16 px takes
@@ -199,7 +200,7 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
     )  # fmt: skip
     canvas.log(f"{path}/pixels", image, ViewSpec(Panel.DISPARITY, f"{path}/pixels", path))
     canvas.scale(f"{path}/pixels/scale", steps.shape, 0.0, limit, "px", cv2.COLORMAP_TURBO)
-    known = _percent(disparity.source)
+    share_known = _percent(known(disparity.source))
     shares = {kind: _percent(disparity.source == kind) for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
     made = {kind: share for kind, share in shares.items() if share}
     if made:  # else it is measured wherever it is known
@@ -212,7 +213,7 @@ def draw_disparity(canvas: Canvas, path: str, disparity: Disparity) -> str:
         place = ViewSpec(Panel.SUPERPIXELS, f"{path}/superpixels", f"{path}: superpixels")
         canvas.log(place.path, overlay, place)
     parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in made.items())
-    return f"{path} {', '.join([f'{known:.0f} % known', *parts])}"
+    return f"{path} {', '.join([f'{share_known:.0f} % known', *parts])}"
 
 
 @draws(PointCloud)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import kernel
-from stages.data import Array, PixelOrigin, StereoCamera
+from stages.compiled.jit import kernel, part
+from stages.data import Array, PixelOrigin, StereoCamera, known
 
 _FILLED = int(PixelOrigin.FILLED)
 _PLANE = int(PixelOrigin.PLANE)
-_UNKNOWN = int(PixelOrigin.UNKNOWN)
+_known = part(known)
 
 
 def triangulate(
@@ -51,7 +51,7 @@ def triangulate(
 @kernel
 def _depth(disparity, source, shift, focal_baseline, max_depth, filled):  # type: ignore[no-untyped-def]
     """Depth of a pixel, or 0 where it has no point."""
-    if source == _UNKNOWN or (source == _FILLED and not filled):
+    if not _known(source) or (source == _FILLED and not filled):
         return 0.0
     effective = disparity + shift
     # Written so that NaN, a point behind the camera and one beyond max_depth all fail the one comparison.
@@ -104,7 +104,7 @@ def triangulate_reference(
 ) -> tuple[Array, Array, Array, Array]:
     """The same as `triangulate`, in plain numpy."""
     effective = disparity.astype(np.float64) + camera.cx_right - camera.cx
-    wanted = np.isfinite(effective) & (source != PixelOrigin.UNKNOWN) & (filled | (source != PixelOrigin.FILLED))
+    wanted = np.isfinite(effective) & known(source) & (filled | (source != PixelOrigin.FILLED))
     wanted &= np.where(wanted, effective, 0) * max_depth >= camera.fx * camera.baseline
     v, u = np.nonzero(wanted)
     z = camera.fx * camera.baseline / effective[v, u]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.compiled.parallel import by_bands, shared_by
-from stages.data import Array, PixelOrigin
+from stages.data import Array, PixelOrigin, known
 
 F32 = np.float32
 UNKNOWN = int(PixelOrigin.UNKNOWN)
+_known = part(known)
 Layers = tuple[Array, Array, Array]
 
 
@@ -33,7 +34,7 @@ def drop_contradicted(found: Layers, backward: Layers, tolerance: float, largest
 
 @kernel
 def _drop(  # type: ignore[no-untyped-def]
-    pixels, source, confidence, backward, known, tolerance, largest, left_pixels, left_source, left_confidence
+    pixels, source, confidence, backward, backward_source, tolerance, largest, left_pixels, left_source, left_confidence
 ):
     last = pixels.shape[1] - 1
     for y in range(pixels.shape[0]):
@@ -43,7 +44,7 @@ def _drop(  # type: ignore[no-untyped-def]
             differs = False
             if d <= largest and partner >= 0 and partner <= last:
                 there = last - np.int64(partner)
-                differs = known[y, there] != UNKNOWN and abs(backward[y, there] - d) > tolerance
+                differs = _known(backward_source[y, there]) and abs(backward[y, there] - d) > tolerance
             left_pixels[y, x] = F32(np.nan) if differs else d
             left_source[y, x] = UNKNOWN if differs else source[y, x]
             left_confidence[y, x] = F32(0) if differs else confidence[y, x]
@@ -52,7 +53,7 @@ def _drop(  # type: ignore[no-untyped-def]
 def drop_contradicted_reference(found: Layers, backward: Layers, tolerance: float, largest: float) -> Layers:
     """`drop_contradicted` in plain numpy."""
     pixels, source, confidence = found
-    theirs = np.where(backward[1] == UNKNOWN, F32(np.nan), backward[0])[:, ::-1]
+    theirs = np.where(known(backward[1]), backward[0], F32(np.nan))[:, ::-1]
     partner = np.rint(np.arange(pixels.shape[1]) - pixels.astype(np.float64))
     inside = (partner >= 0) & (partner < pixels.shape[1])
     asked = np.take_along_axis(theirs, np.where(inside, partner, 0).astype(int), axis=1)

@@ -13,7 +13,7 @@ from stages.refinement.kernels.holes import KEPT, MISMATCH
 
 F32 = np.float32
 OWN = 0.5, 0.75, 1.0
-UNKNOWN, MEASURED, PLANE, FILLED = (int(code) for code in PixelOrigin)
+UNKNOWN, MEASURED, PLANE, FILLED = (int(code) for code in list(PixelOrigin)[:4])
 
 
 class Trust(NamedTuple):

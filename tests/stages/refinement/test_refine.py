@@ -55,7 +55,7 @@ def test_every_pixel_says_where_it_comes_from(box):
     assert np.array_equal(refined.source == PixelOrigin.MEASURED, near)
     assert (refined.source[matched & ~near] == PixelOrigin.PLANE).all()
     assert np.array_equal(refined.source == PixelOrigin.UNKNOWN, ~known)
-    confidence = {code: refined.confidence[refined.source == code] for code in PixelOrigin}
+    confidence = {code: refined.confidence[refined.source == code] for code in list(PixelOrigin)[:4]}
     # as calibrated: of matches by their own confidence, 0.8, and by whether a plane agrees
     assert np.unique(confidence[PixelOrigin.MEASURED]) == pytest.approx([0.882, 0.984], abs=0.002)
     assert np.unique(confidence[PixelOrigin.PLANE]) == pytest.approx([0.79, 0.81])
