@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 
 class LossReason(StrEnum):
@@ -132,6 +132,7 @@ class Sink(Protocol):
     """
 
     suffix: str
+    __dataclass_fields__: ClassVar[dict[str, Any]]  # a sink is a dataclass; every run opens a copy of its own
 
     def wants(self, stream: str, kind: type) -> bool:
         """Whether the sink has a use for a stream of this name and type."""

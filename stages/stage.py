@@ -52,24 +52,21 @@ class Stage:
                 bounds = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
                 raise ValueError(f"{where} must be {bounds}{f' {unit}' if unit else ''}, not {value}")
 
-    def snapshot(self) -> bytes:
-        """What the stage remembers of the frames so far, to go on from with `restore`, in this version of the product.
 
-        All that is remembered stands in fields that are no parameters, so no stage has to write its own.
-        """
-        memory = {item.name: getattr(self, item.name) for item in fields(self) if not item.init}
-        return pickle.dumps((type(self).__qualname__, memory))
+def snapshot(stage: Any, state: Any) -> bytes:
+    """The state of a stage in the middle of a run, as bytes from which `restore` continues in the same version."""
+    return pickle.dumps((type(stage).__qualname__, state))
 
-    def restore(self, snapshot: bytes) -> None:
-        """Remember what a stage of this class, with the same parameters, did when it made the snapshot.
 
-        It is a pickle: restore none that comes from strangers. Raises ValueError for one of another class.
-        """
-        name, memory = pickle.loads(snapshot)
-        if name != type(self).__qualname__:
-            raise ValueError(f"a snapshot of {name} is not one of {type(self).__qualname__}; restore each into its own")
-        for field_name, value in memory.items():
-            object.__setattr__(self, field_name, value)
+def restore(stage: Any, saved: bytes) -> Any:
+    """The state that `snapshot` saved for a stage of this class with the same parameters.
+
+    The bytes are a pickle: never restore any from an untrusted source. Raises ValueError for those of another class.
+    """
+    name, state = pickle.loads(saved)
+    if name != type(stage).__qualname__:
+        raise ValueError(f"a snapshot of {name} is not one of {type(stage).__qualname__}; restore each into its own")
+    return state
 
 
 def check_cells(what: str, width: float, resolution: float, times: int = 1) -> None:

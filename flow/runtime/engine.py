@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flow.contracts import Absent, FrameRecord, Loss, LossReason, Sink
-from flow.runtime.graph import Node
+from flow.runtime.graph import Node, start
 from flow.runtime.ledger import Ledger, failure
 
 
@@ -54,6 +54,7 @@ class Engine:
     """Runs stages and sinks over frames.
 
     stages: in topological order; sinks: name -> (sink, the streams it is given); capacity: of each inbox, frames.
+    `states` maps the streams of the stages with state to the states of this run.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class Engine:
         self._ledger, self._capacity, self._on_frame = ledger, capacity, on_frame
         self._condition = threading.Condition()
         self._frames: deque[_Frame] = deque()
+        self.states = start(stages)
         self._work = [self._stage_work(node) for node in stages]
         self._work += [self._sink_work(name, sink, streams) for name, (sink, streams) in sinks.items()]
         for work in self._work:
@@ -252,15 +254,16 @@ class Engine:
 
     # -- the work itself, outside the lock -------------------------------------------------------------------
 
-    @staticmethod
-    def _stage_work(node: Node) -> _Work:
+    def _stage_work(self, node: Node) -> _Work:
+        own = {"state": self.states[node.name]} if node.stateful else {}
+
         def run(frame: _Frame) -> Any:
-            value = node.actor(**{port: frame.values[stream] for port, stream in node.inputs.items()})
+            value = node.actor(**{port: frame.values[stream] for port, stream in node.inputs.items()}, **own)
             if not isinstance(value, node.output):
                 raise TypeError(f"{node.use} returned {type(value).__name__}, not {node.output.__name__}")
             return value
 
-        return _Work(node.name, tuple(node.inputs.values()), node.name, node.ordered, run)
+        return _Work(node.name, tuple(node.inputs.values()), node.name, node.stateful, run)
 
     def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> _Work:
         order = {work.name: index for index, work in enumerate(self._work)}

@@ -34,14 +34,14 @@ def plain(said: Any) -> Finding:
     return finding(severity, sentence)
 
 
-def findings(graph: Graph) -> dict[str, Finding]:
-    """What there is to say at the end of a run: what was left out, and what the `finding()` of stages returns."""
+def findings(graph: Graph, states: Mapping[str, Any]) -> dict[str, Finding]:
+    """What there is to say at the end of a run: what was left out, and what the `finding(state)` of stages returns."""
     said = {name: finding(NOTE, f"left out: {why}") for name, why in graph.left_out.items()}
     for node in graph.stages:
-        if not hasattr(node.actor, "finding"):
+        if not (node.stateful and hasattr(node.actor, "finding")):
             continue
         try:
-            returned = node.actor.finding()
+            returned = node.actor.finding(states[node.name])
             if returned is not None:
                 said[node.name] = plain(returned)
         except Exception as error:  # no reason to leave the outputs open

@@ -15,6 +15,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from flow.contracts import Sink
 from flow.errors import PipelineError
+from flow.runtime.ledger import failure
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,9 @@ class Node:
         return is_aligner(type(self.actor))
 
     @property
-    def ordered(self) -> bool:
-        """Whether the stage remembers, and so must see frames one at a time in stamp order."""
-        return bool(getattr(self.actor, "ordered", False))
+    def stateful(self) -> bool:
+        """Whether the actor is a stage with state; it gets frames one at a time, in stamp order."""
+        return not self.aligns and has_state(type(self.actor))
 
 
 @dataclass(frozen=True)
@@ -135,15 +136,40 @@ def is_aligner(kind: type) -> bool:
     return hasattr(kind, "start") and hasattr(kind, "ports")
 
 
+def start(stages: Iterable[Node]) -> dict[str, Any]:
+    """Stream -> state, made for one run, of those stages that have one; raises PipelineError where that fails."""
+    states = {}
+    for node in stages:
+        if node.stateful:
+            try:
+                states[node.name] = node.actor.start()
+            except Exception as error:  # the stage may be the user's own
+                raise node.place.error(f"'{node.name}' cannot start: {failure(error)}") from error
+    return states
+
+
+def has_state(kind: type) -> bool:
+    """Whether a stage class makes a state for each run, which `__call__` takes as its keyword-only argument `state`."""
+    return hasattr(kind, "start")
+
+
 def ports_of(kind: type) -> tuple[dict[str, Any], set[str]]:
     """Input ports of a stage or aligner class (name -> type), and which of them may stay unconnected.
 
-    Raises TypeError for a stage that does not say the name and type of an input.
+    The argument `state` of a stage with `start` is no port. Raises TypeError for a stage that does not say the name and
+    type of an input, or has one of `start` and `state` without the other.
     """
     if is_aligner(kind):
         return dict.fromkeys(kind.ports, object), set()  # type: ignore[attr-defined]
     hints = hints_of(kind.__call__)
     parameters = list(signature(kind.__call__).parameters.values())[1:]
+    state = next((parameter for parameter in parameters if parameter.name == "state"), None)
+    if has_state(kind) and (state is None or state.kind is not Parameter.KEYWORD_ONLY):
+        raise TypeError(f"{kind.__name__} has 'start', so its __call__ must take 'state' by keyword only (after '*')")
+    if not has_state(kind) and (state is not None or hasattr(kind, "finding")):
+        what = "finding" if state is None else "__call__"
+        raise TypeError(f"{kind.__name__}.{what} needs a 'state', so {kind.__name__} must have 'start', which makes it")
+    parameters = [parameter for parameter in parameters if parameter.name != "state"]
     for parameter in parameters:
         if parameter.kind not in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY):
             raise TypeError(f"{kind.__name__}.__call__ must take each input by its name, unlike '{parameter}'")

@@ -38,7 +38,7 @@ def surveyed(graph: Graph, excerpts: Excerpts) -> tuple[Graph, dict[str, Finding
     for place, node in enumerate(nodes):
         if node.aligns or node.name not in needed:
             continue
-        if node.ordered:
+        if node.stateful:
             raise node.place.error(f"'{node.name}' remembers frames, so nothing that depends on it can survey the log")
         if _surveys(node):
             given = {port: [sample[stream] for sample in samples] for port, stream in node.inputs.items()}

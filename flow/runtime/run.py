@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -147,7 +147,8 @@ def run(
     with suppress(_StoppedError):
         graph, surveys = surveyed(graph, lambda *which: (_read(part, stop) for part in log.excerpts(*which)))
     streams = graph.frame_streams
-    used = {use: sink for use, sink in graph.sinks if use in outputs}
+    # A sink of the graph is configuration; the copy that is opened belongs to this run.
+    used = {use: replace(sink) for use, sink in graph.sinks if use in outputs}
     wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
     sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
     feeder, started, finished = FrameAssembler(graph, ledger), 0.0, False
@@ -170,7 +171,7 @@ def run(
             "pipeline": graph.name,
             **_counted(feeder, engine, ledger, times),
             "surveys": surveys,
-            "findings": _notes(log, graph) | findings(graph),
+            "findings": _notes(log, graph) | findings(graph, engine.states),
             "outputs": [str(outputs[use]) for use in sinks.opened],
             "withheld": [str(outputs[use]) for use in sinks.withheld],
         }

@@ -9,7 +9,6 @@ nothing but the images to go by, and their covariance grows.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,7 +24,7 @@ VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" af
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
+class _Estimate:
     """What is known of the camera after a frame.
 
     segment, camera, told: as the motion tells, the camera in its segment's first and the covariance (6, 6) of that;
@@ -42,11 +41,11 @@ class _State:
 
 
 @dataclass
-class _Memory:
-    """The state after the last frame, how many poses were made, the last segment of the motion, and what is thought of
-    the poses that were logged."""
+class PoseMemory:
+    """The estimate after the last frame, how many poses were made, the last segment of the motion, and the check of the
+    logged poses."""
 
-    state: _State | None = None
+    estimate: _Estimate | None = None
     visual: int = 0
     segment: int = 0
     check: PoseCheck = field(default_factory=PoseCheck)
@@ -66,73 +65,75 @@ class PoseFilter(Stage):
     turn_error: float = parameter(
         np.deg2rad(0.015), "error of all steps' turn alike, per metre of way", unit="rad", low=0.0, high=0.1
     )
-    _memory: _Memory = field(default_factory=_Memory, init=False, repr=False, compare=False)
 
-    ordered: ClassVar[bool] = True
+    def start(self) -> PoseMemory:
+        """The memory of one run, empty."""
+        return PoseMemory()
 
-    def __call__(self, motion: CameraMotion, tilt: Tilt, mount: Mount, logged: Pose | None = None) -> Pose:
+    def __call__(
+        self, motion: CameraMotion, tilt: Tilt, mount: Mount, logged: Pose | None = None, *, state: PoseMemory
+    ) -> Pose:
         """`logged` where it is connected; else the pose of base_link, or of the camera where base_link is unknown.
 
         Its frame is `visual_odom`: z up, origin and heading those of the first frame, and "visual_odom/2" and so on for
         what came after tracking was lost. Raises ValueError where the images do not tell the motion.
         """
-        self._memory.segment = motion.segment
+        state.segment = motion.segment
         if logged is not None:
-            self._memory.check.add(motion, logged, mount)
+            state.check.add(motion, logged, mount)
             return logged
         if motion.camera is None:
             raise ValueError(f"PoseFilter: no pose can be told from the images: {motion.lost}")
-        before = self._memory.state
+        before = state.estimate
         if before is None or before.segment != motion.segment:
-            state = self._begun(motion, motion.camera, tilt, mount)
+            estimate = self._begun(motion, motion.camera, tilt, mount)
         else:
-            state = self._drawn(_carried(before, motion, motion.camera), tilt, mount)
-        self._memory.state = state
-        self._memory.visual += 1
-        return self._pose(motion.stamp, state, mount)
+            estimate = self._drawn(_carried(before, motion, motion.camera), tilt, mount)
+        state.estimate = estimate
+        state.visual += 1
+        return self._pose(motion.stamp, estimate, mount)
 
-    def finding(self) -> Finding | None:
+    def finding(self, state: PoseMemory) -> Finding | None:
         """Where poses come from, if not from the log, and how often tracking was lost: a warning where that parts them,
         and where those of the log do not fit the images; None where they are given and do."""
-        memory = self._memory
-        if doubt := memory.check.doubt():
+        if doubt := state.check.doubt():
             return Finding(doubt, Severity.WARNING)
-        lost = "tracking was lost " + ("once" if memory.segment == 2 else f"{memory.segment - 1} times")
-        if memory.state is None:
-            return Finding(f"{lost} by visual odometry; the poses are the log's own") if memory.segment > 1 else None
-        said = f"no pose is given: visual odometry supplies it ({counted(memory.visual, 'pose')})"
-        if memory.segment < 2:
+        lost = "tracking was lost " + ("once" if state.segment == 2 else f"{state.segment - 1} times")
+        if state.estimate is None:
+            return Finding(f"{lost} by visual odometry; the poses are the log's own") if state.segment > 1 else None
+        said = f"no pose is given: visual odometry supplies it ({counted(state.visual, 'pose')})"
+        if state.segment < 2:
             return Finding(f"{said}, in frame {VISUAL_FRAME}")
-        frames = f"{VISUAL_FRAME} {'and' if memory.segment == 2 else 'to'} {_frame_of(memory.segment)}"
-        parted = f"{said}; {lost}, so they are in {memory.segment} frames, {frames}, that nothing joins"
+        frames = f"{VISUAL_FRAME} {'and' if state.segment == 2 else 'to'} {_frame_of(state.segment)}"
+        parted = f"{said}; {lost}, so they are in {state.segment} frames, {frames}, that nothing joins"
         return Finding(parted, Severity.WARNING)
 
-    def _begun(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> _State:
+    def _begun(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> _Estimate:
         """The first frame of a segment: at its origin, upright by the tilt."""
         world = level_transform(tilt, mount, camera.child, camera_height=0.0)
         # About the origin, which is base_link where that is known, the tilt's error moves the camera as well.
         covariance = levered(np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0]), world.translation)
-        return _State(motion.segment, camera, motion.covariance, world, covariance, 0.0)
+        return _Estimate(motion.segment, camera, motion.covariance, world, covariance, 0.0)
 
-    def _drawn(self, state: _State, tilt: Tilt, mount: Mount) -> _State:
-        """The state after the tilt had its say: it tells where up is, that is, the turns about the two level axes."""
-        world, covariance = state.world, state.covariance
+    def _drawn(self, estimate: _Estimate, tilt: Tilt, mount: Mount) -> _Estimate:
+        """The estimate corrected by the tilt, which measures the turns about the two level axes."""
+        world, covariance = estimate.world, estimate.covariance
         up = world.rotation @ mount.camera_from_inclinometer @ tilt.up
         gain = covariance[:, 3:5] @ np.linalg.inv(covariance[3:5, 3:5] + self.tilt_noise**2 * np.eye(2))
         change = gain @ np.array([up[1], -up[0]])  # the turn that brings up to z
         turn = np.asarray(Rotation.from_rotvec(change[3:]).as_matrix())
         drawn = Transform(world.parent, world.child, turn @ world.rotation, world.translation + change[:3])
-        return replace(state, world=drawn, covariance=covariance - gain @ covariance[3:5])
+        return replace(estimate, world=drawn, covariance=covariance - gain @ covariance[3:5])
 
-    def _pose(self, stamp: int, state: _State, mount: Mount) -> Pose:
+    def _pose(self, stamp: int, estimate: _Estimate, mount: Mount) -> Pose:
         base = mount.base_from_camera
-        placed = state.world if base is None else state.world.after(base.inverse())
-        alike = self._alike(placed.translation, state.way)
-        covariance = levered(state.covariance, placed.translation - state.world.translation) + alike.T @ alike
+        placed = estimate.world if base is None else estimate.world.after(base.inverse())
+        alike = self._alike(placed.translation, estimate.way)
+        covariance = levered(estimate.covariance, placed.translation - estimate.world.translation) + alike.T @ alike
         np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # the origin's is zero but for rounding
         return Pose(
             stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),
-            _frame_of(state.segment), placed.child, covariance,
+            _frame_of(estimate.segment), placed.child, covariance,
         )  # fmt: skip
 
     def _alike(self, place: Array, way: float) -> Array:
@@ -149,8 +150,8 @@ class PoseFilter(Stage):
         ])  # fmt: skip
 
 
-def _carried(before: _State, motion: CameraMotion, camera: Transform) -> _State:
-    """The state carried along by the images: the way levers the turns' errors, and the step adds its own."""
+def _carried(before: _Estimate, motion: CameraMotion, camera: Transform) -> _Estimate:
+    """The estimate carried along by the images: the way levers the turns' errors, and the step adds its own."""
     world = before.world.after(before.camera.inverse().after(camera))
     way = world.translation - before.world.translation
     # What the motion's covariance, in the axes of its segment's first camera, has gained since the frame before.
@@ -160,7 +161,7 @@ def _carried(before: _State, motion: CameraMotion, camera: Transform) -> _State:
     turned = np.kron(np.eye(2), world.rotation @ camera.rotation.T)
     covariance = levered(before.covariance, way) + turned @ added @ turned.T
     driven = before.way + float(np.linalg.norm(way))
-    return _State(motion.segment, camera, motion.covariance, world, covariance, driven)
+    return _Estimate(motion.segment, camera, motion.covariance, world, covariance, driven)
 
 
 def _frame_of(segment: int) -> str:

@@ -7,8 +7,7 @@ poses of different segments have nothing to do with each other, and nothing is m
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,7 +26,9 @@ class _Keyframe:
 
 
 @dataclass
-class _Memory:
+class OdometryMemory:
+    """The keyframe, the number of the segment, and how many frames showed too little to track."""
+
     keyframe: _Keyframe | None = None
     segment: int = 0  # 1 from the first frame on that shows something
     blind: int = 0
@@ -48,42 +49,45 @@ class VisualOdometry(Stage):
     min_keyframe_share: float = parameter(
         0.5, "and while this share of its features is still tracked", low=0.0, high=1.0
     )
-    _memory: _Memory = field(default_factory=_Memory, init=False, repr=False, compare=False)
 
-    ordered: ClassVar[bool] = True
+    def start(self) -> OdometryMemory:
+        """The memory of one run, empty."""
+        return OdometryMemory()
 
-    def __call__(self, frame: StereoFrame, disparity: Disparity) -> CameraMotion:
+    def __call__(self, frame: StereoFrame, disparity: Disparity, *, state: OdometryMemory) -> CameraMotion:
         """The camera's motion since its segment began; without `camera` where the frame shows too little to track."""
         check_joined(self, frame, disparity)
-        before, seen = self._memory.keyframe, view(frame, disparity)
+        before, seen = state.keyframe, view(frame, disparity)
         step = step_between(before.view, seen, self.min_features) if before is not None else None
         if before is not None and step is not None and self._likely(step):
-            return self._followed(frame.stamp, before, step, seen)
+            return self._followed(frame.stamp, before, step, seen, state)
         # What all is counted from needs no more than to show something: it may be the only frame.
         if seen.known < (1 if before is None else self.min_features):
-            return self._blind(frame.stamp, seen)
-        return self._begun(frame, seen, self._parted(before.view, seen) if before is not None else "")
+            return self._blind(frame.stamp, seen, state)
+        lost = self._parted(before.view, seen, state.segment + 1) if before is not None else ""
+        return _begun(frame, seen, lost, state)
 
-    def finding(self) -> Finding | None:
+    def finding(self, state: OdometryMemory) -> Finding | None:
         """How many frames show too little; None where all show enough. That tracking was lost is for PoseFilter to
         tell, which knows what that does to the poses."""
-        blind = self._memory.blind
+        blind = state.blind
         shows = "frame shows" if blind == 1 else "frames show"
         return Finding(f"{blind} {shows} too little to track") if blind else None
 
     def _likely(self, step: Step) -> bool:
         return step.error <= self.max_rms and float(np.linalg.norm(step.translation)) <= self.max_motion
 
-    def _parted(self, before: VoFrame, seen: VoFrame) -> str:
+    def _parted(self, before: VoFrame, seen: VoFrame, segment: int) -> str:
         """Why the segment ends."""
         sizes = [f"{width}x{height}" for height, width in (before.gray.shape, seen.gray.shape)]
         why = f"less than {self.min_features} features agree with the frame before"
         if sizes[0] != sizes[1]:
             why = f"the images, {sizes[0]} before, are {sizes[1]} now"
-        return f"{why}; segment {self._memory.segment + 1} begins"
+        return f"{why}; segment {segment} begins"
 
-    def _followed(self, stamp: int, before: _Keyframe, step: Step, seen: VoFrame) -> CameraMotion:
-        memory = self._memory
+    def _followed(
+        self, stamp: int, before: _Keyframe, step: Step, seen: VoFrame, memory: OdometryMemory
+    ) -> CameraMotion:
         back = Transform(before.camera.child, before.camera.child, step.rotation.T, -step.rotation.T @ step.translation)
         camera = before.camera.after(back)
         covariance = _grown(before, step, camera)
@@ -94,19 +98,19 @@ class VisualOdometry(Stage):
             memory.keyframe = _Keyframe(seen, camera, covariance)
         return CameraMotion(stamp, memory.segment, camera, covariance, step.inliers)
 
-    def _blind(self, stamp: int, seen: VoFrame) -> CameraMotion:
+    def _blind(self, stamp: int, seen: VoFrame, memory: OdometryMemory) -> CameraMotion:
         """No motion; the keyframe stays, so that the next frame that shows enough goes on from it."""
-        self._memory.blind += 1
+        memory.blind += 1
         lost = f"only {seen.known} features with a disparity are in view, less than {self.min_features}"
-        return CameraMotion(stamp, self._memory.segment, None, np.zeros((6, 6)), lost=lost)
+        return CameraMotion(stamp, memory.segment, None, np.zeros((6, 6)), lost=lost)
 
-    def _begun(self, frame: StereoFrame, seen: VoFrame, lost: str = "") -> CameraMotion:
-        """The first frame of a segment; `lost` says why the one before ended."""
-        memory = self._memory
-        memory.segment += 1
-        camera = Transform(f"{frame.camera.frame_id}/start", frame.camera.frame_id, np.eye(3), np.zeros(3))
-        memory.keyframe = _Keyframe(seen, camera, np.zeros((6, 6)))
-        return CameraMotion(frame.stamp, memory.segment, camera, np.zeros((6, 6)), lost=lost)
+
+def _begun(frame: StereoFrame, seen: VoFrame, lost: str, memory: OdometryMemory) -> CameraMotion:
+    """The first frame of a segment; `lost` says why the one before ended."""
+    memory.segment += 1
+    camera = Transform(f"{frame.camera.frame_id}/start", frame.camera.frame_id, np.eye(3), np.zeros(3))
+    memory.keyframe = _Keyframe(seen, camera, np.zeros((6, 6)))
+    return CameraMotion(frame.stamp, memory.segment, camera, np.zeros((6, 6)), lost=lost)
 
 
 def _grown(before: _Keyframe, step: Step, camera: Transform) -> Array:

@@ -6,8 +6,7 @@ it, or something is wrong with the images; and what is found there all the same 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,11 +24,14 @@ class CheckMatches(Stage):
         low=0.01, high=1.0,
     )  # fmt: skip
     min_matched: float = parameter(0.7, "share of it that must be matched", low=0.0, high=1.0)
-    _near: list[float] = field(default_factory=list, init=False, repr=False, compare=False)
 
-    ordered: ClassVar[bool] = True
+    def start(self) -> list[float]:
+        """The share that was matched in each frame of one run; none yet."""
+        return []
 
-    def __call__(self, disparity: Disparity, tilt: Tilt | None = None, mount: Mount | None = None) -> MatchHealth:
+    def __call__(
+        self, disparity: Disparity, tilt: Tilt | None = None, mount: Mount | None = None, *, state: list[float]
+    ) -> MatchHealth:
         """What is matched, of the right half of the image: part of the left one no other camera sees.
 
         tilt, mount: tell a camera that hangs; without them it is taken to stand.
@@ -40,16 +42,16 @@ class CheckMatches(Stage):
         rows = max(1, round(self.near_rows * height))
         hangs = tilt is not None and mount is not None and (mount.camera_from_inclinometer @ tilt.up)[1] > 0
         near = float((matched[:rows] if hangs else matched[-rows:]).mean())
-        self._near.append(near)
+        state.append(near)
         return MatchHealth(disparity.stamp, float(matched.mean()), near)
 
-    def finding(self) -> Finding | None:
+    def finding(self, state: list[float]) -> Finding | None:
         """A warning where that is less than `min_matched` in the median of the frames."""
-        if not self._near or np.median(self._near) >= self.min_matched:
+        if not state or np.median(state) >= self.min_matched:
             return None
         return Finding(
-            f"of the nearest ground in view {100 * np.median(self._near):.0f} % is matched (median of "
-            f"{counted(len(self._near), 'frame')}), what else the map has there may be wrong: set `disparities` larger "
+            f"of the nearest ground in view {100 * np.median(state):.0f} % is matched (median of "
+            f"{counted(len(state), 'frame')}), what else the map has there may be wrong: set `disparities` larger "
             "if that ground is nearer than the search reaches; or else the images are dark, blurred, bare, or left for "
             "right",
             Severity.WARNING,

@@ -8,8 +8,7 @@ join without a seam.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -77,9 +76,6 @@ class Fuse(Stage):
     max_contradiction: float = parameter(3.0, "standard deviations that two heights of a cell may differ", low=1.0)
     shared_share: float = parameter(0.5, "share of a cell's variance that is the same in all frames", low=0.0, high=1.0)
 
-    ordered: ClassVar[bool] = True
-    _map: FusedMap = field(default_factory=FusedMap, init=False, repr=False, compare=False)
-
     def __post_init__(self) -> None:
         super().__post_init__()
         check_cells("Fuse.window", self.window, self.resolution)
@@ -90,48 +86,53 @@ class Fuse(Stage):
                 f"(region, {self.max_range:g} m) and {MARGIN:g} m about it"
             )
 
-    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> ElevationMap:
+    def start(self) -> FusedMap:
+        """An empty map, the memory of one run."""
+        return FusedMap()
+
+    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> ElevationMap:
         """The regional map around the rover, in the pose's frame, with the cloud, in frame `level`, fused in.
 
         mount: how the camera sits on the frame whose pose is given; may be left out where that is the camera itself.
+        state: the map so far.
         """
-        self._check(cloud)
+        self._check(cloud, state)
         placed, up = placement(cloud, pose, mount)
         sight = sight_of(cloud, placed, self.resolution, self.max_range)
-        if pose.frame_id != self._map.frame_id:
-            self._map.begin(pose.frame_id, cloud.stamp)
+        if pose.frame_id != state.frame_id:
+            state.begin(pose.frame_id, cloud.stamp)
         known, seen = sight.known, self._seen(sight)
-        cells, plane = self._joined(sight, seen)
-        self._map.ups += up
-        now = self._map.age(cloud.stamp)
+        cells, plane = self._joined(sight, seen, state)
+        state.ups += up
+        now = state.age(cloud.stamp)
         cells[known] = merged(cells[known], seen.raised(plane), now, self.max_contradiction, self.shared_share)
         hidden = ~known & np.isfinite(sight.ceiling) & (cells["frames"] == 0)
         cells[hidden] = hidden_below(cells[hidden], sight.ceiling[hidden] + rise(plane, *sight.offsets(hidden)))
-        self._map.cells.write(sight.row, sight.col, cells, known | hidden)
-        self._map.last, self._map.hides = cloud.stamp, "ceiling" in sight.terrain.layers
-        return self._window(cloud.stamp, raised(sight.placed, plane))
+        state.cells.write(sight.row, sight.col, cells, known | hidden)
+        state.last, state.hides = cloud.stamp, "ceiling" in sight.terrain.layers
+        return self._window(cloud.stamp, raised(sight.placed, plane), state)
 
-    def finding(self) -> Finding | None:
+    def finding(self, state: FusedMap) -> Finding | None:
         """That the map began anew amid a run, and that its frame leans, a warning."""
         found = []
-        if self._map.anew:
+        if state.anew:
             found.append(
-                f"height or tilt jumped against the map, which began anew in the same frame, {self._map.frame_id}, "
-                f"{counted(self._map.anew, 'time')}: maps from before and after that do not join"
+                f"height or tilt jumped against the map, which began anew in the same frame, {state.frame_id}, "
+                f"{counted(state.anew, 'time')}: maps from before and after that do not join"
             )
-        lean = float(np.degrees(np.arctan2(np.linalg.norm(self._map.ups[:2]), self._map.ups[2])))
+        lean = float(np.degrees(np.arctan2(np.linalg.norm(state.ups[:2]), state.ups[2])))
         if lean > _LEANING:
             found.append(
-                f"z of the pose's frame '{self._map.frame_id}' is {lean:.0f} degrees off the vertical of the tilt: the "
+                f"z of the pose's frame '{state.frame_id}' is {lean:.0f} degrees off the vertical of the tilt: the "
                 "map is upright and its way is foreshortened; record the pose in a frame whose z points up"
             )
         return Finding("; ".join(found), Severity.WARNING) if found else None
 
-    def _check(self, cloud: PointCloud) -> None:
+    def _check(self, cloud: PointCloud, state: FusedMap) -> None:
         if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
             raise ValueError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
-        if cloud.stamp <= self._map.last:
-            raise ValueError(f"Fuse: the cloud of {cloud.stamp} ns comes after that of {self._map.last} ns")
+        if cloud.stamp <= state.last:
+            raise ValueError(f"Fuse: the cloud of {cloud.stamp} ns comes after that of {state.last} ns")
 
     def _seen(self, sight: FrameGrid) -> Observation:
         """What a frame shows of the cells that it knows; its errors of place are added to their variance."""
@@ -149,22 +150,22 @@ class Fuse(Stage):
             self.alignment_sigma**2 + self.position_sigma**2 * np.minimum(east**2 + north**2, _STEEPEST**2)
         )
 
-    def _joined(self, sight: FrameGrid, seen: Observation) -> tuple[Array, Array]:
+    def _joined(self, sight: FrameGrid, seen: Observation, state: FusedMap) -> tuple[Array, Array]:
         """The region's cells (rows, cols) that the frame lies on, and the plane (3,) that joins it to them; where that
         jumped, cells of a map that begins anew."""
-        cells = self._map.cells.read(sight.row, sight.col, *sight.terrain.shape)
-        plane = self._plane(cells[sight.known], seen)
-        if self._jumped(plane):
-            self._map.begin(sight.terrain.frame_id, sight.terrain.stamp)
-            self._map.anew += 1
+        cells = state.cells.read(sight.row, sight.col, *sight.terrain.shape)
+        plane = self._plane(cells[sight.known], seen, state.plane)
+        if self._jumped(plane, state):
+            state.begin(sight.terrain.frame_id, sight.terrain.stamp)
+            state.anew += 1
             cells, plane = np.zeros_like(cells), np.zeros(3)
-        self._map.plane, self._map.refused = plane, 0
+        state.plane, state.refused = plane, 0
         return cells, plane
 
-    def _plane(self, cells: Array, seen: Observation) -> Array:
+    def _plane(self, cells: Array, seen: Observation, last: Array) -> Array:
         """What a frame has to rise to join the map: (3,) height at the rover, m, and slopes along x and y.
 
-        cells, seen: (n,), of the cells that the frame knows.
+        cells, seen: (n,), of the cells that the frame knows; last: the plane that joined the frame before.
         """
         both = cells["frames"] > 0
         cells, seen = cells[both], seen.only(both)
@@ -172,7 +173,7 @@ class Fuse(Stage):
         variance = variance_of(cells, self.shared_share) + seen.variance
         expected = np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])
         # What joined the frame before tells what to expect: a pose whose height drifts is off by much, but by and by.
-        before = np.array([self._map.plane[0], 0.0, 0.0])
+        before = np.array([last[0], 0.0, 0.0])
         plane = before + fit_plane(seen.x, seen.y, off - before[0], variance, expected, self.resolution)
         # Far enough off, all is an outlier to a robust fit.
         left = np.abs(off - rise(plane, seen.x, seen.y))
@@ -181,23 +182,23 @@ class Fuse(Stage):
             return np.array([np.median(off), 0.0, 0.0])
         return np.asarray(plane * (1 - np.array([self.follow_height, self.follow_tilt, self.follow_tilt])))
 
-    def _jumped(self, plane: Array) -> bool:
+    def _jumped(self, plane: Array, state: FusedMap) -> bool:
         """Whether frame after frame does not join the map; raises ValueError for the first of them."""
-        change = np.abs(plane - self._map.plane)
+        change = np.abs(plane - state.plane)
         if np.all(change <= LARGEST_JUMP * np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])):
             return False
-        self._map.refused += 1
-        if self._map.refused < PATIENCE:
+        state.refused += 1
+        if state.refused < PATIENCE:
             raise ValueError(
                 f"Fuse: the frame lies {change[0]:.2f} m and {np.degrees(change[1:].max()):.1f} degrees off the map, "
                 "unlike those before; its pose or its tilt has jumped, and it is left out of the regional map"
             )
         return True
 
-    def _window(self, stamp: int, placed: Transform) -> ElevationMap:
+    def _window(self, stamp: int, placed: Transform, state: FusedMap) -> ElevationMap:
         """The map around the rover."""
         half = int(np.ceil(self.window / 2 / self.resolution - 1e-9))
         col, row = (int(np.floor(place / self.resolution)) - half for place in placed.translation[:2])
-        layers = layers_of(self._map.cells.read(row, col, 2 * half, 2 * half), self.shared_share, self._map.hides)
+        layers = layers_of(state.cells.read(row, col, 2 * half, 2 * half), self.shared_share, state.hides)
         origin = (col * self.resolution, row * self.resolution)
-        return ElevationMap(stamp, layers, self.resolution, origin, placed.parent, placed, self._map.epoch)
+        return ElevationMap(stamp, layers, self.resolution, origin, placed.parent, placed, state.epoch)

@@ -79,21 +79,22 @@ class Add:
 
 @dataclass(frozen=True)
 class Total:
-    """Remembers: the running sum of all frames."""
+    """The running sum of all frames."""
 
-    ordered: ClassVar[bool] = True
-    seen: list[float] = field(default_factory=list, init=False)
+    def start(self) -> list[float]:
+        """The values so far: none."""
+        return []
 
-    def __call__(self, couple: Couple) -> Couple:
-        self.seen.append(couple.value)
-        return Couple(couple.stamp, sum(self.seen))
+    def __call__(self, couple: Couple, *, state: list[float]) -> Couple:
+        state.append(couple.value)
+        return Couple(couple.stamp, sum(state))
 
-    def finding(self) -> Finding | None:
-        """The sum of all, a warning from 30 on; it breaks down at 12."""
-        if sum(self.seen) == 12:
+    def finding(self, state: list[float]) -> Finding | None:
+        """The sum of all, a warning from 30 on; it fails at 12."""
+        if sum(state) == 12:
             raise RuntimeError("unlucky")
-        severity = Severity.WARNING if sum(self.seen) >= 30 else Severity.NOTE
-        return Finding(f"the sum is {sum(self.seen)}", severity) if self.seen else None
+        severity = Severity.WARNING if sum(state) >= 30 else Severity.NOTE
+        return Finding(f"the sum is {sum(state)}", severity) if state else None
 
 
 @dataclass(frozen=True)
@@ -142,22 +143,36 @@ class Meter:
 
 
 @dataclass
+class Kept:
+    """What a sink was given."""
+
+    records: list[Any] = field(default_factory=list)
+    streams: Mapping[str, type] = field(default_factory=dict)
+    summary: dict[str, Any] | None = None
+    meter: Meter = field(default_factory=Meter)
+
+
+@dataclass
 class Keep:
-    """A sink that keeps what it is given."""
+    """A sink that keeps what it is given; the copies that runs make of it share `kept`."""
 
     suffix: ClassVar[str] = ".txt"
     names_streams: ClassVar[tuple[str, ...]] = ("only",)
     only: tuple[str, ...] = ()
     fail_at: int | None = None
-    records: list[Any] = field(default_factory=list, init=False)
-    summary: dict[str, Any] | None = field(default=None, init=False)
-    meter: Meter = field(default_factory=Meter, init=False)
+    kept: Kept = field(default_factory=Kept)
+
+    def __getattr__(self, name: str) -> Any:
+        """The parts of `kept`."""
+        if name not in Kept.__dataclass_fields__:
+            raise AttributeError(name)
+        return getattr(self.kept, name)
 
     def wants(self, stream: str, kind: type) -> bool:
         return True
 
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
-        self.streams = streams
+        self.kept.streams = streams
 
     def write(self, record: Any) -> None:
         with self.meter:
@@ -166,7 +181,7 @@ class Keep:
             self.records.append(record)
 
     def close(self, summary: Mapping[str, Any]) -> None:
-        self.summary = dict(summary)
+        self.kept.summary = dict(summary)
 
     def values(self, stream: str) -> dict[int, float]:
         return {r.stamp: r.items[stream].value for r in self.records if stream in r.items}

@@ -1,4 +1,4 @@
-"""A stage that remembers can be put down halfway and taken up by another: the results have the same bits."""
+"""The state of a stage can be saved halfway through a run and restored: the results have the same bits."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import stages
+from flow.runtime.graph import has_state
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages import (
@@ -23,6 +24,7 @@ from stages import (
     Tilt,
     VisualOdometry,
 )
+from stages.stage import restore, snapshot
 from tests.stages.localisation.drive import Drive, motions
 
 FRAMES = 6
@@ -64,28 +66,25 @@ def same(one, other):
 
 @pytest.mark.parametrize("kind", [VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse])
 def test_a_run_in_two_parts_is_the_whole_run(inputs, kind):
-    frames, whole, first, second = inputs[kind], kind(), kind(), kind()
-    half = len(frames) // 2 + 1
-    wanted = [whole(*given) for given in frames]
-    found = [first(*given) for given in frames[:half]]
-    kept = first.snapshot()
-    first(*frames[half])  # what the first does afterwards is no concern of the second
-    second.restore(kept)
-    found += [second(*given) for given in frames[half:]]
+    frames, stage = inputs[kind], kind()
+    half, whole, first, fresh = len(frames) // 2 + 1, stage.start(), stage.start(), stage.start()
+    wanted = [stage(*given, state=whole) for given in frames]
+    found = [stage(*given, state=first) for given in frames[:half]]
+    saved = snapshot(stage, first)
+    stage(*frames[half], state=first)  # changes nothing that was saved
+    second = restore(kind(), saved)
+    found += [stage(*given, state=second) for given in frames[half:]]
     assert all(map(same, wanted, found))
-    if hasattr(whole, "finding"):
-        assert second.finding() == whole.finding()
-    afresh = kind()
-    forgotten = [afresh(*given) for given in frames[half:]]
-    said = [stage.finding() if hasattr(stage, "finding") else None for stage in (whole, afresh)]
-    assert not all(map(same, wanted[half:], forgotten)) or said[0] != said[1]
+    assert stage.finding(second) == stage.finding(whole)
+    forgotten = [stage(*given, state=fresh) for given in frames[half:]]
+    assert not all(map(same, wanted[half:], forgotten)) or stage.finding(whole) != stage.finding(fresh)
 
 
-def test_every_stage_that_remembers_is_tried_above():
-    remembering = {kind for name in stages.__all__ if getattr(kind := getattr(stages, name), "ordered", False)}
-    assert remembering == {VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse}
+def test_every_stage_with_state_is_tried_above():
+    with_state = {kind for name in stages.__all__ if has_state(kind := getattr(stages, name))}
+    assert with_state == {VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse}
 
 
 def test_a_snapshot_of_another_stage_is_refused():
     with pytest.raises(ValueError, match="a snapshot of PoseFilter is not one of CheckTilt"):
-        CheckTilt().restore(PoseFilter().snapshot())
+        restore(CheckTilt(), snapshot(PoseFilter(), PoseFilter().start()))

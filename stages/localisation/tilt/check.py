@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -60,7 +59,7 @@ class _Verdict:
 
 
 @dataclass
-class _Memory:
+class TiltMemory:
     """The frames that count, the last frame of all, how many were kept since they were judged, the verdict, and the
     least angle, rad, by which the ground was off level in any frame that shows it, with the number of these."""
 
@@ -82,13 +81,15 @@ class CheckTilt(Stage):
         np.deg2rad(2.0), "least error of the mount that is called a fault", unit="rad", low=1e-3, high=0.5
     )
     min_offset: float = parameter(0.08, "least error of the tilt's stamps that is", unit="s", low=0.01, high=1.0)
-    _memory: _Memory = field(default_factory=_Memory, init=False, repr=False, compare=False)
 
-    ordered: ClassVar[bool] = True
+    def start(self) -> TiltMemory:
+        """The memory of one run, empty."""
+        return TiltMemory()
 
-    def __call__(self, motion: CameraMotion, tilt: Tilt, mount: Mount, cloud: PointCloud | None = None) -> TiltHealth:
+    def __call__(
+        self, motion: CameraMotion, tilt: Tilt, mount: Mount, cloud: PointCloud | None = None, *, state: TiltMemory
+    ) -> TiltHealth:
         """The tilt's health so far. `cloud`, of the same camera, shows the ground; without it only motion counts."""
-        memory = self._memory
         ground = _ground_normal(cloud) if cloud is not None else np.full(3, np.nan)
         up = mount.camera_from_inclinometer @ tilt.up
         turn = np.nan
@@ -97,43 +98,28 @@ class CheckTilt(Stage):
             sight = _TiltSample(
                 motion.stamp, motion.segment, motion.camera, drift, tilt.up, mount.camera_from_inclinometer, ground
             )  # fmt: skip
-            turn = self._residual(sight)
-            memory.last = sight
-            self._keep(sight)
+            turn = _residual(sight, state.last)
+            state.last = sight
+            self._keep(sight, state)
         slope = np.nan
         if np.isfinite(ground).all():
             slope = _angle(up, ground)
-            memory.least_slope, memory.slopes = min(memory.least_slope, slope), memory.slopes + 1
-        judged = self._told(memory.verdict)
-        return TiltHealth(motion.stamp, turn, slope, len(memory.kept), judged.fault, judged.sentence)
+            state.least_slope, state.slopes = min(state.least_slope, slope), state.slopes + 1
+        judged = _told(state.verdict, state)
+        return TiltHealth(motion.stamp, turn, slope, len(state.kept), judged.fault, judged.sentence)
 
-    def finding(self) -> Finding:
+    def finding(self, state: TiltMemory) -> Finding:
         """What to say of the whole run, the frames after the last judgement included; a fault is a warning."""
-        verdict = self._memory.verdict
-        if self._memory.since:
-            verdict = verdict.and_then(self._diagnosis())
+        verdict = state.verdict
+        if state.since:
+            verdict = verdict.and_then(self._diagnosis(state))
         if verdict.fault is None:
-            told = self._told(verdict)
+            told = _told(verdict, state)
             return Finding(told.sentence, Severity.WARNING if told.fault else Severity.NOTE)
         where = "" if verdict.faults == verdict.clear else f" ({verdict.faults} of {verdict.clear} judgements)"
         return Finding(verdict.fault.sentence + where, Severity.WARNING)
 
-    def _told(self, verdict: _Verdict) -> Diagnosis:
-        """The last judgement; as long as none could tell anything, what the ground alone says of every frame so far."""
-        memory = self._memory
-        steep = off_level(memory.least_slope, memory.slopes) if verdict.clear == 0 and not verdict.last.fault else None
-        return steep or verdict.last
-
-    def _residual(self, sight: _TiltSample) -> float:
-        """By how much up differs from the last frame's, carried along by the camera; NaN in a new segment."""
-        last = self._memory.last
-        if last is None or last.segment != sight.segment:
-            return float("nan")
-        carried = sight.camera.rotation.T @ last.camera.rotation @ last.mount @ last.up
-        return _angle(sight.mount @ sight.up, carried)
-
-    def _keep(self, sight: _TiltSample) -> None:
-        memory = self._memory
+    def _keep(self, sight: _TiltSample, memory: TiltMemory) -> None:
         before = memory.kept[-1] if memory.kept else None
         if before is not None and before.segment == sight.segment:
             step = before.camera.inverse().after(sight.camera)
@@ -146,17 +132,31 @@ class CheckTilt(Stage):
             memory.kept.popleft()
         memory.since += 1
         if memory.since >= self.interval:
-            memory.verdict, memory.since = memory.verdict.and_then(self._diagnosis()), 0
+            memory.verdict, memory.since = memory.verdict.and_then(self._diagnosis(memory)), 0
 
-    def _diagnosis(self) -> Diagnosis:
+    def _diagnosis(self, memory: TiltMemory) -> Diagnosis:
         """What the frames that are kept now show."""
-        kept = self._memory.kept
+        kept = memory.kept
         evidence = Evidence(
             np.array([sight.stamp for sight in kept]), np.array([sight.segment for sight in kept]),
             np.array([sight.camera.rotation for sight in kept]), np.array([sight.drift for sight in kept]),
             np.array([sight.up for sight in kept]), kept[-1].mount, np.array([sight.ground for sight in kept]),
         )  # fmt: skip
         return diagnose(evidence, self.min_angle, self.min_offset)
+
+
+def _told(verdict: _Verdict, memory: TiltMemory) -> Diagnosis:
+    """The last judgement; as long as none could tell anything, what the ground alone says of every frame so far."""
+    steep = off_level(memory.least_slope, memory.slopes) if verdict.clear == 0 and not verdict.last.fault else None
+    return steep or verdict.last
+
+
+def _residual(sight: _TiltSample, last: _TiltSample | None) -> float:
+    """By how much up differs from the last frame's, carried along by the camera; NaN in a new segment."""
+    if last is None or last.segment != sight.segment:
+        return float("nan")
+    carried = sight.camera.rotation.T @ last.camera.rotation @ last.mount @ last.up
+    return _angle(sight.mount @ sight.up, carried)
 
 
 def _ground_normal(cloud: PointCloud) -> Array:

@@ -26,6 +26,7 @@ from stages.data import (
     TiltHealth,
     Transform,
 )  # fmt: skip
+from tests.stages.running import Running
 from tests.stages.terrain.region_scene import MOUNT, SECOND, drive
 from tests.stages.terrain.region_scene import START as DRIVE
 
@@ -133,7 +134,7 @@ def test_losses_are_in_the_diagnostics_of_their_frame_and_the_late_ones_at_the_e
 
 
 def test_the_stamps_in_a_regional_map_s_cells_can_be_told_from_the_diagnostics_beside_it(tmp_path: Path) -> None:
-    fuse, sink = Fuse(), McapSink()
+    fuse, sink = Running(Fuse()), McapSink()
     sink.open(tmp_path / "out.mcap", {"regional_map": ElevationMap}, ABOUT)
     for frame in range(3):
         cloud, pose = drive(frame)

@@ -14,6 +14,7 @@ from recordings.simulator.traverse import level_pose
 from stages import Mount, Pose, PoseFilter, Tilt, Transform
 from stages.data import Array
 from tests.stages.localisation.drive import FRAMES, Drive, motions
+from tests.stages.running import Running
 
 DRIVE = Drive(2, 6.0)
 
@@ -22,7 +23,7 @@ def mount_of(drive: Drive, based: bool = True) -> Mount:
     return Mount(0, drive.mount, drive.truth.mounts[0] if based else None)
 
 
-def located(drive: Drive, stage: PoseFilter, based: bool = True) -> list[Pose]:
+def located(drive: Drive, stage: Running, based: bool = True) -> list[Pose]:
     mount, ups = mount_of(drive, based), drive.ups()
     given = motions(drive.cameras(), drive.stamps())
     return [stage(motion, Tilt(motion.stamp, up), mount) for motion, up in zip(given, ups, strict=True)]
@@ -40,7 +41,7 @@ def errors(drive: Drive, poses: list[Pose]) -> tuple[Array, Array]:
 
 
 def test_poses_of_base_link_follow_the_drive_and_say_that_they_are_visual():
-    stage = PoseFilter()
+    stage = Running(PoseFilter())
     poses = located(DRIVE, stage)
     places, turns = errors(DRIVE, poses)
     assert {(pose.frame_id, pose.child_frame_id) for pose in poses} == {("visual_odom", "base_link")}
@@ -53,12 +54,12 @@ def test_poses_of_base_link_follow_the_drive_and_say_that_they_are_visual():
 
 def test_the_tilt_is_smoothed_along_the_images():
     """Roll and pitch get better than any single tilt, and the tilt keeps them from drifting."""
-    _, turns = errors(DRIVE, located(DRIVE, PoseFilter(tilt_noise=float(np.radians(0.15)))))
+    _, turns = errors(DRIVE, located(DRIVE, Running(PoseFilter(tilt_noise=float(np.radians(0.15))))))
     assert np.sqrt(np.mean(np.square(turns[20:, :2]))) < 0.4 * 0.3 * 0.45
     tilted = Drive(2, 6.0, noise=0.0)
     mount, given = mount_of(tilted), motions(tilted.cameras(), tilted.stamps())
     leaning = np.radians(0.1)  # the images lean over by 0.1 degrees a frame
-    stage, leans = PoseFilter(), []
+    stage, leans = Running(PoseFilter()), []
     for count, (motion, up) in enumerate(zip(given, tilted.ups(), strict=True)):
         assert motion.camera is not None
         lean = Rotation.from_rotvec([0, 0, leaning * count]).as_matrix()
@@ -73,7 +74,7 @@ def test_the_tilt_is_smoothed_along_the_images():
 def test_the_stated_covariance_covers_the_errors_and_grows():
     for seed in (2, 3, 4):
         drive = Drive(seed, 6.0)
-        poses = located(drive, PoseFilter(tilt_noise=float(np.radians(0.15))))
+        poses = located(drive, Running(PoseFilter(tilt_noise=float(np.radians(0.15)))))
         places, turns = errors(drive, poses)
         spread = np.array([np.sqrt(np.diag(pose.covariance)) for pose in poses[1:]])
         found = np.abs(np.hstack([places, np.radians(turns)]))[1:]
@@ -87,7 +88,7 @@ def test_a_rover_that_stands_stays_where_it_is_however_its_tilts_err():
     noise, rng, places, stated = np.radians(0.5), np.random.default_rng(0), [], []
     camera = DRIVE.truth.base_at(DRIVE.stamps(1)[0]).after(DRIVE.truth.mounts[0])
     for _ in range(20):
-        stage = PoseFilter(tilt_noise=float(noise), tilt_bias=0.0)
+        stage = Running(PoseFilter(tilt_noise=float(noise), tilt_bias=0.0))
         for motion in motions([camera] * 10, list(range(10))):
             wrong = Rotation.from_rotvec([*rng.normal(0, noise, 2), 0.0]).as_matrix()
             up = DRIVE.mount.T @ camera.rotation.T @ wrong[:, 2]
@@ -101,7 +102,7 @@ def test_a_rover_that_stands_stays_where_it_is_however_its_tilts_err():
 def test_the_logs_own_pose_goes_through_untouched():
     pose = Pose(7, [1, 2, 3], [0, 0, 0, 1], "odom", "base_link")
     motion = motions(DRIVE.cameras(1), DRIVE.stamps(1))[0]
-    stage = PoseFilter()
+    stage = Running(PoseFilter())
     given = (Tilt(7, DRIVE.ups(1)[0]), mount_of(DRIVE))
     assert stage(motion, *given, pose) is pose
     assert stage(replace(motion, camera=None, lost="dark"), *given, pose) is pose
@@ -111,7 +112,7 @@ def test_the_logs_own_pose_goes_through_untouched():
 def test_after_a_lost_track_the_poses_are_in_a_frame_of_their_own():
     cameras, stamps, ups = DRIVE.cameras(6), DRIVE.stamps(6), DRIVE.ups(6)
     given = [*motions(cameras[:3], stamps[:3]), *motions(cameras[3:], stamps[3:], segment=2)]
-    stage = PoseFilter()
+    stage = Running(PoseFilter())
     poses = [stage(motion, Tilt(motion.stamp, up), mount_of(DRIVE)) for motion, up in zip(given, ups, strict=True)]
     assert [pose.frame_id for pose in poses] == ["visual_odom"] * 3 + ["visual_odom/2"] * 3
     np.testing.assert_allclose(poses[3].position, 0, atol=1e-12)
@@ -123,7 +124,7 @@ def test_after_a_lost_track_the_poses_are_in_a_frame_of_their_own():
 
 
 def test_a_lost_track_is_a_mere_note_where_the_log_has_the_poses():
-    pose, stage = Pose(7, [1, 2, 3], [0, 0, 0, 1], "odom", "base_link"), PoseFilter()
+    pose, stage = Pose(7, [1, 2, 3], [0, 0, 0, 1], "odom", "base_link"), Running(PoseFilter())
     for segment in (1, 2, 3):
         motion = motions(DRIVE.cameras(1), DRIVE.stamps(1), segment=segment)[0]
         stage(motion, Tilt(7, DRIVE.ups(1)[0]), mount_of(DRIVE), pose)
@@ -156,8 +157,8 @@ def slipping(poses: list[Pose]) -> list[Pose]:
     (leaping, r"jumps once against the images, by up to 8\.\d m"),
 ])  # fmt: skip
 def test_a_logged_pose_that_does_not_fit_the_images_is_a_warning(change, said, based):
-    stage, mount = PoseFilter(), mount_of(DRIVE, based)
-    poses = change(located(DRIVE, PoseFilter(), based))
+    stage, mount = Running(PoseFilter()), mount_of(DRIVE, based)
+    poses = change(located(DRIVE, Running(PoseFilter()), based))
     given = motions(DRIVE.cameras(), DRIVE.stamps())
     for motion, up, pose in zip(given, DRIVE.ups(), poses, strict=True):
         assert stage(motion, Tilt(motion.stamp, up), mount, pose) is pose
@@ -169,7 +170,7 @@ def test_a_logged_pose_that_does_not_fit_the_images_is_a_warning(change, said, b
 
 
 def test_without_base_link_it_is_the_cameras_pose():
-    poses = located(DRIVE, PoseFilter(), based=False)
+    poses = located(DRIVE, Running(PoseFilter()), based=False)
     assert poses[0].child_frame_id == DRIVE.truth.mounts[0].child
     first, last = (DRIVE.cameras()[frame].translation for frame in (0, -1))
     assert abs(np.linalg.norm(poses[-1].position) - np.linalg.norm(last - first)) < 0.05
@@ -180,4 +181,4 @@ def test_without_base_link_it_is_the_cameras_pose():
 def test_no_pose_is_made_up_where_the_images_show_none():
     motion = replace(motions(DRIVE.cameras(1), DRIVE.stamps(1))[0], camera=None, lost="only 3 features are in view")
     with pytest.raises(ValueError, match="no pose can be told from the images: only 3 features are in view"):
-        PoseFilter()(motion, Tilt(0, DRIVE.ups(1)[0]), mount_of(DRIVE))
+        Running(PoseFilter())(motion, Tilt(0, DRIVE.ups(1)[0]), mount_of(DRIVE))

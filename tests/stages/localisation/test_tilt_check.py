@@ -13,12 +13,13 @@ from flow.contracts import Severity
 from stages import CheckTilt, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.data import Array
 from tests.stages.localisation.drive import FRAMES, Drive, motions
+from tests.stages.running import Running
 from tests.tilt_faults import flipped
 
 DRIVE = Drive(2, 8.0)
 
 
-def checked(ups: Array, stage: CheckTilt, repeats: int = 1) -> list[TiltHealth]:
+def checked(ups: Array, stage: Running, repeats: int = 1) -> list[TiltHealth]:
     found = []
     for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), ups, strict=True):
         for _ in range(repeats):
@@ -40,7 +41,7 @@ def ground(slope: float, rocks: int = 0) -> PointCloud:
 
 
 def test_a_sound_tilt_comes_to_be_called_sound():
-    stage = CheckTilt()
+    stage = Running(CheckTilt())
     found = checked(DRIVE.ups(), stage)
     assert found[0].judgement == "no frames to judge the tilt by"
     assert np.isnan(found[0].turn)
@@ -52,7 +53,7 @@ def test_a_sound_tilt_comes_to_be_called_sound():
 
 
 def test_a_flipped_sign_is_found_long_before_the_fiftieth_frame_and_told_at_the_end():
-    stage = CheckTilt()
+    stage = Running(CheckTilt())
     found = checked(np.array([flipped(0)(up) for up in DRIVE.ups()]), stage)
     first = next(count for count, health in enumerate(found) if health.fault)
     assert first < 30
@@ -62,14 +63,14 @@ def test_a_flipped_sign_is_found_long_before_the_fiftieth_frame_and_told_at_the_
 
 
 def test_frames_that_stand_still_crowd_nothing_out():
-    moving, halting = CheckTilt(), CheckTilt()
+    moving, halting = Running(CheckTilt()), Running(CheckTilt())
     checked(DRIVE.ups(), moving)
     assert checked(DRIVE.ups(), halting, repeats=4)[-1].frames == FRAMES
     assert halting.finding() == moving.finding()
 
 
 def test_stamps_that_repeat_or_go_back_hide_no_fault():
-    flip, stage = flipped(0), CheckTilt()
+    flip, stage = flipped(0), Running(CheckTilt())
     for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), DRIVE.ups(), strict=True):
         stamp = motion.stamp // 10**9 * 10**9  # of a clock that counts whole seconds
         stage(replace(motion, stamp=stamp), Tilt(stamp, flip(up)), Mount(0, DRIVE.mount))
@@ -79,7 +80,7 @@ def test_stamps_that_repeat_or_go_back_hide_no_fault():
 def test_what_the_log_mends_halfway_is_still_told_at_the_end():
     ups = DRIVE.ups()
     ups[:25] = [flipped(0)(up) for up in ups[:25]]
-    stage = CheckTilt(window=20)
+    stage = Running(CheckTilt(window=20))
     checked(ups, stage)
     assert "the sign of pitch is flipped" in stage.finding().sentence
     assert "judgements)" in stage.finding().sentence
@@ -90,22 +91,23 @@ def test_the_ground_in_view_is_measured_whatever_lies_on_it_and_whatever_frame_t
     mount = Mount(0, np.eye(3))
     for slope in (0.0, 8.0, -15.0):
         cloud = ground(slope, rocks=1500)
-        health = CheckTilt()(motion, tilt, mount, cloud)
+        health = Running(CheckTilt())(motion, tilt, mount, cloud)
         assert abs(np.degrees(health.ground) - abs(slope)) < 0.5
         sensor = Transform("level", "camera", Rotation.from_euler("y", 40, degrees=True).as_matrix(), np.ones(3))
         moved = PointCloud(
             0, sensor(cloud.points).astype(np.float32), cloud.colors, cloud.sigma, cloud.pixel, "level", sensor=sensor
         )  # fmt: skip
-        assert abs(CheckTilt()(motion, tilt, mount, moved).ground - health.ground) < 1e-3
+        assert abs(Running(CheckTilt())(motion, tilt, mount, moved).ground - health.ground) < 1e-3
         points = cloud.points.copy()
         points[::50, 0] = np.nan
-        assert abs(CheckTilt()(motion, tilt, mount, replace(cloud, points=points)).ground - health.ground) < 1e-3
+        gappy = replace(cloud, points=points)
+        assert abs(Running(CheckTilt())(motion, tilt, mount, gappy).ground - health.ground) < 1e-3
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 12])
 def test_ground_far_off_level_in_every_frame_is_a_warning_however_few_they_are(frames):
     """As where the pitch of a camera that looks down by 14.6 degrees has the wrong sign."""
-    stage, mount, tilt = CheckTilt(), Mount(0, np.eye(3)), np.array([0, -1.0, 0])
+    stage, mount, tilt = Running(CheckTilt()), Mount(0, np.eye(3)), np.array([0, -1.0, 0])
     for motion in motions(DRIVE.cameras(1), [0]) * frames:
         health = stage(motion, Tilt(motion.stamp, tilt, "camera"), mount, ground(29.2))
         assert health.fault == "up is off the ground"
@@ -118,13 +120,13 @@ def test_ground_far_off_level_in_every_frame_is_a_warning_however_few_they_are(f
 def test_steep_ground_is_no_fault_nor_is_a_bank_that_only_some_frames_show():
     motion, tilt = motions(DRIVE.cameras(1), [0])[0], Tilt(0, np.array([0, -1.0, 0]), "camera")
     for slopes in ((15.0, 15.0), (-15.0,), (29.0, 18.0)):
-        stage = CheckTilt()
+        stage = Running(CheckTilt())
         health = [stage(motion, tilt, Mount(0, np.eye(3)), ground(slope)) for slope in slopes][-1]
         assert (health.fault, stage.finding().severity) == ("", Severity.NOTE)
 
 
 def test_a_tilt_that_the_motion_proves_sound_stays_sound_on_a_hillside_of_25_degrees():
-    stage, mount = CheckTilt(), Mount(0, DRIVE.mount)
+    stage, mount = Running(CheckTilt()), Mount(0, DRIVE.mount)
     for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), DRIVE.ups(), strict=True):
         level = Rotation.align_vectors([mount.camera_from_inclinometer @ up], [[0, -1.0, 0]])[0].as_matrix()
         hill = ground(25.0)
@@ -138,5 +140,5 @@ def test_an_empty_cloud_has_no_ground():
     empty = PointCloud(
         0, nothing, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32), "camera"
     )  # fmt: skip
-    health = CheckTilt()(motion, Tilt(0, np.array([0, -1.0, 0])), Mount(0, np.eye(3)), empty)
+    health = Running(CheckTilt())(motion, Tilt(0, np.array([0, -1.0, 0])), Mount(0, np.eye(3)), empty)
     assert np.isnan(health.ground)

@@ -12,6 +12,7 @@ from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages import CameraMotion, Disparity, StereoCamera, StereoFrame, Transform, VisualOdometry
 from stages.localisation.vo_tracking import view
+from tests.stages.running import Running
 
 FRAMES = 5
 Input = tuple[StereoFrame, Disparity]
@@ -43,7 +44,7 @@ def blank(given: Input) -> Input:
 
 def test_the_camera_is_followed_to_a_fraction_of_a_degree_and_a_hundredth_of_the_way(drive):
     inputs, cameras = drive
-    odometry = VisualOdometry()
+    odometry = Running(VisualOdometry())
     motions = [odometry(*given) for given in inputs]
     true = cameras[0].inverse().after(cameras[-1])
     found = camera_of(motions[-1])
@@ -58,7 +59,7 @@ def test_the_camera_is_followed_to_a_fraction_of_a_degree_and_a_hundredth_of_the
 
 def test_what_it_says_of_its_error_grows_and_holds(drive):
     inputs, cameras = drive
-    odometry = VisualOdometry()
+    odometry = Running(VisualOdometry())
     spreads = []
     for given, camera in zip(inputs, cameras, strict=True):
         motion = odometry(*given)
@@ -72,7 +73,7 @@ def test_what_it_says_of_its_error_grows_and_holds(drive):
 def test_a_rover_that_stands_still_does_not_drift(drive):
     inputs, _ = drive
     frame, disparity = inputs[0]
-    odometry, rng = VisualOdometry(), np.random.default_rng(0)
+    odometry, rng = Running(VisualOdometry()), np.random.default_rng(0)
     for count in range(8):
         noise = rng.integers(-3, 4, frame.left.shape)
         seen = replace(frame, stamp=frame.stamp + count, left=np.clip(frame.left + noise, 0, 255).astype(np.uint8))
@@ -83,7 +84,7 @@ def test_a_rover_that_stands_still_does_not_drift(drive):
 
 def test_tracking_that_is_lost_begins_a_segment_and_says_so(drive):
     inputs, _ = drive
-    odometry = VisualOdometry()
+    odometry = Running(VisualOdometry())
     odometry(*inputs[0])
     frame, disparity = inputs[1]
     elsewhere = replace(frame, left=frame.left[:, ::-1].copy(), right=frame.right[:, ::-1].copy())
@@ -103,7 +104,7 @@ def test_images_of_another_size_begin_a_segment_and_say_so(drive):
     half = replace(camera, fx=camera.fx / 2, fy=camera.fy / 2, cx=camera.cx / 2 - 0.25, cy=camera.cy / 2 - 0.25,
                    cx_right=camera.cx_right / 2 - 0.25, width=camera.width // 2, height=camera.height // 2)  # fmt: skip
     smaller = StereoFrame(frame.stamp, frame.left[::2, ::2], frame.right[::2, ::2], half)
-    odometry = VisualOdometry()
+    odometry = Running(VisualOdometry())
     odometry(*inputs[0])
     motion = odometry(smaller, Disparity(frame.stamp, *(layer[::2, ::2].copy() for layer in layers), camera=half))
     size = f"{camera.width}x{camera.height}"
@@ -118,14 +119,14 @@ def test_an_image_smaller_than_a_patch_shows_too_little(shape):
     image = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
     camera = StereoCamera(50.0, 50.0, width / 2, height / 2, 0.2, width, height)
     known = [np.ones(shape, kind) for kind in (np.float32, np.uint8, np.float32)]
-    motion = VisualOdometry()(StereoFrame(0, image, image, camera), Disparity(0, *known))
+    motion = Running(VisualOdometry())(StereoFrame(0, image, image, camera), Disparity(0, *known))
     assert motion.lost == "only 0 features with a disparity are in view, less than 40"
 
 
 def test_features_that_agree_only_roughly_are_no_track(drive):
     """An image turned by half a turn looks as if the camera had rolled, but for its principal point."""
     inputs, _ = drive
-    odometry = VisualOdometry()
+    odometry = Running(VisualOdometry())
     odometry(*inputs[0])
     frame, disparity = inputs[1]
     turned = replace(frame, left=frame.left[::-1, ::-1].copy(), right=frame.right[::-1, ::-1].copy())
@@ -134,7 +135,7 @@ def test_features_that_agree_only_roughly_are_no_track(drive):
 
 def test_a_blind_frame_has_no_motion_and_the_next_goes_on_from_the_last_that_saw(drive):
     inputs, cameras = drive
-    odometry = VisualOdometry()
+    odometry = Running(VisualOdometry())
     odometry(*inputs[0])
     blind = odometry(*blank(inputs[1]))
     assert blind.camera is None
@@ -148,7 +149,7 @@ def test_a_blind_frame_has_no_motion_and_the_next_goes_on_from_the_last_that_saw
 
 def test_everything_is_counted_from_the_first_frame_that_shows_something(drive):
     inputs, cameras = drive
-    odometry = VisualOdometry()
+    odometry = Running(VisualOdometry())
     assert odometry(*blank(inputs[0])).camera is None
     first, second = odometry(*inputs[1]), odometry(*inputs[2])
     assert (first.segment, first.lost, second.segment) == (1, "", 1)
@@ -163,13 +164,13 @@ def test_what_everything_is_counted_from_needs_few_features(drive):
     patch[180:210, 150:190] = disparity.source[180:210, 150:190]
     few = replace(disparity, source=patch)
     assert 0 < view(frame, few).known < VisualOdometry().min_features
-    np.testing.assert_array_equal(camera_of(VisualOdometry()(frame, few)).rotation, np.eye(3))
+    np.testing.assert_array_equal(camera_of(Running(VisualOdometry())(frame, few)).rotation, np.eye(3))
 
 
 def test_a_filled_disparity_is_no_place_in_space(drive):
     frame, disparity = drive[0][0]
     filled = replace(disparity, source=np.full_like(disparity.source, 3))
-    assert VisualOdometry()(frame, filled).lost == "only 0 features with a disparity are in view, less than 40"
+    assert Running(VisualOdometry())(frame, filled).lost == "only 0 features with a disparity are in view, less than 40"
 
 
 def test_disparities_of_another_size_are_refused(drive):
@@ -177,4 +178,4 @@ def test_disparities_of_another_size_are_refused(drive):
     layers = disparity.pixels, disparity.source, disparity.confidence
     half = Disparity(0, *(layer[::2, ::2].copy() for layer in layers))
     with pytest.raises(ValueError, match="join the disparity with the rectified frame"):
-        VisualOdometry()(frame, half)
+        Running(VisualOdometry())(frame, half)

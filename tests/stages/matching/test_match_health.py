@@ -7,6 +7,7 @@ from flow.contracts import Severity
 from recordings.simulator import Simulation
 from stages import CheckMatches, Disparity, Mount, PixelOrigin, StereoFrame, Tilt
 from tests.bench.refining import stereo_part
+from tests.stages.running import Running
 
 
 def disparity_with(matched: np.ndarray) -> Disparity:
@@ -18,7 +19,7 @@ def test_the_warning_asks_for_the_lowest_rows_and_for_most_frames():
     sky, ground = np.ones((80, 100), bool), np.ones((80, 100), bool)
     sky[:60] = False
     ground[68:] = False
-    check = CheckMatches()
+    check = Running(CheckMatches())
     assert check(disparity_with(sky)).near == check(disparity_with(sky)).near == 1
     health = check(disparity_with(ground))
     assert (health.all, health.near) == (0.85, 0)
@@ -35,7 +36,7 @@ def test_of_a_camera_that_hangs_upside_down_the_nearest_ground_is_above(up, near
     matched = np.ones((80, 100), bool)
     matched[:10] = False
     tilt = None if up is None else Tilt(0, np.array(up) / np.linalg.norm(up))
-    assert CheckMatches()(disparity_with(matched), tilt, Mount(0, np.eye(3))).near == near
+    assert Running(CheckMatches())(disparity_with(matched), tilt, Mount(0, np.eye(3))).near == near
 
 
 @pytest.mark.parametrize("pipeline", ["rover", "fast"])
@@ -43,7 +44,7 @@ def test_a_search_range_that_ends_short_of_the_ground_is_a_warning_and_one_that_
     simulation = Simulation(frames=1, width=320, height=240, seed=1, abundance=0.1)
     frame = StereoFrame(1, *simulation.frame(0).images, simulation.camera)  # of ground up to 46 px near
     for disparities, words in ((48, None), (16, None), (8, "set `disparities` larger")):
-        check = CheckMatches()
+        check = Running(CheckMatches())
         check(stereo_part(pipeline, frame, disparities, entry="rectified")["disparity"])
         found = check.finding()
         assert (found is None) == (words is None)

@@ -13,11 +13,12 @@ import pytest
 from stages import Binarise, Cell, Fuse, PixelOrigin, TerrainFeatures
 from stages.data.tiles import Tiles
 from stages.terrain.map_registration import placement, sight_of
+from tests.stages.running import Running
 from tests.stages.terrain.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
 
 
 def test_frames_at_any_heading_make_one_map_of_the_ground():
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame in range(12):
         cloud, pose = drive(frame)
         terrain = fuse(cloud, pose, MOUNT)
@@ -33,7 +34,7 @@ def test_a_rock_seen_from_two_headings_stands_where_it_is():
     def with_rock(x, y):
         return np.where(np.hypot(x - 1.0, y - 2.0) < 0.3, 0.25, 0.0)
 
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame, at in enumerate([(-3.0, 2.0, 0.0), (1.0, -2.0, np.pi / 2), (4.0, 5.0, np.radians(-135))]):
         cloud, pose = drive(frame, with_rock, at=at)
         terrain = fuse(cloud, pose, MOUNT)
@@ -53,7 +54,7 @@ def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(
 
     heights = iter((-0.2, -0.1))
     monkeypatch.setattr("stages.terrain.fuse.sight_of", hiding)
-    fuse = Fuse()
+    fuse = Running(Fuse())
     fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
     terrain = fuse(*drive(1, flat, at=(0.0, 0.0, 1.2)), MOUNT)
     assert [cell(terrain, *place, "occluded") for place in ((1.02, 0.02), (2.52, 0.02), (1.02, 2.22))] == [1, 0, 0]
@@ -64,7 +65,7 @@ def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(
 
 
 def test_a_mean_over_frames_is_weighted_by_inverse_variance():
-    fuse = Fuse(tilt_sigma=0.0, height_sigma=0.0, position_sigma=0.0)
+    fuse = Running(Fuse(tilt_sigma=0.0, height_sigma=0.0, position_sigma=0.0))
     clouds = [
         drive(0, flat, at=(0.0, 0.0, 0.0)),
         drive(1, lambda x, y: flat(x, y) + 0.01, sigma=0.04, at=(0.0, 0.0, 0.0)),
@@ -87,7 +88,7 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance():
 def test_a_frame_is_surer_of_level_cells_than_of_steep_ones_for_its_place_is_not_sure():
     spread, steep = {}, 0.2
     for position in (0.0, 0.05):
-        terrain = Fuse(position_sigma=position)(*drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0)), MOUNT)
+        terrain = Running(Fuse(position_sigma=position))(*drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0)), MOUNT)
         spread[position] = terrain.layers["variance"]
     known = np.isfinite(spread[0.0])
     added = float(np.mean((spread[0.05] - spread[0.0])[known]))
@@ -95,7 +96,7 @@ def test_a_frame_is_surer_of_level_cells_than_of_steep_ones_for_its_place_is_not
 
 
 def test_many_frames_of_one_place_do_not_make_it_known_beyond_what_they_share():
-    fuse = Fuse(alignment_sigma=0.01, position_sigma=0.0)
+    fuse = Running(Fuse(alignment_sigma=0.01, position_sigma=0.0))
     for frame in range(40):
         cloud, pose = drive(frame, at=(0.0, 0.0, 0.3))
         terrain = fuse(cloud, pose, MOUNT)
@@ -107,7 +108,7 @@ def test_many_frames_of_one_place_do_not_make_it_known_beyond_what_they_share():
 
 
 def test_cells_know_when_and_by_how_many_frames_they_were_seen():
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame in range(6):
         cloud, pose = drive(frame, at=(1.0 * frame, 0.0, 0.0))
         terrain = fuse(cloud, pose, MOUNT)
@@ -119,7 +120,7 @@ def test_cells_know_when_and_by_how_many_frames_they_were_seen():
 
 @pytest.mark.parametrize("gap", [0.0, 5.0, 12.0])
 def test_a_height_that_drifts_by_and_by_joins_after_a_gap_and_makes_no_step(gap):
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame in range(90):
         along = 0.25 * frame + (gap if frame >= 60 else 0.0)
         cloud, pose = drive(frame, flat, at=(along, 0.0, 0.0), noise=0.005)
@@ -131,7 +132,7 @@ def test_a_height_that_drifts_by_and_by_joins_after_a_gap_and_makes_no_step(gap)
 
 
 def test_a_clock_that_jumps_by_years_leaves_the_map_as_it_is():
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame in range(2):
         fuse(*drive(frame, flat, at=(0.0, 0.0, 0.0)), MOUNT)
     cloud, pose = drive(2, flat, at=(0.0, 0.0, 0.0))
@@ -143,7 +144,7 @@ def test_a_clock_that_jumps_by_years_leaves_the_map_as_it_is():
 def test_a_pose_whose_frame_has_no_name_makes_the_map_that_a_named_one_does():
     maps = {}
     for name in ("odom", ""):
-        fuse = Fuse()
+        fuse = Running(Fuse())
         for frame in range(3):
             cloud, pose = drive(frame)
             maps[name] = fuse(cloud, replace(pose, frame_id=name), MOUNT)
@@ -157,7 +158,7 @@ def with_box(x, y):
 
 
 def test_newer_evidence_clears_what_is_gone_and_says_since_when():
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame in range(10):
         cloud, pose = drive(frame, with_box if frame < 5 else flat, at=(0.05 * frame, 0.0, 0.0))
         terrain = fuse(cloud, pose, MOUNT)
@@ -171,7 +172,7 @@ def test_newer_evidence_clears_what_is_gone_and_says_since_when():
 
 
 def test_one_uncertain_frame_does_not_overturn_what_many_saw():
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame in range(6):
         cloud, pose = drive(frame, with_box, at=(0.05 * frame, 0.0, 0.0))
         fuse(cloud, pose, MOUNT)
@@ -182,7 +183,7 @@ def test_one_uncertain_frame_does_not_overturn_what_many_saw():
 
 
 def test_the_windows_laid_over_each_other_are_the_whole_map():
-    fuse, whole = Fuse(max_range=7.0, window=17.0), {}
+    fuse, whole = Running(Fuse(max_range=7.0, window=17.0)), {}
     for frame in range(12):
         cloud, pose = drive(frame, at=(1.5 * frame - 9, 0.3 * frame, 0.2))
         terrain = fuse(cloud, pose, MOUNT)
@@ -200,7 +201,7 @@ def test_the_windows_laid_over_each_other_are_the_whole_map():
 def test_equal_frames_give_equal_bits():
     maps = []
     for _ in range(2):
-        fuse = Fuse()
+        fuse = Running(Fuse())
         for frame in range(3):
             cloud, pose = drive(frame, noise=0.01)
             terrain = fuse(cloud, pose, MOUNT)
@@ -209,7 +210,7 @@ def test_equal_frames_give_equal_bits():
 
 
 def test_an_obstacle_that_appears_is_never_stated_to_be_flat_ground():
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame in range(16):
         ground, sigma = (with_box, 0.05) if frame >= 10 else (flat, 0.01)
         cloud, pose = drive(frame, ground, at=(0.0, 0.0, 0.0), sigma=sigma)
@@ -222,14 +223,14 @@ def test_an_obstacle_that_appears_is_never_stated_to_be_flat_ground():
 
 
 def test_an_empty_cloud_changes_nothing():
-    fuse = Fuse()
+    fuse = Running(Fuse())
     cloud, pose = drive(0)
     assert np.isnan(fuse(part(cloud, np.s_[:0]), pose, MOUNT).layers["elevation"]).all()
     assert np.isfinite(fuse(*drive(1), MOUNT).layers["elevation"]).any()
 
 
 def test_points_whose_error_is_not_known_do_not_enter_the_map():
-    fuse, (cloud, pose) = Fuse(), drive(0)
+    fuse, (cloud, pose) = Running(Fuse()), drive(0)
     unsure = cloud.sigma.copy()
     left = cloud.points[:, 1] > 0
     unsure[left] = np.nan
@@ -244,7 +245,7 @@ def test_what_refinement_made_up_is_no_evidence_for_the_map():
     cloud, pose = drive(0)
     guessed = cloud.points[:, 1] > 0
     made_up = replace(cloud, source=np.where(guessed, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8))
-    terrain, expected = Fuse()(made_up, pose, MOUNT), Fuse()(part(cloud, ~guessed), pose, MOUNT)
+    terrain, expected = Running(Fuse())(made_up, pose, MOUNT), Running(Fuse())(part(cloud, ~guessed), pose, MOUNT)
     assert np.isfinite(terrain.layers["elevation"]).any()
     for name, layer in expected.layers.items():
         np.testing.assert_array_equal(terrain.layers[name], layer)
@@ -259,10 +260,11 @@ TRACK = """
 import sys
 import numpy as np
 from stages import Fuse, PointCloud, Pose, Transform
+from tests.stages.running import Running
 def peak():
     with open("/proc/self/status") as status:
         return next(int(line.split()[1]) / 1024 for line in status if line.startswith("VmHWM"))
-before, fuse, step = peak(), Fuse(max_range=11.0, window=25.0), 8.0
+before, fuse, step = peak(), Running(Fuse(max_range=11.0, window=25.0)), 8.0
 x, y = (axis.ravel() + 0.025 for axis in np.meshgrid(np.arange(-4, 4, 0.05), np.arange(-10, 10, 0.05)))
 points = np.column_stack([x, y, 0.1 * np.sin(x)]).astype(np.float32)
 n = len(points)

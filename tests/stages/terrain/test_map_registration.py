@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from flow.contracts import Severity
 from stages import Fuse, Pose, Transform
 from stages.terrain.map_registration import placement
+from tests.stages.running import Running
 from tests.stages.terrain.region_scene import MOUNT, START, drive, flat, part
 
 
@@ -23,7 +24,7 @@ def heights(cloud, placed):
 
 
 def test_frames_with_errors_of_their_tilt_join_without_a_seam():
-    rng, fuse, seams, before = np.random.default_rng(3), Fuse(), [], None
+    rng, fuse, seams, before = np.random.default_rng(3), Running(Fuse()), [], None
     for frame in range(12):
         cloud, pose = drive(frame, tilt=tuple(rng.normal(0, np.radians(0.4), 2)), noise=0.01)
         now = [heights(cloud, placed) for placed in (placement(cloud, pose, MOUNT)[0], fuse(cloud, pose, MOUNT).level)]
@@ -38,7 +39,7 @@ def test_frames_with_errors_of_their_tilt_join_without_a_seam():
 
 
 def test_the_tilt_error_of_the_first_frame_fades_and_does_not_swing_back():
-    fuse, lean, found = Fuse(), np.radians(0.6), []
+    fuse, lean, found = Running(Fuse()), np.radians(0.6), []
     for frame in range(61):
         cloud, pose = drive(frame, flat, tilt=(lean if frame == 0 else 0.0, 0.0), at=(0.25 * frame, 0.0, 0.0))
         placed = fuse(part(cloud, np.s_[::10]), pose, MOUNT).level
@@ -55,7 +56,10 @@ def test_a_pose_of_the_camera_is_as_good_as_one_of_the_rover():
     base = Transform("odom", "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
     camera = base.after(MOUNT.base_from_camera)
     turn = Rotation.from_matrix(camera.rotation).as_quat()
-    seen = [Fuse()(cloud, pose, MOUNT), Fuse()(cloud, Pose(pose.stamp, camera.translation, turn, "odom", "camera"))]
+    seen = [
+        Running(Fuse())(cloud, pose, MOUNT),
+        Running(Fuse())(cloud, Pose(pose.stamp, camera.translation, turn, "odom", "camera")),
+    ]
     np.testing.assert_allclose(seen[0].level.translation, seen[1].level.translation, atol=1e-9)
     np.testing.assert_allclose(seen[0].layers["elevation"], seen[1].layers["elevation"], atol=1e-5)
 
@@ -86,7 +90,7 @@ def upside_down(pose):
     ],
 )  # fmt: skip
 def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(change, sentence):
-    fuse = Fuse()
+    fuse = Running(Fuse())
     fuse(*drive(0), MOUNT)
     before = fuse._map.cells.read(-300, -300, 600, 600)
     with pytest.raises(ValueError, match=sentence):
@@ -96,7 +100,7 @@ def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(c
 
 @pytest.mark.parametrize(("degrees", "told"), [(0, False), (3, False), (12, True)])
 def test_a_pose_in_a_frame_that_leans_is_told(degrees, told):
-    fuse, lean = Fuse(), Rotation.from_euler("x", degrees, degrees=True)
+    fuse, lean = Running(Fuse()), Rotation.from_euler("x", degrees, degrees=True)
     for frame in range(4):
         cloud, pose = drive(frame)
         quaternion = (lean * Rotation.from_quat(pose.quaternion)).as_quat()
@@ -109,7 +113,7 @@ def test_a_pose_in_a_frame_that_leans_is_told(degrees, told):
 
 
 def test_a_frame_that_is_refused_does_not_lean_the_map():
-    fuse, lean = Fuse(), Rotation.from_euler("x", 29, degrees=True)
+    fuse, lean = Running(Fuse()), Rotation.from_euler("x", 29, degrees=True)
     for frame in range(3):
         fuse(*drive(frame), MOUNT)
     for frame in (3, 4):
@@ -122,7 +126,7 @@ def test_a_frame_that_is_refused_does_not_lean_the_map():
 
 @pytest.mark.parametrize("jump", [np.array([0, 0, up]) for up in (0.6, -0.4, 30.0, -1e3, 1e6)])
 def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jump):
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame in range(5):
         terrain = fuse(*drive(frame), MOUNT)
     for frame in (5, 6):
@@ -155,7 +159,7 @@ def leaning(frame, degrees, up=0.0):
     ({"tilt_sigma": 0.05}, (0, 3, -4, 5, -3, 4)), ({"height_sigma": 0.002}, (0.0, 0.4, -0.3, 0.5, -0.4, 0.3)),
 ])  # fmt: skip
 def test_what_the_stated_errors_of_height_and_tilt_explain_together_is_no_jump(sigmas, degrees):
-    fuse = Fuse(**sigmas)
+    fuse = Running(Fuse(**sigmas))
     for frame, angle in enumerate(degrees):
         terrain = fuse(*leaning(frame, angle), MOUNT)
     assert terrain.layers["frames"].max() == len(degrees)
@@ -163,7 +167,7 @@ def test_what_the_stated_errors_of_height_and_tilt_explain_together_is_no_jump(s
 
 
 def test_a_tilt_that_jumps_is_told_in_degrees():
-    fuse = Fuse()
+    fuse = Running(Fuse())
     for frame in range(3):
         fuse(*drive(frame), MOUNT)
     with pytest.raises(ValueError, match=r"and [3-6]\.\d degrees off the map"):
@@ -171,7 +175,7 @@ def test_a_tilt_that_jumps_is_told_in_degrees():
 
 
 def test_a_pose_in_another_frame_begins_the_map_anew():
-    fuse, fresh = Fuse(), Fuse()
+    fuse, fresh = Running(Fuse()), Running(Fuse())
     fuse(*drive(0), MOUNT)
     cloud, pose = drive(1)
     lost = replace(pose, frame_id="visual_odom/2")

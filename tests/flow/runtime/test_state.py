@@ -1,0 +1,151 @@
+"""A graph is configuration: its runs, one after the other or at once, share no state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from mcap.reader import make_reader
+
+from flow.config.loader import load
+from flow.errors import PipelineError
+from flow.runtime.run import run
+from tests.flow.toys import PIPELINE, Couple, Log, graph
+from tests.flow.toys import traverse as numbers
+
+
+@dataclass
+class Lines:
+    """A sink that writes a line a frame."""
+
+    suffix: ClassVar[str] = ".txt"
+
+    def wants(self, stream: str, kind: type) -> bool:
+        return True
+
+    def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
+        self.file = path.open("w")
+
+    def write(self, record: Any) -> None:
+        self.file.write(f"{record.stamp} {dict(record.items)} {record.entries}\n")
+
+    def close(self, summary: Mapping[str, Any]) -> None:
+        self.file.write(str(summary["findings"]))
+        self.file.close()
+
+
+TOYS = PIPELINE[: PIPELINE.index("sinks:")] + "sinks: [{use: tests.flow.runtime.test_state.Lines}]\n"
+FRAMES = 40
+
+
+def lines_of(pipeline, path, events, **options):
+    """What a run of a graph writes."""
+    run(pipeline, Log(events), {"tests.flow.runtime.test_state.Lines": path}, **options)
+    return path.read_text()
+
+
+def test_a_graph_run_twice_gives_the_same_bits_as_two_fresh_ones(tmp_path):
+    loaded = graph(tmp_path, text=TOYS)
+    again = [lines_of(loaded, tmp_path / f"{name}.txt", numbers(FRAMES)) for name in "ab"]
+    fresh = [lines_of(graph(tmp_path, text=TOYS), tmp_path / f"{name}.txt", numbers(FRAMES)) for name in "cd"]
+    assert again == fresh
+    assert "the sum is 1560.0" in again[1]
+
+
+def test_a_graph_run_in_two_threads_at_once_gives_the_bits_of_two_runs(tmp_path):
+    loaded = graph(tmp_path, nap=0.003, text=TOYS)
+    logs = [numbers(FRAMES), numbers(FRAMES, start=1)]
+    alone = [lines_of(loaded, tmp_path / f"alone{i}.txt", log) for i, log in enumerate(logs)]
+    with ThreadPoolExecutor(2) as pool:
+        paths = [tmp_path / f"at_once{i}.txt" for i in range(2)]
+        at_once = list(pool.map(lambda path, log: lines_of(loaded, path, log, workers=3), paths, logs))
+    assert at_once == alone
+
+
+@dataclass(frozen=True)
+class NoStart:
+    def __call__(self, couple: Couple, *, state: list[float]) -> Couple:
+        return couple
+
+
+@dataclass(frozen=True)
+class NoState:
+    def start(self) -> list[float]:
+        return []
+
+    def __call__(self, couple: Couple) -> Couple:
+        return couple
+
+
+@dataclass(frozen=True)
+class StateAsInput:
+    def start(self) -> list[float]:
+        return []
+
+    def __call__(self, couple: Couple, state: list[float]) -> Couple:
+        return couple
+
+
+@dataclass(frozen=True)
+class OnlyFinding:
+    def __call__(self, couple: Couple) -> Couple:
+        return couple
+
+    def finding(self, state: list[float]) -> None:
+        return None
+
+
+@dataclass(frozen=True)
+class CannotStart:
+    def start(self) -> list[float]:
+        raise OSError("no map on this disk")
+
+    def __call__(self, couple: Couple, *, state: list[float]) -> Couple:
+        return couple
+
+
+@pytest.mark.parametrize(("stage", "sentence"), [
+    (NoStart, "NoStart.__call__ needs a 'state', so NoStart must have 'start', which makes it"),
+    (NoState, r"NoState has 'start', so its __call__ must take 'state' by keyword only \(after '\*'\)"),
+    (StateAsInput, r"StateAsInput has 'start', so its __call__ must take 'state' by keyword only"),
+    (OnlyFinding, "OnlyFinding.finding needs a 'state', so OnlyFinding must have 'start', which makes it"),
+])  # fmt: skip
+def test_a_stage_with_half_of_a_state_is_refused_with_its_line(tmp_path, stage, sentence):
+    with pytest.raises(PipelineError, match=r"toy\.yaml:10: " + sentence):
+        graph(tmp_path, text=TOYS.replace("tests.flow.toys.Total", f"tests.flow.runtime.test_state.{stage.__name__}"))
+
+
+def test_a_stage_that_cannot_start_is_named_before_anything_runs(tmp_path):
+    use = f"tests.flow.runtime.test_state.{CannotStart.__name__}"
+    pipeline = graph(tmp_path, text=TOYS.replace("tests.flow.toys.Total", use))
+    with pytest.raises(PipelineError, match=r"toy\.yaml:10: 'total' cannot start: OSError: no map on this disk"):
+        lines_of(pipeline, tmp_path / "out.txt", numbers(3))
+    assert not (tmp_path / "out.txt").exists()
+
+
+def test_the_default_pipeline_keeps_nothing_between_runs(traverse, tmp_path):
+    """A simulated log through one loaded graph: twice, then twice at once."""
+    loaded = load("rover", ["disparities=64"])
+    ((use, _), _) = loaded.sinks
+
+    def result(name):
+        with loaded.source.open(traverse, start=None, end=None) as log:
+            summary = run(loaded, log, {use: tmp_path / name}, workers=1)
+        return messages(tmp_path / name), summary["findings"], summary["ledger"]
+
+    first, second = result("first"), result("second")
+    with ThreadPoolExecutor(2) as pool:
+        at_once = list(pool.map(result, ["third", "fourth"]))
+    assert first[0]
+    assert [second, *at_once] == [first] * 3
+
+
+def messages(path):
+    """The messages of a result log."""
+    with path.open("rb") as stream:
+        found = make_reader(stream).iter_messages()
+        return [(channel.topic, message.log_time, message.data) for _, channel, message in found]
