@@ -65,7 +65,7 @@ def nearest_two(codes: Array, others: Array) -> tuple[Array, Array, Array]:
 
 
 @kernel
-def _nearest_two(codes, planes, outside, index, best, second, width):  # type: ignore[no-untyped-def]
+def _nearest_two(codes, planes, outside, index, best, second, width):
     lanes = lanes_in(width)
     firsts, nexts, blocks = (np.empty(lanes, np.uint8), np.empty(lanes, np.uint8), np.empty(lanes, np.uint8))
     for i in range(codes.shape[0]):

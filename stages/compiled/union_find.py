@@ -10,7 +10,7 @@ from stages.compiled.jit import part
 
 
 @part
-def root(parent, i):  # type: ignore[no-untyped-def]
+def root(parent, i):
     """The root of `i`."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -19,7 +19,7 @@ def root(parent, i):  # type: ignore[no-untyped-def]
 
 
 @part
-def join(parent, one, other):  # type: ignore[no-untyped-def]
+def join(parent, one, other):
     """Make one set of those of two things; the earlier root becomes the root of both."""
     one, other = root(parent, one), root(parent, other)
     if one < other:

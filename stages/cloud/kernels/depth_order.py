@@ -38,7 +38,7 @@ def out_of_order(inverse: Array, patch: Array) -> Array:
 
 
 @kernel
-def _vote(inverse, patch, sizes, clear, votes):  # type: ignore[no-untyped-def]
+def _vote(inverse, patch, sizes, clear, votes):
     """Add 1 for every column in which a patch is out of order with a larger one, take 1 off where it is not."""
     below = np.full(inverse.shape[1], -1, np.int64)
     for row in range(inverse.shape[0] - 1, -1, -1):
@@ -56,7 +56,7 @@ def _vote(inverse, patch, sizes, clear, votes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _drop(patch, votes):  # type: ignore[no-untyped-def]
+def _drop(patch, votes):
     for i in range(patch.size):
         if patch[i] >= 0 and votes[patch[i]] > 0:
             patch[i] = -1

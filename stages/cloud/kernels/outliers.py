@@ -89,7 +89,7 @@ def pixel_rays(points: Array, pixel: Array, width: int) -> Array:
 
 
 @kernel
-def _inverse_depth(points, pixel, height, width, reach):  # type: ignore[no-untyped-def]
+def _inverse_depth(points, pixel, height, width, reach):
     inverse = np.full(height * width, np.nan, np.float32)
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
@@ -99,7 +99,7 @@ def _inverse_depth(points, pixel, height, width, reach):  # type: ignore[no-unty
 
 
 @kernel
-def _supported(points, sigma, pixel, inverse, offsets, deviations, slope, share, least, rays, reach):  # type: ignore[no-untyped-def]
+def _supported(points, sigma, pixel, inverse, offsets, deviations, slope, share, least, rays, reach):
     height, width = inverse.shape
     enough = int(np.ceil(share * len(offsets)))
     keep = np.zeros(points.shape[0], np.bool_)

@@ -35,7 +35,7 @@ def depth_images(
 
 
 @kernel
-def _depth_images(points, sigma, pixel, kept, factor, images):  # type: ignore[no-untyped-def]
+def _depth_images(points, sigma, pixel, kept, factor, images):
     for i in kept:
         inverse = 1.0 / np.float64(points[i, 2])
         images[0, pixel[i]] = inverse
@@ -56,7 +56,7 @@ def patches(inverse: Array, tolerance: Array, slope: float) -> Array:
 
 
 @kernel
-def _linked(inverse, tolerance, slope, row, col, up, left):  # type: ignore[no-untyped-def]
+def _linked(inverse, tolerance, slope, row, col, up, left):
     """Flat index of the next point upwards or leftwards if it is linked to this one, else -1."""
     width = inverse.shape[1]
     for gap in range(1, _GAP + 1):
@@ -70,7 +70,7 @@ def _linked(inverse, tolerance, slope, row, col, up, left):  # type: ignore[no-u
 
 
 @kernel
-def _patches(inverse, tolerance, slope):  # type: ignore[no-untyped-def]
+def _patches(inverse, tolerance, slope):
     height, width = inverse.shape
     parent = np.empty(height * width, np.int32)
     for row in range(height):

@@ -24,7 +24,7 @@ def transform_points(points: Array, rotation: Array, translation: Array) -> Arra
 
 
 @kernel
-def _transform_points(points, r, t):  # type: ignore[no-untyped-def]
+def _transform_points(points, r, t):
     moved = np.empty(points.shape, np.float32)
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])

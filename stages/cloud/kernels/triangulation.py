@@ -49,7 +49,7 @@ def triangulate(
 
 
 @kernel
-def _depth(disparity, source, shift, focal_baseline, max_depth, filled):  # type: ignore[no-untyped-def]
+def _depth(disparity, source, shift, focal_baseline, max_depth, filled):
     """Depth of a pixel, or 0 where it has no point."""
     if not _known(source) or (source == _FILLED and not filled):
         return 0.0
@@ -59,7 +59,7 @@ def _depth(disparity, source, shift, focal_baseline, max_depth, filled):  # type
 
 
 @kernel
-def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, sigmas):  # type: ignore[no-untyped-def]
+def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, sigmas):
     fx, fy, cx, cy, focal_baseline, shift = camera
     log_best, log_worst, sigma_plane, sigma_filled = sigmas
     count = 0

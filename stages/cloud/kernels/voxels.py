@@ -27,7 +27,7 @@ def voxel_means(points: Array, colors: Array, edge: float) -> tuple[Array, Array
 
 
 @kernel
-def _voxel_means(points, colors, edge):  # type: ignore[no-untyped-def]
+def _voxel_means(points, colors, edge):
     n = points.shape[0]
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     for axis in range(3):  # numpy takes four times as long for this as all the rest does

@@ -58,9 +58,7 @@ def brightness_steps(image: Array) -> Array:
 
 
 @part
-def aggregate_row(  # type: ignore[no-untyped-def]
-    pair, rule, first_lane, costs, paths, y, step, sums, place, total, final, width
-):
+def aggregate_row(pair, rule, first_lane, costs, paths, y, step, sums, place, total, final, width):
     """Follow the paths of one sweep from the row before into row y, and add them up.
 
     pair, rule: `pair.MatchingInputs` and `SgmParams`; first_lane: the disparity of the first lane, less the smallest
@@ -113,14 +111,14 @@ def aggregate_row(  # type: ignore[no-untyped-def]
 
 
 @part
-def _continued(path, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+def _continued(path, cost, p1, p2, width):
     """L of the next pixel of a path that is at hand, above its smallest value."""
     near = lesser(shifted(path, FAR, 1), shifted(path, FAR, -1))
     return next_path(path, near, cost, p1, p2, width)
 
 
 @part
-def _follow(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+def _follow(paths, at, cost, p1, p2, width):
     """`_continued` of a path that is kept in `paths`, and is there again."""
     path = load(paths, at, width)
     near = lesser(shifted_in_memory(path, paths, at, FAR, 1), shifted_in_memory(path, paths, at, FAR, -1))
@@ -130,13 +128,13 @@ def _follow(paths, at, cost, p1, p2, width):  # type: ignore[no-untyped-def]
 
 
 @part
-def next_path(path, near, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+def next_path(path, near, cost, p1, p2, width):
     """L of the next pixel above its smallest value. path, near: L before, and the lesser of its neighbours."""
     return above_smallest(plus_capped(cost, lesser(lesser(plus_capped(near, p1), path), spread(p2, width))))
 
 
 @part
-def _around(place, columns):  # type: ignore[no-untyped-def]
+def _around(place, columns):
     """`place` modulo `columns`, from one step outside at most."""
     return 0 if place == columns else columns - 1 if place < 0 else place
 

@@ -27,7 +27,7 @@ def blank_windows(image: Array, first: int, end: int) -> Array:
 
 
 @kernel
-def drop_blank(blank, partner, pixels, evidence):  # type: ignore[no-untyped-def]
+def drop_blank(blank, partner, pixels, evidence):
     """Forget, in place, matches of pixels that are blank, or whose partner is.
 
     blank, partner: of `blank_windows` of the left and of the right image; pixels: (H, W) float32, px, disparities;

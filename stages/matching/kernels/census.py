@@ -48,7 +48,7 @@ def census(image: Array, planes: Array, mirrored: bool = False) -> None:
 
 
 @kernel
-def _census(image, sign, planes, columns, width):  # type: ignore[no-untyped-def]
+def _census(image, sign, planes, columns, width):
     nothing, stride = spread(0, width), image.shape[1]
     for y in range(planes.shape[0]):
         for x in range(0, columns, lanes_in(width)):
@@ -78,7 +78,7 @@ def census_reference(image: Array, mirrored: bool = False) -> Array:
 
 
 @part
-def census_costs(left, right, pair, unseen, x, i, width):  # type: ignore[no-untyped-def]
+def census_costs(left, right, pair, unseen, x, i, width):
     """The costs of pixel x of a row at each disparity.
 
     left, right: the row's planes in pair, `pair.MatchingInputs`, of which the right ones run backwards; i: where they
@@ -89,7 +89,7 @@ def census_costs(left, right, pair, unseen, x, i, width):  # type: ignore[no-unt
 
 
 @part
-def differing_bits(left, right, x, i, width):  # type: ignore[no-untyped-def]
+def differing_bits(left, right, x, i, width):
     """How many of the 24 comparisons differ between pixel x and its partners, from i on."""
     bits = ones(exclusive_or(spread(byte(left[0], x), width), load(right[0], i, width)))
     bits = plus(bits, ones(exclusive_or(spread(byte(left[1], x), width), load(right[1], i, width))))
@@ -97,7 +97,7 @@ def differing_bits(left, right, x, i, width):  # type: ignore[no-untyped-def]
 
 
 @part
-def seen_costs(costs, pair, unseen, i, width):  # type: ignore[no-untyped-def]
+def seen_costs(costs, pair, unseen, i, width):
     """`costs` of partners from i on, but `unseen` where they are outside the right image."""
     if pair.whole_from <= i < pair.whole_to:
         return costs

@@ -50,7 +50,7 @@ def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
 
 
 @kernel
-def _gradients(image, sign, planes, columns, width):  # type: ignore[no-untyped-def]
+def _gradients(image, sign, planes, columns, width):
     stride = image.shape[1]
     for y in range(planes.shape[0]):
         dx, dy = planes[y, DX], planes[y, DY]
@@ -63,14 +63,14 @@ def _gradients(image, sign, planes, columns, width):  # type: ignore[no-untyped-
 
 
 @part
-def _smooth(image, at, stride, width):  # type: ignore[no-untyped-def]
+def _smooth(image, at, stride, width):
     """Mean of three pixels `stride` apart, the middle one, at `at`, twice."""
     ends = average(load(image, at - stride, width), load(image, at + stride, width))
     return average(ends, load(image, at, width))
 
 
 @part
-def _signed_difference(more, less, width):  # type: ignore[no-untyped-def]
+def _signed_difference(more, less, width):
     most = spread(MIDDLE - 1, width)
     above = plus_capped(spread(MIDDLE, width), lesser(minus_capped(more, less), most))
     return minus_capped(above, lesser(minus_capped(less, more), most))
@@ -92,7 +92,7 @@ def gradients_reference(image: Array, mirrored: bool = False) -> Array:
 
 
 @part
-def smoothed_costs(pair, unseen, first_lane, ahead, column_sums, costs, width):  # type: ignore[no-untyped-def]
+def smoothed_costs(pair, unseen, first_lane, ahead, column_sums, costs, width):
     """The costs of the row before row `ahead` of a sweep, all pixels and disparities: costs (W * n,) uint8.
 
     pair, unseen: as of `census_costs`; first_lane: the disparity of the first lane, less the smallest searched; ahead:
@@ -120,7 +120,7 @@ def smoothed_costs(pair, unseen, first_lane, ahead, column_sums, costs, width): 
 
 
 @part
-def raw_costs(left, right, pair, unseen, x, i, width):  # type: ignore[no-untyped-def]
+def raw_costs(left, right, pair, unseen, x, i, width):
     """The costs of pixel x, not smoothed; all as of `census_costs`."""
     bits = differing_bits(left, right, x, i, width)
     dx = difference(spread(byte(left[DX], x), width), load(right[DX], i, width))

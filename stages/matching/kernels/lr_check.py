@@ -33,7 +33,7 @@ def drop_contradicted(found: Layers, backward: Layers, tolerance: float, largest
 
 
 @kernel
-def _drop(  # type: ignore[no-untyped-def]
+def _drop(
     pixels, source, confidence, backward, backward_source, tolerance, largest, left_pixels, left_source, left_confidence
 ):
     last = pixels.shape[1] - 1

@@ -43,7 +43,7 @@ def prior_costs(
 
 
 @kernel
-def _begin(apart, least, most, length, far, begin):  # type: ignore[no-untyped-def]
+def _begin(apart, least, most, length, far, begin):
     for y in range(apart.shape[0]):
         for x in range(apart.shape[1]):
             quarters = np.rint(apart[y, x] * np.float32(PHASES))

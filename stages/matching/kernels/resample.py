@@ -32,7 +32,7 @@ def doubled(small: Array, height: int, width: int, threads: int = 1) -> Array:
 
 
 @kernel
-def _double(small, large, first, end):  # type: ignore[no-untyped-def]
+def _double(small, large, first, end):
     rows, columns = small.shape
     for y in range(first, end):
         row, beside = y >> 1, min(max((y >> 1) + (y & 1) * 2 - 1, 0), rows - 1)

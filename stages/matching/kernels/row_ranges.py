@@ -84,7 +84,7 @@ def within(rows: range, ranges: list[Range]) -> Iterator[tuple[range, Range]]:
 
 
 @kernel
-def _count(prior, top, end, minimum, counts):  # type: ignore[no-untyped-def]
+def _count(prior, top, end, minimum, counts):
     """Add up how many of rows top to end have each disparity; what is beyond the range is at its end."""
     last = np.float32(counts.size - 1)
     for y in range(top, end):
@@ -95,7 +95,7 @@ def _count(prior, top, end, minimum, counts):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def move_paths(paths, lanes, later, moved, other_lanes):  # type: ignore[no-untyped-def]
+def move_paths(paths, lanes, later, moved, other_lanes):
     """Costs of paths, `lanes` for each place, as those of a range that begins `later` and has `other_lanes`: what it
     has and the other had not is 255, not searched."""
     begin = min(max(-later, 0), other_lanes)

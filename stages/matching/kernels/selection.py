@@ -33,7 +33,7 @@ from stages.matching.kernels.sgm_params import SgmParams
 
 
 @part
-def find_winners(total, beyond, guard, step, winner, votes, right, width):  # type: ignore[no-untyped-def]
+def find_winners(total, beyond, guard, step, winner, votes, right, width):
     """The best disparity of each pixel of a row, left and right; the smallest of equals.
 
     total: (W * n,) uint8, the sums; beyond: (n,) uint8, 255 for lanes that are no disparities; guard: (2 n,) uint8, 255
@@ -64,7 +64,7 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):  # ty
 
 
 @part
-def find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[no-untyped-def]
+def find_winner(sums, total, guard, x, winner, votes, width):
     """The best disparity of pixel x, and what else `find_winners` says of it. sums: of the pixel, as in `total`."""
     n = lanes_in(width)
     low, d = first_smallest(sums)
@@ -76,7 +76,7 @@ def find_winner(sums, total, guard, x, winner, votes, width):  # type: ignore[no
 
 
 @part
-def find_partners(winner, right, partners):  # type: ignore[no-untyped-def]
+def find_partners(winner, right, partners):
     """What the winner's partner in the right image chose, (W,) int16. winner, right: of `find_winners`."""
     columns = winner.size
     for x in range(columns):
@@ -84,7 +84,7 @@ def find_partners(winner, right, partners):  # type: ignore[no-untyped-def]
 
 
 @part
-def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):  # type: ignore[no-untyped-def]
+def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):
     """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
 
     winner, votes, partners: of `find_winners` and `find_partners`; first: (W,) int32, disparity of the first lane;

@@ -106,7 +106,7 @@ def _search_rows(
 
 
 @kernel
-def _sweep(  # type: ignore[no-untyped-def]
+def _sweep(
     pair, rule, pixels, evidence, width, scratch, first_lane, top, paths, y, end, step, sums, origin, stride, final
 ):
     """Rows y to end (exclusive) in steps of 1 or -1; the sums of row y are at (y - origin) * stride of `sums`."""

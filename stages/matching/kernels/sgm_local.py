@@ -69,7 +69,7 @@ def windows(prior: Array, reach: int, least: int, threads: int = 1) -> SearchWin
 
 
 @kernel
-def _begin(prior, lanes, least, first):  # type: ignore[no-untyped-def]
+def _begin(prior, lanes, least, first):
     height, columns = prior.shape
     middle = np.float32((lanes - 1) / 2)
     for y in range(height):
@@ -117,28 +117,28 @@ def _slots(columns: int, lanes: int) -> int:
 
 
 @part
-def _slot(x, width):  # type: ignore[no-untyped-def]
+def _slot(x, width):
     """Where the lanes of pixel x begin, from -1 on."""
     n = lanes_in(width)
     return (x + 1) * (2 * n + GAP) + n + GAP
 
 
 @part
-def _place(x, later, width):  # type: ignore[no-untyped-def]
+def _place(x, later, width):
     """Where the lanes in slot x begin for a window that begins `later`."""
     n = lanes_in(width)
     return _slot(x, width) + min(max(later, -n - 1), n + 1)
 
 
 @part
-def _or_own(row, x, later, own, width):  # type: ignore[no-untyped-def]
+def _or_own(row, x, later, own, width):
     """The lanes in slot x as a window has them that begins `later`; those that were not searched are `own`."""
     found = load(row, _place(x, later, width), width)
     return where_less(found, spread(FAR, width), found, own)
 
 
 @kernel
-def _costs(pair, rule, width, first, costs, span, rows):  # type: ignore[no-untyped-def]
+def _costs(pair, rule, width, first, costs, span, rows):
     """The costs of rows span[0] to span[1] (exclusive), of W * n bytes each, with the prior's.
 
     As those of the whole range; but where a neighbour was not searched at a disparity, the pixel's own cost counts.
@@ -160,7 +160,7 @@ def _costs(pair, rule, width, first, costs, span, rows):  # type: ignore[no-unty
 
 
 @part
-def _sum_columns(pair, rule, first, y, raw, sums, width):  # type: ignore[no-untyped-def]
+def _sum_columns(pair, rule, first, y, raw, sums, width):
     """The costs of row y, summed over 3 columns, into the slots of `sums`."""
     columns = first.shape[1]
     left, right = pair.left[y], pair.right[y]
@@ -175,7 +175,7 @@ def _sum_columns(pair, rule, first, y, raw, sums, width):  # type: ignore[no-unt
 
 
 @part
-def _smooth(pair, first, y, rows, costs, width):  # type: ignore[no-untyped-def]
+def _smooth(pair, first, y, rows, costs, width):
     """The mean of the sums of rows y - 1, y and y + 1, of which y counts twice; and what the prior adds."""
     n, (height, columns) = lanes_in(width), first.shape
     north, south, nothing = max(y - 1, 0), min(y + 1, height - 1), spread(0, width)
@@ -189,7 +189,7 @@ def _smooth(pair, first, y, rows, costs, width):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _arrive(steps, rule, width, first, costs, sums, span, step, rows):  # type: ignore[no-untyped-def]
+def _arrive(steps, rule, width, first, costs, sums, span, step, rows):
     """The sums of the paths of a sweep down (step 1) or up (-1) in rows span[0] to span[1] (exclusive), with which it
     begins; the paths stay in `rows`."""
     rows[:] = FAR
@@ -202,7 +202,7 @@ def _arrive(steps, rule, width, first, costs, sums, span, step, rows):  # type: 
 
 
 @part
-def _add_paths(steps, rule, width, first, y, step, from_cost, rows, total):  # type: ignore[no-untyped-def]
+def _add_paths(steps, rule, width, first, y, step, from_cost, rows, total):
     """Row y of a sweep: its paths, as `aggregation.aggregate_row` follows them, and their sums."""
     n, (height, columns) = lanes_in(width), first.shape
     nothing, p1, table = spread(0, width), spread(rule.p1, width), rule.table
@@ -228,7 +228,7 @@ def _add_paths(steps, rule, width, first, y, step, from_cost, rows, total):  # t
 
 
 @part
-def _next_beside(path, row, later, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+def _next_beside(path, row, later, cost, p1, p2, width):
     """The path along a row, which is at hand, continued into a window that begins `later`."""
     if later == 0:
         near = lesser(shifted(path, FAR, 1), shifted(path, FAR, -1))
@@ -238,15 +238,13 @@ def _next_beside(path, row, later, cost, p1, p2, width):  # type: ignore[no-unty
 
 
 @part
-def _next_from(row, place, cost, p1, p2, width):  # type: ignore[no-untyped-def]
+def _next_from(row, place, cost, p1, p2, width):
     near = lesser(load(row, place - 1, width), load(row, place + 1, width))
     return next_path(load(row, place, width), near, cost, p1, p2, width)
 
 
 @kernel
-def _cross(  # type: ignore[no-untyped-def]
-    steps, rule, width, first, costs, sums, lowest, highest, pixels, evidence, span, step, rows
-):
+def _cross(steps, rule, width, first, costs, sums, lowest, highest, pixels, evidence, span, step, rows):
     """Disparities and evidence of rows span[0] to span[1] (exclusive), into which a sweep goes on that has come with
     the paths in `rows`; the sums of the other are there. As `selection` finds and checks them."""
     n, columns = lanes_in(width), first.shape[1]

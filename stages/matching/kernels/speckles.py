@@ -50,7 +50,7 @@ def drop_speckles(
 
 
 @kernel
-def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):  # type: ignore[no-untyped-def]
+def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):
     """Runs of some rows, joined among themselves, from place first_row * W on; returns the place behind the last.
 
     `seams`, (2, W), all -1, takes the runs of the first and of the last row, pixel by pixel.
@@ -96,7 +96,7 @@ def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):  # ty
 
 
 @kernel
-def _join_bands(disparity, y, step, runs, above, below):  # type: ignore[no-untyped-def]
+def _join_bands(disparity, y, step, runs, above, below):
     """Join the runs of row y - 1, `above`, and of row y, `below`, pixel by pixel."""
     _, _, parent, area = runs
     for x in range(disparity.shape[1]):
@@ -108,7 +108,7 @@ def _join_bands(disparity, y, step, runs, above, below):  # type: ignore[no-unty
 
 
 @kernel
-def _drop(pixels, strength, runs, first, last, largest):  # type: ignore[no-untyped-def]
+def _drop(pixels, strength, runs, first, last, largest):
     start, end, parent, area = runs
     for run in range(first, last):
         patch = run

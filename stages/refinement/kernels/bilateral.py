@@ -43,7 +43,7 @@ def _spatial(radius: int) -> Array:
 
 
 @kernel
-def _prepare(disparity, guide, per_pixel, per_gray, first, end, values, levels):  # type: ignore[no-untyped-def]
+def _prepare(disparity, guide, per_pixel, per_gray, first, end, values, levels):
     """values: the disparities, levels: the guide, in their scales."""
     for y in range(first, end):
         for x in range(disparity.shape[1]):
@@ -52,14 +52,14 @@ def _prepare(disparity, guide, per_pixel, per_gray, first, end, values, levels):
 
 
 @kernel
-def _finish(disparity, scale, first, end, filtered):  # type: ignore[no-untyped-def]
+def _finish(disparity, scale, first, end, filtered):
     for y in range(first, end):
         for x in range(disparity.shape[1]):
             filtered[y, x] = filtered[y, x] * scale if np.isfinite(disparity[y, x]) else F32(np.nan)
 
 
 @fast_kernel
-def _filter(values, levels, spatial, first, end, filtered):  # type: ignore[no-untyped-def]
+def _filter(values, levels, spatial, first, end, filtered):
     height, width = values.shape
     radius = spatial.shape[0] // 2
     sums, weights = np.empty(width, np.float32), np.empty(width, np.float32)

@@ -41,7 +41,7 @@ def _changes(image: Array) -> Array:
 
 
 @kernel
-def _multiply(disparity, guessed, left, right, first, end, products):  # type: ignore[no-untyped-def]
+def _multiply(disparity, guessed, left, right, first, end, products):
     """Squares of the left and of the right change, and their product; 0 where there is no partner."""
     width = disparity.shape[1]
     for y in range(first, end):
@@ -57,14 +57,14 @@ def _multiply(disparity, guessed, left, right, first, end, products):  # type: i
 
 
 @part
-def _add(columns, products, y, sign):  # type: ignore[no-untyped-def]
+def _add(columns, products, y, sign):
     for k in range(3):
         for x in range(columns.shape[1]):
             columns[k, x] += np.int32(sign) * products[k, y, x]
 
 
 @kernel
-def _correlate(products, first, end, found):  # type: ignore[no-untyped-def]
+def _correlate(products, first, end, found):
     height, width = found.shape
     columns = np.zeros((3, width), np.int32)  # sums over the rows of the square
     # Sums along the row so far. They may run over 2^31; the difference of two, of a square, is right all the same.

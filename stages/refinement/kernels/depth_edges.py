@@ -56,7 +56,7 @@ def _weights(brightness: float) -> Array:
 
 
 @kernel
-def _sharpen(disparity, guessed, guide, taps, radius, jump, table, sharp, first, end):  # type: ignore[no-untyped-def]
+def _sharpen(disparity, guessed, guide, taps, radius, jump, table, sharp, first, end):
     """Rows first to end; disparity, guessed and guide are framed by `radius` pixels, taps are steps in memory."""
     width, stride = sharp.shape[1], disparity.shape[1]
     flat, doubt, levels = disparity.reshape(-1), guessed.reshape(-1), guide.reshape(-1)
@@ -76,7 +76,7 @@ def _sharpen(disparity, guessed, guide, taps, radius, jump, table, sharp, first,
 
 
 @part
-def _find_jumps(disparity, y, column, jump, jumps):  # type: ignore[no-untyped-def]
+def _find_jumps(disparity, y, column, jump, jumps):
     """Where in row y, from `column` on, one of the eight neighbours is a jump away."""
     above, row, below = disparity[y - 1, column - 1 :], disparity[y, column - 1 :], disparity[y + 1, column - 1 :]
     for x in range(jumps.size):
@@ -87,7 +87,7 @@ def _find_jumps(disparity, y, column, jump, jumps):  # type: ignore[no-untyped-d
 
 
 @part
-def _compare(flat, doubt, levels, taps, table, at, jump, values, weights):  # type: ignore[no-untyped-def]
+def _compare(flat, doubt, levels, taps, table, at, jump, values, weights):
     """Disparities at the taps, in parts of a pixel, and their weights, 0 where none counts; returns the weight of
     those within `jump` of the one in the middle, and the extremes."""
     near, low, high = F32(0), F32(np.inf), F32(-np.inf)
@@ -104,7 +104,7 @@ def _compare(flat, doubt, levels, taps, table, at, jump, values, weights):  # ty
 
 
 @fast_part
-def _median(values, weights, total, low, high):  # type: ignore[no-untyped-def]
+def _median(values, weights, total, low, high):
     """The smallest whole number within low and high that, with all below it, has half of the weight."""
     below = low - F32(1)
     while high - below > F32(1):
@@ -115,7 +115,7 @@ def _median(values, weights, total, low, high):  # type: ignore[no-untyped-def]
 
 
 @fast_part
-def _weight_up_to(values, weights, limit):  # type: ignore[no-untyped-def]
+def _weight_up_to(values, weights, limit):
     total = F32(0)
     for i in range(values.size):
         total += weights[i] if values[i] <= limit else F32(0)

@@ -69,7 +69,7 @@ def _packed(image: Array) -> Array:
 
 
 @kernel
-def _count(disparity, begin, end, first):  # type: ignore[no-untyped-def]
+def _count(disparity, begin, end, first):
     """first[y + 1]: how many holes row y has."""
     for y in range(begin, end):
         count = np.int64(0)
@@ -79,7 +79,7 @@ def _count(disparity, begin, end, first):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _list(disparity, begin, end, first, holes):  # type: ignore[no-untyped-def]
+def _list(disparity, begin, end, first, holes):
     """holes: the columns of the holes, row by row; those of row y from first[y]."""
     for y in range(begin, end):
         n = first[y]
@@ -92,7 +92,7 @@ def _list(disparity, begin, end, first, holes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _trace(disparity, first, holes, sign, steps):  # type: ignore[no-untyped-def]
+def _trace(disparity, first, holes, sign, steps):
     """How many steps along four of the `RAYS` each hole is from the first known pixel, 0 = there is none.
 
     sign: 1 for the rays left and up, -1 for those right and down. The next pixel is known, or has been asked before.
@@ -120,7 +120,7 @@ def _trace(disparity, first, holes, sign, steps):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _bound(row, bound):  # type: ignore[no-untyped-def]
+def _bound(row, bound):
     """bound: below which disparity each pixel of a row is hidden from the right camera by what lies right of it."""
     hidden = -NOTHING
     for back in range(row.size):
@@ -131,7 +131,7 @@ def _bound(row, bound):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _look(disparity, colour, y, columns, down, across, steps, values, colours):  # type: ignore[no-untyped-def]
+def _look(disparity, colour, y, columns, down, across, steps, values, colours):
     """What lies on one ray from each hole of a row: disparities, inf = none, and the colours beyond."""
     height, width = disparity.shape
     for i in range(columns.size):
@@ -143,7 +143,7 @@ def _look(disparity, colour, y, columns, down, across, steps, values, colours): 
 
 
 @kernel
-def _weigh(own, hidden, reach, worth, length, steps, colours, values, weights):  # type: ignore[no-untyped-def]
+def _weigh(own, hidden, reach, worth, length, steps, colours, values, weights):
     """What the finds on one ray count, for holes of colours `own`; what does not count becomes inf."""
     for i in range(own.size):
         one, other = own[i], colours[i]
@@ -159,7 +159,7 @@ def _weigh(own, hidden, reach, worth, length, steps, colours, values, weights): 
 
 
 @kernel
-def _quantile(values, weights, total, share, least):  # type: ignore[no-untyped-def]
+def _quantile(values, weights, total, share, least):
     """Of eight values each the least that, with all below it, has `QUANTILE` of their weight; without any weight, inf.
 
     values, weights: (8, >= n); total, share: (n,), to work in; least: (n,). Without sorting: each value adds up the
@@ -183,7 +183,7 @@ def _quantile(values, weights, total, share, least):  # type: ignore[no-untyped-
 
 
 @kernel
-def _fill(disparity, colour, within, reach, margin, first, holes, steps, begin, end, filled, kinds):  # type: ignore[no-untyped-def]
+def _fill(disparity, colour, within, reach, margin, first, holes, steps, begin, end, filled, kinds):
     width = disparity.shape[1]
     bound = np.empty(width, np.float32)
     values, weights = np.empty((8, width), np.float32), np.empty((8, width), np.float32)
@@ -222,7 +222,7 @@ def _fill(disparity, colour, within, reach, margin, first, holes, steps, begin, 
 
 
 @kernel
-def _along_row(left, right, before, after, value):  # type: ignore[no-untyped-def]
+def _along_row(left, right, before, after, value):
     """What the row says, where that is the same surface: the line between two ends, or one of them; else the value."""
     if abs(right - left) < F32(APART):
         left += (right - left) * F32(before) / F32(before + after)

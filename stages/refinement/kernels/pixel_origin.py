@@ -55,7 +55,7 @@ def label_origin(
 
 
 @kernel
-def _name(matches, confidence, agreed, kinds, refined, borne_out, moved, tables, others, source, worth):  # type: ignore[no-untyped-def]
+def _name(matches, confidence, agreed, kinds, refined, borne_out, moved, tables, others, source, worth):
     replaced, plane, mismatch, occlusion = others
     for y in range(matches.shape[0]):
         for x in range(matches.shape[1]):

@@ -89,7 +89,7 @@ def near_median_reference(matches: Array, side: int, near: float) -> Array:
 
 
 @kernel
-def _trust(least, pixels, source, confidence, excluded, matches, weights):  # type: ignore[no-untyped-def]
+def _trust(least, pixels, source, confidence, excluded, matches, weights):
     for y in range(pixels.shape[0]):
         for x in range(pixels.shape[1]):
             good = (source[y, x] == MEASURED) & (confidence[y, x] >= least) & (abs(pixels[y, x]) < pixels.shape[1])
@@ -99,7 +99,7 @@ def _trust(least, pixels, source, confidence, excluded, matches, weights):  # ty
 
 
 @kernel
-def _move_near(matches, median, near, moved):  # type: ignore[no-untyped-def]
+def _move_near(matches, median, near, moved):
     for y in range(matches.shape[0]):
         for x in range(matches.shape[1]):
             d, m = matches[y, x], median[y, x]
@@ -107,9 +107,7 @@ def _move_near(matches, median, near, moved):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _pull(  # type: ignore[no-untyped-def]
-    pixels, coefficients, labels, within, near, weight, margin, low, high, first, end, pulled, spoke
-):
+def _pull(pixels, coefficients, labels, within, near, weight, margin, low, high, first, end, pulled, spoke):
     width = pixels.shape[1]
     for y in range(first, end):
         row = pixels[y]

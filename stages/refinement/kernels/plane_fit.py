@@ -86,7 +86,7 @@ def known_points(
 
 
 @kernel
-def _count_points(disparity, labels, known, sizes):  # type: ignore[no-untyped-def]
+def _count_points(disparity, labels, known, sizes):
     width = labels.shape[1]
     for y in range(labels.shape[0]):
         x = 0
@@ -100,7 +100,7 @@ def _count_points(disparity, labels, known, sizes):  # type: ignore[no-untyped-d
 
 
 @kernel
-def _gather(disparity, labels, weights, first, end, place, points):  # type: ignore[no-untyped-def]
+def _gather(disparity, labels, weights, first, end, place, points):
     width = labels.shape[1]
     for y in range(first, end):
         x = 0
@@ -117,7 +117,7 @@ def _gather(disparity, labels, weights, first, end, place, points):  # type: ign
 
 
 @kernel
-def _draw(seed, segment, counter, n):  # type: ignore[no-untyped-def]
+def _draw(seed, segment, counter, n):
     """A number below n: splitmix64 of (seed, segment, counter)."""
     z = seed + U64(segment) * U64(0xD1B54A32D192ED03) + U64(counter) * U64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> U64(30))) * U64(0xBF58476D1CE4E5B9)
@@ -126,9 +126,7 @@ def _draw(seed, segment, counter, n):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fit(  # type: ignore[no-untyped-def]
-    points, start, sizes, threshold, hypotheses, seed, first, end, coefficients, inlier_share, valid_share
-):
+def _fit(points, start, sizes, threshold, hypotheses, seed, first, end, coefficients, inlier_share, valid_share):
     """Planes of the segments first to end."""
     for s in range(first, end):
         own = slice(start[s], start[s + 1])
@@ -154,7 +152,7 @@ def _fit(  # type: ignore[no-untyped-def]
 
 
 @fast_part
-def _best_hypothesis(x, y, d, limit, hypotheses, seed, segment):  # type: ignore[no-untyped-def]
+def _best_hypothesis(x, y, d, limit, hypotheses, seed, segment):
     """The plane through three drawn pixels with the least truncated squared error: (cost, a, b, c)."""
     n = x.size
     best, best_a, best_b, best_c = F32(1e30), F32(0), F32(0), F32(0)
@@ -179,7 +177,7 @@ def _best_hypothesis(x, y, d, limit, hypotheses, seed, segment):  # type: ignore
 
 
 @fast_part
-def _least_squares(x, y, d, weights, a, b, c, limit):  # type: ignore[no-untyped-def]
+def _least_squares(x, y, d, weights, a, b, c, limit):
     """The weighted least-squares plane of the inliers of (a, b, c), solved for the correction, about their centroid."""
     s = sx = sy = se = F32(0)
     inliers = 0
@@ -212,7 +210,7 @@ def _least_squares(x, y, d, weights, a, b, c, limit):  # type: ignore[no-untyped
 
 
 @fast_part
-def _count_inliers(x, y, d, a, b, c, limit):  # type: ignore[no-untyped-def]
+def _count_inliers(x, y, d, a, b, c, limit):
     inliers = 0
     for q in range(x.size):
         e = a * x[q] + b * y[q] + c - d[q]

@@ -54,7 +54,7 @@ def _superpixel_points(image: Array, labels: Array, count: int, scale: float, th
 
 
 @kernel
-def _settle(points, size, home, rows, cols):  # type: ignore[no-untyped-def]
+def _settle(points, size, home, rows, cols):
     """The grid cell (n,) whose centre each of the points (n, 5) settles for, of the nine about its home (n, 2)."""
     count = len(points)
     nearest = home[:, 0] * cols + home[:, 1]
@@ -83,7 +83,7 @@ def _settle(points, size, home, rows, cols):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sum_up(image, labels, first, sums):  # type: ignore[no-untyped-def]
+def _sum_up(image, labels, first, sums):
     """Add R, G, B, y, x and 1 of every pixel to the sums of its label; the image begins at row `first`."""
     gray = image.ndim == 2
     for y in range(labels.shape[0]):

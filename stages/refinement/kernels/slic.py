@@ -106,7 +106,7 @@ def _assigned(colour: Array, centres: Array, grid: tuple[int, int], weight: floa
 
 
 @fast_kernel
-def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, labels):  # type: ignore[no-untyped-def]
+def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, labels):
     """Find the nearest of nine centres for the pixels of grid rows first_row to end_row."""
     height, width, channels = colour.shape
     # Arrays of their own, not rows of one: so the compiler sees that they do not overlap.
@@ -140,7 +140,7 @@ def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, la
 
 
 @kernel
-def _add_up(colour, labels, first, end, sums):  # type: ignore[no-untyped-def]
+def _add_up(colour, labels, first, end, sums):
     """Add colour, y, x and 1 of the pixels of rows first to end to the `sums` of their labels, (n, 6) float64."""
     channels = colour.shape[2]
     for y in range(first, end):
@@ -156,7 +156,7 @@ def _add_up(colour, labels, first, end, sums):  # type: ignore[no-untyped-def]
 
 
 @fast_part
-def _lay_out(centres, rows, cols, row, beside, position_weight, laid):  # type: ignore[no-untyped-def]
+def _lay_out(centres, rows, cols, row, beside, position_weight, laid):
     """Each pixel's candidate in grid row `row`, `beside` its own column: laid, (5, W), becomes three colours, y, and
     the weighted square of the distance along x; `FAR` where there is no such centre."""
     width = laid.shape[1]
@@ -195,7 +195,7 @@ def connect(labels: Array, smallest: int, scratch: Array, both: Fork = in_turn) 
 
 
 @kernel
-def _join(labels, y, rows, ends, parent):  # type: ignore[no-untyped-def]
+def _join(labels, y, rows, ends, parent):
     """Join the runs of row y with those of equal label in the row above; the earliest run becomes the root."""
     width = labels.shape[1]
     run, run_above = rows[y, 0], rows[y - 1, 0]
@@ -213,7 +213,7 @@ def _join(labels, y, rows, ends, parent):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _join_runs(labels, first, end, rows, ends, parent):  # type: ignore[no-untyped-def]
+def _join_runs(labels, first, end, rows, ends, parent):
     """Find the runs of rows first to end and join those of a component; they are numbered from first * W."""
     width = labels.shape[1]
     run = first * width
@@ -230,7 +230,7 @@ def _join_runs(labels, first, end, rows, ends, parent):  # type: ignore[no-untyp
 
 
 @kernel
-def _number(labels, middle, smallest, rows, ends, parent, number):  # type: ignore[no-untyped-def]
+def _number(labels, middle, smallest, rows, ends, parent, number):
     """The parent of every run becomes its root, which gets the number of its component; returns how many."""
     height = labels.shape[0]
     if 0 < middle < height:
@@ -259,7 +259,7 @@ def _number(labels, middle, smallest, rows, ends, parent, number):  # type: igno
 
 
 @kernel
-def _write(labels, first, end, rows, ends, parent, number):  # type: ignore[no-untyped-def]
+def _write(labels, first, end, rows, ends, parent, number):
     for y in range(first, end):
         start = 0
         for run in range(rows[y, 0], rows[y, 1]):

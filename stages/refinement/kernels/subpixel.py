@@ -42,7 +42,7 @@ def fit_brightness(left: Array, right: Array, disparity: Array, radius: int, thr
 
 
 @kernel
-def _compare(left, right, disparity, radius, framed, first, end):  # type: ignore[no-untyped-def]
+def _compare(left, right, disparity, radius, framed, first, end):
     """Of rows first to end the disparity, what the right image differs by, and the mean gradient; NaN where there is no
     partner, and `radius` columns and more about the image."""
     width = disparity.shape[1]
@@ -63,7 +63,7 @@ def _compare(left, right, disparity, radius, framed, first, end):  # type: ignor
 
 
 @kernel
-def _move(framed, disparity, radius, moved, first, end):  # type: ignore[no-untyped-def]
+def _move(framed, disparity, radius, moved, first, end):
     """Rows first to end of disparities, each moved by what its window says."""
     height, width = disparity.shape
     sums = np.empty(5 * LANES, np.float32)
@@ -87,7 +87,7 @@ def _move(framed, disparity, radius, moved, first, end):  # type: ignore[no-unty
 
 
 @part
-def _add(own, disparity, error, gradient, sums):  # type: ignore[no-untyped-def]
+def _add(own, disparity, error, gradient, sums):
     """Add a pixel of each of `LANES` windows to its sums, if it belongs there: of 1, g, e, g g, g e.
 
     They stand in one array, with constant distances: so the compiler can tell that they are apart, and adds vectors.

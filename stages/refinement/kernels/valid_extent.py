@@ -59,7 +59,7 @@ def within_reach(disparity: Array, within: Extent, reach: float, margin: float) 
 
 
 @kernel
-def _find_top(known, top):  # type: ignore[no-untyped-def]
+def _find_top(known, top):
     missing = top.size
     for y in range(known.shape[0]):
         if missing == 0:
@@ -71,7 +71,7 @@ def _find_top(known, top):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _find_ends(known, first, last):  # type: ignore[no-untyped-def]
+def _find_ends(known, first, last):
     width = known.shape[1]
     for y in range(known.shape[0]):
         row = known[y]

@@ -51,7 +51,7 @@ def _solve_in_blocks(moment: Array, mass: Array, coupling: Array, strength: np.f
 
 
 @kernel
-def _couple(guide, coupling, out):  # type: ignore[no-untyped-def]
+def _couple(guide, coupling, out):
     """out[y, x]: the coupling of pixel (y, x) with the one above it; 0 in row 0."""
     out[0, :] = F32(0)
     for y in range(1, guide.shape[0]):
@@ -60,7 +60,7 @@ def _couple(guide, coupling, out):  # type: ignore[no-untyped-def]
 
 
 @fast_kernel
-def _solve(moment, mass, coupling, strength, upper, start, stop):  # type: ignore[no-untyped-def]
+def _solve(moment, mass, coupling, strength, upper, start, stop):
     """Solve (I + strength * A) u = f down every column of two right-hand sides, in place, by the Thomas algorithm."""
     height = moment.shape[0]
     n = stop - start

@@ -23,7 +23,7 @@ def gradient_and_curvature(heights: Array) -> Array:
 
 
 @kernel
-def _lie_of_cells(heights):  # type: ignore[no-untyped-def]
+def _lie_of_cells(heights):
     rows, cols = heights.shape
     lie = np.full((3, rows, cols), np.nan)
     for row in range(rows):

@@ -39,7 +39,7 @@ def cell_statistics(
 
 
 @kernel
-def _cell_statistics(points, sigma, cells_per_metre, x0, y0, size, region):  # type: ignore[no-untyped-def]
+def _cell_statistics(points, sigma, cells_per_metre, x0, y0, size, region):
     cells = np.zeros((size, size, 6), np.float64)
     cells[:, :, 3] = np.inf
     cells[:, :, 4] = -np.inf

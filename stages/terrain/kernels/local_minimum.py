@@ -43,7 +43,7 @@ def _disc(radius: int) -> Array:
 
 
 @kernel
-def _lowest_around(heights, count, use, trend, reach, lowest, share):  # type: ignore[no-untyped-def]
+def _lowest_around(heights, count, use, trend, reach, lowest, share):
     """heights: infinite where not in use, with `radius` more columns to either side; count: of cells in use, up to and
     with one column less; reach: of the disc along columns, in each of its rows. One offset at a time for a whole row,
     so that the processor takes several cells at once."""

@@ -40,7 +40,7 @@ def lowest_sight(
 
 
 @kernel
-def _mark(lowest, x, y, z, dx, dy, dz, length, cells_per_metre, x0, y0, region):  # type: ignore[no-untyped-def]
+def _mark(lowest, x, y, z, dx, dy, dz, length, cells_per_metre, x0, y0, region):
     """Lower the cells under the line from (x, y, z), in direction (dx, dy, dz), (dx, dy) a unit vector, to it; sampled
     four times a cell, where it is within the region, be it ever so long."""
     size = lowest.shape[0]
@@ -61,7 +61,7 @@ def _mark(lowest, x, y, z, dx, dy, dz, length, cells_per_metre, x0, y0, region):
 
 
 @kernel
-def _lowest_sight(points, pixel, width, camera_x, camera_y, camera_z, cells_per_metre, x0, y0, region, lowest):  # type: ignore[no-untyped-def]
+def _lowest_sight(points, pixel, width, camera_x, camera_y, camera_z, cells_per_metre, x0, y0, region, lowest):
     last = np.full(width, -1, np.int64)
     for i in range(points.shape[0] - 1, -1, -1):
         column = pixel[i] % width

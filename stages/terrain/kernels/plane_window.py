@@ -34,7 +34,7 @@ def window_planes(heights: Array, use: Array, radius: int, leverage: float) -> A
 
 
 @kernel
-def _add_row(sums, heights, use, row, sign):  # type: ignore[no-untyped-def]
+def _add_row(sums, heights, use, row, sign):
     """Add (sign 1) or take away (sign -1) one row from the six sums of every column."""
     for col in range(heights.shape[1]):
         if use[row, col]:
@@ -49,7 +49,7 @@ def _add_row(sums, heights, use, row, sign):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _window_planes(heights, use, radius, leverage, planes):  # type: ignore[no-untyped-def]
+def _window_planes(heights, use, radius, leverage, planes):
     rows, cols = heights.shape
     sums = np.zeros((cols, 6))
     windows = np.empty((10, cols))
@@ -65,7 +65,7 @@ def _window_planes(heights, use, radius, leverage, planes):  # type: ignore[no-u
 
 
 @kernel
-def _sum_up(sums, radius, windows):  # type: ignore[no-untyped-def]
+def _sum_up(sums, radius, windows):
     """The ten sums of every window of a row: windows (10, cols), of 1, x, y, z, xx, xy, yy, xz, yz and zz."""
     cols = len(sums)
     n = sx = sxx = sy = syy = sxy = sz = sxz = syz = szz = 0.0
@@ -93,7 +93,7 @@ def _sum_up(sums, radius, windows):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _solve(windows, row, leverage, height, along, across, rough):  # type: ignore[no-untyped-def]
+def _solve(windows, row, leverage, height, along, across, rough):
     """The planes, (cols,) each of their four numbers, of a row's windows; NaN where the points are too few, or too
     nearly in a line."""
     for col in range(windows.shape[1]):

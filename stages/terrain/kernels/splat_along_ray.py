@@ -30,7 +30,7 @@ def laid_along_sight(
 
 
 @kernel
-def _lay(points, sigma, chosen, eye, axis, reach, most, places, copies):  # type: ignore[no-untyped-def]
+def _lay(points, sigma, chosen, eye, axis, reach, most, places, copies):
     for k in range(chosen.size):
         i = chosen[k]
         x, y, z = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
