@@ -85,6 +85,13 @@ class Finding:
         return {"severity": str(self.severity), "sentence": self.sentence}
 
 
+class StageError(ValueError):
+    """Data that a stage cannot work with; the sentence says what is wrong, where, and what to do.
+
+    The ledger shows the sentence as it is. It shows any other exception with its type, file and line.
+    """
+
+
 Event = tuple[int, str, Any]  # of a log: log time in ns, stream, item; an exception stands for an item that was lost
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from flow.contracts import StageError
 from stages.data import LEVEL_FRAME, Disparity, PointCloud, StereoFrame
 
 WIDEST = 4000  # cells, of a map
@@ -83,21 +84,21 @@ def check_rectified(stage: Stage, frame: StereoFrame) -> None:
     """Refuse a frame as the cameras took it."""
     if frame.camera.raw is not None:
         name = type(stage).__name__
-        raise ValueError(f"{name}: the frame is not rectified; put stages.Rectify before stages.{name}")
+        raise StageError(f"{name}: the frame is not rectified; put stages.Rectify before stages.{name}")
 
 
 def check_level(stage: Stage, cloud: PointCloud) -> None:
     """Refuse a cloud that is not in frame `level`."""
     if cloud.frame_id != LEVEL_FRAME:
         name = type(stage).__name__
-        raise ValueError(f"{name}: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
+        raise StageError(f"{name}: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
 
 
 def check_joined(stage: Stage, frame: StereoFrame, disparity: Disparity) -> None:
     """Refuse a frame that is not rectified, and a disparity that is not of its size."""
     check_rectified(stage, frame)
     if disparity.pixels.shape != frame.left.shape[:2]:
-        raise ValueError(
+        raise StageError(
             f"{type(stage).__name__}: the disparity is {disparity.pixels.shape}, the left image "
             f"{frame.left.shape[:2]}; join the disparity with the rectified frame it was made from"
         )
@@ -107,4 +108,4 @@ def check_same_time(stage: Stage, **stamps: int) -> None:
     """Refuse data that are not of one time; stamps: by the name of the port."""
     if len(set(stamps.values())) > 1:
         found = ", ".join(f"{name} of {stamp} ns" for name, stamp in stamps.items())
-        raise ValueError(f"{type(stage).__name__}: {found}: join data that were made from one frame")
+        raise StageError(f"{type(stage).__name__}: {found}: join data that were made from one frame")

@@ -85,7 +85,7 @@ class NodeSpec:
         except (Exception, SystemExit) as error:  # whatever a stage of the user's own may raise
             named = [key for key in values if f"{self.kind.__name__}.{key}" in str(error)]
             place = self.place_of(named[-1]) if named else self.place_at_fault(values)
-            raise place.error(failure(error)) from error
+            raise place.error(str(error) if isinstance(error, ValueError) else failure(error)) from error
 
 
 def _class(use: str, place: YamlLocation) -> type:

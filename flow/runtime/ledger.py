@@ -9,55 +9,26 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
-from opcode import opmap
 from pathlib import Path
-from types import TracebackType
+from traceback import extract_tb
 
-from flow.contracts import Loss
+from flow.contracts import Loss, StageError
 
 log = logging.getLogger(__name__)
-_HOUSE = {"flow", "stages", "recordings"}
-
-
 FLOW = Path(__file__).resolve().parent.parent
 
 
 def failure(error: BaseException) -> str:
-    """What the ledger says of an exception: a ValueError that a stage chose to raise speaks for itself, others need
-    their name and place."""
+    """The ledger's sentence about an exception: a StageError as it is, any other with its type, file and line."""
     log.debug("%s", error, exc_info=error)
-    calls = _calls(error)
-    if isinstance(error, ValueError) and (not calls or _chosen(calls)):
+    if isinstance(error, StageError):
         return str(error)
-    own = [call for call in calls if _file(call) == _file(calls[0])]
-    place = f" ({_file(own[-1]).name}, line {own[-1].tb_lineno}; --debug shows the way there)" if own else ""
-    return f"{type(error).__name__}: {error}{place}"
-
-
-def _calls(error: BaseException) -> list[TracebackType]:
-    """The way from the stage that was called to where an exception came up; empty where none had been called."""
-    calls, call = list[TracebackType](), error.__traceback__
-    while call is not None:
-        if FLOW not in _file(call).parents and not _file(call).name.startswith("<"):
-            calls.append(call)
-        call = call.tb_next
-    return calls
-
-
-def _chosen(calls: list[TracebackType]) -> bool:
-    """Whether a `raise` of the stage's own package or of this house ends the way: not an operation that failed, nor a
-    library, neither of which can know what to do about it."""
-    last = calls[-1]
-    raised = last.tb_frame.f_code.co_code[last.tb_lasti] == opmap["RAISE_VARARGS"]
-    return raised and _package(last) in {*_HOUSE, _package(calls[0])}
-
-
-def _file(call: TracebackType) -> Path:
-    return Path(call.tb_frame.f_code.co_filename)
-
-
-def _package(call: TracebackType) -> str:
-    return str(call.tb_frame.f_globals.get("__name__")).partition(".")[0]
+    calls = [call for call in extract_tb(error.__traceback__) if not call.filename.startswith("<")]
+    outside = [call for call in calls if FLOW not in Path(call.filename).parents]
+    # The last line in the file of the stage itself: what its libraries do further down means little to a user.
+    own = [call for call in outside if call.filename == outside[0].filename]
+    where = f" ({Path(own[-1].filename).name}, line {own[-1].lineno}; --debug shows the traceback)" if own else ""
+    return f"{type(error).__name__}: {error}{where}"
 
 
 class Ledger:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from flow.contracts import StageError
 from stages.cloud.kernels.depth_order import out_of_order
 from stages.cloud.kernels.outliers import supported, usual_slope
 from stages.cloud.kernels.patches import depth_images, patches
@@ -57,7 +58,7 @@ class Clean(Stage):
     def __call__(self, cloud: PointCloud) -> PointCloud:
         """The points of `cloud`, in their order, that are near and no outliers; there may be none."""
         if cloud.sensor is not None:
-            raise ValueError(f"Clean: the cloud is in frame '{cloud.frame_id}', not its camera's; Clean precedes Level")
+            raise StageError(f"Clean: the cloud is in frame '{cloud.frame_id}', not its camera's; Clean precedes Level")
         keep = self._organised(cloud) if self.method == "organised" else self._knn(cloud)
         return cloud.only(keep)
 
@@ -67,7 +68,7 @@ class Clean(Stage):
         Those that are not measured are no evidence, so they support nobody and are cropped only.
         """
         if cloud.shape is None:
-            raise ValueError("Clean: the cloud does not say its image's shape; set it, or use method: knn")
+            raise StageError("Clean: the cloud does not say its image's shape; set it, or use method: knn")
         measured = np.flatnonzero(cloud.measured)
         square = np.einsum("ij,ij->i", cloud.points, cloud.points)
         kept = ~cloud.measured & (cloud.points[:, 2] > 0) & (square <= (self.max_range + self.margin) ** 2)
@@ -77,7 +78,7 @@ class Clean(Stage):
     def _supported(self, cloud: PointCloud, shape: tuple[int, int]) -> Array:
         """Indices of the points that stay of a cloud all of whose points are measured."""
         if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < shape[0] * shape[1]:
-            raise ValueError(f"Clean: the cloud has pixel indices outside its image of shape {shape}")
+            raise StageError(f"Clean: the cloud has pixel indices outside its image of shape {shape}")
         kept = np.flatnonzero(
             supported(
                 cloud.points,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flow.contracts import StageError
 from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Tilt, Transform
 from stages.stage import Stage, parameter
@@ -43,12 +44,12 @@ class Level(Stage):
         Without `mount` the tilt must be given in the cloud's own frame: how an inclinometer sits is never guessed.
         """
         if cloud.sensor is not None:
-            raise ValueError(f"Level: the cloud is in frame '{cloud.frame_id}', not its camera's; level it only once")
+            raise StageError(f"Level: the cloud is in frame '{cloud.frame_id}', not its camera's; level it only once")
         if not cloud.measured.any():
-            raise ValueError("Level: no measured point of the frame is left; nothing was matched within the region")
+            raise StageError("Level: no measured point of the frame is left; nothing was matched within the region")
         if mount is None:
             if tilt.frame_id != cloud.frame_id:
-                raise ValueError(
+                raise StageError(
                     f"Level: the tilt is in frame '{tilt.frame_id}', the cloud in '{cloud.frame_id}', and nothing says "
                     "how one sits in the other; connect the port 'mount'"
                 )
@@ -70,7 +71,7 @@ def level_transform(tilt: Tilt, mount: Mount, camera_frame: str, camera_height: 
     forward, origin = _heading_and_origin(mount, up, camera_height)
     level = forward - (forward @ up) * up
     if not float(np.linalg.norm(level)) > _LEAST_HORIZONTAL:
-        raise ValueError(
+        raise StageError(
             "Level: the heading is nearly vertical, so the level frame has no x axis; check the tilt's sign and the "
             "inclinometer's mount, or give base_link's transform if the camera looks straight down"
         )

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from flow.contracts import StageError
+
 Array = NDArray[Any]
 
 
@@ -23,10 +25,10 @@ def publish(owner: object, name: str, shape: tuple[int | None, ...], dtype: DTyp
     array = np.asarray(getattr(owner, name))
     where = f"{type(owner).__name__}.{name}"
     if array.dtype != np.dtype(dtype):
-        raise ValueError(f"{where} must be {np.dtype(dtype)}, not {array.dtype}")
+        raise StageError(f"{where} must be {np.dtype(dtype)}, not {array.dtype}")
     if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
         wanted = ", ".join("n" if extent is None else str(extent) for extent in shape)
-        raise ValueError(f"{where} must have shape ({wanted}), not {array.shape}")
+        raise StageError(f"{where} must have shape ({wanted}), not {array.shape}")
     object.__setattr__(owner, name, read_only(array))
 
 
@@ -34,9 +36,9 @@ def publish_image(owner: object, name: str) -> None:
     """Check that the field `name` holds a gray (H, W) or RGB (H, W, 3) image of 8 or 16 bit; make it read-only."""
     pixels = np.asarray(getattr(owner, name))
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{type(owner).__name__}.{name} must be uint8 or uint16, not {pixels.dtype}")
+        raise StageError(f"{type(owner).__name__}.{name} must be uint8 or uint16, not {pixels.dtype}")
     if pixels.ndim != 2 and pixels.shape[2:] != (3,):
-        raise ValueError(f"{type(owner).__name__}.{name} must be (H, W) gray or (H, W, 3) RGB, not {pixels.shape}")
+        raise StageError(f"{type(owner).__name__}.{name} must be (H, W) gray or (H, W, 3) RGB, not {pixels.shape}")
     publish(owner, name, pixels.shape, pixels.dtype)
 
 
@@ -44,7 +46,7 @@ def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: boo
     """Publish a float64 copy of a small array given as any array-like."""
     values = np.array(getattr(owner, name), dtype=np.float64)
     if finite and not np.isfinite(values).all():
-        raise ValueError(f"{type(owner).__name__}.{name} must be finite, not {values.tolist()}")
+        raise StageError(f"{type(owner).__name__}.{name} must be finite, not {values.tolist()}")
     object.__setattr__(owner, name, values)
     publish(owner, name, shape, np.float64)
 
@@ -52,14 +54,14 @@ def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: boo
 def publish_stamp(owner: Any) -> None:
     """Check that the field `stamp` holds whole nanoseconds, and make them an int."""
     if not isinstance(owner.stamp, Integral):
-        raise ValueError(f"{type(owner).__name__}.stamp must be whole nanoseconds, not {owner.stamp!r}")
+        raise StageError(f"{type(owner).__name__}.stamp must be whole nanoseconds, not {owner.stamp!r}")
     object.__setattr__(owner, "stamp", int(owner.stamp))
 
 
 def check_resolution(owner: Any) -> None:
     """Raise ValueError unless the field `resolution`, the size of a cell, is a length."""
     if not 0 < owner.resolution < math.inf:
-        raise ValueError(f"{type(owner).__name__}.resolution must be positive and finite, not {owner.resolution} m")
+        raise StageError(f"{type(owner).__name__}.resolution must be positive and finite, not {owner.resolution} m")
 
 
 def read_only(array: Array) -> Array:
@@ -75,4 +77,4 @@ def read_only(array: Array) -> Array:
 def check_rotation(rotation: Array, where: str) -> None:
     """Raise ValueError unless a (3, 3) matrix is orthonormal and right-handed."""
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
-        raise ValueError(f"{where} is not a rotation matrix")
+        raise StageError(f"{where} is not a rotation matrix")

@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 
+from flow.contracts import StageError
 from stages.data.arrays import Array, publish_image, publish_stamp, publish_vector
 
 ALIKE = 1e-3  # of a focal length or of cy, by which those of a rectified pair may differ: a pixel at 1000 px
@@ -88,9 +89,9 @@ class StereoCamera:
             object.__setattr__(self, "cx_right", self.cx)
         for name in ("fx", "fy", "baseline", "width", "height"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"StereoCamera.{name} must be positive, not {getattr(self, name)}")
+                raise StageError(f"StereoCamera.{name} must be positive, not {getattr(self, name)}")
         if not np.all(np.isfinite([self.fx, self.fy, self.cx, self.cy, self.cx_right, self.baseline])):
-            raise ValueError("StereoCamera has a calibration value that is not finite")
+            raise StageError("StereoCamera has a calibration value that is not finite")
 
     @classmethod
     def from_models(cls, left: CameraModel, right: CameraModel, frame_id: str, rectified: bool) -> StereoCamera:
@@ -99,7 +100,7 @@ class StereoCamera:
         Raises ValueError where these are not those of a rectified pair.
         """
         if differing := left.unlike(right):
-            raise ValueError(f"the cameras' P are not those of a rectified pair: {differing}")
+            raise StageError(f"the cameras' P are not those of a rectified pair: {differing}")
         return cls(
             fx=float(left.p[0, 0]), fy=float(left.p[1, 1]), cx=float(left.p[0, 2]), cy=float(left.p[1, 2]),
             baseline=float(left.p[0, 3] / left.p[0, 0] - right.p[0, 3] / right.p[0, 0]),
@@ -158,11 +159,11 @@ class StereoFrame:
         publish_image(self, "left")
         publish_image(self, "right")
         if self.left.shape != self.right.shape:
-            raise ValueError(f"StereoFrame: left is {self.left.shape}, right is {self.right.shape}")
+            raise StageError(f"StereoFrame: left is {self.left.shape}, right is {self.right.shape}")
         if self.left.dtype != self.right.dtype:
-            raise ValueError(f"StereoFrame: left is {self.left.dtype}, right is {self.right.dtype}; record both alike")
+            raise StageError(f"StereoFrame: left is {self.left.dtype}, right is {self.right.dtype}; record both alike")
         if self.left.shape[:2] != (self.camera.height, self.camera.width):
-            raise ValueError(
+            raise StageError(
                 f"StereoFrame: images are {self.left.shape[1]}x{self.left.shape[0]}, "
                 f"the calibration is for {self.camera.width}x{self.camera.height}"
             )

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from flow.contracts import StageError
 from stages.data.arrays import Array, check_resolution, publish, publish_stamp, read_only
 from stages.data.motion import Transform
 
@@ -62,11 +63,11 @@ class ElevationMap:
         check_resolution(self)
         layers = {name: np.asarray(layer) for name, layer in self.layers.items()}
         if "elevation" not in layers:
-            raise ValueError("ElevationMap has no layer 'elevation'")
+            raise StageError("ElevationMap has no layer 'elevation'")
         rows, cols = layers["elevation"].shape
         for name, layer in layers.items():
             if layer.shape != (rows, cols) or layer.dtype != np.float32:
-                raise ValueError(f"ElevationMap layer '{name}' must be float32 ({rows}, {cols})")
+                raise StageError(f"ElevationMap layer '{name}' must be float32 ({rows}, {cols})")
         object.__setattr__(self, "layers", MappingProxyType({n: read_only(layer) for n, layer in layers.items()}))
         object.__setattr__(self, "shape", (rows, cols))
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import StageError
 from stages.data.arrays import Array, check_rotation, publish_stamp, publish_vector
 from stages.data.covariance import levered
 
@@ -58,7 +59,7 @@ class Tilt:
         publish_stamp(self)
         publish_vector(self, "up", (3,))
         if not abs(float(np.linalg.norm(self.up)) - 1.0) < 1e-6:
-            raise ValueError(f"Tilt.up must be a unit vector, not {self.up.tolist()}")
+            raise StageError(f"Tilt.up must be a unit vector, not {self.up.tolist()}")
 
     def interpolated(self, later: Tilt, stamp: int) -> Tilt:
         """The tilt at `stamp`, ns, between this one and a later one, along the great circle."""
@@ -72,7 +73,7 @@ class Tilt:
         up = np.linalg.lstsq(line, np.array([sample.up for sample in samples]), rcond=None)[0][0]
         length = float(np.linalg.norm(up))
         if not length > 0.5:
-            raise ValueError("Tilt.smoothed: the samples point all ways")
+            raise StageError("Tilt.smoothed: the samples point all ways")
         return Tilt(stamp, up / length, samples[0].frame_id)
 
 
@@ -98,13 +99,13 @@ class Pose:
         if self.covariance is not None:
             publish_vector(self, "covariance", (6, 6), finite=False)
         if not abs(float(np.linalg.norm(self.quaternion)) - 1.0) < 1e-3:
-            raise ValueError(f"Pose.quaternion must be a unit quaternion, not {self.quaternion.tolist()}")
+            raise StageError(f"Pose.quaternion must be a unit quaternion, not {self.quaternion.tolist()}")
 
     def interpolated(self, later: Pose, stamp: int) -> Pose:
         """The pose at `stamp`, ns, between this one and a later one in the same frames; the earlier covariance is
         kept."""
         if (self.frame_id, self.child_frame_id) != (later.frame_id, later.child_frame_id):
-            raise ValueError(
+            raise StageError(
                 f"the pose of '{self.child_frame_id}' in '{self.frame_id}' is followed by one of "
                 f"'{later.child_frame_id}' in '{later.frame_id}'; nothing lies between two frames"
             )
@@ -199,7 +200,7 @@ class TiltHealth:
 def _share(first: int, last: int, stamp: int) -> float:
     """How far `stamp` is on the way from one stamp to the other, 0 to 1."""
     if not first <= stamp <= last:
-        raise ValueError(f"stamp {stamp} is outside [{first}, {last}]")
+        raise StageError(f"stamp {stamp} is outside [{first}, {last}]")
     return (stamp - first) / (last - first) if last > first else 0.0
 
 
@@ -209,5 +210,5 @@ def _slerp(start: Array, end: Array, share: float) -> Array:
     if angle < 1e-9:
         return start
     if angle > np.pi - 1e-6:
-        raise ValueError("cannot interpolate between opposite directions")
+        raise StageError("cannot interpolate between opposite directions")
     return (np.sin((1 - share) * angle) * start + np.sin(share * angle) * end) / np.sin(angle)  # type: ignore[no-any-return]

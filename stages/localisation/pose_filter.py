@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flow.contracts import Finding, Severity, counted
+from flow.contracts import Finding, Severity, StageError, counted
 from stages.cloud.level import level_transform
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.data.covariance import levered
@@ -83,7 +83,7 @@ class PoseFilter(Stage):
             state.check.add(motion, logged, mount)
             return logged
         if motion.camera is None:
-            raise ValueError(f"PoseFilter: no pose can be told from the images: {motion.lost}")
+            raise StageError(f"PoseFilter: no pose can be told from the images: {motion.lost}")
         before = state.estimate
         if before is None or before.segment != motion.segment:
             estimate = self._begun(motion, motion.camera, tilt, mount)

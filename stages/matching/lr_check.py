@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from flow.contracts import StageError
 from stages.data import Disparity
 from stages.matching.kernels.lr_check import drop_contradicted
 from stages.stage import Stage, check_same_time, parameter
@@ -29,7 +30,7 @@ class LeftRightCheck(Stage):
 
     def __call__(self, disparity: Disparity, backward: Disparity) -> Disparity:
         if disparity.pixels.shape != backward.pixels.shape:
-            raise ValueError(
+            raise StageError(
                 f"LeftRightCheck: the disparities have shapes {disparity.pixels.shape} and {backward.pixels.shape}; "
                 "match the swapped frame at the same size"
             )

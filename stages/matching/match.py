@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flow.contracts import StageError
 from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.matching.kernels.prior_cost import prior_costs
@@ -178,16 +179,16 @@ class Match(Stage):
         height, width = frame.left.shape[:2]
         check_rectified(self, frame)
         if min(height, width) < SMALLEST_SIDE:
-            raise ValueError(f"Match: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
+            raise StageError(f"Match: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
         if not -width < self.min_disparity < width:
-            raise ValueError(
+            raise StageError(
                 f"Match.min_disparity = {self.min_disparity} px leaves nothing to compare in images {width} px wide"
             )
         self.check_inputs({"frame"} if prior is None else {"frame", "prior"})
         if prior is not None and not isinstance(prior, Disparity):
-            raise ValueError(f"Match: the prior must be a stages.Disparity, not a {type(prior).__name__}")
+            raise StageError(f"Match: the prior must be a stages.Disparity, not a {type(prior).__name__}")
         if prior is not None and prior.pixels.shape != (height, width):
-            raise ValueError(
+            raise StageError(
                 f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; "
                 "stages.Upsample makes a coarser one fit"
             )
@@ -204,7 +205,7 @@ class Match(Stage):
         largest = camera.width if self.search_radius else search.stop - 1
         reach = self._reach(camera)
         if reach >= largest:
-            raise ValueError(
+            raise StageError(
                 f"Match.max_depth = {self.max_depth} m leaves nothing to search: a depth of {self.max_depth} m is a "
                 f"disparity of {reach:.0f} px, and {largest} px is the largest searched"
             )

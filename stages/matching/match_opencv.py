@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from flow.contracts import StageError
 from stages.data import Array, Disparity, PixelOrigin, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.stage import Stage, check_rectified, parameter
@@ -75,7 +76,7 @@ class MatchOpenCV(Stage):
         """The disparity image (H, W) float32, NaN where the match failed or lies outside the right image."""
         height, width = left.shape[:2]
         if min(height, width) < SMALLEST_SIDE:
-            raise ValueError(f"MatchOpenCV: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
+            raise StageError(f"MatchOpenCV: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
         levels = -(-self.disparities // 16) * 16
         before, after = max(0, self.min_disparity + levels), max(0, -self.min_disparity)
         left, right = (

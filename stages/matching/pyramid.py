@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 
+from flow.contracts import StageError
 from stages.data import Disparity, StereoFrame
 from stages.matching.kernels.resample import doubled, halved
 from stages.matching.match import SMALLEST_SIDE
@@ -26,7 +27,7 @@ class Halve(Stage):
         left, right = halved(frame.left), halved(frame.right)
         height, width = left.shape[:2]
         if min(height, width) < SMALLEST_SIDE:
-            raise ValueError(
+            raise StageError(
                 f"Halve: images are {full_width}x{full_height}, too small to be matched at half size: each side must "
                 f"be at least {2 * SMALLEST_SIDE - 1} px; use a pipeline without stages.Halve, such as paper"
             )
@@ -53,7 +54,7 @@ class Upsample(Stage):
         height, width = frame.left.shape[:2]
         small = disparity.pixels.shape
         if small != ((height + 1) // 2, (width + 1) // 2):
-            raise ValueError(f"Upsample: the disparity has shape {small}, which is not half of {(height, width)}")
+            raise StageError(f"Upsample: the disparity has shape {small}, which is not half of {(height, width)}")
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         pixels = doubled(disparity.pixels, height, width, self.threads)
         source, confidence = (

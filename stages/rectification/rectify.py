@@ -21,7 +21,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from flow.contracts import Finding, Severity, counted
+from flow.contracts import Finding, Severity, StageError, counted
 from stages.data import Array, CameraModel, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.rectification.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
@@ -194,7 +194,7 @@ def _rectifying_maps(
     numbers = np.frombuffer(values)
     k, r, p, d = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:30].reshape(3, 4), numbers[30:]
     if wrong := CameraModel(width, height, k, d, r, p, model).unusable:
-        raise ValueError(f"Rectify: {wrong}")
+        raise StageError(f"Rectify: {wrong}")
     undistort = cv2.fisheye.initUndistortRectifyMap if model == "equidistant" else cv2.initUndistortRectifyMap
     down = offset_field(terms, width, height, first)
     above = int(np.ceil(np.abs(down).max())) if terms else 0  # rows beyond the image that the offset may look up

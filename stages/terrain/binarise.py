@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from flow.contracts import StageError
 from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap
 from stages.stage import Stage, parameter
 
@@ -117,7 +118,7 @@ class Binarise(Stage):
         """Reasons of the observed cells, (rows, cols); what stands in others says nothing."""
         missing = [name for name in LAYERS if name not in elevation.layers]
         if missing:
-            raise ValueError(
+            raise StageError(
                 f"Binarise: the map has no layer '{missing[0]}'; put stages.TerrainFeatures before stages.Binarise"
             )
         ground, step, slope, steepness, roughness, support = (elevation.layers[name] for name in LAYERS)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flow.contracts import Finding, Severity, counted
+from flow.contracts import Finding, Severity, StageError, counted
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
 from stages.stage import Stage, check_cells, parameter
 from stages.terrain.fused_map import FusedMap, Observation, hidden_below, layers_of, merged, variance_of
@@ -130,9 +130,9 @@ class Fuse(Stage):
 
     def _check(self, cloud: PointCloud, state: FusedMap) -> None:
         if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
-            raise ValueError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
+            raise StageError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
         if cloud.stamp <= state.last:
-            raise ValueError(f"Fuse: the cloud of {cloud.stamp} ns comes after that of {state.last} ns")
+            raise StageError(f"Fuse: the cloud of {cloud.stamp} ns comes after that of {state.last} ns")
 
     def _seen(self, sight: FrameGrid) -> Observation:
         """What a frame shows of the cells that it knows; its errors of place are added to their variance."""
@@ -189,7 +189,7 @@ class Fuse(Stage):
             return False
         state.refused += 1
         if state.refused < PATIENCE:
-            raise ValueError(
+            raise StageError(
                 f"Fuse: the frame lies {change[0]:.2f} m and {np.degrees(change[1:].max()):.1f} degrees off the map, "
                 "unlike those before; its pose or its tilt has jumped, and it is left out of the regional map"
             )

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import StageError
 from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
 from stages.terrain.dem import Voxelise
@@ -64,7 +65,7 @@ def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tupl
     turned = camera @ cloud.sensor.rotation.T
     lean = float(np.arccos(np.clip(turned[2, 2], -1.0, 1.0)))
     if lean > _LARGEST_LEAN:
-        raise ValueError(
+        raise StageError(
             f"Fuse: z of the pose's frame '{pose.frame_id}' is {np.degrees(lean):.0f} degrees off the vertical of the "
             "tilt; give a pose in a frame whose z points up"
         )
@@ -79,7 +80,7 @@ def _child_from_camera(pose: Pose, sensor: Transform, mount: Mount | None) -> Tr
     mount = mount or Mount(0, np.eye(3))
     seat = mount.camera_on(pose.child_frame_id, sensor.child)
     if seat is None:
-        raise ValueError(
+        raise StageError(
             f"Fuse: the pose is that of '{pose.child_frame_id}', and nothing tells how the camera '{sensor.child}' "
             "sits on it; record its static transform, or set base_frame of the source"
         )

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from flow.config.loader import load
-from flow.contracts import Finding, Severity
+from flow.contracts import Finding, Severity, StageError
 from flow.runtime.run import run
 
 
@@ -29,7 +29,7 @@ class Number:
 
     def pair_with(self, right: Number) -> Couple:
         if self.value < 0:
-            raise ValueError(f"the left number {self.value} is negative")
+            raise StageError(f"the left number {self.value} is negative")
         return Couple(self.stamp, self.value + right.value)
 
     def interpolated(self, later: Number, stamp: int) -> Number:
@@ -67,7 +67,7 @@ class Scale:
     def __call__(self, couple: Couple) -> Couple:
         time.sleep(self.nap * random.random())
         if couple.value in self.bad:
-            raise ValueError(f"cannot scale {couple.value}")
+            raise StageError(f"cannot scale {couple.value}")
         return Couple(couple.stamp, couple.value * self.factor)
 
 

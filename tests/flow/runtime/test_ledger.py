@@ -1,46 +1,47 @@
-"""The ledger says the same of equal runs, and of an exception what it says or where it broke down."""
+"""Equal runs have equal ledgers; an exception is shown by its sentence, or by its type, file and line."""
 
 from itertools import permutations
 
 import numpy as np
 import pytest
 
-from flow.contracts import Loss, LossReason
+from flow.contracts import Loss, LossReason, StageError
 from flow.runtime.ledger import Ledger, failure
-from stages import Match
+from stages import StereoFrame
 
 
-def said_of(call):
-    with pytest.raises(ValueError) as caught:  # noqa: PT011
+def sentence_of(call):
+    with pytest.raises(Exception) as caught:  # noqa: PT011
         call()
     return failure(caught.value)
 
 
 def refuse():
-    raise ValueError(
-        "the image is too dark; take another"  # a line below the `raise`
+    raise StageError("the image is too dark; take another")
+
+
+def test_a_stage_error_is_shown_as_it_is():
+    assert sentence_of(refuse) == "the image is too dark; take another"
+
+
+def test_so_is_the_stage_error_of_a_library_that_a_stage_calls():
+    assert sentence_of(lambda: StereoFrame(0, np.zeros((2, 2), np.uint8), np.zeros((2, 3), np.uint8), None)) == (
+        "StereoFrame: left is (2, 2), right is (2, 3)"
     )
 
 
-def test_a_refusal_says_what_it_says():
-    assert said_of(refuse) == "the image is too dark; take another"
-
-
-def test_so_does_a_refusal_by_a_stage_of_ours_that_another_is_made_of():
-    assert said_of(lambda: Match(disparities=-1)).startswith("Match.disparities must be")
-
-
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "sentence"),
     [
         (lambda: np.zeros(3).reshape(2), "ValueError: cannot reshape array of size 3 into shape (2,)"),
         (lambda: np.linalg.inv(np.zeros((2, 2))), "LinAlgError: Singular matrix"),  # raised in a file of NumPy's
         (lambda: int("nix"), "ValueError: invalid literal for int() with base 10: 'nix'"),
+        (lambda: {}["left"], "KeyError: 'left'"),
     ],
 )
-def test_an_operation_that_breaks_down_is_named_with_file_and_line(call, said):
+def test_any_other_exception_is_named_with_the_stage_s_file_and_line(call, sentence):
     line = call.__code__.co_firstlineno
-    assert said_of(call) == f"{said} (test_ledger.py, line {line}; --debug shows the way there)"
+    assert sentence_of(call) == f"{sentence} (test_ledger.py, line {line}; --debug shows the traceback)"
 
 
 def test_equal_runs_give_equal_ledgers_whatever_fails_first():
