@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test check-all bench study pictures lint clean
+.PHONY: demo test check-all bench study pictures docs lint clean
 
 demo: $(READY)
 	$(BIN)/roverflow demo --out demo
@@ -23,6 +23,11 @@ study: $(READY)
 
 pictures: $(READY)
 	$(BIN)/python -m tests.pictures docs
+
+docs: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(BIN)/python -m tests.docs.generated
+	$(BIN)/mkdocs build --strict
 
 lint: $(READY)
 	$(BIN)/ruff check .

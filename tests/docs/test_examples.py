@@ -1,0 +1,55 @@
+"""The code of README and docs runs as it stands."""
+
+import importlib
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from recordings.simulator import Simulation
+from stages import ElevationMap
+from tests.docs import pages
+
+
+def save(page, folder):
+    """Write the named blocks of a page into a folder."""
+    for language in ("python", "yaml"):
+        for block in pages.blocks(language):
+            if block.page == page and pages.named(block):
+                (folder / pages.named(block)).write_text(block.text)
+
+
+@pytest.fixture
+def written(tmp_path, monkeypatch):
+    """Writes the blocks of a page and imports a module of it."""
+
+    def write(page, module):
+        save(page, tmp_path)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        monkeypatch.delitem(sys.modules, module, raising=False)
+        return importlib.import_module(module)
+
+    return write
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/writing-a-stage.md"])
+def test_the_stage_of_the_page_removes_sparse_cells(page, written):
+    stage = written(page, "my_module").DropSparse(min_points=5)
+    layers = {"elevation": np.ones((1, 2), np.float32), "count": np.array([[4, 5]], np.float32)}
+    dense = stage(ElevationMap(0, layers, 0.05, (0.0, 0.0), "level"))
+    np.testing.assert_array_equal(dense.layers["elevation"], [[np.nan, 1]])
+    np.testing.assert_array_equal(dense.layers["count"], [[4, 5]])
+
+
+def test_two_images_become_a_picture_of_the_terrain(tmp_path):
+    for name, image in zip(("left", "right"), Simulation(width=640, height=480).frame(0).images, strict=True):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    example = pages.ROOT / "docs" / "examples" / "two_images_to_dem.py"
+    done = subprocess.run(
+        [sys.executable, str(example), "left.png", "right.png", "dem.png"],
+        cwd=tmp_path, env={"PYTHONPATH": str(pages.ROOT)}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert int(done.stdout.split()[0]) > 4000
+    assert cv2.imread(str(tmp_path / "dem.png")).shape == (240, 240, 3)
