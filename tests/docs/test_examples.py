@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from flow.contracts import Severity
 from recordings.simulator import Simulation
-from stages import ElevationMap
+from stages import ElevationMap, NavigationMap
 from tests.docs import pages
 
 
@@ -53,3 +54,24 @@ def test_two_images_become_a_picture_of_the_terrain(tmp_path):
     )  # fmt: skip
     assert int(done.stdout.split()[0]) > 4000
     assert cv2.imread(str(tmp_path / "dem.png")).shape == (240, 240, 3)
+
+
+def test_flow_runs_without_a_rover(tmp_path):
+    save("docs/flow-without-a-rover.md", tmp_path)
+    done = subprocess.run(
+        [sys.executable, "run_numbers.py"],
+        cwd=tmp_path, env={"PYTHONPATH": str(pages.ROOT)}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout == "COMPLETE 3\n"
+    shown = next(block.text for block in pages.blocks("text") if block.page == "docs/flow-without-a-rover.md")
+    assert (tmp_path / "numbers.txt").read_text() == shown
+
+
+def test_the_stage_with_state_starts_each_run_empty(written):
+    stage = written("docs/writing-a-stage.md", "counting").CountHazards(max_hazards=1)
+    cells = np.array([[100, 100, 0]], np.int8)
+    navigation = NavigationMap(0, cells, np.zeros_like(cells, np.uint8), 0.05, (0.0, 0.0), "level")
+    first, second = stage.start(), stage.start()
+    assert stage(navigation, state=first) == 2
+    assert stage.finding(first).severity == Severity.WARNING
+    assert stage.finding(second) is None
