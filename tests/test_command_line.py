@@ -266,7 +266,7 @@ def test_a_run_without_any_result_replaces_none(tmp_path, capsys):
     before = out.read_bytes()
     assert roverflow("run", log, "-o", out) == 3  # too small to be halved twice
     assert out.read_bytes() == before
-    assert "out.mcap was not written or replaced: it would hold no result" in capsys.readouterr().out
+    assert "out.mcap was not written because the run produced no results" in capsys.readouterr().out
     assert out.with_suffix(".rrd").exists()  # which shows why
 
 
@@ -341,7 +341,7 @@ def test_an_interrupted_demo_reports_what_there_is_and_goes_on_to_nothing_else(t
             os.kill(os.getpid(), signal.SIGINT)
 
     folder = tmp_path / "demo"
-    monkeypatch.setattr("flow.cli.main.simulate", lambda log, frames: log.write_bytes(traverse.read_bytes()))
+    monkeypatch.setattr("flow.cli.demo.simulate", lambda log, frames: log.write_bytes(traverse.read_bytes()))
     monkeypatch.setattr(McapSink, "write", interrupted)
     assert roverflow("demo", "--out", folder) == 130
     assert f"{folder / 'result.mcap'} (" in capsys.readouterr().out.splitlines()[-2]
@@ -353,7 +353,7 @@ def test_an_interrupt_inside_compiled_code_is_an_interrupt(traverse, capsys, mon
     def compiled(*arguments, **more):
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
 
-    monkeypatch.setattr("flow.cli.main.replay", compiled)
+    monkeypatch.setattr("flow.cli.run.replay", compiled)
     assert roverflow("run", traverse, "-o", traverse.with_name("interrupted.mcap")) == 130
     assert capsys.readouterr().err == "roverflow: interrupted\n"
 

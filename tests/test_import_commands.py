@@ -70,7 +70,7 @@ def test_a_broken_scene_does_not_keep_the_others_from_being_imported(tmp_path, c
         ("disp0GT.pfm", "out.mcap", "disp0GT.pfm is not a PFM file"),
         ("calib.txt", "out.mcap", "calib.txt lacks 'cam0'"),
         ("im1.png", "out.mcap", "im1.png is not an image"),
-        (None, "Box/im0.png", "is what is being read"),
+        (None, "Box/im0.png", "is an input of this command"),
         (None, "Box", "is a folder or a device"),
         (None, "Bex.png", "no input log of roverflow"),
     ],
@@ -93,4 +93,4 @@ def test_a_scene_that_cannot_be_imported_is_refused_in_one_sentence(tmp_path, ca
 def test_the_help_of_the_import_says_what_it_takes_for_granted(capsys):
     with pytest.raises(SystemExit):
         roverflow("import", "middlebury", "--help")
-    assert "it is taken to look level from 1 m" in " ".join(capsys.readouterr().out.split())
+    assert "assumes level, 1 m above ground" in " ".join(capsys.readouterr().out.split())

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import rerun
 
-from flow.cli.arguments import check_demo
+from flow.cli.demo import check_folder
 from flow.errors import UsageError
 from recordings import McapSource, RerunSink
 from recordings.sinks.overwrite import is_ours
@@ -20,7 +20,7 @@ from tests.conftest import SMALL, rewrite, roverflow
 from tests.recordings.importers.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
-TAKEN = "is there already and no {} of roverflow; choose another name or remove it"
+TAKEN = "exists and is no {} of roverflow; choose another name or remove it"
 
 
 def drop(*parts: str):
@@ -88,7 +88,7 @@ def test_what_is_read_is_never_overwritten(traverse, tmp_path, capsys, option):
     (tmp_path / "link").symlink_to(traverse)
     for name in (traverse, tmp_path / "link"):
         assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, name) == 2
-        assert "is what is being read" in capsys.readouterr().err
+        assert "is an input of this command" in capsys.readouterr().err
     assert traverse.stat() == before
 
 
@@ -162,20 +162,20 @@ def test_the_demo_takes_no_folder_that_holds_anything_else(traverse, tmp_path, c
         (folder / name).parent.mkdir(parents=True)
         (folder / name).write_bytes(content)
         assert roverflow("demo", "--out", folder, "--frames", 1) == 2
-        assert "not of an earlier demo; choose another folder" in capsys.readouterr().err
+        assert "not from an earlier demo; choose another folder" in capsys.readouterr().err
         assert (folder / name).read_bytes() == content
     with pytest.raises(UsageError, match="is a file; give the name of a folder"):
-        check_demo(tmp_path / "notes.txt" / "notes.txt", is_ours)
+        check_folder(tmp_path / "notes.txt" / "notes.txt")
     folder = tmp_path / "earlier"
     folder.mkdir()
-    check_demo(folder, is_ours)
+    check_folder(folder)
     (folder / "traverse.mcap").write_bytes(traverse.read_bytes())
-    check_demo(folder, is_ours)
+    check_folder(folder)
     (folder / "maps").mkdir()
     with pytest.raises(UsageError):
-        check_demo(folder, is_ours)
+        check_folder(folder)
     (folder / "summary.json").touch()
-    check_demo(folder, is_ours)
+    check_folder(folder)
 
 
 @pytest.mark.parametrize("options", [("--rrd", "out.mcap"), ("--summary", "out.mcap")])

@@ -1,4 +1,4 @@
-"""Where the program begins: so little is imported here that an interrupt finds it ready from the first moment on."""
+"""The command line as a process of its own: signals, closed streams and the exit. Imports little, to start at once."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from flow.errors import INTERRUPTED
 
 
 def program() -> int:
-    """`flow.cli.main.main` for a process of its own: while it begins and when it is through, too, an interrupt is no
-    traceback, and the exit code is that of `main`."""
+    """Run `flow.cli.main.main`; returns its exit code. An interrupt at any moment is no traceback."""
     import os
     import signal
 
     try:
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is signal.SIG_DFL:
-                signal.signal(number, signal.default_int_handler)  # so that nothing half done is left behind
-        _open_what_is_closed()
+                signal.signal(number, signal.default_int_handler)  # outputs are then closed or removed
+        _open_closed_streams()
         from flow.runtime.malloc import keep_freed_memory
 
         keep_freed_memory()
@@ -30,27 +29,27 @@ def program() -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda *_: os._exit(code))
-    # Python itself, asked to run a module, may end an interrupted process by the signal; and native code that the
-    # interpreter is torn down under may abort it, where a stage of an abandoned frame still works.
-    if code == INTERRUPTED or _working():
+    # Python may end an interrupted `-m` process by the signal instead of the code. Native code in a stage of an
+    # abandoned frame may abort the process while the interpreter is torn down.
+    if code == INTERRUPTED or _stage_at_work():
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
     return code
 
 
-def _open_what_is_closed() -> None:
-    """Give a program that was started without stdout or stderr ones that go nowhere."""
+def _open_closed_streams() -> None:
+    """Replace a closed stdout or stderr by the null device."""
     import os
 
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115
-        getattr(sys, name).reconfigure(errors="backslashreplace")  # what its encoding lacks
+        getattr(sys, name).reconfigure(errors="backslashreplace")  # characters that its encoding lacks
 
 
-def _working() -> bool:
-    """Whether a stage still works."""
+def _stage_at_work() -> bool:
+    """Whether a worker thread is alive."""
     import threading
 
     return any(thread.name.startswith("worker-") for thread in threading.enumerate())

@@ -1,4 +1,4 @@
-"""What a run prints when it is through: the verdict, notes, what was lost and written, and last of all any warnings."""
+"""What a run prints at its end: the verdict, notes, losses, outputs, and warnings last."""
 
 from __future__ import annotations
 
@@ -8,34 +8,42 @@ from pathlib import Path
 from typing import Any
 
 from flow.contracts import LossReason, Verdict, counted
+from flow.errors import COMPLETE, INCOMPLETE, INTERRUPTED
 from flow.runtime.findings import NOTE, WARNING, lines
 
 
 def say(text: str) -> None:
-    """Print to stdout; a reader that has left does not stop the work."""
+    """Print to stdout. A reader that closes the pipe does not stop the work."""
     try:
         print(text, flush=True)
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or what is left would fail again at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # later prints would fail as well
         if not isinstance(error, BrokenPipeError):
             raise
 
 
-def headline(summary: dict[str, Any]) -> str:
-    """The verdict of a run in a line: how many frames are whole, and what was lost, be it frames or what made none.
+def exit_code(summary: dict[str, Any]) -> int:
+    """The exit code of a run."""
+    if summary["interrupted"]:
+        return INTERRUPTED
+    return COMPLETE if summary["verdict"] == Verdict.COMPLETE else INCOMPLETE
 
-    Frames that were in work as the run was stopped, or broke off, are told, but are no losses of the log.
+
+def headline(summary: dict[str, Any]) -> str:
+    """The verdict in one line: complete frames, losses by reason, and the rate.
+
+    Frames in flight at an interrupt are reported as abandoned, but are not counted as losses of the log.
     """
-    whole, of, drops = summary["frames_out"], summary["frames_in"], summary["drops"]
-    all_but = summary["verdict"] == Verdict.COMPLETE or whole != of  # else "18 of 18" would hide what made no frame
-    frames = f"{whole} of {counted(of, 'frame')}" if all_but else counted(whole, "frame")
+    complete, total, drops = summary["frames_out"], summary["frames_in"], summary["drops"]
+    of_total = summary["verdict"] == Verdict.COMPLETE or complete != total  # "18 of 18" would hide other losses
+    frames = f"{complete} of {counted(total, 'frame')}" if of_total else counted(complete, "frame")
     cut_off = summary["interrupted"] and summary["verdict"] != Verdict.COMPLETE
-    said = f"interrupted after {frames}" if cut_off else f"{frames} whole"
+    outcome = f"interrupted after {frames}" if cut_off else f"{frames} complete"
     losses = {reason: number for reason, number in drops.items() if reason != LossReason.ABANDONED}
     abandoned = f", {drops[LossReason.ABANDONED]} abandoned" if LossReason.ABANDONED in drops else ""
     lost = ", ".join(f"{number} {reason}" for reason, number in losses.items())
     count = f", {counted(sum(losses.values()), 'loss', 'losses')}: {lost}" if losses else ""
-    return f"{summary['verdict']}: {said}{abandoned}{count}; {summary['frames_per_second']:.2f} frames/s"
+    return f"{summary['verdict']}: {outcome}{abandoned}{count}; {summary['frames_per_second']:.2f} frames/s"
 
 
 def report(summary: dict[str, Any]) -> None:
@@ -46,10 +54,10 @@ def report(summary: dict[str, Any]) -> None:
         say(f"  {line}")
     for reason, number in summary["drops"].items():
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
-        say(f"  {number} {reason}, first: {first['stream']} at {first['stamp']}: {first['detail']}")
+        say(f"  {number} {reason}, first: {first['stream']} at {first['stamp']} ns: {first['detail']}")
     for path in summary["withheld"]:
-        say(f"  {path} was not written or replaced: it would hold no result; --summary has what was lost")
+        say(f"  {path} was not written because the run produced no results. --summary FILE lists the losses.")
     for path in map(Path, summary["outputs"]):
-        say(f"  {path} ({path.stat().st_size / 1e6:.1f} MB)")
+        say(f"  wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
     for line in [line for part in found for line in lines(part, WARNING)]:
         say(f"WARNING: {line}")

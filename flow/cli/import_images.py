@@ -1,0 +1,38 @@
+"""`roverflow import images`: makes a log from a folder of rectified image pairs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from flow.cli.outputs import check_outputs
+from flow.cli.report import say
+from flow.contracts import counted
+from flow.errors import COMPLETE
+
+HELP = "a folder of rectified left and right images"
+
+
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    sub.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
+    sub.add_argument("out", type=Path, metavar="OUT.mcap")
+    camera = "rectified pair: fx, cx, cy (px), baseline (m); optionally fy, cx_right, width, height"
+    sub.add_argument("--calibration", type=Path, required=True, metavar="CAM.yaml", help=camera)
+    pitch = "angle of the camera below the horizon"
+    sub.add_argument("--pitch-down", type=float, required=True, metavar="DEG", help=pitch)
+    sub.add_argument("--roll", type=float, default=0.0, metavar="DEG", help="camera roll, right side down positive")
+    sub.add_argument("--height", type=float, required=True, metavar="M", help="camera height above the ground")
+    sub.add_argument("--rate", type=float, default=1.0, metavar="HZ", help="frames per second of the log (1)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write the log."""
+    from recordings.importers.images import import_images, pair_images
+
+    left, right = pair_images(options.source)
+    check_outputs({"input log": options.out}, [options.calibration, *left, *right])
+    attitude = {name: getattr(options, name) for name in ("pitch_down", "roll", "height", "rate")}
+    frames = import_images(left, right, options.calibration, options.out, **attitude)
+    say(f"{options.out}: {counted(frames, 'stereo frame')} ({options.out.stat().st_size / 1e6:.1f} MB)")
+    return COMPLETE

@@ -1,0 +1,53 @@
+"""What commands share: checks of output paths, text outputs, and the options of a pipeline."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from flow.errors import UsageError
+from recordings.atomic_write import written
+from recordings.sinks.overwrite import is_ours
+
+
+def add_pipeline_options(sub: argparse.ArgumentParser) -> None:
+    """Add -p and --set."""
+    sub.add_argument("-p", "--pipeline", default="rover", help="rover, fast, paper, or a YAML file (rover)")
+    sub.add_argument(
+        "--set", action="append", default=[], metavar="STREAM.PARAM=VALUE", help="change a parameter of the pipeline"
+    )
+
+
+def write_text(path: Path | None, text: str) -> None:
+    """Write a text output, if it has a path."""
+    if path is None:
+        return
+    with written(path) as temporary:
+        temporary.write_text(f"{text}\n")
+
+
+def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = ()) -> None:
+    """Refuse outputs that cannot be written, or that would replace an input, a foreign file or each other.
+
+    outputs: kind -> path. A kind is one of those that `recordings.sinks.overwrite.is_ours` recognises.
+    """
+    taken: list[str] = []
+    for kind, path in outputs.items():
+        if path is None:
+            continue
+        if not path.parent.is_dir():
+            raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
+        if path.exists() and not path.is_file():
+            raise UsageError(f"{path} is a folder or a device; give the name of a file")
+        for given in inputs:
+            if path.exists() and given.exists() and path.samefile(given):
+                raise UsageError(f"{path} is an input of this command; choose another name for the output")
+        if (resolved := os.path.realpath(path)) in taken:
+            raise UsageError(f"{path} is given for two outputs; choose another name for one")
+        if path.suffix.lower() == ".mcap" and not kind.endswith("log"):
+            raise UsageError(f"{path} has the name of a log; choose another for a {kind}")
+        if path.exists() and not is_ours(path, kind):
+            raise UsageError(f"{path} exists and is no {kind} of roverflow; choose another name or remove it")
+        taken.append(resolved)

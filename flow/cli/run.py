@@ -1,0 +1,51 @@
+"""`roverflow run`: replays a log through a pipeline."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from flow.cli.arguments import seconds, workers
+from flow.cli.outputs import add_pipeline_options, check_outputs, write_text
+from flow.cli.report import exit_code, headline, report, say
+from flow.errors import SinkError
+from flow.runtime.replay import as_json, replay
+from recordings.errors import UnwritableError
+
+HELP = "replay a log through a pipeline"
+
+
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    sub.add_argument("log", type=Path, metavar="LOG.mcap")
+    add_pipeline_options(sub)
+    sub.add_argument("-o", "--out", type=Path, metavar="OUT.mcap", help="result log (LOG-nav.mcap)")
+    recording = sub.add_mutually_exclusive_group()
+    recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
+    recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
+    sub.add_argument("--start", type=seconds, metavar="T", help="begin T seconds after the log's first message")
+    sub.add_argument("--end", type=seconds, metavar="T", help="stop T seconds after the log's first message")
+    sub.add_argument("--workers", type=workers, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
+    sub.add_argument("--summary", type=Path, metavar="OUT.json", help="counts, losses, times and verdict as JSON")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the pipeline, print the verdict and write the summary."""
+    out = options.out or options.log.parent / f"{options.log.stem}-nav.mcap"
+    rrd = None if options.no_rrd else options.rrd or out.parent / f"{out.stem}.rrd"
+    outputs = {"result log": out, "recording": rrd, "summary": options.summary}
+    check_outputs(outputs, [options.log, Path(options.pipeline)])
+    settings = {name: getattr(options, name) for name in ("workers", "start", "end")}
+    try:
+        summary = replay(options.log, options.pipeline, out, rrd, overrides=options.set, **settings)
+    except SinkError as error:
+        say(headline(error.summary))
+        with suppress(UnwritableError):  # the failed sink is the error to report
+            write_text(options.summary, json.dumps(as_json(error.summary), indent=2))
+        raise
+    report(summary)
+    write_text(options.summary, json.dumps(summary, indent=2))
+    return exit_code(summary)

@@ -1,0 +1,59 @@
+"""The start: foreign modules with roverflow's package names are named in one sentence, not in a traceback."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+START = "import sys, roverflow; sys.exit(roverflow.program())"
+
+
+def start(folder: Path, *path: Path) -> subprocess.CompletedProcess[str]:
+    """`roverflow --version` in `folder`, with `path` as the PYTHONPATH."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))}
+    command = [sys.executable, "-c", START, "--version"]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("name", ["flow.py", "stages.py", "recordings/__init__.py"])
+def test_a_foreign_module_on_the_path_is_named(tmp_path: Path, name: str) -> None:
+    foreign = tmp_path / "path" / name
+    foreign.parent.mkdir(parents=True, exist_ok=True)
+    foreign.write_text("raise RuntimeError('not ours')\n")
+    done = start(tmp_path, tmp_path / "path", ROOT)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"roverflow: {foreign} is in the way of roverflow's package")
+    assert done.stderr.count("\n") == 1
+
+
+def test_without_foreign_modules_the_program_starts(tmp_path: Path) -> None:
+    done = start(tmp_path, ROOT)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("roverflow ")
+
+
+def test_python_m_flow_runs_the_program() -> None:
+    done = subprocess.run([sys.executable, "-m", "flow", "--version"], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout[:10]) == (0, "roverflow ")
+
+
+@pytest.mark.slow
+def test_an_overwritten_package_of_the_wheel_is_named(tmp_path: Path) -> None:
+    venv.create(tmp_path / "venv", with_pip=True, system_site_packages=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", str(ROOT)]
+    subprocess.run(pip, cwd=tmp_path, check=True, capture_output=True)
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    ask = [str(python), "-c", "import importlib.util as u; print(u.find_spec('stages').origin)"]
+    installed = subprocess.check_output(ask, cwd=tmp_path, env=environment, text=True).strip()
+    Path(installed).write_text("# another package\n")
+    command = [str(tmp_path / "venv" / "bin" / "roverflow"), "--version"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"roverflow: another package overwrote {installed}")
