@@ -192,7 +192,7 @@ def test_the_windows_laid_over_each_other_are_the_whole_map():
             whole.setdefault(name, Tiles(np.dtype("f4"))).write(
                 row, col, np.nan_to_num(layer), np.ones(layer.shape, bool)
             )
-    cells = fuse._map.cells.read(-400, -400, 900, 900)
+    cells = fuse.state.cells.read(-400, -400, 900, 900)
     assert (cells["frames"] > 0).sum() > 50_000
     np.testing.assert_array_equal(whole["elevation"].read(-400, -400, 900, 900), cells["height"])
     np.testing.assert_array_equal(whole["frames"].read(-400, -400, 900, 900), cells["frames"])
@@ -274,7 +274,7 @@ for frame in range(int(sys.argv[1]) // 8):
     cloud = PointCloud(frame + 1, points, np.zeros((n, 3), np.uint8), np.full(n, 0.02, np.float32),
                        np.arange(n, dtype=np.int32), "level", sensor=sensor)
     fuse(cloud, pose)
-tiles = fuse._map.cells.tiles.values()
+tiles = fuse.state.cells.tiles.values()
 cells = sum(int((tile["frames"] > 0).sum()) for tile in tiles)
 print(cells, sum(tile.nbytes for tile in tiles) / 1e6, peak() - before)
 """
