@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
-import math
-import numbers
 import pickle
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import Any
 
 from flow.contracts import StageError
+from flow.parameters import check_parameters
+from flow.parameters import parameter as parameter
 from stages.data import LEVEL_FRAME, Disparity, PointCloud, StereoFrame
 
-WIDEST = 4000  # cells, of a map
-
-
-def parameter(
-    default: Any,
-    help: str,
-    *,
-    unit: str = "",
-    low: float | None = None,
-    high: float | None = None,
-    choices: Sequence[Any] | None = None,
-) -> Any:
-    """A dataclass field for a stage parameter: its default, meaning, unit ("m", "rad", "px", "s") and closed range."""
-    return field(
-        default=default, metadata={"help": help, "unit": unit, "low": low, "high": high, "choices": choices}
-    )  # fmt: skip
+MAX_CELLS = 4000  # cells, of a map
 
 
 @dataclass(frozen=True)
@@ -35,23 +19,7 @@ class Stage:
     """Base of the stages: a frozen dataclass whose fields are its parameters and whose `__call__` is the work."""
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value, meta = getattr(self, item.name), item.metadata
-            if value is None and item.default is None:
-                continue
-            where = f"{type(self).__name__}.{item.name}"
-            choices, low, high, unit = (meta.get(key) for key in ("choices", "low", "high", "unit"))
-            if choices is not None and value not in choices:
-                raise ValueError(f"{where} must be one of {', '.join(map(str, choices))}, not {value}")
-            if (low, high) != (None, None) and not isinstance(value, numbers.Real):
-                raise ValueError(f"{where} must be a number{f' of {unit}' if unit else ''}, not {value!r}")
-            if isinstance(value, numbers.Real) and not math.isfinite(value):
-                raise ValueError(f"{where} must be a finite number{f' of {unit}' if unit else ''}, not {value}")
-            if item.type in ("int", "int | None", int) and not isinstance(value, numbers.Integral):
-                raise ValueError(f"{where} must be a whole number{f' of {unit}' if unit else ''}, not {value}")
-            if (low is not None and not value >= low) or (high is not None and not value <= high):
-                bounds = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
-                raise ValueError(f"{where} must be {bounds}{f' {unit}' if unit else ''}, not {value}")
+        check_parameters(self)
 
 
 def snapshot(stage: Any, state: Any) -> bytes:
@@ -73,10 +41,10 @@ def restore(stage: Any, saved: bytes) -> Any:
 def check_cells(what: str, width: float, resolution: float, times: int = 1) -> None:
     """Raise ValueError for a map of more cells than memory has room for, `times` the width, m, of a parameter."""
     cells = times * width / resolution
-    if cells > WIDEST:
+    if cells > MAX_CELLS:
         raise ValueError(
-            f"{what} = {width:g} m makes a map {cells:.0f} cells of {resolution:g} m wide, and {WIDEST} is the most; "
-            "take larger cells or a smaller map"
+            f"{what} = {width:g} m makes a map {cells:.0f} cells of {resolution:g} m wide, and {MAX_CELLS} is "
+            "the most; take larger cells or a smaller map"
         )
 
 

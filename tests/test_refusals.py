@@ -71,7 +71,7 @@ def test_what_a_stage_cannot_do_without_is_asked_for_before_anything_runs(traver
     ("change", "words"),
     [
         ("disparity=96", "disparity.param=value; did you mean 'disparities'?"),
-        ("max_slope=95deg", "must be at most 89 deg, not 95deg"),
+        ("rover.max_slope=95deg", "must be at most 89 deg, not 95deg"),
     ],
 )
 def test_a_setting_that_cannot_be_is_told_as_it_was_written(traverse, tmp_path, capsys, change, words):
@@ -423,7 +423,7 @@ def test_a_pipeline_whose_aliases_hold_each_other_is_refused_at_once(tmp_path, c
 
 @pytest.mark.parametrize(("settings", "said"), [
     (["max_range=1km"], "stages.Clean.max_range: must be at most 200 m, not 1km"),
-    (["wheel=1km"], "stages.TerrainFeatures.wheel: must be at most 5 m, not 1km"),
+    (["rover.wheel=1km"], "stages.TerrainFeatures.rover.wheel: must be at most 5 m, not 1km"),
     (["cells.max_range=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
     (["regional_cells.window=400m"], "makes a map 8000 cells of 0.05 m wide, and 4000 is the most"),
 ])  # fmt: skip

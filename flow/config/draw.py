@@ -8,8 +8,8 @@ from dataclasses import fields
 from html import escape
 from typing import Any
 
-from flow.config.units import as_written
 from flow.runtime.graph import Graph
+from flow.units import as_written
 
 _BOX_WIDTH, _BOX_HEIGHT, _GAP_X, _GAP_Y, _MARGIN = 168, 44, 76, 22, 16
 

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, get_args
 
-from flow.config.node_spec import NodeSpec, mapping
+from flow.config.node_spec import NodeSpec, mapping, place_at_fault
 from flow.config.yaml_tree import Value, nearest, read, settled
 from flow.errors import UsageError
 from flow.runtime.graph import (
@@ -143,7 +143,7 @@ def _inputs(name: str, entry: NodeSpec, streams: list[str]) -> dict[str, str]:
             raise entry.place.error(f"'{name}' lacks its input '{port}' ({entry.use} needs it)")
     if is_aligner(entry.kind) and len(set(inputs.values())) < len(inputs):
         twice = f"'{name}' aligns '{next(iter(inputs.values()))}' with itself; name two streams"
-        raise entry.place_at_fault(inputs).error(twice)
+        raise place_at_fault([entry.item.value[port] for port in inputs], entry.place).error(twice)
     if not inputs:
         raise entry.place.error(f"'{name}' has no input: give it a stream, for it works once for each item of one")
     return inputs

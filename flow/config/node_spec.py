@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Collection, Iterable
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import Field, dataclass, fields, is_dataclass
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
-from flow.config.values import coerced
 from flow.config.yaml_tree import Value, nearest
+from flow.parameters import coerced, is_required
 from flow.runtime.graph import YamlLocation, hints_of, is_aligner
 from flow.runtime.ledger import failure
 
@@ -50,11 +51,6 @@ class NodeSpec:
         """Where a key of it stands."""
         return self.item.value[key].place  # type: ignore[no-any-return]
 
-    def place_at_fault(self, keys: Iterable[str]) -> YamlLocation:
-        """Where it went wrong, as far as can be told: at the last of the keys that the command line set, if any."""
-        by_hand = [place for place in map(self.place_of, keys) if place.line is None]
-        return by_hand[-1] if by_hand else self.place
-
     def given(self, but: Collection[str] = ()) -> dict[str, Value]:
         """What it says beside its class, but for some keys."""
         return {key: value for key, value in self.item.value.items() if key != "use" and key not in but}
@@ -65,27 +61,54 @@ class NodeSpec:
 
     def made(self, inputs: Collection[str] = ()) -> Any:
         """The object that it describes; `inputs` are no parameters."""
-        parameters, values = self.parameters(), {}
         try:
-            hints = hints_of(self.kind)
+            return _constructed(self.kind, self.use, self.given(but=inputs), self.place)
         except TypeError as error:
             raise self.place_of("use").error(str(error)) from error
-        for key, value in self.given(but=inputs).items():
-            if key not in parameters:
-                raise value.place.error(f"{self.use} has no parameter '{key}'{nearest(key, parameters)}")
+
+
+def _constructed(kind: type, name: str, given: Mapping[str, Value], place: YamlLocation) -> Any:
+    """The object of a dataclass with the given parameters; name: of it in messages. Raises TypeError for annotations
+    that cannot be read."""
+    hints, values = hints_of(kind), {}
+    parameters = {item.name: item for item in fields(kind) if item.init}
+    for key, value in given.items():
+        if key not in parameters:
+            raise value.place.error(f"{name} has no parameter '{key}'{nearest(key, parameters)}")
+        inner = _dataclass_of(hints[key])
+        if inner is not None and isinstance(value.value, dict):
+            values[key] = _constructed(inner, f"{name}.{key}", value.value, value.place)
+        elif inner is not None and value.value is not None:
+            names = ", ".join(item.name for item in fields(inner) if item.init)
+            raise value.place.error(f"{name}.{key}: expected a mapping of {names}, not {value.plain()!r}")
+        else:
             try:
                 values[key] = coerced(value.plain(), hints[key], parameters[key])
             except (ValueError, OverflowError) as error:
-                raise value.place.error(f"{self.use}.{key}: {error}") from error
-        for key, parameter in parameters.items():
-            if key not in values and parameter.default is MISSING and parameter.default_factory is MISSING:
-                raise self.place.error(f"{self.use} needs its parameter '{key}'")
-        try:
-            return self.kind(**values)
-        except (Exception, SystemExit) as error:  # whatever a stage of the user's own may raise
-            named = [key for key in values if f"{self.kind.__name__}.{key}" in str(error)]
-            place = self.place_of(named[-1]) if named else self.place_at_fault(values)
-            raise place.error(str(error) if isinstance(error, ValueError) else failure(error)) from error
+                raise value.place.error(f"{name}.{key}: {error}") from error
+    for key, parameter in parameters.items():
+        if key not in values and is_required(parameter):
+            raise place.error(f"{name} needs its parameter '{key}'")
+    try:
+        return kind(**values)
+    except (Exception, SystemExit) as error:  # whatever a stage of the user's own may raise
+        named = [key for key in values if f"{kind.__name__}.{key}" in str(error)]
+        at = given[named[-1]].place if named else place_at_fault(given.values(), place)
+        raise at.error(str(error) if isinstance(error, ValueError) else failure(error)) from error
+
+
+def _dataclass_of(hint: Any) -> type | None:
+    """The dataclass that a parameter is annotated with, also beside None."""
+    for kind in get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,):
+        if isinstance(kind, type) and is_dataclass(kind):
+            return kind
+    return None
+
+
+def place_at_fault(values: Iterable[Value], place: YamlLocation) -> YamlLocation:
+    """Where to report an error: the last of the values that the command line set, or else `place`."""
+    by_hand = [value.place for value in values if value.place.line is None]
+    return by_hand[-1] if by_hand else place
 
 
 def _class(use: str, place: YamlLocation) -> type:

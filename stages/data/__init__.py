@@ -15,6 +15,7 @@ from stages.data.cloud import PointCloud, VoxelMap
 from stages.data.disparity import Disparity, MatchHealth, PixelOrigin, known
 from stages.data.maps import LEVEL_FRAME, Cell, CellReason, ElevationMap, NavigationMap
 from stages.data.motion import CameraMotion, Mount, Pose, Tilt, TiltHealth, Transform
+from stages.data.rover import Rover
 from stages.data.tiles import Tiles
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "PixelOrigin",
     "PointCloud",
     "Pose",
+    "Rover",
     "StereoCamera",
     "StereoFrame",
     "Tiles",

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from flow.contracts import StageError
-from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap
+from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, Rover
 from stages.stage import Stage, parameter
 
 LAYERS = ("ground", "step", "slope", "steepness", "roughness", "support")  # that TerrainFeatures adds
@@ -57,11 +57,7 @@ class Binarise(Stage):
     """
 
     method: str = parameter("rover", "hazard rule", choices=("rover", "absolute"))
-    max_step: float = parameter(0.2, "height of a step, or elevation, that is a hazard", unit="m", low=0.01)
-    ground_clearance: float = parameter(0.25, "height that reaches the rover's belly", unit="m", low=0.01)
-    max_slope: float = parameter(
-        0.349, "steepest slope that is free (20 degrees)", unit="rad", low=0.0, high=float(np.deg2rad(89))
-    )
+    rover: Rover = parameter(Rover(), "the vehicle; `absolute` compares elevations with its max_step")
     max_roughness: float = parameter(0.06, "root mean square of heights off their plane", unit="m", low=0.0)
     height_margin: float = parameter(
         0.03, "a height this close to its limit counts as reaching it: cells blunt a peak", unit="m", low=0.0
@@ -79,8 +75,6 @@ class Binarise(Stage):
         "shows of a ditch", unit="m", low=0.0,
     )  # fmt: skip
     max_drop_distance: float = parameter(1.0, "how far from there it may begin to fall", unit="m", low=0.0)
-    wheel: float = parameter(0.3, "diameter of a wheel: half of it from where it may fall nothing is free", unit="m",
-                             low=0.0)  # fmt: skip
     steepness_error: float = parameter(
         0.25, "share of the difference of steepness and slope that may be missing from it", low=0.0
     )
@@ -89,10 +83,11 @@ class Binarise(Stage):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("max_step", "ground_clearance"):
-            if self.method == "rover" and not getattr(self, name) > self.height_margin:
+            limit = getattr(self.rover, name)
+            if self.method == "rover" and not limit > self.height_margin:
                 raise ValueError(
-                    f"Binarise.{name} must be above Binarise.height_margin, {self.height_margin:g} m, not "
-                    f"{getattr(self, name):g} m: level ground would reach it"
+                    f"Binarise.rover.{name} must be above Binarise.height_margin, {self.height_margin:g} m, not "
+                    f"{limit:g} m: level ground would reach it"
                 )
 
     def __call__(self, elevation: ElevationMap) -> NavigationMap:
@@ -100,7 +95,7 @@ class Binarise(Stage):
         height = elevation.layers["elevation"]
         observed = np.isfinite(height)
         if self.method == "absolute":
-            reason = np.where(observed & (height > self.max_step), CellReason.ELEVATION, CellReason.CLEAR)
+            reason = np.where(observed & (height > self.rover.max_step), CellReason.ELEVATION, CellReason.CLEAR)
         else:
             reason = self._rover(elevation, observed)
         if "count" in elevation.layers:
@@ -123,9 +118,9 @@ class Binarise(Stage):
             )
         ground, step, slope, steepness, roughness, support = (elevation.layers[name] for name in LAYERS)
         above = elevation.layers["elevation"] - ground
-        high = observed & (step >= self.max_step - self.height_margin)
-        belly = observed & (above >= self.ground_clearance - self.height_margin)
-        limit = self.max_slope + _SLOPE_ROUNDING
+        high = observed & (step >= self.rover.max_step - self.height_margin)
+        belly = observed & (above >= self.rover.ground_clearance - self.height_margin)
+        limit = self.rover.max_slope + _SLOPE_ROUNDING
 
         known = np.isfinite(slope) & np.isfinite(roughness) & (support >= self.min_support) & self._sure(elevation)
         known &= steepness + self.steepness_error * (steepness - slope) <= limit
@@ -153,7 +148,7 @@ class Binarise(Stage):
         reach = int(self.max_drop_distance / elevation.resolution + 1e-6)
         if reach and falls.any():
             falls = binary_dilation(falls, np.ones((3, 3)), iterations=reach, mask=hidden)
-        return _near(falls, np.ceil(self.wheel / 2 / elevation.resolution - 1e-6))
+        return _near(falls, np.ceil(self.rover.wheel / 2 / elevation.resolution - 1e-6))
 
 
 def _near(cells: Array, distance: float) -> Array:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label
 
-from stages.data import Array, ElevationMap
+from stages.data import Array, ElevationMap, Rover
 from stages.stage import Stage, parameter
 from stages.terrain.kernels.local_minimum import lowest_around
 from stages.terrain.kernels.plane_window import window_planes
@@ -67,30 +67,18 @@ class TerrainFeatures(Stage):
       nearest ground carried on, for the wide plane leans on what lies below a drop, where that is seen.
     """
 
-    footprint: float = parameter(1.0, "width and length of the rover: the window of slope and roughness", unit="m",
-                                 low=0.05, high=20.0)  # fmt: skip
-    wheel_track: float = parameter(1.0, "distance between left and right wheels: the window of `ground`", unit="m",
-                                   low=0.05, high=20.0)  # fmt: skip
-    wheel: float = parameter(
-        0.3, "diameter of a wheel: its reach, and the window of steepness", unit="m", low=0.05, high=5.0
-    )
+    rover: Rover = parameter(Rover(), "the vehicle")
     surroundings: float = parameter(
         2.5, "width of the window in which an obstacle stands out", unit="m", low=0.05, high=50.0
     )
-    max_step: float = parameter(0.2, "height of a step that is a hazard; what reaches most of it is no ground",
-                                unit="m", low=0.01)  # fmt: skip
     skirt: float = parameter(
         0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.01
     )
-    max_slope: float = parameter(
-        0.349, "slope of the surroundings up to which it is no step (20 degrees)", unit="rad", low=0.0,
-        high=float(np.deg2rad(89)),
-    )  # fmt: skip
 
     @property
     def obstacle(self) -> float:
         """How far from the ground that is, m."""
-        return MOST * self.max_step
+        return MOST * self.rover.max_step
 
     def __call__(self, elevation: ElevationMap) -> ElevationMap:
         """The map with the layers added."""
@@ -105,7 +93,7 @@ class TerrainFeatures(Stage):
     def _window(self, elevation: ElevationMap) -> tuple[slice, slice]:
         """The rows and columns that anything can be told of: those of the observed cells, and of the widest window."""
         found = find_objects(np.isfinite(elevation.layers["elevation"]).astype(np.int8))
-        reach = _reach(max(self.surroundings, self.footprint, self.wheel_track) / 2, elevation.resolution)
+        reach = _reach(max(self.surroundings, self.rover.footprint, self.rover.wheel_track) / 2, elevation.resolution)
         rows, cols = found[0] if found else (slice(0, 1), slice(0, 1))
         first_row, first_col = max(rows.start - reach, 0), max(cols.start - reach, 0)
         return slice(first_row, rows.stop + reach), slice(first_col, cols.stop + reach)
@@ -118,8 +106,11 @@ class TerrainFeatures(Stage):
         ground = self._ground(height, observed, elevation.resolution)
         step, support = self._step(elevation, height, observed, ground)
         passable = observed & ~(step >= self.obstacle)
-        steepness = window_planes(height, passable, _reach(self.wheel / 2, elevation.resolution), _WHEEL_LEVERAGE)
-        roughness = window_planes(height, passable, _reach(self.footprint / 2, elevation.resolution), _LEVERAGE)[3]
+        wheel, footprint = (
+            _reach(width / 2, elevation.resolution) for width in (self.rover.wheel, self.rover.footprint)
+        )
+        steepness = window_planes(height, passable, wheel, _WHEEL_LEVERAGE)
+        roughness = window_planes(height, passable, footprint, _LEVERAGE)[3]
         layers = {
             "ground": ground.height,
             "step": step,
@@ -139,8 +130,8 @@ class TerrainFeatures(Stage):
         Where the plane between the wheels is not known (the middle of a large rock), the height is that of the
         surroundings' plane; where that is not known, a step is measured against the level.
         """
-        wide = _reach(max(self.surroundings, self.footprint) / 2, resolution)
-        narrow = _reach(self.wheel_track / 2, resolution)
+        wide = _reach(max(self.surroundings, self.rover.footprint) / 2, resolution)
+        narrow = _reach(self.rover.wheel_track / 2, resolution)
         ground = observed
         for above, below in _WITHIN:
             around = window_planes(height, ground, wide, _LEVERAGE)
@@ -151,7 +142,7 @@ class TerrainFeatures(Stage):
             level = np.where(np.isfinite(local[0]), local[0], around[0])
             ground = observed & (np.abs(height - level) <= share * self.obstacle)
         local = window_planes(height, ground, narrow, _LEVERAGE)
-        footprint = _reach(self.footprint / 2, resolution)
+        footprint = _reach(self.rover.footprint / 2, resolution)
         under = local if footprint == narrow else window_planes(height, ground, footprint, _LEVERAGE)
         level = np.where(np.isfinite(local[0]), local[0], around[0])
         trend, planes = self._trend(around[1:3], resolution), np.where(ground, local[:3], np.nan)
@@ -159,12 +150,12 @@ class TerrainFeatures(Stage):
 
     def _trend(self, slopes: Array, resolution: float) -> Array:
         """The slopes (2, rows, cols), rise per cell, cut to `max_slope`; 0 where they are not known."""
-        steep = np.hypot(*slopes) / (np.tan(self.max_slope) * resolution + 1e-12)
+        steep = np.hypot(*slopes) / (np.tan(self.rover.max_slope) * resolution + 1e-12)
         return np.where(np.isfinite(steep), slopes / np.maximum(steep, 1.0), 0.0)
 
     def _step(self, elevation: ElevationMap, height: Array, observed: Array, ground: _Ground) -> tuple[Array, Array]:
         """The layers `step` and `support`."""
-        lowest, support = lowest_around(height, observed, ground.trend, _reach(self.wheel, elevation.resolution))
+        lowest, support = lowest_around(height, observed, ground.trend, _reach(self.rover.wheel, elevation.resolution))
         top, bottom = (_finite(elevation.layers.get(extreme), height) for extreme in ("maximum", "minimum"))
         rise = np.minimum(top - lowest, 4 * (height - lowest))
         above = np.minimum(top - ground.height, 4 * (height - ground.height))

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flow.config.loader import load
-from flow.config.units import as_written, quantity
 from flow.errors import PipelineError, UsageError
+from flow.units import as_written, quantity
 
 GOOD = """\
 source: {use: tests.flow.toys.Source, gain: 2.5}
@@ -118,7 +118,7 @@ def test_a_key_of_a_setting_is_replaced_wherever_it_is_named_or_in_one_place_alo
         ("25 cm", "-1 m", 5, ["at least 0 m"]),
         ("25 cm", "true", 5, ["expected a number in m"]),
         ("5 ms", "-5 ms", 3, ["must be at least 0 ns, not -5 ms"]),
-        ("25 cm", ".inf", 5, ["must be finite"]),
+        ("25 cm", ".inf", 5, ["must be a finite number in m"]),
         ("5 ms", "5", 3, ["pair.slop: 5 needs a unit; write 5 ms or 5 s"]),
         ("25 cm", "0.25", 5, ["Scale.factor: 0.25 needs a unit; write 0.25 cm or 0.25 m"]),
         ("25 cm", "'25'", 5, ["25 needs a unit"]),

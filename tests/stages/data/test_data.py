@@ -167,7 +167,7 @@ class Free(Stage):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, F32("nan")])
 def test_a_parameter_that_is_not_finite_is_refused_with_or_without_a_range(value: float) -> None:
-    with pytest.raises(ValueError, match=r"Free\.length must be a finite number of m, not"):
+    with pytest.raises(ValueError, match=r"Free\.length must be a finite number in m, not"):
         Free(length=value)
     with pytest.raises(ValueError, match=r"Match\.p2 must be a finite number, not"):
         Match(p2=value)

@@ -272,7 +272,7 @@ def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
         ({"p2": 220}, "at most 196 with cost census\\+gradient"),
         ({"paths": 5}, "must be one of 4, 8"),
         ({"cost": "sad"}, "must be one of census, census\\+gradient"),
-        ({"max_depth": "12m"}, "max_depth must be a number of m, not '12m'"),
+        ({"max_depth": "12m"}, "max_depth must be a number in m, not '12m'"),
     ],
 )
 def test_parameters_that_cannot_work_are_refused(parameters, message):

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import binary_dilation
 
-from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap
+from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, Rover
 from stages.terrain.binarise import Binarise
 from stages.terrain.features import TerrainFeatures
 from tests.stages.terrain.terrain_scene import Terrain, map_of, rolling_terrain
@@ -104,16 +104,16 @@ def test_the_slope_within_a_cell_is_no_step(resolution: float, heading: float) -
 @pytest.mark.parametrize(("resolution", "wheel"), [(0.05, 0.14), (0.1, 0.3), (0.2, 0.3)])
 def test_level_ground_is_free_under_a_wheel_that_spans_three_cells(resolution: float, wheel: float) -> None:
     level = replace(map_of(np.zeros_like(grid()[0])), resolution=resolution)
-    result = Binarise(wheel=wheel)(TerrainFeatures(wheel=wheel)(level))
+    result = Binarise(rover=Rover(wheel=wheel))(TerrainFeatures(rover=Rover(wheel=wheel))(level))
     assert (result.cells[10:-10, 10:-10] == Cell.FREE).all()
 
 
 @pytest.mark.parametrize("limit", ["max_step", "ground_clearance"])
 def test_a_limit_that_level_ground_would_reach_is_refused(limit: str) -> None:
-    parameters: dict[str, Any] = {limit: 0.03}
-    with pytest.raises(ValueError, match=rf"Binarise.{limit} must be above Binarise.height_margin, 0.03 m, not 0.03 m"):
-        Binarise(**parameters)
-    Binarise(method="absolute", **parameters)
+    rover = Rover(**{limit: 0.03})
+    with pytest.raises(ValueError, match=rf"Binarise.rover.{limit} must be above Binarise.height_margin, 0.03 m"):
+        Binarise(rover=rover)
+    Binarise(method="absolute", rover=rover)
 
 
 def test_a_plane_beyond_the_slope_limit_is_a_hazard_for_its_slope() -> None:
@@ -141,7 +141,7 @@ def test_tilting_and_raising_the_scene_changes_no_step_and_no_roughness(
 ) -> None:
     terrain = rolling_terrain(seed, rocks=5, cells=80)
     plain, moved = (
-        Binarise(max_slope=1.3)(TerrainFeatures(max_slope=1.0)(elevation))
+        Binarise(rover=Rover(max_slope=1.3))(TerrainFeatures(rover=Rover(max_slope=1.0))(elevation))
         for elevation in (terrain.elevation, with_plane(terrain.elevation, gx, gy, offset))
     )
     # float32 heights round; a cell that lies on a threshold may fall to the other side, and its neighbours with it.
@@ -176,9 +176,8 @@ def test_an_edge_is_a_step_if_and_only_if_it_is_higher_than_the_limit(
     """A terrace across a slope, seen from below or above: its edge is a step, the rest of it is not."""
     x, y = grid()
     scene = map_of(np.tan(np.deg2rad(degrees)) * x + np.where(y > 2, step, 0.0))
-    result = Binarise(max_step=limit, height_margin=0.0, max_slope=1.5, max_roughness=1.0)(
-        TerrainFeatures(max_step=limit)(scene)
-    )
+    features = TerrainFeatures(rover=Rover(max_step=limit))(scene)
+    result = Binarise(rover=Rover(max_step=limit, max_slope=1.5), height_margin=0.0, max_roughness=1.0)(features)
     assert (result.reason[np.abs(y - 2.05) < 0.05] == CellReason.STEP).all() == (step > limit)
     assert not (result.reason[np.abs(y - 2) > 0.6] == CellReason.STEP).any()
 
@@ -207,7 +206,7 @@ def test_a_ditch_is_a_hazard_and_so_are_its_edges() -> None:
 def test_what_would_touch_the_belly_is_a_hazard_below_the_limit_of_a_step() -> None:
     x, y = grid()
     bump = 0.15 * np.exp(-((x - 2) ** 2 + (y - 2) ** 2) / 0.3**2)
-    low, high = (decided(map_of(bump), ground_clearance=clearance) for clearance in (0.1, 0.25))
+    low, high = (decided(map_of(bump), rover=Rover(ground_clearance=clearance)) for clearance in (0.1, 0.25))
     assert (low.reason == CellReason.CLEARANCE).sum() > 20
     assert (low.cells[np.hypot(x - 2, y - 2) > 1] == Cell.FREE).all()
     assert (high.cells == Cell.FREE).mean() > 0.9
@@ -217,7 +216,8 @@ def test_the_cells_beside_an_obstacle_are_hazards_as_far_as_told() -> None:
     x, y = grid()
     rock = (np.abs(x - 2) < 0.2) & (np.abs(y - 2) < 0.2)
     for beside in (0.0, 0.05, 0.1):
-        result = Binarise(hazard_margin=beside, max_slope=1.5)(TerrainFeatures()(map_of(np.where(rock, 0.4, 0.0))))
+        features = TerrainFeatures()(map_of(np.where(rock, 0.4, 0.0)))
+        result = Binarise(hazard_margin=beside, rover=Rover(max_slope=1.5))(features)
         around = (np.abs(x - 2) < 0.2 + beside) & (np.abs(y - 2) < 0.2 + beside) & ~rock
         assert (result.cells[around] == Cell.HAZARD).all()
         np.testing.assert_array_equal(result.reason == CellReason.BESIDE, around)
@@ -264,7 +264,7 @@ def test_the_low_back_of_a_rock_belongs_to_it_and_bumps_apart_from_it_do_not() -
     scene = map_of(height + 0.08 * far + 0.04 * touching)
     back = rock & (height > 0.1) & (height < 0.15)
     whole = Binarise(hazard_margin=0.0)(TerrainFeatures()(scene))
-    peaks_only = Binarise(hazard_margin=0.0, max_slope=1.0)(TerrainFeatures(skirt=1.0)(scene))
+    peaks_only = Binarise(hazard_margin=0.0, rover=Rover(max_slope=1.0))(TerrainFeatures(skirt=1.0)(scene))
     assert (whole.reason[back] == CellReason.STEP).all()
     assert (whole.cells[rock & (height < 0.03)] == Cell.FREE).mean() > 0.9
     assert not (
@@ -392,5 +392,5 @@ def test_a_cell_of_which_no_steepness_is_known_is_not_free() -> None:
     """An obstacle lower than a rover's step: its top takes no part in planes."""
     height = np.zeros((80, 80))
     height[40:43, 40:43] = 0.25
-    navigation = decided(map_of(height), max_step=0.4, ground_clearance=0.5)
+    navigation = decided(map_of(height), rover=Rover(max_step=0.4, ground_clearance=0.5))
     assert (navigation.cells[40:43, 40:43] == Cell.UNKNOWN).all()

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from stages.data import (
     Mount,
     NavigationMap,
     Pose,
+    Rover,
     StereoCamera,
     StereoFrame,
     Tilt,
@@ -69,7 +71,7 @@ def test_a_simulated_scene_has_its_ground_at_zero_its_rocks_as_hazards_and_their
         assert behind.any()
 
 
-def profiled(profile: Callable[[Array], Array], seed: int = 1, **limits: float) -> tuple[Array, NavigationMap]:
+def profiled(profile: Callable[[Array], Array], seed: int = 1, **limits: Any) -> tuple[Array, NavigationMap]:
     """Distance ahead (rows, cols), m, and the navigation map of ground with this profile, before a noisy camera."""
     exact = profile_disparity(profile)
     noisy = exact + np.random.default_rng(seed).normal(0, 0.1, exact.shape)
@@ -106,7 +108,7 @@ def test_the_edge_of_a_drop_is_not_free_where_the_ground_below_it_is_seen(edge: 
 
 def test_nothing_is_free_within_half_a_wheel_of_a_drop() -> None:
     for wheel in (0.3, 0.6, 1.0):
-        ahead, cliff = profiled(lambda x: np.where(x < 4.5, 0.0, -3.0), wheel=wheel)
+        ahead, cliff = profiled(lambda x: np.where(x < 4.5, 0.0, -3.0), rover=Rover(wheel=wheel))
         assert not (cliff.cells[(ahead > 4.5 - wheel / 2 + 0.05) & (ahead < 4.5)] == Cell.FREE).any()
         assert (cliff.cells[(ahead > 2.0) & (ahead < 4.35 - wheel / 2)] == Cell.FREE).mean() > 0.98
 

@@ -1,0 +1,136 @@
+"""The parameters of stages, aligners, sources and sinks: their unit, range and choices, and the one check of them.
+
+A parameter is a dataclass field made by `parameter`. `check_parameters` checks the values of an object when it is made.
+`coerced` turns a value of a pipeline file, such as `5 ms`, into one of the parameter's type and unit.
+"""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Sequence
+from dataclasses import MISSING, Field, field, fields, is_dataclass
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
+
+from flow.units import as_written, check_bare, quantity
+
+
+def parameter(
+    default: Any,
+    help: str,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: Sequence[Any] | None = None,
+) -> Any:
+    """A dataclass field for a parameter.
+
+    Parameters
+    ----------
+    default
+        The value where none is given.
+    help
+        Its meaning, as `roverflow stages` prints it.
+    unit
+        The unit of a number in the program, such as "m", "rad", "px" or "ns".
+    low, high
+        The closed range of a number.
+    choices
+        All valid values, if they are few.
+    """
+    about = {"help": help, "unit": unit, "low": low, "high": high, "choices": choices}
+    return field(default=default, metadata=about)
+
+
+def check_parameters(item: Any) -> None:
+    """Raise ValueError for the first parameter of a dataclass object that is out of its range or not of its type."""
+    for known in fields(item):
+        if known.init:
+            try:
+                check(getattr(item, known.name), known)
+            except ValueError as error:
+                raise ValueError(f"{type(item).__name__}.{known.name} {error}") from None
+
+
+def check(value: Any, known: Field[Any], given: Any = None) -> None:
+    """Raise ValueError, "must be ...", for a value that the parameter `known` does not take.
+
+    given: the value as the user wrote it, for the message.
+    """
+    if value is None and known.default is None:
+        return
+    about, shown = known.metadata, value if given is None else given
+    low, high, unit, choices = (about.get(key) for key in ("low", "high", "unit", "choices"))
+    of_unit = f" in {unit}" if unit else ""
+    if choices is not None and value not in choices:
+        raise ValueError(f"must be one of {', '.join(map(str, choices))}, not {shown}")
+    if is_dataclass(known.default) and not isinstance(value, type(known.default)):
+        raise ValueError(f"must be a {type(known.default).__name__}, not {shown!r}")
+    is_whole = known.type in ("int", "int | None", int)
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not is_number and (is_whole or low is not None or high is not None):
+        raise ValueError(f"must be a number{of_unit}, not {shown!r}")
+    if is_number and not math.isfinite(value):
+        raise ValueError(f"must be a finite number{of_unit}, not {shown}")
+    if is_whole and not isinstance(value, numbers.Integral):
+        raise ValueError(f"must be a whole number{of_unit}, not {shown}")
+    if low is not None and value < low:
+        raise ValueError(f"must be at least {_limit(low, unit)}, not {shown}")
+    if high is not None and value > high:
+        raise ValueError(f"must be at most {_limit(high, unit)}, not {shown}")
+
+
+def coerced(value: Any, kind: Any, known: Field[Any]) -> Any:
+    """A value of a pipeline file as the parameter `known` of type `kind`. Raises ValueError where it is none."""
+    if get_origin(kind) in (Union, UnionType):
+        options = get_args(kind)
+        if value is None and type(None) in options:
+            return None
+        return coerced(value, _option(value, options), known)
+    if get_origin(kind) is tuple:
+        if not isinstance(value, list):
+            raise ValueError(f"expected a list, not {value!r}")
+        return tuple(coerced(item, get_args(kind)[0], known) for item in value)
+    if get_origin(kind) is not None or kind is Any:
+        return value
+    if kind in (int, float):
+        return _number(value, kind, known)
+    if not isinstance(value, kind):
+        raise ValueError(f"expected {kind.__name__}, not {value!r}")
+    return value
+
+
+def _option(value: Any, options: Sequence[Any]) -> Any:
+    """The type of a union to read a value as: a list as the tuple, anything else as the type that is no tuple."""
+    options = [option for option in options if option is not type(None)]
+    fitting = [option for option in options if (get_origin(option) is tuple) == isinstance(value, list)]
+    return (fitting or options)[0]
+
+
+def _number(value: Any, kind: type, known: Field[Any]) -> float | int:
+    """A number of the pipeline file in the parameter's unit, within its range."""
+    unit, given = known.metadata.get("unit", ""), value
+    if isinstance(value, str):
+        value = quantity(value, unit)
+        if kind is int and float(value).is_integer():
+            value = int(value)
+    elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        check_bare(value, unit)
+    if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
+        wanted = {"int": "a whole number", "float": "a number"}[kind.__name__]
+        raise ValueError(f"expected {wanted}{f' in {unit}' if unit else ''}, not {given!r}")
+    check(value, known, given)
+    return kind(value)  # type: ignore[no-any-return]
+
+
+def _limit(value: float, unit: str | None) -> str:
+    """A limit with its unit, even where it is 0."""
+    text = as_written(value, unit or "")
+    return text if text[-1].isalpha() else f"{text} {unit or ''}".rstrip()
+
+
+def is_required(known: Field[Any]) -> bool:
+    """Whether a parameter has no default."""
+    return known.default is MISSING and known.default_factory is MISSING
