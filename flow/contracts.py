@@ -133,7 +133,8 @@ class Log(Protocol):
 class Sink(Protocol):
     """Where frames go. `write` is called once for every frame, in stamp order, by one thread at a time.
 
-    A sink whose parameters name streams says which do, in `names_streams`, for pipeline files to be checked. With a
+    A sink whose parameters name streams says which do, in `names_streams`, for pipeline files to be checked. Its method
+    `unwritable(stream, kind)` returns why it cannot write a stream, or an empty str, when a pipeline is loaded. With a
     method `discard` it gives up what `open` began, where another output of the run could not be opened, or no frame
     got through; by an attribute `empty` it says that it was given nothing worth keeping, and is to give up then, too.
     """

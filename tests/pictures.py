@@ -19,7 +19,7 @@ import tifffile
 
 from flow.cli.main import main as roverflow
 from recordings.simulator import Simulation
-from recordings.sinks import colormaps as paint
+from recordings.sinks import colormaps
 from stages.data import Array, Cell, CellReason, ElevationMap
 from tests.bench.refining import DISPARITIES, stereo_part
 from tests.bench.terrain import frames, measured_tilt, through
@@ -61,12 +61,13 @@ def terrain_picture() -> Array:
         stamp = given["stereo"].stamp
         streams, _ = through("rover", given | {"tilt": measured_tilt("rover", simulation, stamp)})
         terrain, navigation = streams["elevation_map"], streams["navigation_map"]
-        told = paint.legend_colours(navigation.reason, paint.REASONS)
-        true = paint.legend_colours(
+        told = colormaps.legend_colors(navigation.reason, colormaps.REASON_LEGEND)
+        true = colormaps.legend_colors(
             np.select([~ground.seen, ground.rock >= 0.2, ground.hazard],
-                      [CellReason.UNOBSERVED, CellReason.STEP, CellReason.SLOPE], CellReason.CLEAR), paint.REASONS,
+                      [CellReason.UNOBSERVED, CellReason.STEP, CellReason.SLOPE], CellReason.CLEAR),
+            colormaps.REASON_LEGEND,
         )  # fmt: skip
-        maps = [_ahead(grid, terrain) for grid in (paint.paint_elevation(terrain), told, true)]
+        maps = [_ahead(grid, terrain) for grid in (colormaps.elevation_colors(terrain), told, true)]
         rows.append(np.hstack([cv2.resize(given["stereo"].left, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), *maps]))
     return np.vstack([*rows, _legend(rows[0].shape[1])])
 
@@ -83,8 +84,10 @@ def region_picture() -> Array:
         gray = cv2.imread(str(maps / "navigation_map.pgm"), cv2.IMREAD_UNCHANGED)
     terrain = ElevationMap(0, {"elevation": elevation[::-1].copy()}, 0.05, (0.0, 0.0), "odom")
     cells = np.select([gray == 254, gray == 0], [Cell.FREE, Cell.HAZARD], Cell.UNKNOWN).astype(np.int8)
-    painted = np.hstack([paint.paint_elevation(terrain)[::-1], paint.legend_colours(cells, paint.CELLS)])
-    framed = cv2.copyMakeBorder(painted, 8, 8, 8, 8, cv2.BORDER_CONSTANT, value=paint.UNKNOWN_RGB)
+    painted = np.hstack(
+        [colormaps.elevation_colors(terrain)[::-1], colormaps.legend_colors(cells, colormaps.CELL_LEGEND)]
+    )
+    framed = cv2.copyMakeBorder(painted, 8, 8, 8, 8, cv2.BORDER_CONSTANT, value=colormaps.UNKNOWN_RGB)
     return framed.repeat(ZOOM, 0).repeat(ZOOM, 1)
 
 
@@ -93,8 +96,8 @@ def devon_picture(data: Path) -> Array:
     rows = []
     for _, frame in devon(data):
         disparity = stereo_part("rover", frame, DISPARITIES, threads=2)["disparity"]
-        known = np.where(np.isfinite(disparity.pixels)[..., None], paint.paint_disparity(disparity.pixels), 0)
-        pictures = known.astype(np.uint8), paint.legend_colours(disparity.source, paint.SOURCES)
+        known = np.where(np.isfinite(disparity.pixels)[..., None], colormaps.disparity_colors(disparity.pixels), 0)
+        pictures = known.astype(np.uint8), colormaps.legend_colors(disparity.source, colormaps.SOURCE_LEGEND)
         rows.append(np.hstack([cv2.resize(picture, None, fx=0.5, fy=0.5) for picture in pictures]))
     return np.vstack(rows)
 
@@ -102,7 +105,7 @@ def devon_picture(data: Path) -> Array:
 def _ahead(painted: Array, terrain: ElevationMap) -> Array:
     """A painted grid, from the rover's place on, as seen from above, in a panel."""
     behind = round(-terrain.origin[0] / terrain.resolution)
-    view = paint.birds_eye(painted[:, behind:])
+    view = colormaps.birds_eye(painted[:, behind:])
     scale = HEIGHT / view.shape[0]
     view = cv2.resize(view, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     left = (view.shape[1] - WIDTH) // 2
@@ -110,9 +113,9 @@ def _ahead(painted: Array, terrain: ElevationMap) -> Array:
 
 
 def _legend(width: int) -> Array:
-    line = np.full((40, width, 3), paint.UNKNOWN_RGB, np.uint8)
+    line = np.full((40, width, 3), colormaps.UNKNOWN_RGB, np.uint8)
     for place, reason in enumerate(SHOWN):
-        name, rgb = paint.REASONS[reason]
+        name, rgb = colormaps.REASON_LEGEND[reason]
         x = 16 + place * (width // len(SHOWN))
         cv2.rectangle(line, (x, 10), (x + 20, 30), rgb, cv2.FILLED)
         cv2.rectangle(line, (x, 10), (x + 20, 30), INK, 1)

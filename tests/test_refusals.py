@@ -211,7 +211,7 @@ def test_an_output_that_cannot_be_begun_leaves_the_others_of_an_earlier_run(
 ):
     out, rrd = tmp_path / "out.mcap", tmp_path / "out.rrd"
     out.write_bytes(result.read_bytes())
-    monkeypatch.setattr("recordings.sinks.rerun_sink.RESERVE", 1 << 62)
+    monkeypatch.setattr("recordings.sinks.rerun_sink.RESERVED_BYTES", 1 << 62)
     assert roverflow("run", traverse, *SMALL, "-o", out, "--rrd", rrd) == 1
     assert "MB more can be written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [out]

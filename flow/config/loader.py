@@ -186,8 +186,9 @@ def _check_clock(nodes: list[Node], place: YamlLocation) -> None:
 
 
 def _check_streams(sink: Any, entry: NodeSpec, graph: Graph) -> None:
-    """Whether the streams that a sink's entry names are there, and of the frames."""
-    for key in set(getattr(sink, "names_streams", ())) & entry.given().keys():
+    """Whether the streams that a sink's entry names are there, of the frames, and of types that it can write."""
+    keys = set(getattr(sink, "names_streams", ())) & entry.given().keys()
+    for key in keys:
         for name in entry.item.value[key].plain():
             if name not in graph.kinds:
                 raise entry.place_of(key).error(f"there is no stream '{name}'{nearest(str(name), graph.kinds)}")
@@ -196,6 +197,10 @@ def _check_streams(sink: Any, entry: NodeSpec, graph: Graph) -> None:
                     f"'{name}' is not of the frames, which run on the clock of '{graph.clock}'; align it first "
                     "(flow.align)"
                 )
+    for name, kind in graph.frame_streams.items() if hasattr(sink, "unwritable") else ():
+        if why := sink.unwritable(name, kind):
+            named = [key for key in keys if name in entry.item.value[key].plain()]
+            raise (entry.place_of(named[0]) if named else entry.place).error(why)
 
 
 def _shown(kind: Any) -> str:

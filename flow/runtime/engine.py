@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flow.contracts import Absent, FrameRecord, Loss, LossReason, Sink
-from flow.runtime.graph import Node, start
+from flow.runtime.graph import Node, is_item, start
 from flow.runtime.ledger import Ledger, failure
 
 
@@ -259,7 +259,7 @@ class Engine:
 
         def run(frame: _Frame) -> Any:
             value = node.actor(**{port: frame.values[stream] for port, stream in node.inputs.items()}, **own)
-            if not isinstance(value, node.output):
+            if not is_item(value, node.output):
                 raise TypeError(f"{node.use} returned {type(value).__name__}, not {node.output.__name__}")
             return value
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
+from numbers import Real
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -191,8 +192,17 @@ def accepts(wanted: Any, given: type) -> bool:
     """Whether a port annotated `wanted` takes items of type `given`."""
     if get_origin(wanted) in (Union, UnionType):
         return any(accepts(option, given) for option in get_args(wanted))
-    wanted = get_origin(wanted) or wanted
+    wanted, given = get_origin(wanted) or wanted, get_origin(given) or given
     return wanted is Any or (isinstance(wanted, type) and issubclass(given, wanted))
+
+
+def is_item(value: Any, kind: Any) -> bool:
+    """Whether a stage that is annotated to return `kind` may return this value; a number of numpy is a number."""
+    plain = get_origin(kind) or kind
+    number = {bool: "b", int: "iu", float: "fiu"}.get(plain, "")
+    if number and getattr(value, "shape", None) == ():
+        return value.dtype.kind in number
+    return isinstance(value, Real if plain is float else plain)
 
 
 def output_of(actor: Any, kinds: dict[str, type], place: YamlLocation) -> type:
@@ -202,10 +212,11 @@ def output_of(actor: Any, kinds: dict[str, type], place: YamlLocation) -> type:
             return actor.output(kinds)  # type: ignore[no-any-return]
         except TypeError as error:
             raise place.error(f"{error}") from error
-    returned = get_type_hints(type(actor).__call__).get("return")
-    if not isinstance(returned, type):
+    returned: Any = get_type_hints(type(actor).__call__).get("return")
+    origin = get_origin(returned) or returned  # of `NDArray[...]` and `dict[str, float]` the class
+    if not isinstance(origin, type) or origin is UnionType:
         raise place.error(f"{type(actor).__name__}.__call__ does not say which one type it returns")
-    return returned
+    return returned  # type: ignore[no-any-return]
 
 
 def clock_of(name: str, actor: Any, clocks: dict[str, str], place: YamlLocation) -> str:

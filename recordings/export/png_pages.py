@@ -16,7 +16,7 @@ import numpy as np
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
-from recordings.sinks import colormaps as paint
+from recordings.sinks import colormaps
 from stages.data import Array, ElevationMap, NavigationMap
 
 MAP_HEIGHT = 900  # px; maps are enlarged by a whole factor to about that
@@ -47,17 +47,17 @@ def draw(result: Path, out: Path) -> list[Path]:
 
 def disparity_picture(disparity: Array) -> Array:
     """Disparities (H, W), px, NaN = unknown, as an RGB picture with a colour bar."""
-    limit = paint.disparity_limit(disparity)
-    page = _page(paint.paint_disparity(disparity, limit), "disparity, px")
+    limit = colormaps.disparity_limit(disparity)
+    page = _page(colormaps.disparity_colors(disparity, limit), "disparity, px")
     _bar(page, 0.0, limit, cv2.COLORMAP_TURBO)
     return page
 
 
 def elevation_picture(terrain: ElevationMap) -> Array:
     """Shaded relief of a terrain as an RGB picture with coordinates and a colour bar."""
-    terrain = paint.terrain_ahead(terrain)
-    low, high = paint.elevation_limits(terrain.layers["elevation"])
-    rgb = paint.paint_elevation(terrain, (low, high))
+    terrain = colormaps.terrain_ahead(terrain)
+    low, high = colormaps.elevation_limits(terrain.layers["elevation"])
+    rgb = colormaps.elevation_colors(terrain, (low, high))
     page = _map_page(rgb, terrain.resolution, terrain.origin, f"elevation, m ({terrain.frame_id})")
     _bar(page, low, high, cv2.COLORMAP_VIRIDIS)
     return page
@@ -65,11 +65,11 @@ def elevation_picture(terrain: ElevationMap) -> Array:
 
 def navigation_picture(navigation: NavigationMap) -> Array:
     """A navigation map as an RGB picture with coordinates and a legend."""
-    navigation = paint.navigation_ahead(navigation)
-    rgb = paint.legend_colours(navigation.cells, paint.CELLS)
+    navigation = colormaps.navigation_ahead(navigation)
+    rgb = colormaps.legend_colors(navigation.cells, colormaps.CELL_LEGEND)
     title = f"navigation map ({navigation.frame_id})"
     page = _map_page(rgb, navigation.resolution, navigation.origin, title)
-    _legend(page, paint.CELLS)
+    _legend(page, colormaps.CELL_LEGEND)
     return page
 
 
@@ -93,7 +93,7 @@ def _map_page(rgb: Array, resolution: float, origin: tuple[float, float], title:
     """A painted grid (rows, cols, 3) as a bird's-eye view, with x at its left and y below it, at every second metre."""
     rows, cols = rgb.shape[:2]
     zoom = max(1, MAP_HEIGHT // max(rows, cols))
-    page = _page(paint.birds_eye(rgb).repeat(zoom, 0).repeat(zoom, 1), title)
+    page = _page(colormaps.birds_eye(rgb).repeat(zoom, 0).repeat(zoom, 1), title)
     bottom, right = MARGIN + cols * zoom, MARGIN + rows * zoom
     for x in _ticks(origin[0], cols * resolution):
         row = round(bottom - (x - origin[0]) / resolution * zoom)
@@ -119,21 +119,21 @@ def _bar(page: Array, low: float, high: float, palette: int) -> None:
     """A vertical colour bar with five values, and the colour of unknown below it."""
     height, width = page.shape[0] - 2 * MARGIN, page.shape[1]
     left, top, length = width - 2 * MARGIN - 32, MARGIN, height * 3 // 4
-    ramp = paint.colours(np.linspace(high, low, length), low, high, palette)
+    ramp = colormaps.apply_palette(np.linspace(high, low, length), low, high, palette)
     page[top : top + length, left : left + 28] = ramp[:, None]
     for share in np.linspace(0.0, 1.0, 5):
         value = high + share * (low - high)
-        _text(page, paint.figure(value), (left + 36, round(top + share * (length - 1)) + 6))
-    _swatch(page, (left, top + length + 20), "unknown", paint.UNKNOWN_RGB)
+        _text(page, colormaps.format_value(value), (left + 36, round(top + share * (length - 1)) + 6))
+    _swatch(page, (left, top + length + 20), "unknown", colormaps.UNKNOWN_RGB)
 
 
-def _legend(page: Array, legend: Mapping[int, tuple[str, paint.Rgb]]) -> None:
+def _legend(page: Array, legend: Mapping[int, tuple[str, colormaps.Rgb]]) -> None:
     left = page.shape[1] - 2 * MARGIN - 32
     for place, (name, rgb) in enumerate(legend.values()):
         _swatch(page, (left, MARGIN + 44 * place), name, rgb)
 
 
-def _swatch(page: Array, corner: tuple[int, int], name: str, rgb: paint.Rgb) -> None:
+def _swatch(page: Array, corner: tuple[int, int], name: str, rgb: colormaps.Rgb) -> None:
     x, y = corner
     cv2.rectangle(page, (x, y), (x + 27, y + 27), rgb, cv2.FILLED)
     cv2.rectangle(page, (x, y), (x + 27, y + 27), INK, 1)

@@ -34,6 +34,10 @@ _IMAGE_ENCODINGS = {
     (np.dtype(np.uint16), 2): "mono16",
     (np.dtype(np.uint16), 3): "rgb16",
     (np.dtype(np.float32), 2): "32FC1",
+    (np.dtype(np.int8), 2): "8SC1",
+    (np.dtype(np.int16), 2): "16SC1",
+    (np.dtype(np.int32), 2): "32SC1",
+    (np.dtype(np.float64), 2): "64FC1",
 }
 
 
@@ -42,11 +46,16 @@ def header(stamp: int, frame_id: str) -> Any:
     return make("std_msgs/msg/Header", stamp=_time(stamp), frame_id=frame_id)
 
 
+def has_encoding(pixels: Array) -> bool:
+    """Whether `image` takes these pixels."""
+    return (pixels.dtype, pixels.ndim) in _IMAGE_ENCODINGS and (pixels.ndim == 2 or pixels.shape[2] == 3)
+
+
 def image(stamp: int, frame_id: str, pixels: Array) -> Any:
-    """sensor_msgs/Image of (H, W) uint8, uint16 or float32 (NaN = unknown), or (H, W, 3) RGB uint8 or uint16."""
-    encoding = _IMAGE_ENCODINGS.get((pixels.dtype, pixels.ndim))
-    if encoding is None or (pixels.ndim == 3 and pixels.shape[2] != 3):
+    """sensor_msgs/Image of (H, W) integers or floats (NaN = unknown), or (H, W, 3) RGB uint8 or uint16."""
+    if not has_encoding(pixels):
         raise ValueError(f"no ROS image encoding for {pixels.dtype} {pixels.shape}")
+    encoding = _IMAGE_ENCODINGS[pixels.dtype, pixels.ndim]
     height, width = pixels.shape[:2]
     data = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)).view(np.uint8).reshape(-1)
     return make(
@@ -177,7 +186,8 @@ def occupancy_grid(navigation: NavigationMap) -> Any:
 
 def transform_message(transforms: Iterable[tuple[Transform, int]]) -> Any:
     """tf2_msgs/TFMessage of (transform, stamp in ns) pairs."""
-    return make("tf2_msgs/msg/TFMessage", transforms=[_transform(transform, stamp) for transform, stamp in transforms])
+    stamped = [transform_stamped(transform, stamp) for transform, stamp in transforms]
+    return make("tf2_msgs/msg/TFMessage", transforms=stamped)
 
 
 def imu(stamp: int, frame_id: str, attitude: Array, covariance: Array | None = None) -> Any:
@@ -235,7 +245,8 @@ def _region(width: int, height: int) -> Any:
     )  # fmt: skip
 
 
-def _transform(transform: Transform, stamp: int) -> Any:
+def transform_stamped(transform: Transform, stamp: int) -> Any:
+    """geometry_msgs/TransformStamped."""
     turn = Rotation.from_matrix(transform.rotation).as_quat(canonical=True)
     return make(
         "geometry_msgs/msg/TransformStamped", header=header(stamp, transform.parent), child_frame_id=transform.child,

@@ -1,7 +1,7 @@
-"""Numbers to colours: disparities, sources, terrain and maps as RGB arrays, for the rerun desk and for PNG pictures.
+"""Numbers to colours: disparities, pixel origins, terrain and maps as RGB arrays, for the timeline and for PNG pages.
 
 Every picture of a grid is a bird's-eye view: x (forward) up, y (left) to the left, as the driver sees it. Unknown has a
-colour of its own that no value can have, and ranges are rounded, so that neighbouring frames share their colours.
+colour that no value has. Colour ranges are rounded, so that neighbouring frames share their colours.
 """
 
 from __future__ import annotations
@@ -18,24 +18,26 @@ from recordings.scoring.metrics import cell_centres
 from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, PixelOrigin
 
 Rgb = tuple[int, int, int]
+Legend = Mapping[int, tuple[str, Rgb]]  # code -> name, colour
 
-SAMPLE = 4096  # values that a colour range is found from, at least, where there are so many
-BEHIND = 1.0  # m behind the rover that a picture shows where the camera has looked ahead only
+MIN_SAMPLES = 4096  # values that a colour range is found from, where there are so many
+METRES_BEHIND = 1.0  # m behind the rover that a picture shows if nothing is known farther behind
 
 UNKNOWN_RGB: Rgb = (46, 47, 54)
-SOURCES: Mapping[int, tuple[str, Rgb]] = {
-    PixelOrigin.UNKNOWN: ("unknown", UNKNOWN_RGB),
-    PixelOrigin.MEASURED: ("measured", (62, 150, 104)),
-    PixelOrigin.PLANE: ("plane", (84, 132, 222)),
-    PixelOrigin.FILLED: ("filled", (232, 164, 60)),
-}
-CELLS: Mapping[int, tuple[str, Rgb]] = {
+_ORIGIN_RGB: tuple[Rgb, ...] = (  # by code
+    UNKNOWN_RGB, (62, 150, 104), (84, 132, 222), (232, 164, 60),
+    (96, 100, 112), (150, 104, 74), (196, 70, 92), (190, 110, 190), (236, 220, 120), (18, 18, 22), (132, 186, 214),
+)  # fmt: skip
+SOURCE_LEGEND: Legend = {
+    origin: (origin.name.lower().replace("_", " "), _ORIGIN_RGB[origin]) for origin in PixelOrigin
+}  # fmt: skip
+CELL_LEGEND: Legend = {
     Cell.UNKNOWN: ("unknown", UNKNOWN_RGB),
     Cell.FREE: ("free", (196, 204, 190)),
     Cell.HAZARD: ("hazard", (216, 62, 48)),
 }
-REASONS: Mapping[int, tuple[str, Rgb]] = {
-    CellReason.CLEAR: ("clear", CELLS[Cell.FREE][1]),
+REASON_LEGEND: Legend = {
+    CellReason.CLEAR: ("clear", CELL_LEGEND[Cell.FREE][1]),
     CellReason.UNOBSERVED: ("unobserved", UNKNOWN_RGB),
     CellReason.ELEVATION: ("elevation", (200, 40, 90)),
     CellReason.STEP: ("step", (240, 140, 40)),
@@ -47,11 +49,11 @@ REASONS: Mapping[int, tuple[str, Rgb]] = {
     CellReason.UNSURE: ("unsure", (120, 130, 128)),
 }
 
-_LIGHT = np.array([1.0, 1.0, np.sqrt(2.0)]) / 2.0  # from ahead on the left, 45 degrees high: the upper left of the map
-_AMBIENT = 0.35
+_SUN = np.array([1.0, 1.0, np.sqrt(2.0)]) / 2.0  # from ahead on the left, 45 degrees high: the upper left of the map
+_AMBIENT_LIGHT = 0.35
 
 
-def colours(values: Array, low: float, high: float, palette: int) -> Array:
+def apply_palette(values: Array, low: float, high: float, palette: int) -> Array:
     """values, any shape (..., ), as RGB uint8 (..., 3) of an OpenCV palette over [low, high]; NaN is UNKNOWN_RGB."""
     known = np.isfinite(values)
     share = np.clip((values[known] - low) / (high - low), 0.0, 1.0)
@@ -60,7 +62,7 @@ def colours(values: Array, low: float, high: float, palette: int) -> Array:
     return rgb
 
 
-def legend_colours(codes: Array, legend: Mapping[int, tuple[str, Rgb]]) -> Array:
+def legend_colors(codes: Array, legend: Legend) -> Array:
     """codes, integers of any shape (..., ), as RGB uint8 (..., 3) by a legend; a code that is not in it is white."""
     rgb = np.full((*codes.shape, 3), 255, np.uint8)
     for code, (_, colour) in legend.items():
@@ -89,9 +91,9 @@ def disparity_limit(disparity: Array) -> float:
     return max(16.0, 16.0 * np.ceil(np.percentile(known, 99.5, method="nearest") / 16.0)) if known.size else 16.0
 
 
-def paint_disparity(disparity: Array, limit: float | None = None) -> Array:
+def disparity_colors(disparity: Array, limit: float | None = None) -> Array:
     """Disparities (H, W), px, as RGB (H, W, 3): near is red, far is blue."""
-    return colours(disparity, 0.0, disparity_limit(disparity) if limit is None else limit, cv2.COLORMAP_TURBO)
+    return apply_palette(disparity, 0.0, disparity_limit(disparity) if limit is None else limit, cv2.COLORMAP_TURBO)
 
 
 def segment_edges(labels: Array) -> Array:
@@ -108,7 +110,7 @@ def birds_eye(grid: Array) -> Array:
 
 
 def terrain_ahead(terrain: ElevationMap) -> ElevationMap:
-    """The terrain without the columns farther than `BEHIND` behind its origin, if nothing is known of them."""
+    """The terrain without the columns farther than `METRES_BEHIND` behind its origin, if nothing is known of them."""
     columns, origin = _behind(terrain, np.isfinite(terrain.layers["elevation"]))
     return replace(terrain, layers={name: layer[:, columns:] for name, layer in terrain.layers.items()}, origin=origin)
 
@@ -123,7 +125,7 @@ def navigation_ahead(navigation: NavigationMap) -> NavigationMap:
 
 def _behind(grid: ElevationMap | NavigationMap, known: Array) -> tuple[int, tuple[float, float]]:
     """How many columns to leave out, and the origin of what is left."""
-    columns = max(0, round((-BEHIND - grid.origin[0]) / grid.resolution))
+    columns = max(0, round((-METRES_BEHIND - grid.origin[0]) / grid.resolution))
     if known[:, :columns].any():
         columns = 0
     return columns, (grid.origin[0] + columns * grid.resolution, grid.origin[1])
@@ -150,7 +152,7 @@ def value_limits(layer: Array) -> tuple[float, float]:
     return low, high if high > low else low + 1.0
 
 
-def figure(value: float) -> str:
+def format_value(value: float) -> str:
     """A value of a colour scale in three digits, 0 without a sign."""
     return f"{round(value, 9) + 0.0:.3g}"
 
@@ -158,10 +160,10 @@ def figure(value: float) -> str:
 def _some_known(layer: Array) -> Array:
     """The known values of a layer, every n-th of many."""
     known = layer[np.isfinite(layer)]
-    return known[:: max(1, known.size // SAMPLE)]
+    return known[:: max(1, known.size // MIN_SAMPLES)]
 
 
-def hillshade(elevation: Array, resolution: float, light: Array = _LIGHT) -> Array:
+def hillshade(elevation: Array, resolution: float, light: Array = _SUN) -> Array:
     """Brightness of sunlit ground, (rows, cols) float in [0, 1]; slopes next to unknown cells are one-sided.
 
     light: unit vector (3,) towards the sun, along x, y and up.
@@ -176,17 +178,17 @@ def hillshade(elevation: Array, resolution: float, light: Array = _LIGHT) -> Arr
 def _brightness(slope_x: Array, slope_y: Array, light: Array) -> Array:
     normal = np.sqrt(slope_x**2 + slope_y**2 + 1.0)
     lit: Array = np.clip((light[2] - light[0] * slope_x - light[1] * slope_y) / normal, 0.0, 1.0)
-    return _AMBIENT + (1.0 - _AMBIENT) * lit
+    return _AMBIENT_LIGHT + (1.0 - _AMBIENT_LIGHT) * lit
 
 
-def paint_elevation(terrain: ElevationMap, limits: tuple[float, float] | None = None) -> Array:
+def elevation_colors(terrain: ElevationMap, limits: tuple[float, float] | None = None) -> Array:
     """Shaded relief of the layer "elevation" as RGB (rows, cols, 3), in grid order (see `birds_eye`)."""
     elevation = terrain.layers["elevation"]
     low, high = elevation_limits(elevation) if limits is None else limits
     rgb: Array = np.full((*elevation.shape, 3), UNKNOWN_RGB, np.uint8)
     known = np.isfinite(elevation)
-    rgb_known = colours(elevation[known], low, high, cv2.COLORMAP_VIRIDIS)
-    flat = _AMBIENT + (1.0 - _AMBIENT) * _LIGHT[2]  # level ground keeps the palette's colour
+    rgb_known = apply_palette(elevation[known], low, high, cv2.COLORMAP_VIRIDIS)
+    flat = _AMBIENT_LIGHT + (1.0 - _AMBIENT_LIGHT) * _SUN[2]  # level ground keeps the palette's colour
     shade = hillshade(elevation, terrain.resolution)[known] / flat
     rgb[known] = np.clip(rgb_known * shade[:, None], 0.0, 255.0).astype(np.uint8)
     return rgb

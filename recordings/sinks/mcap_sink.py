@@ -7,6 +7,7 @@ differs between two equal runs goes in (no times of day, no durations): equal ru
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any, ClassVar
 from flow.contracts import FrameRecord, Loss
 from recordings.errors import LogError
 from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
+from recordings.ros2.plain import message_of
 from recordings.ros2.to_msg import (
     diagnostics,
     disparity_image,
@@ -26,34 +28,46 @@ from recordings.ros2.to_msg import (
     source_image,
     transform_message,
 )
+from recordings.sinks.own_types import leaves, plain_type, refusal
 from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
 
-_BUILDERS: dict[type, Callable[[Any], Any]] = {
-    Disparity: disparity_image,
-    PointCloud: point_cloud,
-    ElevationMap: grid_map,
-    NavigationMap: occupancy_grid,
-    Pose: odometry,
+# Type -> its messages: topic below that of the stream -> builder. What a message has no room for goes beside it.
+_MESSAGES: dict[type, dict[str, Callable[[Any], Any]]] = {
+    Disparity: {"": disparity_image, "/source": source_image},
+    PointCloud: {"": point_cloud},
+    ElevationMap: {"": grid_map},
+    NavigationMap: {"": occupancy_grid, "/reason": reason_map},
+    Pose: {"": odometry},
 }
-# What a message has no room for, and so is told beside it: a guess must not look like a measurement.
-_BESIDE: dict[type, tuple[str, Callable[[Any], Any]]] = {
-    Disparity: ("source", source_image),
-    NavigationMap: ("reason", reason_map),
-}
+_KNOWN = (*_MESSAGES, Transform)
 _OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/DiagnosticStatus
 _COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
 
 
 @dataclass
 class McapSink:
-    """Writes streams to /nav/<stream>, the frame's transforms to /tf, its losses to /nav/diagnostics; there too what is
-    known of the tilt's health, the stamp from which the cells of a regional map count their times, and at the end the
-    findings of the run.
+    """Writes streams to /nav/<stream>, transforms to /tf, and losses, tilt health and findings to /nav/diagnostics.
 
-    results: the streams to write: Disparity, PointCloud, ElevationMap, NavigationMap or Pose each; where each pixel of
-    a Disparity comes from goes to /nav/<stream>/source, why each cell of a NavigationMap has its state to
-    /nav/<stream>/reason. also: further streams, for those who would keep the results as they are. compression: of the
-    log, lz4, zstd or none; zstd takes a fifth less room than lz4, and twice the time to write.
+    Every type of item has a standard form (see docs/results.md). A stream of a type without one is refused when the
+    pipeline is loaded.
+
+    Parameters
+    ----------
+    results
+        Streams to write. The run leaves no log if it makes none of them.
+    also
+        Further streams to write.
+    compression
+        Of the log: lz4, zstd or none. zstd takes a fifth less room than lz4 and twice the time.
+
+    Examples
+    --------
+    >>> from recordings import McapSink
+    >>> sink = McapSink(also=("sharpness",))
+    >>> sink.wants("sharpness", float), sink.wants("blur", float)
+    (True, False)
+    >>> sink.unwritable("sharpness", complex)
+    "McapSink cannot write 'sharpness': complex has no standard form; leave it out of 'also'"
     """
 
     results: tuple[str, ...] = (
@@ -66,33 +80,34 @@ class McapSink:
     suffix = ".mcap"
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
     _writer: Ros2Writer = field(init=False, repr=False)
+    _kinds: Mapping[str, Any] = field(default_factory=dict, init=False, repr=False)
+    _owners: dict[str, tuple[str, ...]] = field(default_factory=dict, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
-    empty: bool = field(default=False, init=False, repr=False)  # whether it lacks all results that it is to hold
+    empty: bool = field(default=False, init=False, repr=False)  # whether none of the streams to write had an item
 
     def __post_init__(self) -> None:
         if self.compression not in COMPRESSIONS:
             raise ValueError(f"McapSink.compression must be one of {', '.join(COMPRESSIONS)}, not '{self.compression}'")
 
-    def wants(self, stream: str, kind: type) -> bool:
-        """Whether a stream of data of type `kind` is to be written. Raises LogError where it is but cannot be."""
+    def wants(self, stream: str, kind: Any) -> bool:
+        """Whether the sink writes a stream of this name and type."""
+        plain = plain_type(kind)
+        return stream in self._written or (isinstance(plain, type) and issubclass(plain, TiltHealth))
+
+    def unwritable(self, stream: str, kind: Any) -> str:
+        """Why the sink cannot write a stream that it is to write, in a sentence; empty where it can."""
         if stream not in self._written:
-            return issubclass(kind, TiltHealth)
-        if kind not in _BUILDERS:
-            known = ", ".join(builder.__name__ for builder in _BUILDERS)
-            setting = "results" if stream in self.results else "also"
-            raise LogError(
-                f"McapSink cannot write '{stream}' of type {kind.__name__} (it writes {known}); leave it out of "
-                f"'{setting}'"
-            )
-        if stream == "diagnostics":
-            raise LogError(
-                "McapSink cannot write 'diagnostics', for /nav/diagnostics is the ledger's; rename the stream"
-            )
-        return True
+            return ""
+        if stream.partition("/")[0] == "diagnostics":
+            return f"McapSink cannot write '{stream}': /nav/diagnostics contains the losses; rename the stream"
+        setting = "results" if stream in self.results else "also"
+        why = refusal(kind, _KNOWN)
+        return f"McapSink cannot write '{stream}': {why}; leave it out of '{setting}'" if why else ""
 
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: what it was made from and with, kept as its metadata record "roverflow"."""
         self._last_stamp, self.empty = None, any(stream in streams for stream in self._written)
+        self._kinds, self._owners = dict(streams), {}
         self._writer = Ros2Writer(Path(path), keep=True, compression=self.compression)
         try:
             self._writer.metadata("roverflow", about)
@@ -104,13 +119,9 @@ class McapSink:
         """Write a frame that is through."""
         writer, stamp = self._writer, record.stamp
         for stream in self._written:
-            data = record.items.get(stream)
-            if data is not None:
+            for topic, message in self._messages(stream, record.items.get(stream), stamp):
                 self.empty = False
-                writer.write(f"/nav/{stream}", _BUILDERS[type(data)](data), stamp)
-            if type(data) in _BESIDE:
-                name, build = _BESIDE[type(data)]
-                writer.write(f"/nav/{stream}/{name}", build(data), stamp)
+                writer.write(topic, message, stamp)
         transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)
@@ -149,6 +160,30 @@ class McapSink:
     @property
     def _written(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys((*self.results, *self.also)))
+
+    def _messages(self, stream: str, item: Any, stamp: int) -> Iterator[tuple[str, Any]]:
+        """Topic and message of each part of an item."""
+        for path, leaf in leaves(item, self._kinds.get(stream, type(item)), _KNOWN):
+            topic = "/".join(["/nav", stream, *map(_topic_part, path)])
+            builders = next((_MESSAGES[base] for base in type(leaf).__mro__ if base in _MESSAGES), None)
+            try:
+                if builders is None:
+                    found = {"": message_of(leaf, stamp, str(getattr(item, "frame_id", "")))}
+                else:
+                    found = {below: build(leaf) for below, build in builders.items()}
+            except ValueError as error:
+                raise LogError(f"McapSink cannot write '{'/'.join((stream, *path))}': {error}") from error
+            for below, message in found.items():
+                owner = self._owners.setdefault(topic + below, (stream, *path))
+                if owner != (stream, *path):
+                    one, other = ("/".join(names) for names in (owner, (stream, *path)))
+                    raise LogError(f"McapSink cannot write both '{one}' and '{other}' to {topic + below}; rename one")
+                yield topic + below, message
+
+
+def _topic_part(name: str) -> str:
+    """A name as part of a topic: letters, digits and underscores, no digit first."""
+    return re.sub(r"^(?=\d|$)", "_", re.sub(r"[^A-Za-z0-9_]", "_", name))
 
 
 def _transforms(items: Iterable[Any]) -> Iterator[Transform]:

@@ -1,14 +1,14 @@
-"""Writes every intermediate of a run into a rerun recording, for the debugging desk of `recordings.sinks.blueprint`.
+"""Writes every intermediate of a run into a rerun recording, laid out by `recordings.sinks.blueprint`.
 
-The pictures are in `recordings.sinks.loggers`; this is their clock, their ledger and their file. rerun's errors, by
-its default mere warnings, are raised.
+The loggers draw the items; the sink sets the timelines and writes the ledger and the file. rerun only warns of its
+errors by default; here they are raised.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from itertools import islice
 from pathlib import Path
 from resource import RLIM_INFINITY, RLIMIT_FSIZE, getrlimit
@@ -23,22 +23,39 @@ from flow.contracts import FrameRecord, Loss, counted
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
 from recordings.errors import LogError
 from recordings.sinks.blueprint import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, ViewSpec, blueprint
-from recordings.sinks.loggers import PICTURES, Canvas, same_view
-from stages.data import Array, ElevationMap, Pose, StereoFrame
+from recordings.sinks.canvas import Canvas
+from recordings.sinks.loggers import LOGGERS, same_view
+from recordings.sinks.own_loggers import log_own
+from recordings.sinks.own_types import NUMBERS, plain_type
+from stages.data import Array, ElevationMap, Mount, Pose, StereoFrame
 
-RESERVE = 64 << 20  # bytes that must stay free; the largest frame and the file's end fit in well
-PLOTTED = 32  # frames whose times and queues are sent at once
-STEPS = rr.components.InterpolationMode.StepAfter  # how numbers of frames are drawn
-END = b"RRF2FOOT"  # the last magic number of a whole recording, before a checksum of 4 bytes
+RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
+PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
+STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
+FOOTER_MAGIC = b"RRF2FOOT"  # at the end of a whole recording, before a checksum of 4 bytes
 
 
 @dataclass(eq=False)
 class RerunSink:
     """Writes a rerun recording, which `rerun FILE.rrd` opens.
 
-    application_id: recordings of one application share the viewer's saved layout.
-    max_points: of a cloud at most so many points are kept, every n-th of them; the cloud in the result log is whole.
-    jpeg_quality: of the camera images, 1 to 100.
+    A type of `stages.data` is drawn by its logger. Of other types, images, numbers, texts, points, and tables and
+    dataclasses of these are drawn.
+
+    Parameters
+    ----------
+    application_id
+        Recordings of one application share the layout that the viewer saves.
+    max_points
+        Of a cloud every n-th point is drawn, at most so many. The cloud in the result log is whole.
+    jpeg_quality
+        Of the camera images, 1 to 100.
+
+    Examples
+    --------
+    >>> from recordings import RerunSink
+    >>> RerunSink(jpeg_quality=95).wants("sharpness", float)
+    True
     """
 
     application_id: str = "roverflow"
@@ -54,17 +71,24 @@ class RerunSink:
             raise ValueError(f"RerunSink.jpeg_quality must be 1 to 100, not {self.jpeg_quality}")
         self._closed = True
 
-    def wants(self, stream: str, kind: type) -> bool:
-        """Whether there is a picture of items of type `kind`."""
-        return any(issubclass(kind, wanted) for kinds in PICTURES for wanted in kinds)
+    def wants(self, stream: str, kind: Any) -> bool:
+        """Whether items of type `kind` can be drawn."""
+        plain = plain_type(kind)
+        if not isinstance(plain, type) or issubclass(plain, Mount):
+            return False
+        known = (wanted for kinds in LOGGERS for wanted in kinds)
+        return issubclass(plain, (*known, str, *NUMBERS, np.ndarray, Mapping)) or is_dataclass(plain)
 
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
-        """Begin a recording. streams: name -> type of item, in the pipeline's order; about: what to say of the run."""
+        """Begin a recording.
+
+        streams: name -> type of item, in the pipeline's order; about: facts of the run for its summary.
+        """
         self._path, self._streams, self._about = Path(path), tuple(streams), dict(about)
         self._partial = temporary_name(self._path)
         self._stamp = 0  # the latest, ns
-        self._frames, self._hung = 0, -1
-        self._plots: list[tuple[int, int, dict[str, float]]] = []  # of frames: stamp, number, value of each path
+        self._frames, self._views = 0, -1
+        self._plots: list[tuple[int, int, dict[str, float]]] = []  # per frame: stamp, number, path -> value
         with writing(self._path):
             self._partial.open("wb").close()
         try:
@@ -77,9 +101,9 @@ class RerunSink:
         self._closed = False
 
     def _check_room(self) -> None:
-        """Raise LogError before the disk is full: rerun's writer does not return from a full one."""
-        if _room(self._partial) < RESERVE:
-            raise unwritable(self._path, f"less than {RESERVE >> 20} MB more can be written there")
+        """Raise LogError before the disk is full: rerun's writer never returns from a full one."""
+        if _room(self._partial) < RESERVED_BYTES:
+            raise unwritable(self._path, f"less than {RESERVED_BYTES >> 20} MB more can be written there")
 
     def _begin(self) -> None:
         self._check_room()
@@ -88,7 +112,7 @@ class RerunSink:
         self._recording.set_sinks(rr.FileSink(str(self._partial)))
         self._recording.send_recording_name(self._about.get("log", self._path.stem))
         self._recording.log(SUMMARY, _document("RUNNING", self._about), static=True)
-        self._recording.flush()  # so that the file begins with it
+        self._recording.flush()  # the file begins with it
 
     def write(self, record: FrameRecord) -> None:
         """Draw one frame. May be called from any thread, one call at a time."""
@@ -99,15 +123,15 @@ class RerunSink:
             self._set_clocks(record.stamp, self._frames)
             captions = self._draw(record.items)
             self._plot(record)
-            self._canvas.clear_the_rest()
+            self._canvas.clear_missing()
             text = "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions])
             self._recording.log(LEDGER, rr.TextLog(text, level=rr.TextLogLevel.INFO))
-            self._enter(record.entries, self._frames)
-            self._arrange()
+            self._log_losses(record.entries, self._frames)
+            self._send_blueprint()
         self._frames += 1
 
     def close(self, summary: Mapping[str, Any]) -> None:
-        """End the recording with the run's verdict and give it its name. Does nothing where none is open."""
+        """End the recording with the run's verdict and give it its name. Does nothing if none is open."""
         if self._closed:
             return
         self._closed = True
@@ -115,97 +139,96 @@ class RerunSink:
             with catch_and_log_exceptions(strict=True):
                 self._conclude(summary)
             self._publish()
-        except (OSError, RuntimeError) as error:  # rerun says RuntimeError where its file could not be written
+        except (OSError, RuntimeError) as error:  # rerun raises RuntimeError if it cannot write its file
             raise unwritable(self._path, getattr(error, "strerror", None) or str(error)) from error
         finally:
             self._partial.unlink(missing_ok=True)
 
     def discard(self) -> None:
-        """Give up the recording; one that stood under its name stays. Does nothing where none is open."""
+        """Discard the recording; an earlier file of its name stays. Does nothing if none is open."""
         if not self._closed:
             self._closed = True
             self._recording.disconnect()
             self._partial.unlink(missing_ok=True)
 
     def _conclude(self, summary: Mapping[str, Any]) -> None:
-        """Enter what there is to say of the whole run."""
+        """Log the verdict, the remaining losses and the findings."""
         self._send_plots()
         verdict = str(summary.get("verdict", "INCOMPLETE"))
         last = max(0, self._frames - 1)
         drops = [f"{count} {reason}" for reason, count in dict(summary.get("drops", {})).items()]
-        self._enter(summary.get("entries", ()), last)
+        self._log_losses(summary.get("entries", ()), last)
         self._set_clocks(self._stamp, last)
         level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
         text = f"{verdict}: {counted(self._frames, 'frame')}{''.join(f', {drop}' for drop in drops)}"
         self._recording.log(LEDGER, rr.TextLog(text, level=level))
-        said = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
-        for stream, found in said:
-            level = rr.TextLogLevel.WARN if found["severity"] == "warning" else rr.TextLogLevel.INFO
-            self._recording.log(LEDGER, rr.TextLog(f"{stream}: {found['sentence']}", level=level))
+        found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
+        for stream, finding in found:
+            level = rr.TextLogLevel.WARN if finding["severity"] == "warning" else rr.TextLogLevel.INFO
+            self._recording.log(LEDGER, rr.TextLog(f"{stream}: {finding['sentence']}", level=level))
         facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
         for key in {"surveys", "findings"} & facts.keys():
-            facts[key] = {name: f"{found['severity']}: {found['sentence']}" for name, found in summary[key].items()}
+            facts[key] = {name: f"{one['severity']}: {one['sentence']}" for name, one in summary[key].items()}
         self._recording.log(SUMMARY, _document(verdict, self._about, facts), static=True)
-        self._arrange()
+        self._send_blueprint()
 
     def _publish(self) -> None:
-        """Finish the file, and name it if its end is there: of a disk that is full rerun tells late, or nobody."""
+        """Finish the file, and name it if its end is there: rerun may not report a full disk."""
         self._recording.flush()
         self._recording.disconnect()
         with self._partial.open("rb") as file:
-            file.seek(max(0, self._partial.stat().st_size - len(END) - 4))
-            whole = END in file.read()
+            file.seek(max(0, self._partial.stat().st_size - len(FOOTER_MAGIC) - 4))
+            whole = FOOTER_MAGIC in file.read()
         if not whole:
             raise OSError("its end is missing, as after a full disk")
         give_name(self._partial, self._path)
 
     def _set_clocks(self, stamp: int, frame: int) -> None:
-        """rerun's clocks belong to the calling thread, so every call from outside sets them first."""
+        """rerun's timelines belong to the calling thread, so every call from outside sets them first."""
         self._stamp = max(stamp, self._stamp)
         self._recording.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
         self._recording.set_time(FRAME, sequence=frame)
 
     def _draw(self, items: Mapping[str, Any]) -> list[str]:
-        """Draw every picture these items allow; what the pictures say of them."""
+        """Log the items of a frame; returns their captions."""
         present = {stream: items[stream] for stream in self._streams if stream in items}
         captions = []
         for stream, item in present.items():
             if _drawn_later(stream, present):
                 continue
-            for kinds, draw in PICTURES.items():
-                if len(kinds) == 1 and isinstance(item, kinds[0]):
-                    captions.append(draw(self._canvas, stream, item))
-        for kinds, draw in PICTURES.items():
+            loggers = [log for kinds, log in LOGGERS.items() if len(kinds) == 1 and isinstance(item, kinds[0])]
+            captions += [log(self._canvas, stream, item) for log in loggers or [log_own]]
+        for kinds, log in LOGGERS.items():
             if len(kinds) > 1:
                 for chosen in _together(present, kinds):
-                    captions.append(draw(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
+                    captions.append(log(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
         return [caption for caption in captions if caption]
 
     def _plot(self, record: FrameRecord) -> None:
-        """Stage times and queues: kept, and sent for many frames at once, for they would be half of all calls."""
+        """Keep stage times and queues, to send many frames at once: sent one by one they would be half of all calls."""
         values = {}
         for root, numbers in ((SECONDS, record.seconds), (QUEUES, record.queues)):
             for stage, number in numbers.items():
-                path = f"{root}/{rr.escape_entity_path_part(stage)}"
-                values[path] = float(number)
-                if root == QUEUES and (Panel.STAGE, path) not in self._canvas.hung:
-                    self._recording.log(path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
-                self._canvas.add_view(ViewSpec(Panel.STAGE, path, stage))
+                view = ViewSpec(Panel.STAGE, root, rr.escape_entity_path_part(stage), stage)
+                values[view.path] = float(number)
+                if root == QUEUES and (Panel.STAGE, view.path) not in self._canvas.views:
+                    self._recording.log(view.path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
+                self._canvas.add_view(view)
         self._plots.append((record.stamp, self._frames, values))
-        if len(self._plots) == PLOTTED:
+        if len(self._plots) == PLOT_BATCH:
             self._send_plots()
 
     def _send_plots(self) -> None:
-        """Send what is kept; a frame without a stage has a gap in its line."""
+        """Send the kept numbers; a frame without a stage has a gap in its line."""
         if not self._plots:
             return
         stamps, frames, kept = zip(*self._plots, strict=True)
         self._plots, clocks = [], _clocks(stamps, frames)
-        for path in [place.path for place in self._canvas.hung.values() if place.panel is Panel.STAGE]:
+        for path in [view.path for view in self._canvas.views.values() if view.panel is Panel.STAGE]:
             columns = rr.Scalars.columns(scalars=[values.get(path, math.nan) for values in kept])
             self._recording.send_columns(path, indexes=clocks, columns=columns, strict=True)
 
-    def _enter(self, entries: Iterable[Loss], frame: int) -> None:
+    def _log_losses(self, entries: Iterable[Loss], frame: int) -> None:
         """Losses, at their own stamps on the log's clock."""
         losses = sorted(entries, key=lambda entry: entry.stamp)
         if not losses:
@@ -216,43 +239,46 @@ class RerunSink:
         self._recording.send_columns(LEDGER, indexes=clocks, columns=columns, strict=True)
         self._stamp = max(losses[-1].stamp, self._stamp)
 
-    def _arrange(self) -> None:
-        """Lay out the desk again when a picture has come to it."""
-        if len(self._canvas.hung) != self._hung:
-            self._hung = len(self._canvas.hung)
-            self._recording.send_blueprint(blueprint(self._canvas.hung.values()))
+    def _send_blueprint(self) -> None:
+        """Send the blueprint again if the frame added a view."""
+        if len(self._canvas.views) != self._views:
+            self._views = len(self._canvas.views)
+            self._recording.send_blueprint(blueprint(self._canvas.views.values()))
 
 
 def _clocks(stamps: Sequence[int], frames: Sequence[int]) -> list[rr.TimeColumn]:
-    """The recording's two clocks at these stamps, ns, and frames."""
+    """The recording's two timelines at these stamps, ns, and frames."""
     times = np.array(stamps, "datetime64[ns]")
     return [rr.TimeColumn(CLOCK, timestamp=times), rr.TimeColumn(FRAME, sequence=frames)]
 
 
 def _together(items: Mapping[str, Any], kinds: tuple[type, ...]) -> Iterator[list[str]]:
-    """The streams that a picture of several types is drawn from: the last of each type, for every frame of reference.
+    """The streams for a logger of several types: the last of each type, for every frame of reference.
 
-    A type that names no frame goes with every one. Of stereo frames it is the last as the camera took it.
+    A type without a frame of reference goes with every frame. Of stereo frames the last one of the camera's size goes.
     """
     frames = {getattr(item, "frame_id", None): None for item in items.values() if isinstance(item, kinds)}
     for frame in [frame for frame in frames if frame is not None] or [None]:
         fitting = {stream: item for stream, item in items.items() if getattr(item, "frame_id", frame) == frame}
-        chosen = [_one_of(kind, fitting) for kind in kinds]
+        chosen = [_last_of(kind, fitting) for kind in kinds]
         if all(chosen):
             yield [stream for streams in chosen for stream in streams]
 
 
-def _one_of(kind: type, items: Mapping[str, Any]) -> list[str]:
-    """The stream of this type to draw, if there is one."""
+def _last_of(kind: type, items: Mapping[str, Any]) -> list[str]:
+    """The last stream of this type, if there is one."""
     streams = [stream for stream, item in items.items() if isinstance(item, kind)]
-    if kind is StereoFrame:  # as the camera took it: not at half size, say
+    if kind is StereoFrame:  # of the camera's size
         streams = [stream for stream in streams if same_view(items[stream].camera, items[streams[0]].camera)]
     return streams[-1:]
 
 
 def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
-    """Whether a later stream shows the same: stereo with the very same pixels, as where the log was rectified already,
-    an elevation map of the same heights with layers added, or the very same pose, as where the log has one."""
+    """Whether a later stream shows the same.
+
+    That is stereo with the same pixels, as in a log that is rectified already; an elevation map with the same heights
+    and more layers; the very same pose.
+    """
     mine, later = items[stream], islice(items.values(), list(items).index(stream) + 1, None)
     if isinstance(mine, Pose):
         return any(item is mine for item in later)
@@ -271,7 +297,7 @@ def _same(one: Array, other: Array) -> bool:
 
 
 def _document(verdict: str, *tables: Mapping[str, Any]) -> rr.TextDocument:
-    """The verdict and tables of what is known of the run, as markdown."""
+    """The verdict and the facts of the run, as markdown."""
     rows = [
         f"| {key} | {', '.join(f'{k} {v}' for k, v in value.items()) if isinstance(value, Mapping) else value} |"
         for table in tables
@@ -283,7 +309,7 @@ def _document(verdict: str, *tables: Mapping[str, Any]) -> rr.TextDocument:
 
 
 def _room(file: Path) -> int:
-    """By how many bytes a file may still grow: what the disk has, and what a process is allowed to write into one."""
+    """How many bytes a file may still grow, by the disk's free space and the process' limit."""
     free, (allowed, _) = disk_usage(file.parent).free, getrlimit(RLIMIT_FSIZE)
     if allowed == RLIM_INFINITY:
         return free

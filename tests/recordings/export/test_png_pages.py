@@ -14,11 +14,11 @@ from recordings.errors import LogError
 from recordings.export.png_pages import MARGIN, disparity_picture, draw, elevation_picture, navigation_picture
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
-from recordings.sinks import colormaps as paint
+from recordings.sinks import colormaps
 from stages.data import LEVEL_FRAME, Array, Cell, Disparity, ElevationMap, NavigationMap
 
 START, STEP = 1_000_000_000, 500_000_000
-FREE, HAZARD, UNKNOWN = (paint.CELLS[cell][1] for cell in (Cell.FREE, Cell.HAZARD, Cell.UNKNOWN))
+FREE, HAZARD, UNKNOWN = (colormaps.CELL_LEGEND[cell][1] for cell in (Cell.FREE, Cell.HAZARD, Cell.UNKNOWN))
 ROWS, COLS = 6, 9
 
 
@@ -76,7 +76,7 @@ def test_ahead_is_up_and_left_is_left() -> None:
 
 def test_terrain_brightens_with_height_and_holes_stay_holes() -> None:
     picture = cells_of(elevation_picture(terrain())).astype(int)
-    assert tuple(picture[COLS - 1 - 4, ROWS - 1 - 3]) == paint.UNKNOWN_RGB
+    assert tuple(picture[COLS - 1 - 4, ROWS - 1 - 3]) == colormaps.UNKNOWN_RGB
     green = picture[1:-1, 0, 1]  # viridis is greener the higher; the ramp rises ahead, which is up
     assert (np.diff(green) < 0).all()
 
@@ -86,7 +86,7 @@ def test_near_is_red_far_is_blue_unknown_is_neither() -> None:
     near, far = picture[46, 40].astype(int), picture[8, 40].astype(int)
     assert near[0] > near[2]
     assert far[2] > far[0]
-    assert tuple(picture[20, 4]) == paint.UNKNOWN_RGB
+    assert tuple(picture[20, 4]) == colormaps.UNKNOWN_RGB
 
 
 def test_the_log_gives_the_first_middle_and_last_frame(result: Path, tmp_path: Path) -> None:
@@ -120,14 +120,14 @@ def test_a_log_without_results_is_named(tmp_path: Path) -> None:
 def test_nothing_known_is_still_a_picture() -> None:
     nothing = np.full((ROWS, COLS), np.nan, np.float32)
     page = elevation_picture(ElevationMap(START, {"elevation": nothing}, 0.5, (0.0, -1.5), LEVEL_FRAME))
-    assert (cells_of(page)[:-1] == paint.UNKNOWN_RGB).all()
-    assert (disparity_picture(nothing)[MARGIN : MARGIN + ROWS, MARGIN : MARGIN + COLS] == paint.UNKNOWN_RGB).all()
+    assert (cells_of(page)[:-1] == colormaps.UNKNOWN_RGB).all()
+    assert (disparity_picture(nothing)[MARGIN : MARGIN + ROWS, MARGIN : MARGIN + COLS] == colormaps.UNKNOWN_RGB).all()
 
 
 def test_light_comes_from_ahead_on_the_left() -> None:
     x, y = np.meshgrid(np.arange(20), np.arange(20))
     towards, level, away = (
-        paint.hillshade((share * (x + y)).astype(np.float32), 1.0)[10, 10] for share in (-0.3, 0.0, 0.3)
+        colormaps.hillshade((share * (x + y)).astype(np.float32), 1.0)[10, 10] for share in (-0.3, 0.0, 0.3)
     )
     assert towards > level > away
 
@@ -136,11 +136,11 @@ def test_light_comes_from_ahead_on_the_left() -> None:
 def test_a_hole_does_not_change_the_shade_of_a_plane(rise_x: float, rise_y: float, hole: tuple[int, int]) -> None:
     x, y = np.meshgrid(np.arange(8), np.arange(8))
     plane = rise_x * x + rise_y * y
-    shade = paint.hillshade(plane, 1.0)
+    shade = colormaps.hillshade(plane, 1.0)
     np.testing.assert_allclose(shade, shade[0, 0], atol=1e-9)
     plane[hole] = np.nan
     known = np.isfinite(plane)
-    np.testing.assert_allclose(paint.hillshade(plane, 1.0)[known], shade[0, 0], atol=1e-9)
+    np.testing.assert_allclose(colormaps.hillshade(plane, 1.0)[known], shade[0, 0], atol=1e-9)
 
 
 @given(st.integers(2, 9), st.integers(2, 9), st.integers(0, 2**32 - 1))
@@ -149,7 +149,7 @@ def test_every_triangle_of_a_surface_joins_three_known_neighbours(rows: int, col
     elevation = random.normal(size=(rows, cols)).astype(np.float32)
     elevation[random.random((rows, cols)) < 0.3] = np.nan
     grid = ElevationMap(START, {"elevation": elevation}, 1.0, (0.0, 0.0), LEVEL_FRAME)
-    vertices, triangles = paint.surface(grid)
+    vertices, triangles = colormaps.surface(grid)
     np.testing.assert_array_equal(vertices[:, 2], elevation[np.isfinite(elevation)])
     corners = vertices[triangles]
     edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -162,33 +162,33 @@ def test_sixteen_bit_images_keep_their_contrast() -> None:
     twelve = np.linspace(0, 4095, 256).astype(np.uint16).reshape(16, 16)
     bright, dark = np.tile(twelve, (16, 16)), np.tile(twelve // 2, (16, 16))
     dark[0, 0] = 65535  # a hot pixel
-    eight, other = paint.top_eight_bits(bright, dark)
+    eight, other = colormaps.top_eight_bits(bright, dark)
     assert (eight.min(), eight.max()) == (0, 255)
     assert other[-1, -1] == eight[-1, -1] // 2  # of one exposure
-    assert paint.top_eight_bits(eight, bright)[0] is eight
+    assert colormaps.top_eight_bits(eight, bright)[0] is eight
 
 
 def test_a_picture_leaves_out_what_lies_behind_the_rover_unless_something_is_known_there():
     elevation = np.full((4, 80), np.nan, np.float32)
     elevation[1, 50] = 1.0
     terrain = ElevationMap(0, {"elevation": elevation}, 0.05, (-2.0, 0.0), "level")
-    ahead = paint.terrain_ahead(terrain)
+    ahead = colormaps.terrain_ahead(terrain)
     assert (ahead.shape, ahead.origin) == ((4, 60), (-1.0, 0.0))
     assert ahead.layers["elevation"][1, 30] == 1.0
     cells = np.where(np.isfinite(elevation), 0, -1).astype(np.int8)
     navigation = NavigationMap(0, cells, np.zeros_like(cells, np.uint8), 0.05, (-2.0, 0.0), "level")
-    assert paint.navigation_ahead(navigation).cells[1, 30] == 0
+    assert colormaps.navigation_ahead(navigation).cells[1, 30] == 0
     behind = np.where(np.arange(80) == 3, np.float32(1.0), elevation)
-    assert paint.terrain_ahead(ElevationMap(0, {"elevation": behind}, 0.05, (-2.0, 0.0), "level")).shape == (4, 80)
+    assert colormaps.terrain_ahead(ElevationMap(0, {"elevation": behind}, 0.05, (-2.0, 0.0), "level")).shape == (4, 80)
 
 
 @pytest.mark.parametrize(("value", "said"), [(-0.0, "0"), (-5.55e-17, "0"), (-0.25, "-0.25"), (112.0, "112")])
 def test_a_scale_names_its_values_in_few_digits_and_has_no_minus_zero(value, said):
-    assert paint.figure(value) == said
+    assert colormaps.format_value(value) == said
 
 
 def test_a_colour_range_is_that_of_the_whole_layer_though_found_from_a_part():
-    layer = np.linspace(-1.0, 1.0, 20 * paint.SAMPLE, dtype=np.float32).reshape(-1, 64)
-    assert paint.value_limits(layer) == pytest.approx((-0.98, 0.98), abs=1e-3)
-    assert paint.elevation_limits(layer) == pytest.approx((-1.0, 1.0))
-    assert paint.disparity_limit(100.0 * layer) == 112.0
+    layer = np.linspace(-1.0, 1.0, 20 * colormaps.MIN_SAMPLES, dtype=np.float32).reshape(-1, 64)
+    assert colormaps.value_limits(layer) == pytest.approx((-0.98, 0.98), abs=1e-3)
+    assert colormaps.elevation_limits(layer) == pytest.approx((-1.0, 1.0))
+    assert colormaps.disparity_limit(100.0 * layer) == 112.0

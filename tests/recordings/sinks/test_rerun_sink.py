@@ -14,7 +14,7 @@ import rerun as rr
 
 from recordings.errors import LogError
 from recordings.sinks.blueprint import CLOCK, FRAME
-from recordings.sinks.rerun_sink import PLOTTED, RESERVE, RerunSink
+from recordings.sinks.rerun_sink import PLOT_BATCH, RESERVED_BYTES, RerunSink
 from stages.data import Mount
 from tests.recordings.sinks.recorded_scene import START, STEP, STREAMS, Loss, Record, entities, record_of, rows, scene
 
@@ -74,7 +74,7 @@ def test_what_a_frame_lacks_is_cleared_at_that_frame(tmp_path: Path) -> None:
 
 def test_the_times_of_every_frame_are_there_once_and_have_a_gap_where_a_frame_lacks_a_stage(tmp_path: Path) -> None:
     """However many frames are sent at once."""
-    count, without = 2 * PLOTTED + 1, (5, PLOTTED)
+    count, without = 2 * PLOT_BATCH + 1, (5, PLOT_BATCH)
     records = [
         Record(START + n * STEP, {}, seconds={"matched": float(n)} if n not in without else {}, queues={"matched": n})
         for n in range(count)
@@ -177,7 +177,7 @@ def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it was not foreseen, rerun tells it only to its log: the sink has to find out."""
-    monkeypatch.setattr("recordings.sinks.rerun_sink._room", lambda file: RESERVE)
+    monkeypatch.setattr("recordings.sinks.rerun_sink._room", lambda file: RESERVED_BYTES)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = RerunSink()
     sink.open(tmp_path / "run.rrd", STREAMS, {})
@@ -198,7 +198,7 @@ def test_a_full_disk_is_foreseen_and_the_recording_ends_in_what_room_is_left(tmp
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = RerunSink()
     sink.open(tmp_path / "run.rrd", STREAMS, {})
-    resource.setrlimit(resource.RLIMIT_FSIZE, (RESERVE // 2, limits[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (RESERVED_BYTES // 2, limits[1]))
     try:
         with pytest.raises(LogError, match=r"cannot write .* 64 MB more can be written"):
             sink.write(Record(START, scene(START)))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recordings.sinks.colormaps import REASONS
+from recordings.sinks.colormaps import REASON_LEGEND
 from recordings.sinks.rerun_sink import RerunSink
 from stages.data import LEVEL_FRAME, CellReason, VoxelMap
 from tests.recordings.sinks.recorded_scene import START, Record, entities, rows, scene
@@ -43,5 +43,5 @@ def test_voxels_are_boxes_about_the_middle_of_their_cubes(tmp_path: Path) -> Non
 
 
 def test_every_reason_has_a_colour_of_its_own() -> None:
-    assert set(REASONS) == set(CellReason)
-    assert len({colour for _, colour in REASONS.values()}) == len(REASONS)
+    assert set(REASON_LEGEND) == set(CellReason)
+    assert len({colour for _, colour in REASON_LEGEND.values()}) == len(REASON_LEGEND)

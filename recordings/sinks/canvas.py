@@ -1,0 +1,137 @@
+"""Where loggers put their entities: one recording, whose timelines stand at one frame.
+
+Its one trick: the canvas remembers which entities the last frame had, and clears those that this frame lacks, so the
+viewer never shows an old picture as this frame's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from recordings.sinks import colormaps
+from recordings.sinks.blueprint import LEDGER, Panel, ViewSpec
+from recordings.sinks.colormaps import Legend, Rgb
+from stages.data import Array, StereoCamera
+
+TEXT_RGB: Rgb = (225, 228, 235)
+CURVE_RGB: tuple[Rgb, ...] = ((255, 210, 60), (95, 175, 255), (245, 120, 95), (125, 215, 140), (205, 145, 245))
+LEGEND_COLUMNS = 4
+LEGEND_ROW = 0.14  # height of a row of a legend, share of the picture's height
+
+
+@dataclass(eq=False)
+class Canvas:
+    """A recording at the time of one frame.
+
+    views: every entity that was ever logged, in the order of the first time; the blueprint is made from it. camera: of
+    the first frame; identifies streams of another image size. What does not change from frame to frame, such as a
+    legend, is logged once (`keep`), which halves the number of calls.
+    """
+
+    recording: rr.RecordingStream
+    jpeg_quality: int
+    max_points: int
+    views: dict[tuple[Panel, str], ViewSpec] = field(default_factory=dict)
+    camera: StereoCamera | None = None
+    _curves: dict[Panel, list[str]] = field(default_factory=dict)
+    _texts: dict[str, str] = field(default_factory=dict)
+    _legends: dict[str, Legend] = field(default_factory=dict)
+    _kept: dict[str, Hashable] = field(default_factory=dict)
+    _before: dict[str, type] = field(default_factory=dict)
+    _now: dict[str, type] = field(default_factory=dict)
+
+    def log(self, path: str, archetype: Any, *views: ViewSpec) -> None:
+        """Log an entity at the frame's time; views: where the blueprint shows it."""
+        self.recording.log(path, archetype)
+        self._now[path] = type(archetype)
+        for view in views:
+            self.add_view(view)
+
+    def add_view(self, view: ViewSpec) -> None:
+        """Add a view to the blueprint."""
+        self.views.setdefault((view.panel, view.path), view)
+
+    def keep(self, path: str, content: Hashable, draw: Callable[[], Any]) -> None:
+        """Log what `draw()` returns, unless the last frame had it with the same `content`."""
+        if path in self._before and self._kept.get(path) == content:
+            self._now[path] = self._before[path]
+        else:
+            self._kept[path] = content
+            self.log(path, draw())
+
+    def plot(self, path: str, value: float, view: ViewSpec) -> None:
+        """A value over time; the first five curves of a panel differ in colour."""
+        drawn = self._curves.setdefault(view.panel, [])
+        if path not in drawn:
+            self.recording.log(path, rr.SeriesLines(colors=[CURVE_RGB[len(drawn) % len(CURVE_RGB)]]), static=True)
+            drawn.append(path)
+        self.log(path, rr.Scalars(float(value)), view)
+
+    def log_text(self, path: str, text: str, level: rr.TextLogLevel) -> None:
+        """A line in the ledger, unless it is the last one of `path`."""
+        if self._texts.get(path) != text:
+            self._texts[path] = text
+            self.recording.log(f"{LEDGER}/{path}", rr.TextLog(text, level=level))
+
+    def log_image(self, path: str, pixels: Array, view: ViewSpec) -> None:
+        """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as JPEG."""
+        stored = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
+        self.log(path, rr.EncodedImage(contents=blob, media_type="image/jpeg"), view)
+
+    def log_labels(self, view: ViewSpec, codes: Array, legend: Legend) -> None:
+        """A label image (H, W); its names are above it and appear on hover."""
+        path = view.path
+        if self._legends.get(path) != legend:
+            self._legends[path] = legend
+            names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
+            self.recording.log(path, rr.AnnotationContext(names), static=True)
+        self.log(f"{path}/labels", rr.SegmentationImage(codes.astype(np.uint8)), view)
+        self.log_legend(f"{path}/legend", codes.shape, legend.values())
+
+    def log_scale(self, path: str, shape: tuple[int, ...], low: float, high: float, unit: str, palette: int) -> None:
+        """The legend of a colour map: three of its values above the picture."""
+        self.log_legend(path, shape, _scale(low, high, unit, palette))
+
+    def log_legend(self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, Rgb]]) -> None:
+        """Named dots above a picture of (H, W), in rows of at most four."""
+        height, width = shape
+        content = shape, *entries
+        names, colors = zip(*content[1:], strict=True)
+        rows = -(-len(names) // LEGEND_COLUMNS)
+        columns = -(-len(names) // rows)
+        places = (divmod(number, columns) for number in range(len(names)))
+        dots = [((column + 0.5) * width / columns, (row - rows) * LEGEND_ROW * height) for row, column in places]
+        dot, pin = rr.Radius.ui_points(5.0), rr.Radius.ui_points(0.5)
+        self.keep(path, content, lambda: rr.Points2D(dots, colors=colors, radii=dot, draw_order=30.0))
+        # A label takes the colour of its dot, which may be as dark as the background, so labels have dots of their own.
+        texts: dict[str, Any] = {"labels": names, "show_labels": True, "radii": pin, "draw_order": 31.0}
+        self.keep(f"{path}/text", content, lambda: rr.Points2D(dots, colors=[TEXT_RGB], **texts))
+
+    def clear_missing(self) -> None:
+        """Clear the entities of the last frame that this frame lacks."""
+        for path, kind in self._before.items():
+            if path in self._now:
+                continue
+            if issubclass(kind, rr.EncodedImage | rr.EncodedDepthImage):
+                # The viewer goes on showing a cleared encoded image (rerun-io/rerun#12793), but not an empty one.
+                self.recording.log(path, kind.from_fields(clear_unset=True))
+            else:
+                self.recording.log(path, rr.Clear(recursive=False))
+        self._before, self._now = self._now, {}
+
+
+@lru_cache(maxsize=256)
+def _scale(low: float, high: float, unit: str, palette: int) -> tuple[tuple[str, Rgb], ...]:
+    """Three values of a colour map, with their colours."""
+    values = np.linspace(low, high, 3)
+    colors = [(int(r), int(g), int(b)) for r, g, b in colormaps.apply_palette(values, low, high, palette)]
+    names = [f"{colormaps.format_value(value)} {unit}".rstrip() for value in values]
+    return tuple(zip(names, colors, strict=True))

@@ -1,0 +1,80 @@
+"""How streams of a user's own types look in a rerun recording: images, points, plots, bar charts, text logs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from recordings.ros2.plain import is_image, is_points
+from recordings.sinks.blueprint import Panel, ViewSpec
+from recordings.sinks.canvas import Canvas
+from recordings.sinks.colormaps import value_limits
+from recordings.sinks.loggers import LOGGERS
+from recordings.sinks.own_types import leaves
+from stages.data import LEVEL_FRAME, Array
+
+KNOWN = tuple(kinds[0] for kinds in LOGGERS if len(kinds) == 1)
+
+
+def log_own(canvas: Canvas, stream: str, item: Any) -> str:
+    """Log every part of an item under its own path; returns the value where the item is a single number.
+
+    Parts that have no picture, such as a transform, are left out.
+    """
+    frame_id = str(getattr(item, "frame_id", LEVEL_FRAME))
+    caption = ""
+    for path, leaf in leaves(item, type(item), KNOWN):
+        part = "/".join(map(rr.escape_entity_path_part, path))
+        spec = ViewSpec(Panel.OWN_NUMBER, stream, part, ": ".join([stream, *path]), frame_id)
+        if isinstance(leaf, KNOWN):
+            draw = next(draw for kinds, draw in LOGGERS.items() if len(kinds) == 1 and isinstance(leaf, kinds))
+            draw(canvas, spec.path, leaf)
+        elif isinstance(leaf, str):
+            canvas.recording.log(spec.path, rr.TextLog(leaf))
+            canvas.add_view(replace(spec, panel=Panel.OWN_TEXT))
+        elif isinstance(leaf, bool | int | float):
+            canvas.plot(spec.path, float(leaf), spec)
+            caption = f"{stream} {leaf:g}" if not path else caption
+        elif isinstance(leaf, np.ndarray) and leaf.dtype.kind in "biuf" and leaf.size:
+            _log_array(canvas, spec, leaf)
+    return caption
+
+
+def _log_array(canvas: Canvas, spec: ViewSpec, array: Array) -> None:
+    if is_points(array):
+        some = slice(None, None, max(1, -(-len(array) // canvas.max_points)))
+        points = rr.Points3D(array[some].astype(np.float32), radii=rr.Radius.ui_points(1.5))
+        canvas.log(spec.path, points, replace(spec, panel=Panel.CLOUD))
+    elif is_image(array):
+        _log_image(canvas, replace(spec, panel=Panel.OWN_IMAGE), array)
+    elif array.ndim == 1:
+        canvas.log(spec.path, rr.BarChart(array.astype(np.float64)), replace(spec, panel=Panel.OWN_BARS))
+    else:
+        canvas.log(spec.path, rr.Tensor(array), replace(spec, panel=Panel.OWN_TENSOR))
+
+
+def _log_image(canvas: Canvas, spec: ViewSpec, pixels: Array) -> None:
+    """8-bit gray and RGB as they are; other (H, W) values in colours over their range (hover reads the values)."""
+    if pixels.dtype == bool:
+        pixels = pixels.astype(np.uint8) * 255
+    if pixels.ndim == 3 and pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    if pixels.dtype == np.uint8 and pixels.ndim == 3:
+        canvas.log_image(spec.path, pixels, spec)
+        return
+    if pixels.dtype == np.uint8:  # masks and labels stay exact
+        _, png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        canvas.log(spec.path, rr.EncodedImage(contents=png, media_type="image/png"), spec)
+        return
+    values = pixels.astype(np.float32)
+    low, high = value_limits(values)
+    # The palette's darkest end is left to unknown values.
+    image = rr.DepthImage(
+        values, meter=1.0, colormap=rr.components.Colormap.Turbo, depth_range=(low - 0.1 * (high - low), high)
+    )
+    canvas.log(spec.path, image, spec)
+    canvas.log_scale(f"{spec.path}/scale", pixels.shape, low, high, "", cv2.COLORMAP_TURBO)

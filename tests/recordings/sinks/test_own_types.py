@@ -1,0 +1,202 @@
+"""Images, numbers, texts, tables and dataclasses of a stage are drawn, and written in a standard form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flow.config.loader import load
+from flow.errors import PipelineError
+from recordings import McapSink, RerunSink
+from recordings.errors import LogError
+from recordings.mcap.file import iter_decoded
+from recordings.sinks.own_types import leaves, refusal
+from stages.data import Disparity, StereoFrame, Transform
+from tests.conftest import roverflow
+from tests.recordings.sinks.recorded_scene import START, Record, decoded, entities, rows, scene
+
+PIPELINE = """\
+source: {use: recordings.McapSource}
+streams:
+  stereo:     {use: flow.align.pair, left: left, right: right, slop: 5 ms}
+  sharpness:  {use: tests.recordings.sinks.test_own_types.Sharpness, frame: stereo}
+  edges:      {use: tests.recordings.sinks.test_own_types.Edges, frame: stereo}
+sinks:
+  - {use: recordings.RerunSink}
+  - use: recordings.McapSink
+    results: [sharpness]
+    also: [edges]
+"""
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    def __call__(self, frame: StereoFrame) -> float:
+        return float(frame.left.std())
+
+
+@dataclass(frozen=True)
+class Edges:
+    def __call__(self, frame: StereoFrame) -> NDArray[np.uint8]:
+        return np.asarray(cv2.Canny(np.ascontiguousarray(frame.left), 50, 100))
+
+
+@dataclass(frozen=True)
+class Listing:
+    def __call__(self, frame: StereoFrame) -> list[str]:
+        return []
+
+
+@dataclass(frozen=True)
+class Report:
+    stamp: int
+    blur: float
+    lamps: int | None
+    mask: NDArray[np.bool_]
+    corners: NDArray[np.float64]
+    histogram: NDArray[np.int64]
+    text: str
+    range_m: tuple[float, float]
+    mount: Transform
+    disparity: Disparity
+    by_side: Mapping[str, float]
+    frame_id: str = "camera"
+
+
+def report() -> Report:
+    return Report(
+        START, 2, None, np.eye(4, 5, dtype=bool), np.arange(6.0).reshape(2, 3), np.arange(4), "dusty", (0.5, 8.0),
+        Transform("a", "b", np.eye(3), np.ones(3)), scene()["disparity"], {"left eye": 1, "2": 2.5},
+    )  # fmt: skip
+
+
+def written(path: Path, kinds: dict[str, Any], *frames: dict[str, Any]) -> dict[str, Any]:
+    """The last message of each topic of a log with these streams."""
+    sink = McapSink(results=tuple(kinds))
+    assert not any(sink.unwritable(name, kind) for name, kind in kinds.items())
+    sink.open(path, kinds, {})
+    try:
+        for number, items in enumerate(frames):
+            sink.write(Record(START + number, items))  # type: ignore[arg-type]
+        sink.close({})
+    finally:
+        sink.discard()
+    return {topic: message for topic, _, message in iter_decoded(path)}
+
+
+def drawn(path: Path, kinds: dict[str, Any], *frames: dict[str, Any]) -> set[str]:
+    sink = RerunSink()
+    assert all(sink.wants(name, kind) for name, kind in kinds.items())
+    sink.open(path, kinds, {})
+    for number, items in enumerate(frames):
+        sink.write(Record(START + number, items))
+    sink.close({})
+    return entities(path)
+
+
+@pytest.mark.parametrize(("value", "kind", "message"), [
+    (0.5, float, "Float64"), (3, float, "Float64"), (np.float32(0.5), np.float32, "Float64"), (7, int, "Int64"),
+    (True, bool, "Bool"), (np.bool_(False), bool, "Bool"), ("dusty", str, "String"),
+])  # fmt: skip
+def test_numbers_and_texts_become_std_msgs(tmp_path: Path, value: Any, kind: Any, message: str) -> None:
+    read = written(tmp_path / "out.mcap", {"own": kind}, {"own": value})["/nav/own"]
+    assert (read.__msgtype__, read.data) == (f"std_msgs/msg/{message}", value)
+
+
+@pytest.mark.parametrize(("dtype", "shape", "encoding"), [
+    (np.uint8, (4, 6), "mono8"), (np.uint8, (4, 6, 3), "rgb8"), (np.uint16, (4, 6), "mono16"),
+    (np.float32, (4, 6), "32FC1"), (np.float16, (4, 6), "32FC1"), (bool, (4, 6), "mono8"), (np.int32, (4, 6), "32SC1"),
+])  # fmt: skip
+def test_images_become_sensor_msgs_images(tmp_path: Path, dtype: Any, shape: tuple[int, ...], encoding: str) -> None:
+    pixels = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
+    read = written(tmp_path / "out.mcap", {"own/image": np.ndarray}, {"own/image": pixels})["/nav/own/image"]
+    assert (read.__msgtype__, read.encoding, read.height, read.width) == ("sensor_msgs/msg/Image", encoding, 4, 6)
+    if encoding == "mono8" and dtype is bool:
+        np.testing.assert_array_equal(read.data.reshape(4, 6), 255 * pixels.astype(np.uint8))
+    elif encoding == "32FC1":
+        np.testing.assert_array_equal(read.data.view(np.float32).reshape(4, 6), pixels)
+
+
+def test_a_dataclass_becomes_a_topic_per_field(tmp_path: Path) -> None:
+    read = written(tmp_path / "out.mcap", {"own": Report}, {"own": report()})
+    del read["/nav/diagnostics"]
+    types = {topic.removeprefix("/nav/own/"): message.__msgtype__ for topic, message in read.items()}
+    assert {name: kind.replace("/msg/", "/") for name, kind in types.items()} == {
+        "blur": "std_msgs/Float64", "mask": "sensor_msgs/Image", "corners": "sensor_msgs/PointCloud2",
+        "histogram": "std_msgs/Int64MultiArray", "text": "std_msgs/String", "range_m": "std_msgs/Float64MultiArray",
+        "mount": "geometry_msgs/TransformStamped", "disparity": "stereo_msgs/DisparityImage",
+        "disparity/source": "sensor_msgs/Image", "by_side/left_eye": "std_msgs/Float64",
+        "by_side/_2": "std_msgs/Float64",
+    }  # fmt: skip
+    assert read["/nav/own/mask"].header.frame_id == "camera"
+    assert read["/nav/own/histogram"].data.tolist() == [0, 1, 2, 3]
+
+
+def test_keys_of_a_table_that_share_a_topic_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="cannot write both 'own/a b' and 'own/a_b' to /nav/own/a_b"):
+        written(tmp_path / "out.mcap", {"own": dict[str, float]}, {"own": {"a b": 1.0, "a_b": 2.0}})
+
+
+def test_a_value_unlike_its_annotation_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="cannot write 'own/a': a value of type bytes has no standard form"):
+        written(tmp_path / "out.mcap", {"own": dict}, {"own": {"a": b"raw"}})
+
+
+@pytest.mark.parametrize(("kind", "why"), [
+    (list[str], "a list of anything but numbers has no standard form"),
+    (NDArray[np.complex64], "an array of complex64 has no standard form"),
+    (dict[str, bytes], "bytes has no standard form"),
+    (float | None, ""), (tuple[int, ...], ""), (NDArray[Any], ""),
+])  # fmt: skip
+def test_a_type_without_a_standard_form_is_refused(kind: Any, why: str) -> None:
+    assert refusal(kind) == why
+
+
+def test_the_refusal_names_the_field_and_the_line(tmp_path: Path) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text(PIPELINE.replace("Edges", "Listing"))
+    with pytest.raises(PipelineError) as refused:
+        load(str(file))
+    assert str(refused.value) == (
+        "own.yaml:10: McapSink cannot write 'edges': a list of anything but numbers has no standard form; "
+        "leave it out of 'also'"
+    )
+
+
+def test_a_pipeline_of_own_types_runs(tmp_path: Path, traverse: Path) -> None:
+    file, out = tmp_path / "own.yaml", tmp_path / "out.mcap"
+    file.write_text(PIPELINE)
+    assert roverflow("run", traverse, "-p", file, "-o", out) == 0
+    read = list(iter_decoded(out, ["/nav/sharpness", "/nav/edges"]))
+    assert [topic for topic, *_ in read] == 4 * ["/nav/sharpness", "/nav/edges"]
+    assert {"/sharpness", "/edges"} <= entities(out.with_suffix(".rrd"))
+
+
+def test_own_types_are_drawn_field_by_field(tmp_path: Path) -> None:
+    path = tmp_path / "own.rrd"
+    found = drawn(
+        path, {"own/report": Report, "level": int, "note": str}, {"own/report": report(), "level": 3, "note": "dry"}
+    )
+    own = {entity.removeprefix("/own/report/") for entity in found if entity.startswith("/own/report/")}
+    assert own >= {"blur", "mask", "corners", "histogram", "text", "by_side/2", "disparity/pixels", "range_m"}
+    assert rows(path, "/level", "Scalars:scalars")[0][2] == [3.0]
+    assert rows(path, "/note", "TextLog:text")[0][2] == ["dry"]
+    mask = decoded(rows(path, "/own/report/mask", "EncodedImage:blob")[0][2][0], cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(mask, 255 * np.eye(4, 5))
+
+
+def test_an_image_that_a_frame_lacks_is_cleared(tmp_path: Path) -> None:
+    path = tmp_path / "own.rrd"
+    drawn(path, {"own": np.ndarray}, {"own": np.ones((4, 5), np.float32)}, {})
+    assert [row[1] for row in rows(path, "/own", "Clear:is_recursive") if row[2] is not None] == [1]
+
+
+def test_leaves_have_their_paths() -> None:
+    assert dict(leaves({"a": {"b": 1}, "c": None}, dict)) == {("a", "b"): 1.0}
