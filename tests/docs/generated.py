@@ -17,7 +17,7 @@ import flow.align
 import recordings
 import stages
 from flow.cli.main import parser
-from flow.config.units import as_written
+from flow.units import as_written
 from flow.runtime.graph import ports_of
 from stages.stage import Stage
 
