@@ -71,9 +71,12 @@ def senseless_tilt(stamp: int, log: Path) -> Change:
 
 
 CASES: dict[str, tuple[Callable[[int, Path], Change], tuple[str, ...]]] = {
-    "clear sky": (images(clear_sky), ("1 failed", "no measured point of the frame is left")),
-    "grainy sky": (images(grainy_sky), ("1 failed", "no measured point of the frame is left")),
-    "burnt out": (images(lambda h, w: np.full((h, w), 255)), ("1 failed", "no measured point of the frame is left")),
+    "clear sky": (images(clear_sky), ("1 failed", "the frame has no measured point within range")),
+    "grainy sky": (images(grainy_sky), ("1 failed", "the frame has no measured point within range")),
+    "burnt out": (
+        images(lambda h, w: np.full((h, w), 255)),
+        ("1 failed", "the frame has no measured point within range"),
+    ),
     "tilt gap": (no_tilt, ("1 unaligned", "inclinometer has a gap of 650.0 ms, more than 200.0 ms")),
     "NaN tilt": (senseless_tilt, ("12 unreadable", "the quaternion of the inclinometer is not a rotation", "a gap of")),
 }

@@ -1,10 +1,9 @@
 """Clean: drop far points and outliers (paper section 4, "Outlier Removal & ROI Limitation").
 
-The paper's k-nearest-neighbour filter measures distances in space, which on the ground grow with the square of the
-range: it mistakes distance for error. The default here asks the image instead: a point stays where enough of its
-neighbours in the image see the same surface, judged in inverse depth, in which near and far ground look alike. It takes
-time linear in the points. Patches that support themselves but touch nothing else go as well where they are small, or
-hang in the air or lie under the ground. The paper's filter remains as method "knn".
+The paper's k-nearest-neighbour filter uses distances in space. On the ground these grow with the square of the range,
+so it rejects far ground. Method "organised" looks at neighbours in the image instead and compares inverse depth, whose
+steps on a plane are the same near and far. It takes time linear in the points. It also removes small isolated patches,
+and patches that would hang in the air or lie under the ground.
 """
 
 from __future__ import annotations
@@ -16,105 +15,96 @@ from scipy.spatial import cKDTree
 
 from flow.contracts import StageError
 from stages.cloud.kernels.depth_order import out_of_order
-from stages.cloud.kernels.outliers import supported, usual_slope
-from stages.cloud.kernels.patches import depth_images, patches
+from stages.cloud.kernels.outliers import SupportRule, median_slope, supported
+from stages.cloud.kernels.patches import connected_patches, depth_images
 from stages.data import Array, PointCloud
 from stages.stage import Stage, parameter
+
+MAX_DEVIATIONS = 3.0  # standard deviations of noise between two neighbours of one surface
+MAX_SLOPE_RATIO = 2.0  # steepest slope of a surface over the ground's
+MIN_AGREEING_SHARE = 0.3  # of the up to 32 neighbours in the image
+MIN_NEIGHBOURS = 4  # with fewer a point cannot be judged and is dropped
 
 
 @dataclass(frozen=True)
 class Clean(Stage):
-    """Crops a cloud about its camera, then removes outliers.
+    """Crops a cloud around its camera, then removes outliers.
 
-    The crop comes first, so that the far field has no say in what is an outlier near by. It is a ball about the camera
-    of `max_range` + `margin`: before levelling nobody knows what is horizontal, and with the margin it holds all ground
-    within the region for any camera up to 4 m above it. Voxelise cuts the exact circle.
+    The crop is a ball of `max_range` + `margin` around the camera, because the cloud is not levelled yet. With a margin
+    of 1 m it contains all ground in range of a camera up to 4 m high. Method "organised" needs at least every 4th pixel
+    of a row and of a column.
 
-    method "organised" needs at least every 4th pixel of a row and of a column; sparser clouds have no neighbours.
+    Examples
+    --------
+    >>> points = np.float32([[x / 10, 1, z / 10] for z in range(20, 40) for x in range(-5, 5)])
+    >>> n = len(points)
+    >>> cloud = PointCloud(0, points, np.zeros((n, 3), np.uint8), np.zeros(n, np.float32), np.arange(n, dtype=np.int32),
+    ...                    "camera")
+    >>> len(Clean(method="knn", max_range=2.5)(cloud).points)
+    136
     """
 
     method: str = parameter("organised", "outlier removal", choices=("organised", "knn"))
     max_range: float = parameter(8.0, "horizontal range wanted in the map", unit="m", low=0.1, high=200.0)
-    margin: float = parameter(1.0, "added to region to crop by distance from the camera", unit="m", low=0.0)
-    max_deviations: float = parameter(
-        3.0, "organised: difference of neighbours that noise may explain, in standard deviations; knn: threshold above "
-        "the mean distance, in standard deviations of it", low=0.0,
-    )  # fmt: skip
-    max_slope_ratio: float = parameter(
-        2.0, "organised: steepest slope of a surface, in multiples of the ground's", low=0.0
-    )
-    min_agreeing_share: float = parameter(
-        0.3, "organised: part of the 32 neighbours that must agree", low=0.0, high=1.0
-    )
-    min_neighbours: int = parameter(
-        4, "organised: neighbours without which a point cannot be judged, and goes", low=1, high=32
-    )
+    margin: float = parameter(1.0, "added to max_range for the crop around the camera", unit="m", low=0.0)
     min_patch_share: float = parameter(
-        5e-4, "organised: part of the cloud below which a patch with nothing around it at its depth goes",
-        low=0.0, high=1.0,
-    )  # fmt: skip
+        5e-4, "organised: smaller isolated patches, as a share of the cloud, are dropped", low=0.0, high=1.0
+    )
     knn_neighbours: int = parameter(20, "knn: number of nearest neighbours", low=1)
+    knn_max_deviations: float = parameter(
+        3.0, "knn: largest mean distance to them, in standard deviations above the cloud's mean", low=0.0
+    )
 
     def __call__(self, cloud: PointCloud) -> PointCloud:
-        """The points of `cloud`, in their order, that are near and no outliers; there may be none."""
+        """The near points of `cloud` that are no outliers, in their order; there may be none."""
         if cloud.sensor is not None:
             raise StageError(f"Clean: the cloud is in frame '{cloud.frame_id}', not its camera's; Clean precedes Level")
         keep = self._organised(cloud) if self.method == "organised" else self._knn(cloud)
         return cloud.only(keep)
 
-    def _organised(self, cloud: PointCloud) -> Array:
-        """Indices of the points that stay, by their neighbours in the image.
+    @property
+    def _crop(self) -> float:
+        return self.max_range + self.margin
 
-        Those that are not measured are no evidence, so they support nobody and are cropped only.
-        """
+    def _organised(self, cloud: PointCloud) -> Array:
+        """Indices of the points kept by their neighbours in the image; points not measured are only cropped."""
         if cloud.shape is None:
-            raise StageError("Clean: the cloud does not say its image's shape; set it, or use method: knn")
+            raise StageError("Clean: the cloud has no image shape; set it, or use method: knn")
         measured = np.flatnonzero(cloud.measured)
         square = np.einsum("ij,ij->i", cloud.points, cloud.points)
-        kept = ~cloud.measured & (cloud.points[:, 2] > 0) & (square <= (self.max_range + self.margin) ** 2)
+        kept = ~cloud.measured & (cloud.points[:, 2] > 0) & (square <= self._crop**2)
         kept[measured[self._supported(cloud.only(measured), cloud.shape)]] = True
         return np.flatnonzero(kept)
 
     def _supported(self, cloud: PointCloud, shape: tuple[int, int]) -> Array:
-        """Indices of the points that stay of a cloud all of whose points are measured."""
+        """Indices of the points kept from a cloud of measured points."""
         if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < shape[0] * shape[1]:
             raise StageError(f"Clean: the cloud has pixel indices outside its image of shape {shape}")
-        kept = np.flatnonzero(
-            supported(
-                cloud.points,
-                cloud.sigma,
-                cloud.pixel,
-                shape,
-                self.max_range + self.margin,
-                self.max_deviations,
-                self.max_slope_ratio,
-                self.min_agreeing_share,
-                self.min_neighbours,
-            )
-        )
-        return kept[self._whole(cloud, kept, shape)]
+        rule = SupportRule(self._crop, MAX_DEVIATIONS, MAX_SLOPE_RATIO, MIN_AGREEING_SHARE, MIN_NEIGHBOURS)
+        kept = np.flatnonzero(supported(cloud.points, cloud.sigma, cloud.pixel, shape, rule))
+        return kept[self._in_good_patch(cloud, kept, shape)]
 
-    def _whole(self, cloud: PointCloud, kept: Array, shape: tuple[int, int]) -> Array:
-        """Which of the points that were kept are of a patch that is large enough and in order, (len(kept),) bool.
+    def _in_good_patch(self, cloud: PointCloud, kept: Array, shape: tuple[int, int]) -> Array:
+        """Which of the `kept` points lie in a large enough patch in depth order, (len(kept),) bool.
 
-        What lies beyond the crop bears witness: the sky begins above it.
+        Points beyond the crop count here, because the sky begins above them.
         """
-        far = np.flatnonzero(cloud.points[:, 2] > self.max_range + self.margin)
-        seen = np.concatenate([kept, far])
-        inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, seen, shape, self.max_deviations)
-        patch = patches(inverse, tolerance, self.max_slope_ratio * usual_slope(inverse))
+        far = np.flatnonzero(cloud.points[:, 2] > self._crop)
+        used = np.concatenate([kept, far])
+        inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, used, shape, MAX_DEVIATIONS)
+        patch = connected_patches(inverse, tolerance, MAX_SLOPE_RATIO * median_slope(inverse))
         sizes = np.bincount(patch.ravel() + 1, minlength=patch.size + 1)
-        place = cloud.pixel.take(kept)
-        large = sizes.take(patch.ravel().take(place) + 1) >= self.min_patch_share * len(kept)
-        return np.asarray(large & ~out_of_order(inverse, patch).ravel().take(place))
+        pixel = cloud.pixel.take(kept)
+        large = sizes.take(patch.ravel().take(pixel) + 1) >= self.min_patch_share * len(kept)
+        return np.asarray(large & ~out_of_order(inverse, patch).ravel().take(pixel))
 
     def _knn(self, cloud: PointCloud) -> Array:
-        """Indices of the points that stay, by the mean distance to their nearest neighbours in space."""
+        """Indices of the points kept by the mean distance to their nearest neighbours in space."""
         points = cloud.points.astype(np.float64)
-        near = np.flatnonzero(np.einsum("ij,ij->i", points, points) <= (self.max_range + self.margin) ** 2)
+        near = np.flatnonzero(np.einsum("ij,ij->i", points, points) <= self._crop**2)
         if len(near) <= self.knn_neighbours:
             return near
         distance, _ = cKDTree(points[near]).query(points[near], k=self.knn_neighbours + 1, workers=1)
         mean = distance[:, 1:].mean(axis=1)
-        kept: Array = near[mean <= mean.mean() + self.max_deviations * mean.std()]
+        kept: Array = near[mean <= mean.mean() + self.knn_max_deviations * mean.std()]
         return kept

@@ -1,7 +1,7 @@
-"""VoxelGrid: the cubes of space that hold measured points, with their number and mean colour.
+"""VoxelGrid: occupied voxels with the number and mean colour of their points.
 
-An elevation map keeps one height a cell; here an overhang, a wall and a floater remain to be seen. For the timeline:
-nothing is decided on it.
+An elevation map keeps one height per cell. The voxels also show overhangs, walls and floaters on the timeline. No
+decision uses them.
 """
 
 from __future__ import annotations
@@ -17,18 +17,27 @@ from stages.stage import Stage, check_cells, check_level, parameter
 
 @dataclass(frozen=True)
 class VoxelGrid(Stage):
-    """Sorts the measured points of a levelled cloud into cubes; what refinement made up is left out."""
+    """Sorts the measured points of a levelled cloud into voxels.
 
-    resolution: float = parameter(0.05, "edge of a cube", unit="m", low=0.005, high=2.0)
+    Examples
+    --------
+    >>> points, colors = np.float32([[1.01, 1.01, 0.01], [1.02, 1.02, 0.02]]), np.uint8([[10, 20, 30], [20, 30, 41]])
+    >>> cloud = PointCloud(0, points, colors, np.zeros(2, np.float32), np.int32([0, 1]), "level")
+    >>> voxels = VoxelGrid()(cloud)
+    >>> voxels.index.tolist(), voxels.colors.tolist(), voxels.count.tolist()
+    ([[20, 20, 0]], [[15, 25, 35]], [2])
+    """
+
+    resolution: float = parameter(0.05, "edge of a voxel", unit="m", low=0.005, high=2.0)
     max_range: float = parameter(8.0, "horizontal range from the level frame's origin", unit="m", low=0.1, high=200.0)
-    min_points: int = parameter(1, "points without which a cube is left out", low=1)
+    min_points: int = parameter(1, "voxels with fewer points are left out", low=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_cells("VoxelGrid.max_range", self.max_range, self.resolution, 2)
 
     def __call__(self, cloud: PointCloud) -> VoxelMap:
-        """The cubes of a cloud in frame `level`; there may be none."""
+        """The voxels of a cloud in frame `level`; there may be none."""
         check_level(self, cloud)
         x, y = cloud.points[:, 0], cloud.points[:, 1]
         inside = cloud.measured & np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.max_range**2)

@@ -1,10 +1,10 @@
-"""The data that flows: frozen dataclasses, one per kind of thing a stage takes or makes.
+"""The data that flows: frozen dataclasses, one for each kind of stage input or output.
 
-Conventions, everywhere: `stamp` is int nanoseconds of the log's clock; lengths are metres, angles radians; arrays are
-read-only once published; unknown is NaN (or -1 where the type says so), never a number that could be a value.
+Conventions: `stamp` is int nanoseconds of the log's clock; lengths are metres, angles radians. Arrays are read-only
+once published. Unknown is NaN, or -1 where the type documents it, never a valid value.
 
 Camera frame: left optical frame, x right, y down, z forward. Level frame: z up against gravity, x the rover's
-horizontal heading, y left. What says where things are and how they move stands in `stages.data.motion`.
+horizontal heading, y left.
 """
 
 from __future__ import annotations

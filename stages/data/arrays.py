@@ -1,6 +1,6 @@
-"""How the data types take in their arrays: checked, and read-only from then on.
+"""Checks of the arrays that enter a data type; from then on they are read-only.
 
-An error names the type and its field, for the types are made from logs as well as by stages.
+Errors name the type and its field, because logs as well as stages make these types.
 """
 
 from __future__ import annotations
@@ -18,10 +18,7 @@ Array = NDArray[Any]
 
 
 def publish(owner: object, name: str, shape: tuple[int | None, ...], dtype: DTypeLike) -> None:
-    """Check the array field `name` of a frozen dataclass and make it read-only.
-
-    `None` in `shape` stands for any extent. Raises ValueError with the field's name.
-    """
+    """Check the array field `name` of a frozen dataclass and make it read-only; None in `shape` is any extent."""
     array = np.asarray(getattr(owner, name))
     where = f"{type(owner).__name__}.{name}"
     if array.dtype != np.dtype(dtype):
@@ -33,7 +30,7 @@ def publish(owner: object, name: str, shape: tuple[int | None, ...], dtype: DTyp
 
 
 def publish_image(owner: object, name: str) -> None:
-    """Check that the field `name` holds a gray (H, W) or RGB (H, W, 3) image of 8 or 16 bit; make it read-only."""
+    """Check that field `name` is a gray (H, W) or RGB (H, W, 3) image of 8 or 16 bit, and make it read-only."""
     pixels = np.asarray(getattr(owner, name))
     if pixels.dtype not in (np.uint8, np.uint16):
         raise StageError(f"{type(owner).__name__}.{name} must be uint8 or uint16, not {pixels.dtype}")
@@ -43,7 +40,7 @@ def publish_image(owner: object, name: str) -> None:
 
 
 def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: bool = True) -> None:
-    """Publish a float64 copy of a small array given as any array-like."""
+    """Replace a small array-like by a read-only float64 copy."""
     values = np.array(getattr(owner, name), dtype=np.float64)
     if finite and not np.isfinite(values).all():
         raise StageError(f"{type(owner).__name__}.{name} must be finite, not {values.tolist()}")
@@ -52,7 +49,7 @@ def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: boo
 
 
 def publish_stamp(owner: Any) -> None:
-    """Check that the field `stamp` holds whole nanoseconds, and make them an int."""
+    """Check that the field `stamp` is a whole number of nanoseconds, and make it an int."""
     if not isinstance(owner.stamp, Integral):
         raise StageError(f"{type(owner).__name__}.stamp must be whole nanoseconds, not {owner.stamp!r}")
     object.__setattr__(owner, "stamp", int(owner.stamp))
@@ -65,8 +62,7 @@ def check_resolution(owner: Any) -> None:
 
 
 def read_only(array: Array) -> Array:
-    """A read-only view. An array that owns its memory becomes read-only itself, so that nobody who still holds it can
-    change what was published; one that is a part or a view of another cannot promise as much for that other."""
+    """A read-only view. An array that owns its memory becomes read-only itself; the base of a view does not."""
     if array.flags.owndata:
         array.flags.writeable = False
     view = array.view()

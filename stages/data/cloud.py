@@ -13,13 +13,35 @@ from stages.data.motion import Transform
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points of the left image in space.
+    """3-D points of the left image.
 
-    points: (N, 3) float32, m, in `frame_id`; colors: (N, 3) uint8 RGB; sigma: (N,) float32, depth standard deviation,
-    m; pixel: (N,) int32, index into the flattened left image; sensor: where the camera is in `frame_id`, None where
-    the cloud is still in the camera's own frame; shape: (H, W) of the left image that `pixel` indexes, where known;
-    source: (N,) uint8, codes of `PixelOrigin`, None where all points are measured; tilt_sigma: standard deviation of
-    the direction of up that the cloud was levelled with, about each horizontal axis, rad.
+    Parameters
+    ----------
+    stamp : int
+        Nanoseconds of the log's clock.
+    points : (N, 3) float32
+        Metres, in `frame_id`.
+    colors : (N, 3) uint8
+        RGB.
+    sigma : (N,) float32
+        Standard deviation of the depth, m.
+    pixel : (N,) int32
+        Index into the flattened left image.
+    shape : (H, W), optional
+        Size of that image.
+    sensor : Transform, optional
+        The camera in `frame_id`; None while the cloud is in the camera's own frame.
+    source : (N,) uint8, optional
+        Codes of `PixelOrigin`; None if all points are measured.
+    tilt_sigma : float
+        Standard deviation, rad, of the up direction that levelled the cloud, about each horizontal axis.
+
+    Examples
+    --------
+    >>> cloud = PointCloud(0, np.float32([[0, 0, 2], [1, 0, 3]]), np.zeros((2, 3), np.uint8),
+    ...                    np.float32([0.01, 0.02]), np.int32([5, 6]), "camera")
+    >>> cloud.only(cloud.sigma < 0.015).points.tolist()
+    [[0.0, 0.0, 2.0]]
     """
 
     stamp: int
@@ -45,28 +67,29 @@ class PointCloud:
 
     @property
     def measured(self) -> Array:
-        """Which points were matched at their own pixel, (N,) bool: the evidence."""
+        """Mask (N,) bool of the points that were matched at their own pixel."""
         return np.ones(len(self.points), bool) if self.source is None else np.equal(self.source, PixelOrigin.MEASURED)
 
     def only(self, kept: Array) -> PointCloud:
-        """The points of the indices (n,) int or the mask (N,) bool `kept`, in that order."""
+        """The points of a mask (N,) bool or of indices (n,) int, in that order."""
         kept = np.flatnonzero(kept) if kept.dtype == bool else kept
-        return replace(
-            self,
-            points=self.points.take(kept, axis=0),
-            colors=self.colors.take(kept, axis=0),
-            sigma=self.sigma.take(kept),
-            pixel=self.pixel.take(kept),
-            source=None if self.source is None else self.source.take(kept),
-        )
+        source = None if self.source is None else self.source.take(kept)
+        fields = {name: getattr(self, name).take(kept, axis=0) for name in ("points", "colors", "sigma", "pixel")}
+        return replace(self, **fields, source=source)
 
 
 @dataclass(frozen=True, eq=False)
 class VoxelMap:
-    """Cubes of space that hold points.
+    """Occupied voxels.
 
-    index: (N, 3) int32, a cube reaching from index * resolution, m, to (index + 1) * resolution along x, y, z of
-    `frame_id`; colors: (N, 3) uint8 RGB, mean; count: (N,) int32, points.
+    Parameters
+    ----------
+    index : (N, 3) int32
+        A voxel spans index * resolution to (index + 1) * resolution, m, along x, y, z of `frame_id`.
+    colors : (N, 3) uint8
+        Mean RGB of its points.
+    count : (N,) int32
+        Number of its points.
     """
 
     stamp: int

@@ -1,4 +1,4 @@
-"""How the uncertainty of a place and a turn goes along a way."""
+"""Propagation of a pose's covariance."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import numpy as np
 from stages.data.arrays import Array
 
 
-def levered(covariance: Array, way: Array) -> Array:
-    """A covariance (6, 6) of position and turn, after a way (3,), m, whose direction the turn decides."""
+def translated_covariance(covariance: Array, offset: Array) -> Array:
+    """Covariance (6, 6) of position and rotation at a point `offset` (3,), m, from here: rotation errors move it."""
     lever = np.eye(6)
-    lever[:3, 3:] = -cross_matrix(way)
+    lever[:3, 3:] = -cross_matrix(offset)
     return lever @ covariance @ lever.T
 
 

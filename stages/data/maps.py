@@ -25,28 +25,41 @@ class Cell(IntEnum):
 
 
 class CellReason(IntEnum):
-    """Why a navigation cell has its state, the codes of `NavigationMap.reason`."""
+    """Why a navigation cell has its state: the codes of `NavigationMap.reason`."""
 
     CLEAR = 0
     UNOBSERVED = 1
-    ELEVATION = 2
+    ELEVATION = 2  # the paper's rule
     STEP = 3
     SLOPE = 4
     ROUGHNESS = 5
     CLEARANCE = 6  # it would touch the rover's belly
-    BESIDE = 7  # next to a hazard, by less than where heights lie is known
-    OCCLUDED = 8  # unknown: hidden from the cameras, or not matched, amid ground that was measured
+    BESIDE = 7  # next to an obstacle, closer than its outline is known
+    OCCLUDED = 8  # unknown: hidden from the cameras or not matched, between or behind measured ground
     UNSURE = 9  # unknown: measured, but on too little evidence
 
 
 @dataclass(frozen=True, eq=False)
 class ElevationMap:
-    """A 2.5-D terrain grid: row index grows with y, column index with x.
+    """A 2.5-D terrain grid: the row index grows with y, the column index with x.
 
-    layers: name -> (rows, cols) float32, NaN = unknown, all of one shape, among them "elevation" (m);
-    resolution: cell size, m; origin: (x, y) of the lower-left corner of cell [0, 0], m; level: for a map in another
-    frame, where the frame `level` of that stamp lies in it; epoch: for a map of many frames, the stamp, ns, from which
-    its layers "first" and "last" count seconds.
+    Parameters
+    ----------
+    layers : mapping of str to (rows, cols) float32
+        All of one shape; NaN is unknown. "elevation" (m) is required; docs/terrain.md lists the others.
+    resolution : float
+        Cell size, m.
+    origin : (float, float)
+        (x, y) of the lower-left corner of cell [0, 0], m.
+    level : Transform, optional
+        Frame `level` of that stamp in `frame_id`, for a map in another frame.
+    epoch : int, optional
+        Stamp, ns, from which the layers "first" and "last" of a fused map count seconds.
+
+    Examples
+    --------
+    >>> ElevationMap(0, {"elevation": np.zeros((2, 3), np.float32)}, 0.05, (0.0, 0.0), "level").shape
+    (2, 3)
     """
 
     stamp: int
@@ -74,10 +87,20 @@ class ElevationMap:
 
 @dataclass(frozen=True, eq=False)
 class NavigationMap:
-    """Where the rover may drive.
+    """Where the rover may drive; `resolution` and `origin` are as in `ElevationMap`.
 
-    cells: (rows, cols) int8, codes of `Cell`; reason: (rows, cols) uint8, codes of `CellReason`; resolution, m, and
-    origin, m, as in `ElevationMap`.
+    Parameters
+    ----------
+    cells : (rows, cols) int8
+        Codes of `Cell`.
+    reason : (rows, cols) uint8
+        Codes of `CellReason`.
+
+    Examples
+    --------
+    >>> cells, reason = np.int8([[Cell.FREE, Cell.HAZARD]]), np.uint8([[CellReason.CLEAR, CellReason.STEP]])
+    >>> NavigationMap(0, cells, reason, 0.05, (0.0, 0.0), "level").cells.tolist()
+    [[0, 100]]
     """
 
     stamp: int

@@ -1,7 +1,4 @@
-"""Where things are and how they move: rigid transforms, tilts, poses, mounts, the camera's motion.
-
-Part of the contract of `stages.data`, which has its conventions and all of its names; take them from there.
-"""
+"""Frames and motion: rigid transforms, tilts, poses, mounts, the camera's motion."""
 
 from __future__ import annotations
 
@@ -14,14 +11,27 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import StageError
 from stages.data.arrays import Array, check_rotation, publish_stamp, publish_vector
-from stages.data.covariance import levered
+from stages.data.covariance import translated_covariance
 
 
 @dataclass(frozen=True, eq=False)
 class Transform:
     """A rigid transform: a point p of frame `child` is `rotation @ p + translation` in frame `parent`.
 
-    rotation: (3, 3) float64, orthonormal; translation: (3,) float64, metres.
+    Parameters
+    ----------
+    rotation : (3, 3) float64
+        Orthonormal and right-handed.
+    translation : (3,) float64
+        Metres.
+
+    Examples
+    --------
+    >>> mast = Transform("base_link", "camera", np.eye(3), [0.5, 0.0, 1.2])
+    >>> mast([[0.0, 0.0, 1.0]]).tolist()
+    [[0.5, 0.0, 2.2]]
+    >>> mast.inverse().after(mast).translation.tolist()
+    [0.0, 0.0, 0.0]
     """
 
     parent: str
@@ -35,7 +45,7 @@ class Transform:
         check_rotation(self.rotation, f"Transform {self.parent} <- {self.child}: rotation")
 
     def __call__(self, points: ArrayLike) -> Array:
-        """Points (N, 3) of `child`, m, expressed in `parent`."""
+        """Points (N, 3) of `child`, m, in `parent`."""
         return np.asarray(points) @ self.rotation.T + self.translation
 
     def inverse(self) -> Transform:
@@ -49,7 +59,19 @@ class Transform:
 
 @dataclass(frozen=True, eq=False)
 class Tilt:
-    """Where up is. up: (3,) float64 unit vector, gravity's opposite, in the inclinometer's frame `frame_id`."""
+    """The direction of up, as the inclinometer measures it.
+
+    Parameters
+    ----------
+    up : (3,) float64
+        Unit vector against gravity, in the inclinometer's frame `frame_id`.
+
+    Examples
+    --------
+    >>> level, nose_up = Tilt(0, [0.0, 0.0, 1.0]), Tilt(10, [np.sin(0.2), 0.0, np.cos(0.2)])
+    >>> float(np.arcsin(level.interpolated(nose_up, 5).up[0]).round(6))
+    0.1
+    """
 
     stamp: int
     up: Array
@@ -63,17 +85,17 @@ class Tilt:
 
     def interpolated(self, later: Tilt, stamp: int) -> Tilt:
         """The tilt at `stamp`, ns, between this one and a later one, along the great circle."""
-        return Tilt(stamp, _slerp(self.up, later.up, _share(self.stamp, later.stamp, stamp)), self.frame_id)
+        return Tilt(stamp, _slerp(self.up, later.up, _fraction(self.stamp, later.stamp, stamp)), self.frame_id)
 
     @staticmethod
     def smoothed(samples: Sequence[Tilt], stamp: int) -> Tilt:
-        """The tilt at `stamp`, ns, by the straight line, in time, that fits three samples about it or more."""
+        """The tilt at `stamp`, ns, on the line fitted over time to three or more samples around it."""
         seconds = (np.array([sample.stamp for sample in samples]) - stamp) / 1e9
         line = np.column_stack([np.ones_like(seconds), seconds])
         up = np.linalg.lstsq(line, np.array([sample.up for sample in samples]), rcond=None)[0][0]
         length = float(np.linalg.norm(up))
         if not length > 0.5:
-            raise StageError("Tilt.smoothed: the samples point all ways")
+            raise StageError("Tilt.smoothed: the samples have no common direction")
         return Tilt(stamp, up / length, samples[0].frame_id)
 
 
@@ -81,8 +103,20 @@ class Tilt:
 class Pose:
     """Pose of frame `child_frame_id` in frame `frame_id`.
 
-    position: (3,) float64, m; quaternion: (4,) float64, xyzw, unit; covariance: (6, 6) float64 of position (m) and of a
-    turn (rad) about the fixed axes, or None.
+    Parameters
+    ----------
+    position : (3,) float64
+        Metres.
+    quaternion : (4,) float64
+        Unit quaternion x, y, z, w.
+    covariance : (6, 6) float64, optional
+        Of position (m) and rotation (rad) about the fixed axes.
+
+    Examples
+    --------
+    >>> start = Pose(0, [0, 0, 0], [0, 0, 0, 1], "odom", "base_link")
+    >>> start.interpolated(Pose(4, [8, 0, 0], [0, 0, 0, 1], "odom", "base_link"), 1).position.tolist()
+    [2.0, 0.0, 0.0]
     """
 
     stamp: int
@@ -102,39 +136,47 @@ class Pose:
             raise StageError(f"Pose.quaternion must be a unit quaternion, not {self.quaternion.tolist()}")
 
     def interpolated(self, later: Pose, stamp: int) -> Pose:
-        """The pose at `stamp`, ns, between this one and a later one in the same frames; the earlier covariance is
-        kept."""
+        """The pose at `stamp`, ns, between this one and a later one of the same frames, with this covariance."""
         if (self.frame_id, self.child_frame_id) != (later.frame_id, later.child_frame_id):
             raise StageError(
-                f"the pose of '{self.child_frame_id}' in '{self.frame_id}' is followed by one of "
-                f"'{later.child_frame_id}' in '{later.frame_id}'; nothing lies between two frames"
+                f"cannot interpolate from the pose of '{self.child_frame_id}' in '{self.frame_id}' to the pose of "
+                f"'{later.child_frame_id}' in '{later.frame_id}': the frames differ"
             )
-        share = _share(self.stamp, later.stamp, stamp)
+        share = _fraction(self.stamp, later.stamp, stamp)
         position = (1 - share) * self.position + share * later.position
         near = later.quaternion if self.quaternion @ later.quaternion >= 0 else -later.quaternion
         return replace(self, stamp=stamp, position=position, quaternion=_slerp(self.quaternion, near, share))
 
     @property
-    def placed(self) -> Transform:
-        """Frame `child_frame_id` in frame `frame_id`."""
+    def transform(self) -> Transform:
+        """The transform from `child_frame_id` to `frame_id`."""
         rotation = Rotation.from_quat(self.quaternion).as_matrix()
         return Transform(self.frame_id, self.child_frame_id, rotation, self.position)
 
     def of(self, part: Transform) -> Pose:
-        """The pose of another frame, `part.child`, that sits on this one, `part.parent`, as `part` tells."""
-        turn = Rotation.from_quat(self.quaternion)
-        way = turn.as_matrix() @ part.translation
-        covariance = None if self.covariance is None else levered(self.covariance, way)
-        quaternion = (turn * Rotation.from_matrix(part.rotation)).as_quat()
-        return Pose(self.stamp, self.position + way, quaternion, self.frame_id, part.child, covariance)
+        """The pose of `part.child`, a frame fixed to this one, `part.parent`."""
+        rotation = Rotation.from_quat(self.quaternion)
+        offset = rotation.as_matrix() @ part.translation
+        covariance = None if self.covariance is None else translated_covariance(self.covariance, offset)
+        quaternion = (rotation * Rotation.from_matrix(part.rotation)).as_quat()
+        return Pose(self.stamp, self.position + offset, quaternion, self.frame_id, part.child, covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """How the camera sits on the rover.
+    """How the camera and the inclinometer are mounted on the rover.
 
-    camera_from_inclinometer: (3, 3) float64 rotation; base_from_camera: the left camera in the rover's base frame
-    (x forward, y left, z up), or None where the log does not say.
+    Parameters
+    ----------
+    camera_from_inclinometer : (3, 3) float64
+        Rotation from the inclinometer's frame to the left camera's.
+    base_from_camera : Transform, optional
+        The left camera in the rover's base frame (x forward, y left, z up), if the log contains it.
+
+    Examples
+    --------
+    >>> Mount(0, np.eye(3)).camera_in("camera", "camera").translation.tolist()
+    [0.0, 0.0, 0.0]
     """
 
     stamp: int
@@ -146,23 +188,30 @@ class Mount:
         publish_vector(self, "camera_from_inclinometer", (3, 3))
         check_rotation(self.camera_from_inclinometer, "Mount.camera_from_inclinometer")
 
-    def camera_on(self, part: str, camera: str) -> Transform | None:
-        """The frame `camera` in the frame `part` of the rover; None where that is neither the camera nor the base."""
-        if part == camera:
+    def camera_in(self, frame: str, camera: str) -> Transform | None:
+        """The frame `camera` in a frame of the rover; None unless that is the camera or the base."""
+        if frame == camera:
             return Transform(camera, camera, np.eye(3), np.zeros(3))
         base = self.base_from_camera
-        return base if base is not None and base.parent == part else None
+        return base if base is not None and base.parent == frame else None
 
 
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
-    """How the camera moved, by the images alone: nothing but they constrains it, gravity neither.
+    """The camera's motion by visual odometry alone, without gravity.
 
-    camera: the camera in the camera of the frame that began its segment, None where the images do not tell; segment:
-    counts from 1, 0 before anything was seen; a new one begins wherever tracking was lost, and nothing ties it to the
-    one before; covariance: (6, 6) of `camera`, of position (m) and of a turn (rad) about the fixed axes, which grows
-    from step to step; inliers: features that agree on the last step; lost: what to say where tracking was lost at this
-    frame, else empty.
+    Parameters
+    ----------
+    segment : int
+        Number of the track, from 1; 0 before the first usable frame. A new one begins where tracking is lost.
+    camera : Transform or None
+        The camera in the first camera of its segment; None if this frame cannot be tracked.
+    covariance : (6, 6) float64
+        Of `camera`: position (m) and rotation (rad) about the fixed axes. It grows along the segment.
+    inliers : int
+        Features that agree on the last step.
+    lost : str
+        Why tracking was lost at this frame, else empty.
     """
 
     stamp: int
@@ -179,11 +228,20 @@ class CameraMotion:
 
 @dataclass(frozen=True, eq=False)
 class TiltHealth:
-    """Whether the tilt can be believed, judged by the camera and the ground it sees.
+    """Whether the tilt agrees with the camera's rotation and the ground in view.
 
-    turn: rad, between the tilt and the one before carried along by the camera's motion; ground: rad, between up and the
-    upward normal of the ground in view; both NaN where unknown. frames: how many frames the judgement rests on. fault:
-    what is wrong, in a word or two, empty where nothing is or nothing can be told; judgement: a sentence.
+    Parameters
+    ----------
+    turn : float
+        Angle, rad, between the tilt and the previous tilt rotated by the camera's motion; NaN if unknown.
+    ground : float
+        Angle, rad, between up and the normal of the ground in view; NaN if unknown.
+    frames : int
+        Number of frames behind the judgement.
+    fault : str
+        Short name of the fault; empty if none is found.
+    judgement : str
+        One sentence.
     """
 
     stamp: int
@@ -197,15 +255,15 @@ class TiltHealth:
         publish_stamp(self)
 
 
-def _share(first: int, last: int, stamp: int) -> float:
-    """How far `stamp` is on the way from one stamp to the other, 0 to 1."""
+def _fraction(first: int, last: int, stamp: int) -> float:
+    """Position of `stamp` between two stamps, 0 to 1."""
     if not first <= stamp <= last:
         raise StageError(f"stamp {stamp} is outside [{first}, {last}]")
     return (stamp - first) / (last - first) if last > first else 0.0
 
 
 def _slerp(start: Array, end: Array, share: float) -> Array:
-    """The unit vector at this share of the great circle between two, (n,) each."""
+    """Spherical linear interpolation between two unit vectors (n,)."""
     angle = float(np.arctan2(np.linalg.norm(end - start), np.linalg.norm(end + start))) * 2
     if angle < 1e-9:
         return start

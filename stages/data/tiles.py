@@ -1,21 +1,19 @@
-"""A grid without bounds: cells of one dtype, kept in square tiles that exist only where something was written.
+"""An unbounded sparse grid: cells of one dtype in square tiles, allocated on the first write.
 
-Cells are addressed by whole numbers (row, column), of either sign. What was never written reads as zeros, so a dtype is
-chosen such that zero means that nothing is known.
+Row and column may be negative. Cells that were never written read as zeros, so zero must mean "unknown".
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from stages.data.arrays import Array
 
-SIDE = 32  # cells of a tile's side: 1.6 m of 0.05 m cells, so that a track of 20 m wastes a twelfth at its borders
+SIDE = 32  # cells: 1.6 m at 0.05 m a cell, so a track 20 m wide wastes a twelfth at its borders
+Span = tuple[slice, slice]
 
 
 @dataclass(eq=False)
@@ -26,25 +24,23 @@ class Tiles:
     tiles: dict[tuple[int, int], Array] = field(default_factory=dict)
 
     def read(self, row: int, col: int, rows: int, cols: int) -> Array:
-        """A copy of the block of (rows, cols) cells whose first is (row, col)."""
+        """A copy of the (rows, cols) cells from (row, col) on."""
         block = np.zeros((rows, cols), self.dtype)
-        for place, inside, part in _parts(row, col, rows, cols):
-            if place in self.tiles:
-                block[part] = self.tiles[place][inside]
+        for index, inside, part in _parts(row, col, rows, cols):
+            if index in self.tiles:
+                block[part] = self.tiles[index][inside]
         return block
 
     def write(self, row: int, col: int, block: Array, changed: Array) -> None:
-        """Store the cells of `block` (rows, cols) where `changed` (rows, cols) bool; its first cell is (row, col)."""
-        for place, inside, part in _parts(row, col, *block.shape):
+        """Store the cells of `block` from (row, col) on, where `changed`, (rows, cols) bool, is set."""
+        for index, inside, part in _parts(row, col, *block.shape):
             if changed[part].any():
-                tile = self.tiles.setdefault(place, np.zeros((SIDE, SIDE), self.dtype))
+                tile = self.tiles.setdefault(index, np.zeros((SIDE, SIDE), self.dtype))
                 np.copyto(tile[inside], block[part], where=changed[part])
 
 
-def _parts(
-    row: int, col: int, rows: int, cols: int
-) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
-    """The tiles that a block touches: each with its place, and the common cells as slices of tile and of block."""
+def _parts(row: int, col: int, rows: int, cols: int) -> Iterator[tuple[tuple[int, int], Span, Span]]:
+    """The tiles that a block overlaps: index of the tile, then the common cells as slices of tile and block."""
     for tile_row, inside_row, part_row in _spans(row, rows):
         for tile_col, inside_col, part_col in _spans(col, cols):
             yield (tile_row, tile_col), (inside_row, inside_col), (part_row, part_col)

@@ -29,11 +29,11 @@ class PoseCheck:
 
     def add(self, motion: CameraMotion, pose: Pose, mount: Mount) -> None:
         """Take note of a frame."""
-        seat = None if motion.camera is None else mount.camera_on(pose.child_frame_id, motion.camera.child)
+        seat = None if motion.camera is None else mount.camera_in(pose.child_frame_id, motion.camera.child)
         if motion.camera is None or seat is None:
             self.last = None
             return
-        now = motion.segment, pose.frame_id, motion.camera, pose.placed.after(seat)
+        now = motion.segment, pose.frame_id, motion.camera, pose.transform.after(seat)
         if self.last is not None and self.last[:2] == now[:2]:
             seen, told = (_step(before, after) for before, after in zip(self.last[2:], now[2:], strict=True))
             self.steps.append(np.linalg.norm([seen, told, seen - told], axis=1))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from flow.contracts import Finding, Severity, StageError, counted
 from stages.cloud.level import level_transform
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
-from stages.data.covariance import levered
+from stages.data.covariance import translated_covariance
 from stages.localisation.pose_check import PoseCheck
 from stages.stage import Stage, parameter
 
@@ -112,7 +112,7 @@ class PoseFilter(Stage):
         """The first frame of a segment: at its origin, upright by the tilt."""
         world = level_transform(tilt, mount, camera.child, camera_height=0.0)
         # About the origin, which is base_link where that is known, the tilt's error moves the camera as well.
-        covariance = levered(np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0]), world.translation)
+        covariance = translated_covariance(np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0]), world.translation)
         return _Estimate(motion.segment, camera, motion.covariance, world, covariance, 0.0)
 
     def _drawn(self, estimate: _Estimate, tilt: Tilt, mount: Mount) -> _Estimate:
@@ -129,7 +129,7 @@ class PoseFilter(Stage):
         base = mount.base_from_camera
         placed = estimate.world if base is None else estimate.world.after(base.inverse())
         alike = self._alike(placed.translation, estimate.way)
-        covariance = levered(estimate.covariance, placed.translation - estimate.world.translation) + alike.T @ alike
+        covariance = translated_covariance(estimate.covariance, placed.translation - estimate.world.translation) + alike.T @ alike
         np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # the origin's is zero but for rounding
         return Pose(
             stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),
@@ -155,11 +155,11 @@ def _carried(before: _Estimate, motion: CameraMotion, camera: Transform) -> _Est
     world = before.world.after(before.camera.inverse().after(camera))
     way = world.translation - before.world.translation
     # What the motion's covariance, in the axes of its segment's first camera, has gained since the frame before.
-    step = motion.covariance - levered(before.told, camera.translation - before.camera.translation)
+    step = motion.covariance - translated_covariance(before.told, camera.translation - before.camera.translation)
     values, axes = np.linalg.eigh(step)
     added = (axes * np.clip(values, 0, None)) @ axes.T  # two frames tracked from one keyframe may err the same way
     turned = np.kron(np.eye(2), world.rotation @ camera.rotation.T)
-    covariance = levered(before.covariance, way) + turned @ added @ turned.T
+    covariance = translated_covariance(before.covariance, way) + turned @ added @ turned.T
     driven = before.way + float(np.linalg.norm(way))
     return _Estimate(motion.segment, camera, motion.covariance, world, covariance, driven)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from flow.contracts import Finding
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
-from stages.data.covariance import cross_matrix, levered
+from stages.data.covariance import cross_matrix, translated_covariance
 from stages.localisation.vo_tracking import Step, VoFrame, step_between, view
 from stages.stage import Stage, check_joined, parameter
 
@@ -121,5 +121,5 @@ def _grown(before: _Keyframe, step: Step, camera: Transform) -> Array:
     own[:3, :3], own[:3, 3:], own[3:, :3] = -cross_matrix(step.translation), -np.eye(3), -np.eye(3)
     own = np.kron(np.eye(2), camera.rotation) @ own
     way = camera.translation - before.camera.translation
-    grown: Array = levered(before.covariance, way) + own @ step.covariance @ own.T
+    grown: Array = translated_covariance(before.covariance, way) + own @ step.covariance @ own.T
     return grown

@@ -19,7 +19,7 @@ import numpy as np
 
 from stages.compiled.hamming import clear_partners
 from stages.data import Array
-from stages.robust_weights import NORMAL, tukey_weights
+from stages.robust_weights import MAD_TO_SIGMA, tukey_weights
 
 FEATURES = 4000  # per image
 SMALLEST = 32  # px, side of an image that has any
@@ -250,7 +250,7 @@ def _robust_fit(place: Array, values: Array, count: int) -> tuple[Array, float, 
         roots = np.sqrt(weights)
         terms = np.linalg.lstsq(columns * roots[:, None], values * roots, rcond=None)[0]
         residuals = values - columns @ terms
-        scale = max(NORMAL * float(np.median(np.abs(residuals))), 0.02)
+        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), 0.02)
         weights = tukey_weights(residuals, scale)
     repeated = len(place) / len(np.unique(np.floor(place / CELL), axis=0))
     covariance = np.linalg.pinv(columns.T @ (columns * weights[:, None])) * scale**2 * repeated

@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from stages.data import Array, ElevationMap, Rover
 from stages.stage import Stage, parameter
-from stages.terrain.kernels.local_minimum import lowest_around
+from stages.terrain.kernels.local_minimum import local_minimum
 from stages.terrain.kernels.plane_window import window_planes
 
 MOST = 0.85  # share of `max_step`: cells blunt a peak
@@ -155,7 +155,7 @@ class TerrainFeatures(Stage):
 
     def _step(self, elevation: ElevationMap, height: Array, observed: Array, ground: _Ground) -> tuple[Array, Array]:
         """The layers `step` and `support`."""
-        lowest, support = lowest_around(height, observed, ground.trend, _reach(self.rover.wheel, elevation.resolution))
+        lowest, support = local_minimum(height, observed, ground.trend, _reach(self.rover.wheel, elevation.resolution))
         top, bottom = (_finite(elevation.layers.get(extreme), height) for extreme in ("maximum", "minimum"))
         rise = np.minimum(top - lowest, 4 * (height - lowest))
         above = np.minimum(top - ground.height, 4 * (height - ground.height))

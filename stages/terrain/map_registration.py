@@ -61,7 +61,7 @@ def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tupl
     """
     assert cloud.sensor is not None
     child = _child_from_camera(pose, cloud.sensor, mount)
-    camera = pose.placed.rotation @ child.rotation
+    camera = pose.transform.rotation @ child.rotation
     turned = camera @ cloud.sensor.rotation.T
     lean = float(np.arccos(np.clip(turned[2, 2], -1.0, 1.0)))
     if lean > _LARGEST_LEAN:
@@ -78,7 +78,7 @@ def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tupl
 def _child_from_camera(pose: Pose, sensor: Transform, mount: Mount | None) -> Transform:
     """The camera in the frame whose pose is given."""
     mount = mount or Mount(0, np.eye(3))
-    seat = mount.camera_on(pose.child_frame_id, sensor.child)
+    seat = mount.camera_in(pose.child_frame_id, sensor.child)
     if seat is None:
         raise StageError(
             f"Fuse: the pose is that of '{pose.child_frame_id}', and nothing tells how the camera '{sensor.child}' "

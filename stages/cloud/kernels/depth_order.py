@@ -1,9 +1,8 @@
-"""Patches of points that are out of order: up a column of the image the ground recedes.
+"""Floater removal by depth order: up a column of the image the ground recedes.
 
-A line of sight that passes over ground cannot end nearer than one below it, unless something stands there; and what
-stands, stands on the ground. So a patch that touches nothing, with what lies below it in the image farther away, hangs
-in the air, like what is matched in the sky; and one with what lies above it nearer would have to lie under the ground.
-Which of the two is wrong the smaller is taken to be.
+Objects rest on the ground. An isolated patch that is nearer than the patch below it in the image would hang in the air,
+as mismatches in the sky do. A patch that is farther than the patch above it would lie under the ground. If two patches
+contradict the depth order, the smaller one is treated as the outlier.
 """
 
 from __future__ import annotations
@@ -15,21 +14,21 @@ import numpy as np
 from stages.compiled.jit import kernel
 from stages.data import Array
 
-CLEAR = 1.1  # ratio of depths from which one is the nearer
-ROUNDS = 3  # what is out of order may hide that something else is
+MIN_DEPTH_RATIO = 1.1  # between two depths in the wrong order
+ROUNDS = 3  # an outlier may hide another one
 
 
 def out_of_order(inverse: Array, patch: Array) -> Array:
-    """Which pixels belong to a patch that is out of order in most of the columns where it meets another.
+    """Pixels of the patches that are out of order in most of the columns where they meet another, (H, W) bool.
 
-    inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; patch: (H, W) int32, of `patches.patches`, -1 where
-    there is no point. Rows run from the sky down. Returns (H, W) bool.
+    inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; patch: (H, W) int32, labels of `connected_patches`.
+    Rows run from the sky down.
     """
     patch = patch.copy()
     sizes = np.bincount(patch.ravel() + 1, minlength=patch.size + 1)[1:]
     for _ in range(ROUNDS):
         votes = np.zeros(patch.size, np.int32)
-        _vote(inverse, patch, sizes, np.float32(CLEAR), votes)
+        _vote(inverse, patch, sizes, np.float32(MIN_DEPTH_RATIO), votes)
         if not (votes > 0).any():
             break
         _drop(patch.reshape(-1), votes)
@@ -38,8 +37,8 @@ def out_of_order(inverse: Array, patch: Array) -> Array:
 
 
 @kernel
-def _vote(inverse, patch, sizes, clear, votes):
-    """Add 1 for every column in which a patch is out of order with a larger one, take 1 off where it is not."""
+def _vote(inverse, patch, sizes, min_ratio, votes):
+    """Add 1 for every column in which a patch is out of order with a larger one, else subtract 1."""
     below = np.full(inverse.shape[1], -1, np.int64)
     for row in range(inverse.shape[0] - 1, -1, -1):
         for col in range(inverse.shape[1]):
@@ -52,7 +51,7 @@ def _vote(inverse, patch, sizes, clear, votes):
                 continue
             other = patch[last, col]
             smaller = here if sizes[here] < sizes[other] else other
-            votes[smaller] += 1 if inverse[row, col] > clear * inverse[last, col] else -1
+            votes[smaller] += 1 if inverse[row, col] > min_ratio * inverse[last, col] else -1
 
 
 @kernel
@@ -63,7 +62,7 @@ def _drop(patch, votes):
 
 
 def out_of_order_reference(inverse: Array, patch: Array) -> Array:
-    """`out_of_order`, one column after the other in plain numpy."""
+    """The same as `out_of_order`, one column at a time, in plain numpy."""
     patch = patch.copy()
     sizes = np.bincount(patch[patch >= 0], minlength=patch.size)
     for _ in range(ROUNDS):
@@ -73,7 +72,7 @@ def out_of_order_reference(inverse: Array, patch: Array) -> Array:
             for above, under in pairwise(rows):
                 one, other = numbers[above], numbers[under]
                 if one != other:
-                    nearer = column[above] > np.float32(CLEAR) * column[under]
+                    nearer = column[above] > np.float32(MIN_DEPTH_RATIO) * column[under]
                     votes[one if sizes[one] < sizes[other] else other] += 1 if nearer else -1
         patch[(patch >= 0) & (votes > 0)[patch]] = -1
     gone: Array = (patch < 0) & (inverse > 0)

@@ -1,19 +1,20 @@
-"""Outlier test of an organised cloud: does a point's image neighbourhood see a surface at its depth?
+"""Outlier test of an organised cloud: do a point's neighbours in the image lie on a surface at its depth?
 
-Distances between neighbours in space grow with the square of the range, so one threshold on them cuts away the far
-ground (a k-nearest-neighbour filter at its usual settings loses most of it beyond 6 m). Inverse depth does not have
-that flaw: on a plane it is linear in the pixel, its step from row to row is the same near and far, and so is its noise.
-The test counts, in eight directions, the neighbours whose inverse depth differs by what noise and slope explain.
+Distances in space grow with the square of the range, so a threshold on them removes the far ground. On a plane, inverse
+depth is linear in the pixel: its step from row to row and its noise are the same near and far. The test counts, in
+eight directions, the neighbours whose inverse depth differs by no more than noise and slope explain.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from stages.compiled.jit import kernel
 from stages.data import Array
 
-# Four rings of eight neighbours: rings of 1 to 4 px, so that a cloud of every 2nd, 3rd or 4th pixel has some as well.
+# Eight neighbours in each of four rings of 1 to 4 px, so that a cloud of every 4th pixel has neighbours too.
 _RINGS = 4
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 OFFSETS = np.array(
@@ -21,47 +22,33 @@ OFFSETS = np.array(
 )  # fmt: skip
 
 
-def supported(
-    points: Array,
-    sigma: Array,
-    pixel: Array,
-    shape: tuple[int, int],
-    reach: float,
-    deviations: float,
-    spread: float,
-    share: float,
-    least: int,
-) -> Array:
-    """Which points lie on a surface that their neighbours in the image also see.
+class SupportRule(NamedTuple):
+    """When a point is supported by its neighbours."""
+
+    max_depth_range: float  # m from the camera; farther points are dropped and support no other
+    max_deviations: float  # standard deviations of noise in a difference of inverse depth
+    max_slope_ratio: float  # slope of a surface over the scene's median slope
+    min_agreeing_share: float  # of the neighbours present
+    min_neighbours: int  # present
+
+
+def supported(points: Array, sigma: Array, pixel: Array, shape: tuple[int, int], rule: SupportRule) -> Array:
+    """Which points lie on the same surface as enough of their neighbours in the image.
 
     points: (N, 3) float32 in the camera's frame, m; sigma: (N,) float32, depth standard deviation, m; pixel: (N,)
-    int32; shape: (H, W) of the image; reach: m, points farther from the camera are dropped and support nobody;
-    deviations: noise a difference may show, in standard deviations; spread: slope it may show, in multiples of the
-    scene's usual one; share: of the neighbours present, those that must agree; least: how many must be present.
-
-    Returns (N,) bool.
+    int32; shape: (H, W) of the image. Returns (N,) bool.
     """
-    inverse = _inverse_depth(points, pixel, int(shape[0]), int(shape[1]), float(reach))
-    return _supported(  # type: ignore[no-any-return]
-        points,
-        sigma,
-        pixel,
-        inverse,
-        OFFSETS,
-        float(deviations),
-        float(spread) * usual_slope(inverse),
-        float(share),
-        int(least),
-        pixel_rays(points, pixel, int(shape[1])),
-        float(reach),
-    )
+    inverse = _inverse_depth(points, pixel, int(shape[0]), int(shape[1]), rule.max_depth_range)
+    slope = rule.max_slope_ratio * median_slope(inverse)
+    rays = pixel_rays(points, pixel, int(shape[1]))
+    return _supported(points, sigma, pixel, inverse, OFFSETS, rule, slope, rays)  # type: ignore[no-any-return]
 
 
-def usual_slope(inverse: Array) -> float:
-    """The median change of inverse depth, 1/m, from a row to the next: the expected spacing of the ground.
+def median_slope(inverse: Array) -> float:
+    """The median change of inverse depth, 1/m, from one row to the next; 0 without two points to compare.
 
-    inverse: (H, W) float32, NaN = no point. Compares rows twelve apart: a multiple of every common subsampling,
-    and far enough for the slope to show above the noise. 0 where no two points can be compared.
+    inverse: (H, W) float32, NaN = no point. Rows twelve apart are compared: a multiple of every common subsampling, and
+    far enough apart for the slope to exceed the noise.
     """
     change = np.abs(inverse[12::3] - inverse[:-12:3])
     change = change[np.isfinite(change)]
@@ -69,43 +56,44 @@ def usual_slope(inverse: Array) -> float:
 
 
 def pixel_rays(points: Array, pixel: Array, width: int) -> Array:
-    """The lines x/z = a + b * column and y/z = a + b * row that a cloud's points lie on, however many are gross errors.
+    """The lines x/z = a + b * column and y/z = a + b * row on which a cloud's points lie, robust to gross errors.
 
     Theil-Sen: the median slope between points half a sample apart, over an evenly spaced sample of at most 4000 points.
-    Returns (4,) float64, a and b of the columns, a and b of the rows; all NaN where the points do not determine them.
+    Returns (4,) float64, a and b of the columns, a and b of the rows; all NaN if the points do not determine them.
     """
     sample = np.linspace(0, len(points) - 1, min(len(points), 4000)).astype(np.int64)
     sample = sample[points[sample, 2] > 0] if len(points) else sample
     rays = np.full(4, np.nan)
-    for axis, place in ((0, pixel[sample] % width), (1, pixel[sample] // width)):
+    for axis, index in ((0, pixel[sample] % width), (1, pixel[sample] // width)):
         half = len(sample) // 2
-        step = place[half : 2 * half] - place[:half]
+        step = index[half : 2 * half] - index[:half]
         ratio = points[sample, axis].astype(np.float64) / points[sample, 2]
         if not np.any(step):
             return np.full(4, np.nan)
         slope = np.median((ratio[half : 2 * half] - ratio[:half])[step != 0] / step[step != 0])
-        rays[2 * axis : 2 * axis + 2] = np.median(ratio - slope * place), slope
+        rays[2 * axis : 2 * axis + 2] = np.median(ratio - slope * index), slope
     return rays
 
 
 @kernel
-def _inverse_depth(points, pixel, height, width, reach):
+def _inverse_depth(points, pixel, height, width, max_range):
     inverse = np.full(height * width, np.nan, np.float32)
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if z > 0.0 and x * x + y * y + z * z <= reach * reach:
+        if z > 0.0 and x * x + y * y + z * z <= max_range * max_range:
             inverse[pixel[i]] = 1.0 / z
     return inverse.reshape(height, width)
 
 
 @kernel
-def _supported(points, sigma, pixel, inverse, offsets, deviations, slope, share, least, rays, reach):
+def _supported(points, sigma, pixel, inverse, offsets, rule, slope, rays):
+    max_range, deviations, _, share, least = rule
     height, width = inverse.shape
     enough = int(np.ceil(share * len(offsets)))
     keep = np.zeros(points.shape[0], np.bool_)
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if not (z > 0.0 and x * x + y * y + z * z <= reach * reach):
+        if not (z > 0.0 and x * x + y * y + z * z <= max_range * max_range):
             continue
         row = pixel[i] // width
         col = pixel[i] - row * width
@@ -123,30 +111,21 @@ def _supported(points, sigma, pixel, inverse, offsets, deviations, slope, share,
             present += 1
             if abs(inverse[r, c] - own) <= noise + slope * (k // 8 + 1):
                 agreeing += 1
-                # Enough for a full neighbourhood is enough for any: nearly every point of the ground ends here.
+                # Enough for a full neighbourhood is enough for any. Nearly every ground point ends here.
                 if agreeing >= enough and present >= least:
                     break
         keep[i] = present >= least and agreeing >= share * present
     return keep
 
 
-def supported_reference(
-    points: Array,
-    sigma: Array,
-    pixel: Array,
-    shape: tuple[int, int],
-    reach: float,
-    deviations: float,
-    spread: float,
-    share: float,
-    least: int,
-) -> Array:
+def supported_reference(points: Array, sigma: Array, pixel: Array, shape: tuple[int, int], rule: SupportRule) -> Array:
     """The same as `supported`, in plain numpy: one image-sized shift for each neighbour."""
+    max_range, deviations, slope_ratio, share, least = rule
     p = points.astype(np.float64)
-    near = (p[:, 2] > 0) & ((p**2).sum(axis=1) <= reach**2)
+    near = (p[:, 2] > 0) & ((p**2).sum(axis=1) <= max_range**2)
     inverse = np.full(shape, np.nan, np.float32)
     inverse.ravel()[pixel[near]] = 1 / p[near, 2]
-    slope = spread * usual_slope(inverse)
+    slope = slope_ratio * median_slope(inverse)
     rays = pixel_rays(points, pixel, shape[1])
     row, col = np.divmod(pixel, shape[1])
     own = 1 / np.where(near, p[:, 2], np.nan)

@@ -1,8 +1,8 @@
 """The connected patches of an organised cloud, by union-find in one scan.
 
-Two points are linked where they are next to each other in the image, with no more than a few empty pixels between, and
-their inverse depths differ by what noise and slope explain. A mismatch that covers many pixels supports itself, but it
-is an island; a rock is not, for its foot stands on the ground.
+Two points are linked if they are neighbours in the image, at most a few empty pixels apart, and their inverse depths
+differ by no more than noise and slope explain. A large mismatch supports itself, but it is an island. A rock is
+connected to the ground at its foot.
 """
 
 from __future__ import annotations
@@ -15,19 +15,16 @@ from stages.compiled.jit import kernel
 from stages.compiled.union_find import join, root
 from stages.data import Array
 
-# Pixels looked ahead for the next point: a cloud may hold every 4th only.
-_GAP = 4
+_MAX_STEP = 4  # px to the next point: a cloud may contain only every 4th pixel
 
 
 def depth_images(
     points: Array, sigma: Array, pixel: Array, kept: Array, shape: tuple[int, int], deviations: float
 ) -> tuple[Array, Array]:
-    """Inverse depth, 1/m, and the difference of it that noise may explain, of the points `kept`, as images.
+    """Inverse depth, 1/m, of the points `kept` (M,) int64, and the difference that noise explains, as images.
 
     points: (N, 3) float32 in the camera's frame, m; sigma: (N,) float32, depth standard deviation, m; pixel: (N,)
-    int32; kept: (M,) int64, indices; shape: (H, W); deviations: of a difference, in standard deviations.
-
-    Returns two (H, W) float32 images, NaN where there is no point.
+    int32; deviations: standard deviations. Returns two (H, W) float32 images, NaN without a point.
     """
     images = np.full((2, *shape), np.nan, np.float32)
     _depth_images(points, sigma, pixel, kept, float(deviations) * np.sqrt(2.0), images.reshape(2, -1))
@@ -42,24 +39,22 @@ def _depth_images(points, sigma, pixel, kept, factor, images):
         images[1, pixel[i]] = factor * sigma[i] * inverse * inverse
 
 
-def patches(inverse: Array, tolerance: Array, slope: float) -> Array:
-    """Which pixels are of one patch.
+def connected_patches(inverse: Array, tolerance: Array, slope: float) -> Array:
+    """Labels of the patches, (H, W) int32: the flat index of a patch's first pixel, -1 without a point.
 
-    inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; tolerance: (H, W) float32, difference that noise may
-    explain, 1/m, the larger of two counts; slope: difference allowed besides for each pixel of distance, 1/m.
-
-    Returns (H, W) int32: the flat index of the first pixel of its patch, -1 where there is no point.
+    inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; tolerance: (H, W) float32, difference explained by
+    noise, 1/m, of which the larger of two counts; slope: further difference allowed per pixel of distance, 1/m.
     """
-    return _patches(  # type: ignore[no-any-return]
+    return _connected_patches(  # type: ignore[no-any-return]
         np.ascontiguousarray(inverse), np.ascontiguousarray(tolerance), float(slope)
     )
 
 
 @kernel
 def _linked(inverse, tolerance, slope, row, col, up, left):
-    """Flat index of the next point upwards or leftwards if it is linked to this one, else -1."""
+    """Flat index of the next point above or to the left if it is linked to this one, else -1."""
     width = inverse.shape[1]
-    for gap in range(1, _GAP + 1):
+    for gap in range(1, _MAX_STEP + 1):
         r, c = row - gap * up, col - gap * left
         if r < 0 or c < 0:
             return -1
@@ -70,7 +65,7 @@ def _linked(inverse, tolerance, slope, row, col, up, left):
 
 
 @kernel
-def _patches(inverse, tolerance, slope):
+def _connected_patches(inverse, tolerance, slope):
     height, width = inverse.shape
     parent = np.empty(height * width, np.int32)
     for row in range(height):
@@ -91,8 +86,8 @@ def _patches(inverse, tolerance, slope):
     return parent.reshape(height, width)
 
 
-def patches_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
-    """The same as `patches`: scipy's connected components of the graph of links."""
+def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
+    """The same as `connected_patches`: scipy's connected components of the graph of links."""
     present = inverse > 0
     index = np.arange(inverse.size).reshape(inverse.shape)
     links = []
@@ -103,7 +98,7 @@ def patches_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
             at = np.flatnonzero(line > 0)
             near, far = at[:-1], at[1:]
             limit = np.maximum(noise[near], noise[far]) + slope * (far - near)
-            linked = (far - near <= _GAP) & (np.abs(line[near] - line[far]) <= limit)
+            linked = (far - near <= _MAX_STEP) & (np.abs(line[near] - line[far]) <= limit)
             links.append(np.stack([number[near[linked]], number[far[linked]]]))
     one, other = np.concatenate(links, axis=1)
     graph = coo_array((np.ones(len(one)), (one, other)), shape=(inverse.size, inverse.size))

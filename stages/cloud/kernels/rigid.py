@@ -1,6 +1,6 @@
 """A rigid transform of many points, in one pass, in float64.
 
-A matrix product of the linear algebra library would do, but its last bits depend on how many threads it takes.
+A BLAS matrix product is not used, because its last bits depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -12,10 +12,7 @@ from stages.data import Array
 
 
 def transform_points(points: Array, rotation: Array, translation: Array) -> Array:
-    """`rotation @ p + translation` of every point. points: (N, 3) float32; rotation: (3, 3); translation: (3,).
-
-    Returns (N, 3) float32; sums are float64.
-    """
+    """`rotation @ p + translation` of every point (N, 3) float32, as (N, 3) float32."""
     return _transform_points(  # type: ignore[no-any-return]
         np.ascontiguousarray(points),
         np.ascontiguousarray(rotation, dtype=np.float64),

@@ -1,60 +1,61 @@
 """Triangulation of a rectified disparity image (paper section 4, "Depth Estimation").
 
-Z = fx * baseline / (d + cx_right - cx). One pass counts the pixels that have a point, a second one writes them, so the
-cloud is allocated at its own size and comes out in raster order.
+Z = fx * baseline / (d + cx_right - cx). One pass counts the points, a second one writes them in raster order, so the
+arrays are allocated at their final size.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from stages.compiled.jit import kernel, part
-from stages.data import Array, PixelOrigin, StereoCamera, known
+from stages.compiled.jit import kernel
+from stages.data import Array, Disparity, PixelOrigin, StereoCamera
 
 _FILLED = int(PixelOrigin.FILLED)
 _PLANE = int(PixelOrigin.PLANE)
-_known = part(known)
+_UNKNOWN = int(PixelOrigin.UNKNOWN)
+
+
+class DisparitySigma(NamedTuple):
+    """Standard deviation of a disparity, px; from confidence 1 to confidence 0 it rises geometrically."""
+
+    best: float  # at confidence 1
+    worst: float  # at confidence 0
+    plane: float  # of origin PLANE
+    filled: float  # of origin FILLED
 
 
 def triangulate(
-    disparity: Array,
-    source: Array,
-    confidence: Array,
-    colors: Array,
-    camera: StereoCamera,
-    max_depth: float,
-    filled: bool,
-    sigmas: tuple[float, float, float, float],
+    disparity: Disparity, colors: Array, camera: StereoCamera, sigma: DisparitySigma, max_depth: float, filled: bool
 ) -> tuple[Array, Array, Array, Array]:
     """The points of a disparity image, in the left optical frame, in raster order.
 
-    disparity: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `PixelOrigin`; confidence: (H, W)
-    float32; colors: (H, W) or (H, W, 3) uint8; max_depth: m; filled: whether pixels of source FILLED become points;
-    sigmas: standard deviation of the disparity, px: at confidence 1, at confidence 0 (between the two it falls
-    geometrically), of pixels of source PLANE, and of source FILLED.
+    colors: (H, W) or (H, W, 3) uint8; max_depth: m; filled: whether pixels of origin FILLED become points.
 
     Returns points (N, 3) float32 m, colors (N, 3) uint8, depth standard deviation (N,) float32 m, pixel (N,) int32.
     """
     return _triangulate(  # type: ignore[no-any-return]
-        np.ascontiguousarray(disparity).ravel(),
-        np.ascontiguousarray(source).ravel(),
-        np.ascontiguousarray(confidence).ravel(),
-        np.ascontiguousarray(colors).reshape(disparity.size, -1),
-        disparity.shape[1],
+        np.ascontiguousarray(disparity.pixels).ravel(),
+        np.ascontiguousarray(disparity.source).ravel(),
+        np.ascontiguousarray(disparity.confidence).ravel(),
+        np.ascontiguousarray(colors).reshape(disparity.pixels.size, -1),
+        disparity.pixels.shape[1],
         (camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline, camera.cx_right - camera.cx),
         float(max_depth),
         bool(filled),
-        (float(np.log(sigmas[0])), float(np.log(sigmas[1])), float(sigmas[2]), float(sigmas[3])),
+        (float(np.log(sigma.best)), float(np.log(sigma.worst)), float(sigma.plane), float(sigma.filled)),
     )
 
 
 @kernel
 def _depth(disparity, source, shift, focal_baseline, max_depth, filled):
     """Depth of a pixel, or 0 where it has no point."""
-    if not _known(source) or (source == _FILLED and not filled):
+    if source == _UNKNOWN or (source == _FILLED and not filled):
         return 0.0
     effective = disparity + shift
-    # Written so that NaN, a point behind the camera and one beyond max_depth all fail the one comparison.
+    # NaN, a point behind the camera and a point beyond max_depth all fail this one comparison.
     return focal_baseline / effective if effective * max_depth >= focal_baseline and np.isfinite(effective) else 0.0
 
 
@@ -93,27 +94,21 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
 
 
 def triangulate_reference(
-    disparity: Array,
-    source: Array,
-    confidence: Array,
-    colors: Array,
-    camera: StereoCamera,
-    max_depth: float,
-    filled: bool,
-    sigmas: tuple[float, float, float, float],
+    disparity: Disparity, colors: Array, camera: StereoCamera, sigma: DisparitySigma, max_depth: float, filled: bool
 ) -> tuple[Array, Array, Array, Array]:
     """The same as `triangulate`, in plain numpy."""
-    effective = disparity.astype(np.float64) + camera.cx_right - camera.cx
-    wanted = np.isfinite(effective) & known(source) & (filled | (source != PixelOrigin.FILLED))
+    source, confidence = disparity.source, disparity.confidence
+    effective = disparity.pixels.astype(np.float64) + camera.cx_right - camera.cx
+    wanted = np.isfinite(effective) & (source != PixelOrigin.UNKNOWN) & (filled | (source != PixelOrigin.FILLED))
     wanted &= np.where(wanted, effective, 0) * max_depth >= camera.fx * camera.baseline
     v, u = np.nonzero(wanted)
     z = camera.fx * camera.baseline / effective[v, u]
     points = np.column_stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z])
     rgb = colors[v, u] if colors.ndim == 3 else np.repeat(colors[v, u][:, None], 3, axis=1)
     trust = np.clip(np.nan_to_num(confidence[v, u].astype(np.float64)), 0, 1)
-    sigma_d = sigmas[1] * (sigmas[0] / sigmas[1]) ** trust
-    sigma_d = np.where(source[v, u] == PixelOrigin.PLANE, sigmas[2], sigma_d)
-    sigma_d = np.where(source[v, u] == PixelOrigin.FILLED, sigmas[3], sigma_d)
-    sigma = z * z / (camera.fx * camera.baseline) * sigma_d
-    pixel = v * disparity.shape[1] + u
-    return points.astype(np.float32), rgb, sigma.astype(np.float32), pixel.astype(np.int32)
+    sigma_d = sigma.worst * (sigma.best / sigma.worst) ** trust
+    sigma_d = np.where(source[v, u] == PixelOrigin.PLANE, sigma.plane, sigma_d)
+    sigma_d = np.where(source[v, u] == PixelOrigin.FILLED, sigma.filled, sigma_d)
+    sigma_z = z * z / (camera.fx * camera.baseline) * sigma_d
+    pixel = v * disparity.pixels.shape[1] + u
+    return points.astype(np.float32), rgb, sigma_z.astype(np.float32), pixel.astype(np.int32)

@@ -1,7 +1,6 @@
-"""Counts and mean colours of the cubes that points fall in.
+"""Counts and mean colours of occupied voxels.
 
-The points are sorted by the column of cubes they stand in, by counting, so that a column's levels fit in a short list;
-no table of all cubes is needed, nor a comparison of two points.
+A counting sort by column of voxels keeps the sums of one column at a time, so no table of all voxels is needed.
 """
 
 from __future__ import annotations
@@ -13,12 +12,10 @@ from stages.data import Array
 
 
 def voxel_means(points: Array, colors: Array, edge: float) -> tuple[Array, Array, Array]:
-    """The cubes of `edge` m, aligned with the origin, that hold points.
+    """The occupied voxels of `edge` m; a voxel spans index * edge to (index + 1) * edge.
 
-    points: (N, 3) float32, m, finite; colors: (N, 3) uint8.
-
-    Returns index (M, 3) int32, a cube reaching from index * edge to (index + 1) * edge, ordered by y, x, z; count (M,)
-    int32 of its points; and their mean colour (M, 3) uint8, rounded down.
+    points: (N, 3) float32, m, finite; colors: (N, 3) uint8. Returns index (M, 3) int32 in the order of y, x, z, the
+    number of points (M,) int32, and their mean colour (M, 3) uint8, rounded down.
     """
     if not len(points):
         return np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros((0, 3), np.uint8)
@@ -30,26 +27,26 @@ def voxel_means(points: Array, colors: Array, edge: float) -> tuple[Array, Array
 def _voxel_means(points, colors, edge):
     n = points.shape[0]
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
-    for axis in range(3):  # numpy takes four times as long for this as all the rest does
-        least = most = points[0, axis]
+    for axis in range(3):  # numpy would take four times as long as the rest
+        lowest = highest = points[0, axis]
         for i in range(n):
-            least, most = min(least, points[i, axis]), max(most, points[i, axis])
-        low[axis], high[axis] = int(np.floor(np.float64(least) / edge)), int(np.floor(np.float64(most) / edge))
+            lowest, highest = min(lowest, points[i, axis]), max(highest, points[i, axis])
+        low[axis], high[axis] = int(np.floor(np.float64(lowest) / edge)), int(np.floor(np.float64(highest) / edge))
     cols, rows, levels = high[0] - low[0] + 1, high[1] - low[1] + 1, high[2] - low[2] + 1
-    place, height = np.empty(n, np.int32), np.empty(n, np.int32)
+    column, height = np.empty(n, np.int32), np.empty(n, np.int32)
     start = np.zeros(rows * cols + 1, np.int64)
     for i in range(n):
         col = int(np.floor(np.float64(points[i, 0]) / edge)) - low[0]
         row = int(np.floor(np.float64(points[i, 1]) / edge)) - low[1]
-        place[i] = row * cols + col
+        column[i] = row * cols + col
         height[i] = int(np.floor(np.float64(points[i, 2]) / edge)) - low[2]
-        start[place[i] + 1] += 1
+        start[column[i] + 1] += 1
     for k in range(rows * cols):
         start[k + 1] += start[k]
     order, end = np.empty(n, np.int32), start[:-1].copy()
     for i in range(n):
-        order[end[place[i]]] = i
-        end[place[i]] += 1
+        order[end[column[i]]] = i
+        end[column[i]] += 1
     index, count, total = np.empty((n, 3), np.int32), np.empty(n, np.int32), np.empty((n, 3), np.int32)
     sums = np.zeros((levels, 4), np.int32)  # of one column: points, red, green, blue
     found = 0
@@ -75,8 +72,8 @@ def _voxel_means(points, colors, edge):
 
 def voxel_means_reference(points: Array, colors: Array, edge: float) -> tuple[Array, Array, Array]:
     """The same as `voxel_means`, in plain numpy."""
-    cubes = np.floor(points.astype(np.float64) / edge).astype(np.int32)
-    order, which, count = np.unique(cubes[:, [1, 0, 2]], axis=0, return_inverse=True, return_counts=True)
+    voxels = np.floor(points.astype(np.float64) / edge).astype(np.int32)
+    order, which, count = np.unique(voxels[:, [1, 0, 2]], axis=0, return_inverse=True, return_counts=True)
     which = which.ravel()
     total = np.stack([np.bincount(which, colors[:, c], minlength=len(order)) for c in range(3)], axis=1)
     return order[:, [1, 0, 2]], count.astype(np.int32), (total // count[:, None]).astype(np.uint8)

@@ -16,7 +16,7 @@ from flow.contracts import Finding, Severity
 from stages.data import Array, CameraMotion, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.localisation.tilt.causes import Evidence
 from stages.localisation.tilt.diagnosis import INCONSISTENT, Diagnosis, diagnose, off_level
-from stages.robust_weights import NORMAL, tukey_weights
+from stages.robust_weights import MAD_TO_SIGMA, tukey_weights
 from stages.stage import Stage, parameter
 
 MOVED = 0.05  # m, or
@@ -178,7 +178,7 @@ def _ground_normal(cloud: PointCloud) -> Array:
         values, axes = np.linalg.eigh(spread.T @ spread / weights.sum())
         normal = axes[:, 0]
         distance = (some - centre) @ normal
-        scale = max(NORMAL * float(np.median(np.abs(distance))), GROUND_NOISE)
+        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(distance))), GROUND_NOISE)
         weights = tukey_weights(distance, scale) + 1e-9
     if values[1] < 4 * values[0]:  # a heap of points rather than a plane
         return np.full(3, np.nan)

@@ -1,6 +1,6 @@
-"""How the cells of a height grid lie to the four beside them: slope, and height off their mean.
+"""Gradient and curvature of a height grid, from the four neighbours of each cell.
 
-Where one of two opposite neighbours is missing the slope is that to the other one; where both are, there is none.
+The slope is the mean of those to the two opposite neighbours, or the one that exists, or 0.
 """
 
 from __future__ import annotations
@@ -12,20 +12,18 @@ from stages.data import Array
 
 
 def gradient_and_curvature(heights: Array) -> Array:
-    """Slopes and bend at every cell.
+    """Rise per cell along columns (x) and rows (y), and height above the mean of the neighbours.
 
-    heights: (rows, cols) float64, NaN = unknown.
-
-    Returns (3, rows, cols) float64: the rise per cell along columns (x) and along rows (y), 0 without neighbours there,
-    and the height above the mean of the neighbours, 0 without any; NaN where the cell itself is unknown.
+    heights: (rows, cols) float64, NaN = unknown. Returns (3, rows, cols) float64, NaN where the cell is unknown and 0
+    without neighbours.
     """
-    return _lie_of_cells(np.ascontiguousarray(heights))  # type: ignore[no-any-return]
+    return _gradient_and_curvature(np.ascontiguousarray(heights))  # type: ignore[no-any-return]
 
 
 @kernel
-def _lie_of_cells(heights):
+def _gradient_and_curvature(heights):
     rows, cols = heights.shape
-    lie = np.full((3, rows, cols), np.nan)
+    result = np.full((3, rows, cols), np.nan)
     for row in range(rows):
         for col in range(cols):
             here = heights[row, col]
@@ -42,12 +40,12 @@ def _lie_of_cells(heights):
                     total += heights[r, c]
                     sides += 1
                 found += sides
-                lie[axis, row, col] = rise / sides if sides else 0.0
-            lie[2, row, col] = here - total / found if found else 0.0
-    return lie
+                result[axis, row, col] = rise / sides if sides else 0.0
+            result[2, row, col] = here - total / found if found else 0.0
+    return result
 
 
-def lie_of_cells_reference(heights: Array) -> Array:
+def gradient_and_curvature_reference(heights: Array) -> Array:
     """The same as `gradient_and_curvature`, in plain numpy."""
     around = np.pad(heights, 1, constant_values=np.nan)
     west, east, south, north = around[1:-1, :-2], around[1:-1, 2:], around[:-2, 1:-1], around[2:, 1:-1]
@@ -57,6 +55,6 @@ def lie_of_cells_reference(heights: Array) -> Array:
         known = np.isfinite(stack)
         return np.asarray(np.where(known, stack, 0).sum(0) / np.maximum(known.sum(0), 1))
 
-    lie = np.stack([mean(east - heights, heights - west), mean(north - heights, heights - south),
-                    -mean(*(side - heights for side in (west, east, south, north)))])  # fmt: skip
-    return np.where(np.isnan(heights), np.nan, lie)
+    result = np.stack([mean(east - heights, heights - west), mean(north - heights, heights - south),
+                       -mean(*(side - heights for side in (west, east, south, north)))])  # fmt: skip
+    return np.where(np.isnan(heights), np.nan, result)

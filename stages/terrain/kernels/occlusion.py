@@ -1,9 +1,8 @@
-"""Which empty cells of a grid were hidden from the camera, as against never looked at, and below what they lie.
+"""Occluded cells: which empty cells were hidden from the camera, and the line of sight below which they lie.
 
-Up a column of the image the ground recedes. Where two neighbouring points of a column lie cells apart, the line of
-sight has jumped over what lies between: it is behind the nearer one, or was not matched. So is what lies beyond the
-last point of a column, up to the end of the region. Empty cells that no such line crosses were never in view. What is
-hidden lies below the line that jumps over it, or it would be seen.
+Up a column of the image the ground recedes. If two neighbouring points of a column are more than a cell apart, the
+cells between them are occluded or were not matched. So are the cells behind the last point of a column, up to the
+maximum range. Empty cells that no such line crosses were never in view.
 """
 
 from __future__ import annotations
@@ -12,39 +11,31 @@ import numpy as np
 
 from stages.compiled.jit import kernel
 from stages.data import Array
+from stages.terrain.kernels.grid import Grid
 
 
-def lowest_sight(
-    points: Array,
-    pixel: Array,
-    width: int,
-    camera: tuple[float, float, float],
-    resolution: float,
-    origin: tuple[float, float],
-    size: int,
-    region: float,
-) -> Array:
-    """The height, m, of the lowest line of sight that jumps over a cell, (size, size) float64, NaN where none does; be
-    there points of other lines in the cell or not.
+def occlusion_ceiling(points: Array, pixel: Array, width: int, camera: Array, grid: Grid) -> Array:
+    """Height, m, of the lowest line of sight that passes over each cell, (size, size) float64, NaN without one.
 
     points: (N, 3) float32 in the level frame, m; pixel: (N,) int32, ascending, index into an image of `width` columns;
-    camera: where it is, m; resolution, origin, size: the grid; region: m, the largest range from (0, 0).
+    camera: (3,) position, m. Cells with points of other lines get a height too.
     """
-    lowest = np.full((size, size), np.nan)
-    x, y, z = camera
-    _lowest_sight(
-        np.ascontiguousarray(points), np.ascontiguousarray(pixel), int(width), float(x), float(y), float(z),
-        1.0 / resolution, float(origin[0]), float(origin[1]), float(region), lowest,
-    )  # fmt: skip
-    return lowest
+    resolution, (x0, y0), size, max_range = grid
+    ceiling = np.full((size, size), np.nan)
+    eye = (float(camera[0]), float(camera[1]), float(camera[2]))
+    raster = (1.0 / resolution, float(x0), float(y0), float(max_range))
+    _occlusion_ceiling(np.ascontiguousarray(points), np.ascontiguousarray(pixel), int(width), eye, raster, ceiling)
+    return ceiling
 
 
 @kernel
-def _mark(lowest, x, y, z, dx, dy, dz, length, cells_per_metre, x0, y0, region):
-    """Lower the cells under the line from (x, y, z), in direction (dx, dy, dz), (dx, dy) a unit vector, to it; sampled
-    four times a cell, where it is within the region, be it ever so long."""
-    size = lowest.shape[0]
-    middle, aside, reach = -(x * dx + y * dy), x * dy - y * dx, region + 1.0 / cells_per_metre
+def _lower(ceiling, x, y, z, dx, dy, dz, length, raster):
+    """Lower the ceiling to a line from (x, y, z) along (dx, dy, dz), where (dx, dy) is a unit vector.
+
+    The line is sampled four times a cell, only within the range, however long it is."""
+    cells_per_metre, x0, y0, max_range = raster
+    size = ceiling.shape[0]
+    middle, aside, reach = -(x * dx + y * dy), x * dy - y * dx, max_range + 1.0 / cells_per_metre
     if not abs(aside) <= reach:
         return
     half = np.sqrt(reach * reach - aside * aside)
@@ -54,14 +45,15 @@ def _mark(lowest, x, y, z, dx, dy, dz, length, cells_per_metre, x0, y0, region):
         way = k / (4.0 * cells_per_metre)
         px, py = x + dx * way, y + dy * way
         col, row = int(np.floor((px - x0) * cells_per_metre)), int(np.floor((py - y0) * cells_per_metre))
-        if 0 <= row < size and 0 <= col < size and px * px + py * py <= region * region:
+        if 0 <= row < size and 0 <= col < size and px * px + py * py <= max_range * max_range:
             height = z + dz * way
-            if not lowest[row, col] <= height:
-                lowest[row, col] = height
+            if not ceiling[row, col] <= height:
+                ceiling[row, col] = height
 
 
 @kernel
-def _lowest_sight(points, pixel, width, camera_x, camera_y, camera_z, cells_per_metre, x0, y0, region, lowest):
+def _occlusion_ceiling(points, pixel, width, eye, raster, ceiling):
+    cells_per_metre, max_range = raster[0], raster[3]
     last = np.full(width, -1, np.int64)
     for i in range(points.shape[0] - 1, -1, -1):
         column = pixel[i] % width
@@ -73,44 +65,34 @@ def _lowest_sight(points, pixel, width, camera_x, camera_y, camera_z, cells_per_
         dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
         length = np.sqrt(dx * dx + dy * dy)
         if length * cells_per_metre > 1.0:
-            dx, dy, dz = dx / length, dy / length, dz / length
-            _mark(lowest, x, y, z, dx, dy, dz, length, cells_per_metre, x0, y0, region)
+            _lower(ceiling, x, y, z, dx / length, dy / length, dz / length, length, raster)
     for column in range(width):
         end = last[column]
         if end < 0:
             continue
         x, y, z = np.float64(points[end, 0]), np.float64(points[end, 1]), np.float64(points[end, 2])
-        dx, dy, dz = x - camera_x, y - camera_y, z - camera_z
+        dx, dy, dz = x - eye[0], y - eye[1], z - eye[2]
         length = np.sqrt(dx * dx + dy * dy)
-        if length > 0.0 and x * x + y * y < region * region:
-            dx, dy, dz = dx / length, dy / length, dz / length
-            _mark(lowest, x, y, z, dx, dy, dz, 2.0 * region, cells_per_metre, x0, y0, region)
+        if length > 0.0 and x * x + y * y < max_range * max_range:
+            _lower(ceiling, x, y, z, dx / length, dy / length, dz / length, 2.0 * max_range, raster)
 
 
-def lowest_sight_reference(
-    points: Array,
-    pixel: Array,
-    width: int,
-    camera: tuple[float, float, float],
-    resolution: float,
-    origin: tuple[float, float],
-    size: int,
-    region: float,
-) -> Array:
-    """The same as `lowest_sight`, one image column at a time, in plain numpy."""
-    lowest = np.full((size, size), np.inf)
+def occlusion_ceiling_reference(points: Array, pixel: Array, width: int, camera: Array, grid: Grid) -> Array:
+    """The same as `occlusion_ceiling`, one image column at a time, in plain numpy."""
+    resolution, origin, size, max_range = grid
+    ceiling = np.full((size, size), np.inf)
     for column in np.unique(pixel % width):
         line = points[pixel % width == column][::-1].astype(np.float64)
         for start, end in zip(line, [*line[1:], None], strict=True):
             way = start - camera if end is None else end - start
             length = np.hypot(*way[:2])
-            reach = 2 * region if end is None else length
-            if length == 0 or (start[:2] @ start[:2] >= region**2 if end is None else length <= resolution):
+            reach = 2 * max_range if end is None else length
+            if length == 0 or (start[:2] @ start[:2] >= max_range**2 if end is None else length <= resolution):
                 continue
             steps = np.arange(1, int(reach / resolution * 4) + 1) * resolution / 4
-            places = start + way / length * steps[:, None]
-            col, row = np.floor((places[:, :2] - origin) / resolution).astype(int).T
+            samples = start + way / length * steps[:, None]
+            col, row = np.floor((samples[:, :2] - origin) / resolution).astype(int).T
             on_grid = (np.minimum(col, row) >= 0) & (np.maximum(col, row) < size)
-            on_grid &= (places[:, :2] ** 2).sum(axis=1) <= region**2
-            np.minimum.at(lowest, (row[on_grid], col[on_grid]), places[on_grid, 2])
-    return np.where(np.isfinite(lowest), lowest, np.nan)
+            on_grid &= (samples[:, :2] ** 2).sum(axis=1) <= max_range**2
+            np.minimum.at(ceiling, (row[on_grid], col[on_grid]), samples[on_grid, 2])
+    return np.where(np.isfinite(ceiling), ceiling, np.nan)

@@ -1,8 +1,8 @@
-"""Least-squares planes over a square window about every cell of a grid, cells without weight left out.
+"""Least-squares planes over a square window around every cell of a grid.
 
-A fit needs ten sums over the window. They are kept running, first down the columns and then along the row, so a cell
-costs the same whatever the window's size; coordinates are shifted to the window's centroid before anything is divided.
-The sums of a row are written down first and then solved without a branch, so that the processor takes several at once.
+A fit needs ten sums over the window. They are running sums, first down the columns and then along the row, so the cost
+of a cell does not depend on the window's size. The sums of a row are stored first and then solved without a branch, so
+that the loop is vectorised.
 """
 
 from __future__ import annotations
@@ -12,30 +12,28 @@ import numpy as np
 from stages.compiled.jit import kernel
 from stages.data import Array
 
-# Least determinant / trace of the cells' spread, which is close to its smaller eigenvalue: 1/3 of 3x3 cells, at most
-# 1/4 of a band two cells wide, which has no slope across. No ratio of small integers equals it, so that rounding does
-# not decide.
-_NARROWEST = 0.2929
+# Smallest determinant / trace of the covariance of the cells' positions, close to its smaller eigenvalue: 1/3 for 3x3
+# cells, at most 1/4 for a band two cells wide. No ratio of small integers equals it, so rounding does not decide.
+_MIN_WINDOW_WIDTH = 0.2929
 
 
-def window_planes(heights: Array, use: Array, radius: int, leverage: float) -> Array:
-    """The plane fitted to the window of (2 * radius + 1)^2 cells about each cell.
+def window_planes(heights: Array, use: Array, radius: int, max_variance: float) -> Array:
+    """The plane fitted to the window of (2 * radius + 1)^2 cells around each cell.
 
-    heights: (rows, cols) float64, finite where `use`; use: (rows, cols) bool, the cells that count; leverage: the
-    largest variance of the plane's height at the cell, in multiples of one cell's (1 / n in the middle of n cells, more
-    at their edge), for a fit to be believed.
+    heights: (rows, cols) float64, finite where `use`; use: (rows, cols) bool, the cells that count; max_variance: of
+    the plane's height at the cell, in multiples of one cell's (1 / n in the middle of n cells, more at their edge).
 
     Returns (4, rows, cols) float64: the plane's height at the cell, its slopes per cell along columns (x) and rows (y),
-    and the root mean square of the window's residuals. NaN where the cells used are too few, or too nearly in a line.
+    and the RMS of the window's residuals; NaN if the cells are too few or nearly collinear.
     """
     planes = np.empty((4, *heights.shape))
-    _window_planes(np.ascontiguousarray(heights), np.ascontiguousarray(use), int(radius), float(leverage), planes)
+    _window_planes(np.ascontiguousarray(heights), np.ascontiguousarray(use), int(radius), float(max_variance), planes)
     return planes
 
 
 @kernel
 def _add_row(sums, heights, use, row, sign):
-    """Add (sign 1) or take away (sign -1) one row from the six sums of every column."""
+    """Add (sign 1) or subtract (sign -1) one row from the six sums of every column."""
     for col in range(heights.shape[1]):
         if use[row, col]:
             z = heights[row, col]
@@ -49,7 +47,7 @@ def _add_row(sums, heights, use, row, sign):
 
 
 @kernel
-def _window_planes(heights, use, radius, leverage, planes):
+def _window_planes(heights, use, radius, max_variance, planes):
     rows, cols = heights.shape
     sums = np.zeros((cols, 6))
     windows = np.empty((10, cols))
@@ -61,7 +59,7 @@ def _window_planes(heights, use, radius, leverage, planes):
         if row - radius - 1 >= 0:
             _add_row(sums, heights, use, row - radius - 1, -1.0)
         _sum_up(sums, radius, windows)
-        _solve(windows, row, leverage, planes[0, row], planes[1, row], planes[2, row], planes[3, row])
+        _solve(windows, row, max_variance, planes[0, row], planes[1, row], planes[2, row], planes[3, row])
 
 
 @kernel
@@ -93,9 +91,8 @@ def _sum_up(sums, radius, windows):
 
 
 @kernel
-def _solve(windows, row, leverage, height, along, across, rough):
-    """The planes, (cols,) each of their four numbers, of a row's windows; NaN where the points are too few, or too
-    nearly in a line."""
+def _solve(windows, row, max_variance, height, along, across, rough):
+    """The planes of a row's windows, four numbers (cols,) each; NaN if a plane is not determined."""
     for col in range(windows.shape[1]):
         n, sx, sy, sz = windows[0, col], windows[1, col], windows[2, col], windows[3, col]
         sxx, sxy, syy = windows[4, col], windows[5, col], windows[6, col]
@@ -107,10 +104,10 @@ def _solve(windows, row, leverage, height, along, across, rough):
         dx, dy = col - mx, row - my
         gx = (vyy * vxz - vxy * vyz) / determinant
         gy = (vxx * vyz - vxy * vxz) / determinant
-        # Of the height at the cell, in n-ths of one cell's variance
+        # of the height at the cell, in n-ths of one cell's variance
         variance = 1.0 + (vyy * dx * dx - 2.0 * vxy * dx * dy + vxx * dy * dy) / determinant
-        spread = determinant >= _NARROWEST * (vxx + vyy)
-        known = (n >= 3.0) & spread & (variance <= leverage * n)
+        wide = determinant >= _MIN_WINDOW_WIDTH * (vxx + vyy)
+        known = (n >= 3.0) & wide & (variance <= max_variance * n)
         residual = vzz - gx * vxz - gy * vyz
         height[col] = mz + gx * dx + gy * dy if known else np.nan
         along[col] = gx if known else np.nan
@@ -118,7 +115,7 @@ def _solve(windows, row, leverage, height, along, across, rough):
         rough[col] = np.sqrt(residual if residual > 0.0 else 0.0) if known else np.nan
 
 
-def window_planes_reference(heights: Array, use: Array, radius: int, leverage: float) -> Array:
+def window_planes_reference(heights: Array, use: Array, radius: int, max_variance: float) -> Array:
     """The same as `window_planes`: numpy's least squares, one window at a time."""
     planes = np.full((4, *heights.shape), np.nan)
     for row, col in np.ndindex(*heights.shape):
@@ -129,11 +126,11 @@ def window_planes_reference(heights: Array, use: Array, radius: int, leverage: f
         if n < 3:
             continue
         dx, dy = dx + left - col, dy + top - row
-        spread = np.cov(dx, dy, bias=True)
-        if np.linalg.det(spread) < _NARROWEST * np.trace(spread):
+        covariance = np.cov(dx, dy, bias=True)
+        if np.linalg.det(covariance) < _MIN_WINDOW_WIDTH * np.trace(covariance):
             continue
         design = np.column_stack([np.ones(n), dx, dy]).astype(float)
-        if np.linalg.inv(design.T @ design)[0, 0] > leverage:
+        if np.linalg.inv(design.T @ design)[0, 0] > max_variance:
             continue
         fit = np.linalg.lstsq(design, z, rcond=None)[0]
         planes[:3, row, col] = fit

@@ -1,4 +1,4 @@
-"""Clean finds gross errors at every range, and takes little else with them."""
+"""Clean removes gross errors at every range and keeps valid points."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from stages.cloud.clean import Clean
 from stages.cloud.kernels.depth_order import out_of_order, out_of_order_reference
-from stages.cloud.kernels.outliers import supported, supported_reference
-from stages.cloud.kernels.patches import patches, patches_reference
+from stages.cloud.kernels.outliers import SupportRule, supported, supported_reference
+from stages.cloud.kernels.patches import connected_patches, connected_patches_reference
 from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, PixelOrigin, PointCloud, Transform
 from tests.stages.terrain.terrain_scene import (
@@ -34,7 +34,7 @@ def cloud_with_noise(seed: int = 0, sigma: float = 0.25) -> PointCloud:
 
 
 def with_floaters(cloud: PointCloud, share: float, seed: int = 1) -> tuple[PointCloud, Array]:
-    """Some points moved along their pixels' rays, off the ground by 0.5 m or more."""
+    """The cloud with some points moved along their pixel rays by 0.5 m or more off the ground, and which ones."""
     random = np.random.default_rng(seed)
     floats = random.random(len(cloud.points)) < share
     factor = random.uniform(0.15, 0.6, len(cloud.points))
@@ -50,7 +50,7 @@ def horizontal_range(cloud: PointCloud) -> Array:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.25])
-def test_finds_98_percent_of_floaters_and_loses_half_a_percent_of_valid_points_in_every_ring(noise: float) -> None:
+def test_clean_finds_98_percent_of_floaters_and_keeps_99_5_of_valid_points(noise: float) -> None:
     clean = cloud_with_noise(sigma=noise)
     distance = horizontal_range(clean)
     cloud, floats = with_floaters(clean, 0.02)
@@ -64,7 +64,7 @@ def test_finds_98_percent_of_floaters_and_loses_half_a_percent_of_valid_points_i
 
 
 @pytest.mark.parametrize("stride", [2, 3, 4])
-def test_a_cloud_of_every_nth_pixel_is_judged_as_well(stride: int) -> None:
+def test_a_subsampled_cloud_is_cleaned_as_well(stride: int) -> None:
     cloud, floats = with_floaters(cloud_with_noise(), 0.02)
     row, col = np.divmod(cloud.pixel, CAMERA.width)
     take = (row % stride == 0) & (col % stride == 0)
@@ -75,7 +75,7 @@ def test_a_cloud_of_every_nth_pixel_is_judged_as_well(stride: int) -> None:
     assert (~kept[inside & ~floats[take]]).mean() <= 0.005
 
 
-def test_points_off_their_pixels_rays_go_too() -> None:
+def test_points_off_their_pixel_rays_are_dropped() -> None:
     cloud = cloud_with_noise()
     lifted = np.random.default_rng(4).random(len(cloud.points)) < 0.01
     points = cloud.points - np.where(lifted, 0.5, 0)[:, None].astype(np.float32) * level_from_camera()[2] * -1
@@ -85,7 +85,7 @@ def test_points_off_their_pixels_rays_go_too() -> None:
     assert (~kept[inside & ~lifted]).mean() <= 0.005
 
 
-def test_a_speck_of_three_by_three_pixels_goes_and_a_rock_stays() -> None:
+def test_a_speck_of_nine_pixels_is_dropped_and_a_rock_is_kept() -> None:
     d = seen_disparity(((4.0, 0.0, 0.25),))
     d[300:303, 100:103] *= 2
     rock = seen_disparity(((4.0, 0.0, 0.25),)) - seen_disparity(()) > 1.0
@@ -94,7 +94,7 @@ def test_a_speck_of_three_by_three_pixels_goes_and_a_rock_stays() -> None:
     assert np.isin(np.flatnonzero(rock), pixels).mean() > 0.99
 
 
-def test_a_mismatch_of_a_hundred_pixels_that_supports_itself_goes() -> None:
+def test_an_isolated_patch_of_a_hundred_pixels_is_dropped() -> None:
     d = seen_disparity()
     d[300:308, 100:112] *= 2
     cloud = Reproject()(blank_frame(), as_disparity(d))
@@ -103,41 +103,41 @@ def test_a_mismatch_of_a_hundred_pixels_that_supports_itself_goes() -> None:
     assert np.isin(patch[20:70], Clean(min_patch_share=0.0)(cloud).pixel).any()
 
 
-@pytest.mark.parametrize("made_up", [PixelOrigin.PLANE, PixelOrigin.FILLED])
-def test_what_refinement_made_up_supports_nobody_and_is_kept_within_the_crop(made_up: PixelOrigin) -> None:
+@pytest.mark.parametrize("origin", [PixelOrigin.PLANE, PixelOrigin.FILLED])
+def test_filled_points_support_no_other_and_are_only_cropped(origin: PixelOrigin) -> None:
     d = seen_disparity()
     d[300:303, 100:103] *= 2
     disparity = as_disparity(d)
     source = disparity.source.copy()
-    source[290:312, 90:112][source[290:312, 90:112] > 0] = made_up
+    source[290:312, 90:112][source[290:312, 90:112] > 0] = origin
     source[300:303, 100:103] = PixelOrigin.MEASURED
-    pixels = np.where(source == made_up, np.float32(d[301, 101]), disparity.pixels)
+    pixels = np.where(source == origin, np.float32(d[301, 101]), disparity.pixels)
     cloud = Reproject(include_filled=True)(blank_frame(), replace(disparity, pixels=pixels, source=source))
     clean = Clean()(cloud)
     assert clean.source is not None
     assert cloud.source is not None
-    assert 301 * 640 + 101 not in clean.pixel  # a speck, though all the filled pixels about it agree
-    assert (clean.source == made_up).sum() == (cloud.source == made_up).sum() > 400
-    far = replace(disparity, pixels=np.where(source == made_up, np.float32(12.0), pixels), source=source)
-    assert (Clean()(Reproject(include_filled=True)(blank_frame(), far)).source == made_up).sum() == 0
+    assert 301 * 640 + 101 not in clean.pixel  # a speck, although all filled pixels around it agree
+    assert (clean.source == origin).sum() == (cloud.source == origin).sum() > 400
+    far = replace(disparity, pixels=np.where(source == origin, np.float32(12.0), pixels), source=source)
+    assert (Clean()(Reproject(include_filled=True)(blank_frame(), far)).source == origin).sum() == 0
 
 
-def test_patch_kernel_equals_scipys_connected_components() -> None:
+def test_patch_kernel_equals_scipy_connected_components() -> None:
     random = np.random.default_rng(7)
     inverse = random.integers(1, 4, (40, 50)).astype(np.float32)
     inverse[random.random(inverse.shape) < 0.4] = np.nan
     tolerance = random.uniform(0, 0.6, inverse.shape).astype(np.float32)
-    got, want = patches(inverse, tolerance, 0.2), patches_reference(inverse, tolerance, 0.2)
+    got, want = connected_patches(inverse, tolerance, 0.2), connected_patches_reference(inverse, tolerance, 0.2)
     assert len(np.unique(want)) > 8
     np.testing.assert_array_equal(got, want)
 
 
-def test_order_kernel_equals_the_plain_reference() -> None:
+def test_depth_order_kernel_equals_the_reference() -> None:
     random = np.random.default_rng(8)
     coarse = random.uniform(0.1, 0.5, (10, 12)).repeat(5, 0).repeat(5, 1)
     inverse = (coarse + random.normal(0, 0.002, coarse.shape)).astype(np.float32)
     inverse[random.random(inverse.shape) < 0.3] = np.nan
-    patch = patches(inverse, np.full(inverse.shape, 0.01, np.float32), 0.001)
+    patch = connected_patches(inverse, np.full(inverse.shape, 0.01, np.float32), 0.001)
     got = out_of_order(inverse, patch)
     assert 0 < got.sum() < np.isfinite(inverse).sum()
     np.testing.assert_array_equal(got, out_of_order_reference(inverse, patch))
@@ -148,7 +148,7 @@ def test_order_kernel_equals_the_plain_reference() -> None:
     [((0, 60), (200, 300), 45.0), ((110, 150), (200, 400), 17.0), ((400, 480), (100, 500), 14.0)],
     ids=["in the sky", "above far ground", "under the ground"],
 )
-def test_a_large_patch_goes_where_nothing_can_be(
+def test_a_large_patch_in_the_sky_or_under_the_ground_is_dropped(
     rows: tuple[int, int], columns: tuple[int, int], disparity: float
 ) -> None:
     d = seen_disparity(((4.0, 0.0, 0.25),))
@@ -162,11 +162,17 @@ def test_a_large_patch_goes_where_nothing_can_be(
     assert np.isin(np.flatnonzero(rock), pixels).mean() > 0.99
 
 
-def test_kernel_equals_the_plain_reference() -> None:
+def test_support_kernel_equals_the_reference() -> None:
     cloud, _ = with_floaters(cloud_with_noise(5), 0.05)
     random = np.random.default_rng(6)
     some = random.random(len(cloud.points)) < 0.4
-    arguments = (cloud.points[some], cloud.sigma[some], cloud.pixel[some], (480, 640), 9.0, 3.0, 2.0, 0.3, 4)
+    arguments = (
+        cloud.points[some],
+        cloud.sigma[some],
+        cloud.pixel[some],
+        (480, 640),
+        SupportRule(9.0, 3.0, 2.0, 0.3, 4),
+    )
     got, want = supported(*arguments), supported_reference(*arguments)
     assert 0 < got.sum() < some.sum()
     assert (got != want).mean() < 1e-5
@@ -174,14 +180,14 @@ def test_kernel_equals_the_plain_reference() -> None:
 
 @settings(max_examples=10, deadline=None)
 @given(scale=st.sampled_from([0.25, 0.5, 2.0, 4.0]))
-def test_a_scene_twice_as_large_seen_with_twice_the_baseline_is_judged_alike(scale: float) -> None:
+def test_a_scaled_scene_with_a_scaled_baseline_keeps_the_same_points(scale: float) -> None:
     cloud, _ = with_floaters(cloud_with_noise(), 0.02)
     larger = replace(cloud, points=cloud.points * np.float32(scale), sigma=cloud.sigma * np.float32(scale))
     once, again = Clean(margin=0)(cloud), Clean(max_range=8 * scale, margin=0)(larger)
     np.testing.assert_array_equal(once.pixel, again.pixel)
 
 
-def test_crops_about_the_camera_before_it_judges() -> None:
+def test_the_crop_is_a_ball_around_the_camera() -> None:
     cloud = cloud_with_noise()
     kept = Clean(max_range=5.0, margin=0.5)(cloud)
     assert 5.4 < np.linalg.norm(kept.points, axis=1).max() <= 5.5
@@ -190,7 +196,7 @@ def test_crops_about_the_camera_before_it_judges() -> None:
     assert np.isin(cloud.pixel[on_the_ground], kept.pixel).mean() > 0.995
 
 
-def test_the_papers_filter_takes_out_points_far_from_all_others() -> None:
+def test_knn_drops_points_far_from_all_others() -> None:
     d = np.full((480, 640), np.nan)
     d[300:340, 300:380] = seen_disparity(())[300:340, 300:380]
     d[320, 340] *= 0.6
@@ -201,7 +207,7 @@ def test_the_papers_filter_takes_out_points_far_from_all_others() -> None:
 
 
 @pytest.mark.parametrize("method", ["organised", "knn"])
-def test_a_cloud_of_no_or_one_point_is_legal(method: str) -> None:
+def test_a_cloud_of_no_or_one_point_is_accepted(method: str) -> None:
     nothing = Reproject()(blank_frame(), as_disparity(np.full((480, 640), np.nan)))
     assert len(Clean(method=method)(nothing).points) == 0
     d = np.full((480, 640), np.nan)
@@ -210,7 +216,7 @@ def test_a_cloud_of_no_or_one_point_is_legal(method: str) -> None:
     assert len(one.points) == (0 if method == "organised" else 1)
 
 
-def test_refuses_a_levelled_cloud_and_one_without_its_image() -> None:
+def test_a_levelled_cloud_and_a_wrong_image_shape_are_refused() -> None:
     cloud = cloud_with_noise()
     sensor = Transform(LEVEL_FRAME, cloud.frame_id, level_from_camera(), np.array([0, 0, HEIGHT]))
     with pytest.raises(ValueError, match="precedes Level"):

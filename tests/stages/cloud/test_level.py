@@ -1,4 +1,4 @@
-"""Level stands the world upright, whatever the rover's attitude and however the sensors are mounted."""
+"""Level makes any cloud upright, for any attitude of the rover and any mounting of its sensors."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def scattered(n: int = 200) -> Array:
     return np.random.default_rng(0).uniform(-4, 4, (n, 3)) + np.array([0, 0, 5])
 
 
-def test_ground_below_a_pitched_camera_becomes_level_at_height_zero() -> None:
+def test_ground_below_a_pitched_camera_is_level_at_height_zero() -> None:
     ground = np.column_stack([np.random.default_rng(1).uniform((1, -5), (11, 5), (500, 2)), np.zeros(500)])
     seen = (ground - [0, 0, HEIGHT]) @ level_from_camera()
     cloud = Level(camera_height=HEIGHT)(cloud_of(seen), Tilt(3, UP), BARE)
@@ -49,7 +49,7 @@ def test_ground_below_a_pitched_camera_becomes_level_at_height_zero() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(turn=rotations)
-def test_distances_and_handedness_survive_and_up_becomes_z(turn: Array) -> None:
+def test_the_level_transform_is_a_rotation_that_maps_up_to_z(turn: Array) -> None:
     up = turn @ UP
     assume(abs(up[2]) < 0.98)
     transform = level_transform(Tilt(0, up), BARE, "camera")
@@ -62,7 +62,7 @@ def test_distances_and_handedness_survive_and_up_becomes_z(turn: Array) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(turn=rotations)
-def test_how_the_inclinometer_sits_does_not_matter(turn: Array) -> None:
+def test_the_orientation_of_the_inclinometer_does_not_matter(turn: Array) -> None:
     level = Level()(cloud_of(scattered()), Tilt(0, UP), BARE)
     turned = Level()(cloud_of(scattered()), Tilt(0, turn.T @ UP), Mount(0, turn))
     np.testing.assert_allclose(turned.points, level.points, atol=1e-5)
@@ -70,8 +70,7 @@ def test_how_the_inclinometer_sits_does_not_matter(turn: Array) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(turn=rotations)
-def test_turning_the_camera_on_the_rover_leaves_the_levelled_cloud_alone(turn: Array) -> None:
-    """With base_link known, the same world seen by a camera turned in its place levels to the same cloud."""
+def test_with_base_link_the_camera_orientation_does_not_matter(turn: Array) -> None:
     points, place = scattered(), np.array([0.3, 0.12, 0.9])
     up_in_base = Rotation.from_euler("xyz", [0.2, -0.3, 0]).apply([0, 0, 1])
 
@@ -84,7 +83,7 @@ def test_turning_the_camera_on_the_rover_leaves_the_levelled_cloud_alone(turn: A
     np.testing.assert_allclose(turned.points, usual.points, atol=1e-5)
 
 
-def test_with_base_link_known_its_origin_and_heading_are_the_level_frames() -> None:
+def test_the_level_frame_has_the_origin_and_heading_of_base_link() -> None:
     aside = Rotation.from_euler("z", 30, degrees=True).as_matrix() @ BASE_FROM_OPTICAL
     base_from_camera = Transform("base_link", "camera", aside, np.array([0.5, -0.1, 1.2]))
     transform = level_transform(Tilt(0, np.array([0, -1.0, 0])), Mount(0, np.eye(3), base_from_camera), "camera", 99.0)
@@ -92,15 +91,14 @@ def test_with_base_link_known_its_origin_and_heading_are_the_level_frames() -> N
     np.testing.assert_allclose(transform.rotation, aside, atol=1e-12)
 
 
-def test_a_nose_up_rover_sees_the_hill_behind_the_horizon() -> None:
-    """Nose up by 10 degrees, a point on the optical axis is above the camera."""
+def test_a_point_on_the_axis_of_a_nose_up_camera_is_above_it() -> None:
     a = np.deg2rad(10)
     up = np.array([0, -np.cos(a), np.sin(a)])
     cloud = Level(camera_height=0)(cloud_of(np.array([[0, 0, 8.0]])), Tilt(0, up), BARE)
     np.testing.assert_allclose(cloud.points[0], [8 * np.cos(a), 0, 8 * np.sin(a)], atol=1e-6)
 
 
-def test_a_tilt_in_the_cameras_own_frame_needs_no_mount_and_any_other_does() -> None:
+def test_only_a_tilt_in_the_frame_of_the_camera_needs_no_mount() -> None:
     cloud = cloud_of(scattered(), "left_optical")
     alone = Level()(cloud, Tilt(0, UP, "left_optical"))
     np.testing.assert_array_equal(alone.points, Level()(cloud, Tilt(0, UP), BARE).points)
@@ -108,7 +106,7 @@ def test_a_tilt_in_the_cameras_own_frame_needs_no_mount_and_any_other_does() -> 
         Level()(cloud, Tilt(0, UP))
 
 
-def test_a_heading_straight_down_a_wrong_mount_and_a_second_levelling_are_refused() -> None:
+def test_vertical_headings_wrong_mounts_and_levelled_clouds_are_refused() -> None:
     with pytest.raises(ValueError, match="nearly vertical"):
         level_transform(Tilt(0, np.array([0, 0, -1.0])), BARE, "camera")
     with pytest.raises(ValueError, match=r"Mount\.camera_from_inclinometer is not a rotation"):
@@ -118,7 +116,7 @@ def test_a_heading_straight_down_a_wrong_mount_and_a_second_levelling_are_refuse
         Level()(once, Tilt(0, UP), BARE)
 
 
-def test_only_place_changes() -> None:
+def test_level_changes_only_the_points() -> None:
     cloud = cloud_of(scattered())
     level = Level()(cloud, Tilt(0, UP), BARE)
     for name in ("colors", "sigma", "pixel"):
@@ -127,20 +125,20 @@ def test_only_place_changes() -> None:
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), scattered()])
-def test_a_frame_that_measured_nothing_is_no_whole_frame(points: Array) -> None:
+def test_a_frame_without_measured_points_is_refused(points: Array) -> None:
     cloud = replace(cloud_of(points), source=np.full(len(points), PixelOrigin.FILLED, np.uint8))
-    with pytest.raises(ValueError, match="no measured point of the frame is left"):
+    with pytest.raises(ValueError, match="the frame has no measured point within range"):
         Level()(cloud, Tilt(0, UP), BARE)
 
 
-def test_kernel_equals_the_plain_reference() -> None:
+def test_transform_kernel_equals_the_reference() -> None:
     cloud = replace(cloud_of(scattered()), frame_id="camera")
     arguments = (cloud.points, level_from_camera(), np.array([1.0, 2.0, 3.0]))
     got, want = transform_points(*arguments), transform_points_reference(*arguments)
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-6)
 
 
-def test_the_cloud_carries_how_sure_the_tilt_is() -> None:
+def test_the_cloud_carries_the_sigma_of_the_tilt() -> None:
     cloud = cloud_of(scattered())
     assert Level(tilt_sigma=0.01)(cloud, Tilt(3, UP), BARE).tilt_sigma == 0.01
     assert cloud.tilt_sigma == 0

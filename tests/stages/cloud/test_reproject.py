@@ -1,4 +1,4 @@
-"""Reproject puts every known pixel where it is, says how well it knows, and makes nothing of what it does not know."""
+"""Reproject places every known pixel with its depth sigma, and makes no point of an unknown one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.cloud.kernels.triangulation import triangulate, triangulate_reference
+from stages.cloud.kernels.triangulation import DisparitySigma, triangulate, triangulate_reference
 from stages.cloud.reproject import Reproject
 from stages.data import CameraModel, Disparity, PixelOrigin, StereoCamera, StereoFrame
 from tests.stages.terrain.terrain_scene import CAMERA, as_disparity, blank_frame, seen_disparity
@@ -29,12 +29,12 @@ def test_points_project_back_to_their_pixels_and_disparities() -> None:
     assert cloud.sensor is None
 
 
-def test_principal_points_of_both_cameras_enter_the_depth() -> None:
+def test_depth_uses_the_principal_points_of_both_cameras() -> None:
     cloud = Reproject()(blank_frame(SMALL), as_disparity(np.full((12, 16), 3.5), SMALL))
     assert cloud.points[:, 2] == pytest.approx(100.0 * 0.2 / (3.5 + 1.5))
 
 
-def test_kernel_equals_the_plain_reference() -> None:
+def test_triangulation_kernel_equals_the_reference() -> None:
     random = np.random.default_rng(1)
     pixels = random.uniform(-4, 20, (12, 16)).astype(np.float32)
     pixels[random.random(pixels.shape) < 0.2] = np.nan
@@ -42,15 +42,16 @@ def test_kernel_equals_the_plain_reference() -> None:
     source = random.integers(0, 4, pixels.shape).astype(np.uint8)
     confidence = random.uniform(-0.1, 1.1, pixels.shape).astype(np.float32)
     confidence[0, 5] = np.nan
+    disparity, sigma = Disparity(0, pixels, source, confidence), DisparitySigma(0.25, 1.0, 0.7, 3.0)
     for colors in (random.integers(0, 256, (12, 16, 3), np.uint8), random.integers(0, 256, (12, 16), np.uint8)):
         for filled in (False, True):
-            arguments = (pixels, source, confidence, colors, SMALL, 8.0, filled, (0.25, 1.0, 0.7, 3.0))
+            arguments = (disparity, colors, SMALL, sigma, 8.0, filled)
             for got, want in zip(triangulate(*arguments), triangulate_reference(*arguments), strict=True):
                 assert got.dtype == want.dtype
                 np.testing.assert_allclose(got, want, rtol=1e-6)
 
 
-def test_a_filled_disparity_is_left_out_or_marked_as_uncertain_and_a_plane_is_kept() -> None:
+def test_filled_pixels_become_points_on_request_and_planes_always() -> None:
     source = np.array([[PixelOrigin.MEASURED, PixelOrigin.PLANE, PixelOrigin.FILLED, PixelOrigin.UNKNOWN]], np.uint8)
     camera = StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 4, 1)
     disparity = Disparity(0, np.full((1, 4), 5, np.float32), source, np.ones((1, 4), np.float32))
@@ -63,14 +64,14 @@ def test_a_filled_disparity_is_left_out_or_marked_as_uncertain_and_a_plane_is_ke
     assert cloud.source.tolist() == [PixelOrigin.MEASURED, PixelOrigin.PLANE, PixelOrigin.FILLED]
 
 
-def test_depth_uncertainty_predicts_the_scatter_of_noisy_disparities() -> None:
+def test_depth_sigma_predicts_the_scatter_of_noisy_disparities() -> None:
     camera = StereoCamera(969.0, 969.0, 320.0, 240.0, 0.24, 640, 480)
     d = 30 + np.random.default_rng(2).normal(0, 0.25, (480, 640))
     cloud = Reproject(sigma_best=0.25)(blank_frame(camera), as_disparity(d, camera))
     assert cloud.points[:, 2].std() == pytest.approx(cloud.sigma.mean(), rel=0.02)
 
 
-def test_uncertainty_grows_as_confidence_falls() -> None:
+def test_depth_sigma_grows_geometrically_as_confidence_falls() -> None:
     camera = StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 5, 1)
     confidence = np.linspace(1, 0, 5, dtype=np.float32)[None]
     disparity = Disparity(0, np.full((1, 5), 5, np.float32), np.ones((1, 5), np.uint8), confidence)
@@ -78,7 +79,7 @@ def test_uncertainty_grows_as_confidence_falls() -> None:
     assert sigma / sigma[0] == pytest.approx([1, 2, 4, 8, 16])
 
 
-def test_nothing_beyond_max_depth_and_nothing_at_all_is_a_legal_cloud() -> None:
+def test_points_beyond_max_depth_are_left_out_and_a_cloud_may_be_empty() -> None:
     near = Reproject(max_depth=5.0)(blank_frame(), as_disparity(seen_disparity()))
     assert 4.9 < near.points[:, 2].max() <= 5.0
     none = Reproject()(blank_frame(), as_disparity(np.full((480, 640), np.nan)))
@@ -97,7 +98,7 @@ def test_colours_come_from_the_left_image() -> None:
 
 
 @pytest.mark.parametrize("bits", [10, 12, 16])
-def test_a_deep_image_is_as_bright_as_its_eight_bit_twin_however_many_bits_it_uses(bits: int) -> None:
+def test_deep_images_give_the_colours_of_their_eight_bit_twin(bits: int) -> None:
     camera = StereoCamera(100.0, 100.0, 32.0, 24.0, 0.2, 64, 48)
     eight = np.random.default_rng(4).integers(0, 256, (48, 64, 3)).astype(np.uint8)
     deep = eight.astype(np.uint16) << (bits - 8)
@@ -105,17 +106,17 @@ def test_a_deep_image_is_as_bright_as_its_eight_bit_twin_however_many_bits_it_us
     assert np.abs(cloud.colors.astype(int) - eight.reshape(-1, 3)).max() <= 2
 
 
-def test_the_disparitys_own_camera_goes_before_the_frames() -> None:
+def test_the_camera_of_the_disparity_takes_precedence() -> None:
     other = replace(SMALL, baseline=0.4, frame_id="other")
     pixels = np.full((12, 16), 3.5)
     cloud = Reproject()(blank_frame(SMALL), as_disparity(pixels, other))
     assert cloud.points[:, 2] == pytest.approx(100.0 * 0.4 / (3.5 + 1.5))
     assert cloud.frame_id == "other"
-    unsaid = replace(as_disparity(pixels, other), camera=None)
-    assert Reproject()(blank_frame(SMALL), unsaid).points[:, 2] == pytest.approx(100.0 * 0.2 / (3.5 + 1.5))
+    without = replace(as_disparity(pixels, other), camera=None)
+    assert Reproject()(blank_frame(SMALL), without).points[:, 2] == pytest.approx(100.0 * 0.2 / (3.5 + 1.5))
 
 
-def test_a_disparity_of_another_size_and_an_unrectified_frame_are_refused() -> None:
+def test_wrong_sizes_unrectified_frames_and_wrong_sigmas_are_refused() -> None:
     with pytest.raises(ValueError, match="join the disparity with the rectified frame"):
         Reproject()(blank_frame(), as_disparity(np.ones((12, 16)), SMALL))
     model = CameraModel(16, 12, np.eye(3), np.zeros(5), np.eye(3), np.eye(3, 4))

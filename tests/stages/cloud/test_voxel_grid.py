@@ -1,4 +1,4 @@
-"""VoxelGrid holds every measured point once, in the cube it is in."""
+"""VoxelGrid counts every measured point once, in its voxel."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def some(seed: int, n: int = 4000) -> PointCloud:
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), edge=st.sampled_from([0.05, 0.13, 1.0]))
-def test_kernel_equals_the_plain_reference(seed: int, edge: float) -> None:
+def test_voxel_kernel_equals_the_reference(seed: int, edge: float) -> None:
     cloud = some(seed, 500)
     for got, want in zip(voxel_means(cloud.points, cloud.colors, edge),
                          voxel_means_reference(cloud.points, cloud.colors, edge), strict=True):  # fmt: skip
         np.testing.assert_array_equal(got, want)
 
 
-def test_every_measured_point_within_the_region_is_in_its_cube_and_in_one_only() -> None:
+def test_every_measured_point_in_range_is_in_exactly_one_voxel() -> None:
     cloud = some(1)
     filled = np.arange(len(cloud.points)) % 4 == 0
     source = np.where(filled, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8)
@@ -47,7 +47,7 @@ def test_every_measured_point_within_the_region_is_in_its_cube_and_in_one_only()
     assert len(voxels.index) == len(cubes)
 
 
-def test_a_wall_and_what_hangs_over_it_are_cubes_of_their_own_colour() -> None:
+def test_an_overhang_has_voxels_and_colours_of_its_own() -> None:
     points = np.array([[1.01, 1.01, 0.01], [1.02, 1.02, 0.02], [1.01, 1.01, 1.01]])
     colors = np.array([[10, 20, 30], [20, 30, 41], [200, 0, 0]], np.uint8)
     voxels = VoxelGrid()(cloud_of(points, colors))
@@ -57,7 +57,7 @@ def test_a_wall_and_what_hangs_over_it_are_cubes_of_their_own_colour() -> None:
     assert VoxelGrid(min_points=2)(cloud_of(points, colors)).count.tolist() == [2]
 
 
-def test_a_map_of_more_cubes_than_memory_has_room_for_is_refused() -> None:
+def test_a_map_of_too_many_voxels_is_refused() -> None:
     with pytest.raises(
         ValueError, match=r"VoxelGrid\.max_range = 100 m makes a map 40000 cells of 0\.005 m wide, and 4000"
     ):
@@ -67,7 +67,7 @@ def test_a_map_of_more_cubes_than_memory_has_room_for_is_refused() -> None:
     assert widest.index.tolist() == [[0, -1981, 0], [1980, 0, 0], [0, 1980, 0]]
 
 
-def test_no_points_make_no_cubes_and_a_cloud_that_is_not_level_is_refused() -> None:
+def test_no_points_make_no_voxels_and_an_unlevelled_cloud_is_refused() -> None:
     empty = cloud_of(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert VoxelGrid()(empty).index.shape == (0, 3)
     with pytest.raises(ValueError, match="'cam', not 'level'"):

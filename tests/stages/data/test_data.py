@@ -1,4 +1,4 @@
-"""The data types take nothing that is not what they say, and nobody changes them afterwards."""
+"""The data types check their fields, and their arrays are read-only afterwards."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_arrays_are_read_only_once_published(make: Callable[[], Any]) -> None:
             array[...] = 0
 
 
-def test_layers_of_a_map_are_read_only_and_none_can_be_added() -> None:
+def test_map_layers_are_read_only_and_none_can_be_added() -> None:
     terrain = ElevationMap(0, {"elevation": FLAT.copy()}, 0.1, (0.0, 0.0), "level")
     with pytest.raises(ValueError, match="read-only"):
         terrain.layers["elevation"][0, 0] = 1
@@ -63,7 +63,7 @@ def test_layers_of_a_map_are_read_only_and_none_can_be_added() -> None:
         terrain.layers["other"] = FLAT  # type: ignore[index]
 
 
-def test_whoever_made_an_array_cannot_change_what_was_published_of_it() -> None:
+def test_the_maker_of_an_array_cannot_change_it_once_published() -> None:
     pixels, layer = np.full((2, 3), 7, F32), np.zeros((2, 3), F32)
     Disparity(0, pixels, np.ones((2, 3), U8), np.ones((2, 3), F32))
     ElevationMap(0, {"elevation": layer}, 0.1, (0.0, 0.0), "level")
@@ -72,7 +72,7 @@ def test_whoever_made_an_array_cannot_change_what_was_published_of_it() -> None:
             array[0, 0] = 1
 
 
-def test_a_published_part_of_an_array_is_read_only_and_the_rest_is_not() -> None:
+def test_publishing_a_view_leaves_the_rest_of_its_base_writable() -> None:
     whole = np.zeros((4, 3), F32)
     part = Disparity(0, whole[:2], np.zeros((2, 3), U8), np.zeros((2, 3), F32))
     with pytest.raises(ValueError, match="read-only"):
@@ -80,7 +80,7 @@ def test_a_published_part_of_an_array_is_read_only_and_the_rest_is_not() -> None
     whole[3] = 1
 
 
-def test_small_arrays_are_copied_so_that_their_givers_keep_theirs() -> None:
+def test_small_arrays_are_copied() -> None:
     up = np.array([0, 0, 1.0])
     tilt = Tilt(0, up)
     up[2] = 5
@@ -98,14 +98,14 @@ def test_small_arrays_are_copied_so_that_their_givers_keep_theirs() -> None:
     ],
 )
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_not_finite_is_refused_by_name(make: Callable[[float], Any], message: str, bad: float) -> None:
+def test_values_that_are_not_finite_are_refused_by_name(make: Callable[[float], Any], message: str, bad: float) -> None:
     with pytest.raises(ValueError, match=message):
         make(bad)
 
 
 @pytest.mark.parametrize("stamp", [1.5e9, "0", None, np.float64(7)])
 @pytest.mark.parametrize("make", [make for make in MAKERS if hasattr(make(), "stamp")])
-def test_a_stamp_is_whole_nanoseconds(make: Callable[[], Any], stamp: object) -> None:
+def test_a_stamp_that_is_not_whole_nanoseconds_is_refused(make: Callable[[], Any], stamp: object) -> None:
     item = make()
     assert type(replace(item, stamp=np.int64(7)).stamp) is int
     with pytest.raises(ValueError, match=rf"{type(item).__name__}\.stamp must be whole nanoseconds"):
@@ -121,13 +121,13 @@ def test_a_stamp_is_whole_nanoseconds(make: Callable[[], Any], stamp: object) ->
         lambda size: VoxelMap(0, np.zeros((1, 3), np.int32), np.zeros((1, 3), U8), np.ones(1, np.int32), size, "level"),
     ],
 )
-def test_a_cell_has_a_size(make: Callable[[float], Any], resolution: float) -> None:
+def test_a_resolution_that_is_not_positive_is_refused(make: Callable[[float], Any], resolution: float) -> None:
     assert make(0.05).resolution == 0.05
     with pytest.raises(ValueError, match=r"Map\.resolution must be positive and finite"):
         make(resolution)
 
 
-def test_an_unknown_covariance_may_be_infinite() -> None:
+def test_a_covariance_may_be_infinite() -> None:
     pose = Pose(0, np.zeros(3), QUATERNION, "odom", "base", np.full((6, 6), np.inf))
     assert pose.covariance is not None
 
@@ -138,23 +138,23 @@ def test_a_mount_that_is_not_a_rotation_is_refused(matrix: Array) -> None:
         Mount(0, matrix)
 
 
-def test_an_image_of_another_size_than_its_calibration_is_refused() -> None:
+def test_an_image_size_that_differs_from_the_calibration_is_refused() -> None:
     small = np.zeros((10, 10), U8)
     with pytest.raises(ValueError, match="images are 10x10, the calibration is for 640x480"):
         StereoFrame(0, small, small, CAMERA)
 
 
-def test_a_pair_of_images_of_which_one_has_more_bits_is_refused() -> None:
+def test_a_pair_of_images_of_different_depth_is_refused() -> None:
     left = np.zeros((480, 640), U8)
     with pytest.raises(ValueError, match="left is uint8, right is uint16"):
         StereoFrame(0, left, left.astype(np.uint16), CAMERA)
 
 
 @pytest.mark.parametrize("frames", [("map", "base"), ("odom", "mast")])
-def test_between_poses_of_different_frames_there_is_no_pose(frames: tuple[str, str]) -> None:
+def test_poses_of_different_frames_are_not_interpolated(frames: tuple[str, str]) -> None:
     first = Pose(0, np.zeros(3), QUATERNION, "odom", "base")
     assert first.interpolated(Pose(4, np.array([8.0, 0, 0]), QUATERNION, "odom", "base"), 1).position[0] == 2.0
-    with pytest.raises(ValueError, match=f"of 'base' in 'odom' is followed by one of '{frames[1]}' in '{frames[0]}'"):
+    with pytest.raises(ValueError, match=f"of 'base' in 'odom' to the pose of '{frames[1]}' in '{frames[0]}'"):
         first.interpolated(Pose(4, np.array([8.0, 0, 0]), QUATERNION, *frames), 1)
 
 
@@ -166,7 +166,7 @@ class Free(Stage):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, F32("nan")])
-def test_a_parameter_that_is_not_finite_is_refused_with_or_without_a_range(value: float) -> None:
+def test_a_parameter_that_is_not_finite_is_refused(value: float) -> None:
     with pytest.raises(ValueError, match=r"Free\.length must be a finite number in m, not"):
         Free(length=value)
     with pytest.raises(ValueError, match=r"Match\.p2 must be a finite number, not"):

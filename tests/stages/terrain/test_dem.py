@@ -1,4 +1,4 @@
-"""Voxelise counts every point once, averages what it has, and leaves a hole where it has nothing."""
+"""Voxelise counts every point once, averages each cell, and leaves cells without points empty."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from stages.cloud.level import Level
 from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, PixelOrigin, PointCloud, Tilt, Transform
 from stages.terrain.dem import Voxelise
-from stages.terrain.kernels.cell_gradient import gradient_and_curvature, lie_of_cells_reference
-from stages.terrain.kernels.grid import cell_statistics, cell_statistics_reference
-from stages.terrain.kernels.occlusion import lowest_sight, lowest_sight_reference
-from stages.terrain.kernels.splat_along_ray import laid_along_sight, laid_along_sight_reference
+from stages.terrain.kernels.cell_gradient import gradient_and_curvature, gradient_and_curvature_reference
+from stages.terrain.kernels.grid import Grid, cell_statistics, cell_statistics_reference
+from stages.terrain.kernels.occlusion import occlusion_ceiling, occlusion_ceiling_reference
+from stages.terrain.kernels.splat_along_ray import splat_along_ray, splat_along_ray_reference
 from tests.stages.terrain.terrain_scene import (
     CAMERA,
     HEIGHT,
@@ -28,6 +28,7 @@ from tests.stages.terrain.terrain_scene import (
     seen_disparity,
 )
 
+GRID = Grid(0.1, (-8.0, -8.0), 160, 8.0)
 SENSOR = Transform(LEVEL_FRAME, "camera", level_from_camera(), np.array([0, 0, HEIGHT]))
 
 
@@ -46,7 +47,7 @@ def scattered(seed: int, n: int = 3000, extent: float = 9.0) -> Array:
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), resolution=st.sampled_from([0.05, 0.1, 0.3]), region=st.sampled_from([4.0, 8.0]))
-def test_every_point_within_the_region_is_counted_once(seed: int, resolution: float, region: float) -> None:
+def test_every_point_in_range_is_counted_once(seed: int, resolution: float, region: float) -> None:
     cloud = cloud_of(scattered(seed))
     grid = Voxelise(resolution=resolution, max_range=region)(cloud)
     within = np.hypot(*cloud.points[:, :2].T.astype(np.float64)) <= region
@@ -68,7 +69,7 @@ def test_a_mirrored_cloud_gives_the_mirrored_map(seed: int) -> None:
         np.testing.assert_array_equal(mirrored.layers[name], layer[::-1])
 
 
-def test_the_order_of_points_moves_at_most_the_last_bits_and_one_order_gives_the_same_bits() -> None:
+def test_the_order_of_points_changes_at_most_the_last_bits() -> None:
     points = scattered(3, 20000, 1.0)
     one, again = Voxelise()(cloud_of(points)), Voxelise()(cloud_of(points))
     other = Voxelise()(cloud_of(points[::-1]))
@@ -92,7 +93,7 @@ def test_the_layers_of_one_cell_are_those_of_its_points() -> None:
     assert (grid.layers["count"] > 0).sum() == 1
 
 
-def test_the_tilts_uncertainty_is_the_common_variance_and_not_part_of_the_random_one() -> None:
+def test_tilt_uncertainty_is_the_common_variance_not_the_random_one() -> None:
     """A cloud turned by the tilt's sigma is off by its common standard deviation, wherever it lies across the turn."""
     cloud = cloud_of(scattered(5, 20000) * [1, 1, 0])
     sure, unsure = Voxelise()(cloud), Voxelise()(replace(cloud, tilt_sigma=0.01))
@@ -108,10 +109,10 @@ def test_the_tilts_uncertainty_is_the_common_variance_and_not_part_of_the_random
     np.testing.assert_allclose(ratio, 1.0, atol=0.05)
 
 
-@pytest.mark.parametrize("made_up", [PixelOrigin.PLANE, PixelOrigin.FILLED])
-def test_what_refinement_made_up_is_a_layer_of_its_own_unless_it_is_to_count(made_up: PixelOrigin) -> None:
+@pytest.mark.parametrize("filled", [PixelOrigin.PLANE, PixelOrigin.FILLED])
+def test_filled_points_are_a_layer_of_their_own_unless_counted(filled: PixelOrigin) -> None:
     points = np.array([[2.01, 0.01, 0.1], [2.01, 0.01, 0.9], [3.01, 0.01, 0.5]])
-    cloud = replace(cloud_of(points), source=np.array([PixelOrigin.MEASURED, made_up, made_up], np.uint8))
+    cloud = replace(cloud_of(points), source=np.array([PixelOrigin.MEASURED, filled, filled], np.uint8))
     apart, counted = Voxelise()(cloud), Voxelise(filled="counted")(cloud)
     known = np.isfinite(apart.layers["elevation"])
     assert apart.layers["elevation"][known] == pytest.approx([0.1])
@@ -122,7 +123,7 @@ def test_what_refinement_made_up_is_a_layer_of_its_own_unless_it_is_to_count(mad
     assert "filled" not in Voxelise()(cloud_of(points)).layers
 
 
-def test_a_cell_behind_a_rock_is_occluded_and_one_beside_the_view_was_never_looked_at() -> None:
+def test_cells_behind_a_rock_are_occluded_and_cells_out_of_view_are_not() -> None:
     frame, rocks = blank_frame(), ((4.0, 0.0, 0.4),)
     cloud = Reproject()(frame, as_disparity(seen_disparity(rocks)))
     grid = Voxelise()(Level(camera_height=HEIGHT)(Clean()(cloud), Tilt(7, UP, CAMERA.frame_id)))
@@ -139,7 +140,7 @@ def test_a_cell_behind_a_rock_is_occluded_and_one_beside_the_view_was_never_look
     assert np.isnan(occluded[beside | below | (x < 0)]).all()
 
 
-def test_a_hole_stays_a_hole_and_an_empty_cloud_is_an_empty_map_of_the_usual_shape() -> None:
+def test_holes_stay_empty_and_an_empty_cloud_makes_an_empty_map() -> None:
     empty = Voxelise()(cloud_of(np.zeros((0, 3))))
     full = Voxelise()(cloud_of(scattered(0)))
     assert empty.shape == full.shape == (320, 320)
@@ -156,7 +157,7 @@ PURE = Voxelise(
 
 
 @pytest.mark.parametrize("slope", [-0.1, 0.0, 0.3])
-def test_variance_is_that_of_the_mean_when_errors_are_independent(slope: float) -> None:
+def test_variance_is_that_of_the_mean_for_independent_errors(slope: float) -> None:
     """Ground 4 m ahead, level or sloping, each point wrong by its own depth error: the map's error is as stated."""
     random = np.random.default_rng(8)
     truth = np.column_stack([random.uniform(3, 5, 200_000), random.uniform(-1, 1, 200_000), np.zeros(200_000)])
@@ -178,7 +179,7 @@ def test_variance_is_that_of_the_mean_when_errors_are_independent(slope: float) 
     np.testing.assert_allclose(correlated, grid.layers["variance"][full] * 25, rtol=1e-4)
 
 
-def test_a_few_points_that_share_one_error_are_as_sure_as_one_of_them_and_no_less() -> None:
+def test_points_that_share_one_error_have_the_variance_of_one() -> None:
     shared = replace(PURE, correlated_points=10.0)
     stated = []
     for n in (1, 5, 10, 40):
@@ -190,45 +191,45 @@ def test_a_few_points_that_share_one_error_are_as_sure_as_one_of_them_and_no_les
     assert stated[3] == pytest.approx(stated[2] / 4, rel=0.02)
 
 
-def test_kernel_equals_the_plain_reference() -> None:
+def test_statistics_kernel_equals_the_reference() -> None:
     points = scattered(9, 5000).astype(np.float32)
     points[3] = np.nan
     noise = np.random.default_rng(1).uniform(0, 0.1, len(points)).astype(np.float32)
-    arguments = (points, noise, 0.1, (-8.0, -8.0), 160, 8.0)
+    arguments = (points, noise, GRID)
     np.testing.assert_allclose(cell_statistics(*arguments), cell_statistics_reference(*arguments), rtol=1e-9)
 
 
-def test_neighbour_kernel_equals_the_plain_reference() -> None:
+def test_gradient_kernel_equals_the_reference() -> None:
     random = np.random.default_rng(2)
     heights = random.normal(0, 1, (20, 30))
     heights[random.random(heights.shape) < 0.4] = np.nan
-    np.testing.assert_allclose(gradient_and_curvature(heights), lie_of_cells_reference(heights), atol=1e-12)
+    np.testing.assert_allclose(gradient_and_curvature(heights), gradient_and_curvature_reference(heights), atol=1e-12)
 
 
-def test_occlusion_kernel_equals_the_plain_reference() -> None:
+def test_occlusion_kernel_equals_the_reference() -> None:
     random = np.random.default_rng(3)
     cloud = Reproject()(blank_frame(), as_disparity(seen_disparity()))
     some = np.sort(random.choice(len(cloud.points), 3000, replace=False))
     levelled = Level(camera_height=HEIGHT)(cloud.only(some), Tilt(7, UP, CAMERA.frame_id))
-    arguments = (levelled.points, levelled.pixel, 640, (0.0, 0.0, HEIGHT), 0.1, (-8.0, -8.0), 160, 8.0)
-    got, want = lowest_sight(*arguments), lowest_sight_reference(*arguments)
+    arguments = (levelled.points, levelled.pixel, 640, SENSOR.translation, GRID)
+    got, want = occlusion_ceiling(*arguments), occlusion_ceiling_reference(*arguments)
     assert 0.05 < np.isfinite(want).mean() < 0.5
     alike = np.isclose(got, want, atol=1e-6) | (np.isnan(got) & np.isnan(want))
     assert (~alike).mean() < 1e-3  # samples on the border of two cells round either way
 
 
-def test_a_line_of_sight_hides_the_same_cells_however_far_it_goes() -> None:
-    """It is followed within the region only: the farthest of these would take years."""
+def test_a_line_of_sight_hides_the_same_cells_at_any_length() -> None:
+    """It is followed only within the range: the farthest of these would take years."""
     hidden = []
     for far in (30.0, 1e6, 1e15):
-        points = np.array([[far, 0.3 * far, far / 10], [1.0, 0.3, 0.0]], np.float32)  # image rows run from the sky down
-        hidden.append(lowest_sight(points, np.array([5, 15]), 10, (0.0, 0.0, 1.0), 0.1, (-8.0, -8.0), 160, 8.0))
+        points = np.array([[far, 0.3 * far, far / 10], [1.0, 0.3, 0.0]], np.float32)
+        hidden.append(occlusion_ceiling(points, np.array([5, 15]), 10, SENSOR.translation, GRID))
     assert 50 < np.isfinite(hidden[0]).sum() < 150
     np.testing.assert_allclose(hidden[1], hidden[0], atol=0.2)
     np.testing.assert_allclose(hidden[2], hidden[0], atol=0.2)
 
 
-def test_a_cloud_that_is_not_level_is_refused() -> None:
+def test_an_unlevelled_cloud_is_refused() -> None:
     cloud = PointCloud(
         0, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32),
         "cam",
@@ -237,30 +238,30 @@ def test_a_cloud_that_is_not_level_is_refused() -> None:
         Voxelise()(cloud)
 
 
-def test_points_are_laid_along_their_lines_of_sight_as_the_reference_lays_them() -> None:
+def test_splat_kernel_equals_the_reference_and_keeps_to_its_reach() -> None:
     random = np.random.default_rng(3)
     points = (SENSOR.translation + random.uniform(1, 8, (500, 1)) * SENSOR.rotation[:, 2]
               + random.normal(0, 0.3, (500, 3))).astype(np.float32)  # fmt: skip
     sigma = random.uniform(0, 0.1, 500).astype(np.float32)
-    copies, their_sigma = laid_along_sight(points, sigma, SENSOR, 2.0, 0.05, 0.12)
-    expected, expected_sigma = laid_along_sight_reference(points, sigma, SENSOR, 2.0, 0.05, 0.12)
+    copies, copied_sigma = splat_along_ray(points, sigma, SENSOR, 2.0, 0.05, 0.12)
+    expected, expected_sigma = splat_along_ray_reference(points, sigma, SENSOR, 2.0, 0.05, 0.12)
     np.testing.assert_allclose(copies, expected, atol=2e-6)
-    np.testing.assert_array_equal(their_sigma, expected_sigma)
+    np.testing.assert_array_equal(copied_sigma, expected_sigma)
     assert 0 < len(copies) < 4 * len(points)
     eye, axis = SENSOR.translation, SENSOR.rotation[:, 2]
     far = points[sigma * np.float32(2) >= np.float32(0.05)]
     moved = (copies.reshape(-1, 4, 3) - eye) @ axis - ((far - eye) @ axis)[:, None]
-    reach = np.minimum(2 * their_sigma.reshape(-1, 4), 0.12)
+    reach = np.minimum(2 * copied_sigma.reshape(-1, 4), 0.12)
     np.testing.assert_allclose(moved, reach * np.array([-1, -0.5, 0.5, 1]), atol=1e-5)
 
 
 def rows_apart(sigma: float) -> PointCloud:
-    """Level ground hit every 20 cm, as by the rows of an image, 8 points a cell wide, with an unsure depth."""
+    """Level ground with a row of points every 20 cm, 8 points per cell, with an uncertain depth."""
     x, y = (layer.ravel() for layer in np.meshgrid(np.arange(5.02, 6.0, 0.2), np.linspace(0.005, 0.045, 8)))
     return cloud_of(np.column_stack([x, y, np.zeros(len(x))]), sigma)
 
 
-def test_a_cell_that_points_missed_by_their_own_uncertainty_is_known_by_them() -> None:
+def test_splats_fill_cells_that_points_miss_by_their_depth_sigma() -> None:
     cloud = rows_apart(sigma=0.06)
     bare, reached = Voxelise()(cloud).layers, Voxelise(splat_sigmas=2.0)(cloud).layers
     own = bare["count"] > 0
@@ -282,14 +283,14 @@ def test_a_cell_that_points_missed_by_their_own_uncertainty_is_known_by_them() -
     ("points", "x", "reach", "known"),
     [(1, 5.025, 0.04, 1), (2, 5.025, 0.04, 3), (1, 5.025, 0.06, 3), (2, 5.045, 0.024, 1), (2, 5.045, 0.026, 2)],
 )
-def test_a_cell_is_reached_by_two_places_of_points_that_reach_half_a_cell(
+def test_a_cell_needs_two_splats_of_points_that_reach_half_a_cell(
     points: int, x: float, reach: float, known: int
 ) -> None:
     cloud = cloud_of(np.tile([x, 0.02, 0.0], (points, 1)), reach / 2)
     assert (Voxelise(splat_sigmas=2.0)(cloud).layers["count"] > 0).sum() == known
 
 
-def test_only_measured_points_reach_beyond_their_cell() -> None:
+def test_only_measured_points_are_splatted() -> None:
     cloud = rows_apart(sigma=0.06)
     plane = replace(cloud, source=np.full(len(cloud.points), PixelOrigin.PLANE, np.uint8))
     for name, layer in Voxelise()(plane).layers.items():
