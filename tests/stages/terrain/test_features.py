@@ -1,4 +1,4 @@
-"""TerrainFeatures measures what stands above the ground, the same whatever grid it lies in; kernels equal NumPy."""
+"""TerrainFeatures measures heights above the ground on any grid; its kernels equal their references."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from hypothesis import strategies as st
 from stages.data import Array, Cell
 from stages.terrain.binarise import Binarise
 from stages.terrain.features import TerrainFeatures
-from stages.terrain.kernels.local_minimum import lowest_around, lowest_around_reference
+from stages.terrain.kernels.local_minimum import local_minimum, local_minimum_reference
 from stages.terrain.kernels.plane_window import window_planes, window_planes_reference
 from tests.stages.terrain.terrain_scene import map_of, rolling_terrain
 
 
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), radius=st.integers(1, 20), share=st.floats(0.0, 1.0))
-def test_relief_kernel_equals_the_plain_reference(seed: int, radius: int, share: float) -> None:
+def test_local_minimum_kernel_equals_the_reference(seed: int, radius: int, share: float) -> None:
     random = np.random.default_rng(seed)
     heights, trend = random.normal(0, 1, (12, 15)), random.normal(0, 0.1, (2, 12, 15))
     use = random.random(heights.shape) < share
     arguments = (heights, use, trend, radius)
-    for got, want in zip(lowest_around(*arguments), lowest_around_reference(*arguments), strict=True):
+    for got, want in zip(local_minimum(*arguments), local_minimum_reference(*arguments), strict=True):
         np.testing.assert_allclose(got, want, atol=1e-12)
 
 
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), radius=st.integers(1, 20), share=st.floats(0.0, 1.0))
-def test_plane_kernel_equals_the_plain_reference(seed: int, radius: int, share: float) -> None:
+def test_plane_kernel_equals_the_reference(seed: int, radius: int, share: float) -> None:
     random = np.random.default_rng(seed)
     heights = random.normal(0, 1, (12, 15))
     use = random.random(heights.shape) < share
@@ -38,7 +38,7 @@ def test_plane_kernel_equals_the_plain_reference(seed: int, radius: int, share: 
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)
 
 
-def test_the_size_of_the_grid_about_known_ground_changes_nothing() -> None:
+def test_empty_cells_around_the_ground_do_not_change_the_features() -> None:
     terrain = rolling_terrain(3)
     small = terrain.elevation
     rows, cols = small.shape
@@ -55,7 +55,7 @@ def test_the_size_of_the_grid_about_known_ground_changes_nothing() -> None:
         np.testing.assert_allclose(found[name][patch], layer, atol=1e-6, err_msg=name)
 
 
-def test_a_map_of_which_nothing_is_known_is_assessed_as_unknown() -> None:
+def test_an_empty_map_has_unknown_features() -> None:
     nothing = TerrainFeatures()(map_of(np.full((60, 60), np.nan)))
     assert all(np.isnan(layer).all() for layer in nothing.layers.values())
     assert (Binarise()(nothing).cells == Cell.UNKNOWN).all()

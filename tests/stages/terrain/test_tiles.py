@@ -1,4 +1,4 @@
-"""The grid without bounds: it is as if there were one large array, and costs only what was written."""
+"""Tiles behave like one large array, and only written cells take memory."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -13,7 +13,7 @@ sizes = st.integers(1, 2 * SIDE)
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(places, places, sizes, sizes, st.integers(0, 2**32 - 1)), max_size=4), places, places)
-def test_reads_are_those_of_one_large_array(writes, row, col):
+def test_reads_equal_those_of_one_large_array(writes, row, col):
     model = np.zeros((12 * SIDE, 12 * SIDE), DTYPE)
     tiles, half = Tiles(DTYPE), 6 * SIDE
     for first_row, first_col, rows, cols, seed in writes:
@@ -28,14 +28,14 @@ def test_reads_are_those_of_one_large_array(writes, row, col):
     np.testing.assert_array_equal(tiles.read(row, col, 70, 90), expected)
 
 
-def test_a_block_that_was_read_is_a_copy():
+def test_a_read_block_is_a_copy():
     tiles = Tiles(DTYPE)
     tiles.write(0, 0, np.ones((2, 2), DTYPE), np.ones((2, 2), bool))
     tiles.read(0, 0, 2, 2)["value"] = 7
     assert tiles.read(0, 0, 2, 2)["value"].max() == 1
 
 
-def test_what_is_not_changed_costs_nothing():
+def test_unchanged_tiles_take_no_memory():
     tiles = Tiles(DTYPE)
     changed = np.zeros((1, 100 * SIDE), bool)
     changed[0, [0, -1]] = True
