@@ -112,7 +112,9 @@ class PoseFilter(Stage):
         """The first frame of a segment: at its origin, upright by the tilt."""
         world = level_transform(tilt, mount, camera.child, camera_height=0.0)
         # About the origin, which is base_link where that is known, the tilt's error moves the camera as well.
-        covariance = translated_covariance(np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0]), world.translation)
+        covariance = translated_covariance(
+            np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0]), world.translation
+        )
         return _Estimate(motion.segment, camera, motion.covariance, world, covariance, 0.0)
 
     def _drawn(self, estimate: _Estimate, tilt: Tilt, mount: Mount) -> _Estimate:
@@ -129,7 +131,10 @@ class PoseFilter(Stage):
         base = mount.base_from_camera
         placed = estimate.world if base is None else estimate.world.after(base.inverse())
         alike = self._alike(placed.translation, estimate.way)
-        covariance = translated_covariance(estimate.covariance, placed.translation - estimate.world.translation) + alike.T @ alike
+        covariance = (
+            translated_covariance(estimate.covariance, placed.translation - estimate.world.translation)
+            + alike.T @ alike
+        )
         np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # the origin's is zero but for rounding
         return Pose(
             stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),

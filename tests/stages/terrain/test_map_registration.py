@@ -92,10 +92,10 @@ def upside_down(pose):
 def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(change, sentence):
     fuse = Running(Fuse())
     fuse(*drive(0), MOUNT)
-    before = fuse._map.cells.read(-300, -300, 600, 600)
+    before = fuse.state.cells.read(-300, -300, 600, 600)
     with pytest.raises(ValueError, match=sentence):
         fuse(*change(*drive(1)), MOUNT)
-    np.testing.assert_array_equal(fuse._map.cells.read(-300, -300, 600, 600), before)
+    np.testing.assert_array_equal(fuse.state.cells.read(-300, -300, 600, 600), before)
 
 
 @pytest.mark.parametrize(("degrees", "told"), [(0, False), (3, False), (12, True)])
