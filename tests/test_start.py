@@ -45,9 +45,9 @@ def test_python_m_flow_runs_the_program() -> None:
 
 @pytest.mark.slow
 def test_an_overwritten_package_of_the_wheel_is_named(tmp_path: Path) -> None:
-    venv.create(tmp_path / "venv", with_pip=True, system_site_packages=True)
+    venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"
-    pip = [str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", str(ROOT)]
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--no-deps", str(ROOT)]
     subprocess.run(pip, cwd=tmp_path, check=True, capture_output=True)
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     ask = [str(python), "-c", "import importlib.util as u; print(u.find_spec('stages').origin)"]
