@@ -10,10 +10,10 @@ demo: $(READY)
 	$(BIN)/roverflow demo --out demo
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check-all: $(READY) lint
-	$(BIN)/python -m pytest -m ""
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m ""
 
 bench: $(READY)
 	$(BIN)/python -m tests.bench
