@@ -5,7 +5,7 @@ import sys
 import cv2
 import numpy as np
 
-from recordings.sinks.colormaps import birds_eye, paint_elevation
+from recordings.sinks.colormaps import birds_eye, elevation_colors
 from stages import Clean, Level, Match, Refine, Reproject, StereoCamera, StereoFrame, Tilt, Voxelise
 
 left, right = (cv2.cvtColor(cv2.imread(name), cv2.COLOR_BGR2RGB) for name in sys.argv[1:3])
@@ -16,6 +16,6 @@ cloud = Clean(max_range=6.0)(Reproject()(frame, disparity))
 down = np.radians(15)  # how far the camera looks down; up in the camera's frame (x right, y down, z forward)
 tilt = Tilt(0, np.array([0, -np.cos(down), -np.sin(down)]), frame_id=camera.frame_id)
 terrain = Voxelise(max_range=6.0)(Level(camera_height=0.9)(cloud, tilt))
-picture = birds_eye(paint_elevation(terrain))  # x forward is up, one pixel a cell of 5 cm
+picture = birds_eye(elevation_colors(terrain))  # x forward is up, one pixel a cell of 5 cm
 cv2.imwrite(sys.argv[3], cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
 print(f"{np.isfinite(terrain.layers['elevation']).sum()} cells of {terrain.resolution * 100:.0f} cm are known")

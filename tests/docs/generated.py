@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import math
+import re
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
@@ -17,8 +19,8 @@ import flow.align
 import recordings
 import stages
 from flow.cli.main import parser
-from flow.units import as_written
 from flow.runtime.graph import ports_of
+from flow.units import as_written
 from stages.stage import Stage
 
 DOCS = Path(__file__).parent.parent.parent / "docs"
@@ -66,6 +68,7 @@ def _stages() -> str:
         for kind in sorted(found, key=lambda kind: kind.__name__):
             if kind.__module__.split(".")[1] == folder:
                 parts += _section(kind, f"stages.{kind.__name__}")
+    parts += ["## The vehicle\n", *_section(stages.Rover, "stages.Rover")]
     parts.append("## Alignment\n\nAligners join streams of different clocks before any stage runs.\n")
     for name in ("pair", "interpolate", "nearest", "latest"):
         parts += _section(getattr(flow.align, name), f"flow.align.{name}")
@@ -86,7 +89,10 @@ def _section(kind: type, use: str) -> Iterator[str]:
         inputs = [f"`{name}` {_type(hint)}{' (optional)' if name in optional else ''}" for name, hint in ports.items()]
         returned = inspect.signature(kind.__call__).return_annotation
         yield f"Inputs: {', '.join(inputs)}. Output: {returned}.\n"
-    rows = [_row(item) for item in fields(kind) if item.init] if is_dataclass(kind) else []
+    documented = _numpydoc(kind)
+    rows = (
+        [_row(item, documented.get(item.name, "")) for item in fields(kind) if item.init] if is_dataclass(kind) else []
+    )
     if rows:
         yield "| parameter | meaning | unit | range | default |\n|---|---|---|---|---|"
         yield "\n".join(rows) + "\n"
@@ -104,11 +110,23 @@ def _type(hint: Any) -> str:
     return " or ".join(_type(part) for part in hint.__args__ if part is not type(None))
 
 
-def _row(item: Field[Any]) -> str:
+def _numpydoc(kind: type) -> dict[str, str]:
+    """Parameter -> its text in the sections "Parameters" of a class and its bases."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        section = re.search(
+            r"^Parameters\n-+\n(.*?)(?:\n\n\w+\n-+\n|\Z)", inspect.cleandoc(base.__doc__ or ""), re.S | re.M
+        )
+        for names, text in re.findall(r"^(\S.*)\n((?:[ ]+.*\n?)+)", section[1] if section else "", re.M):
+            found |= dict.fromkeys(re.split(r",\s*", names.partition(" : ")[0]), " ".join(text.split()))
+    return found
+
+
+def _row(item: Field[Any], about: str) -> str:
     meta = item.metadata
     unit = meta.get("unit", "")
-    shown = "time" if unit == "ns" else unit
-    return _table_row(f"`{item.name}`", meta.get("help", ""), shown, _range(item), _value(_default(item), unit))
+    shown = {"ns": "s, ms", "rad": "rad, deg"}.get(unit, unit)
+    return _table_row(f"`{item.name}`", meta.get("help") or about, shown, _range(item), _value(_default(item), unit))
 
 
 def _table_row(*cells: str) -> str:
@@ -137,10 +155,12 @@ def _value(value: Any, unit: str) -> str:
         return "none"
     if isinstance(value, bool):
         return str(value).lower()
+    if is_dataclass(value):
+        return f"{type(value).__name__}()"
     if isinstance(value, tuple):
         return ", ".join(_value(part, unit) for part in value) or "none"
     if isinstance(value, int | float):
-        return as_written(round(value, 6) if unit == "rad" else value, unit)
+        return f"{math.degrees(value):.3g} deg" if unit == "rad" and value else as_written(value, unit)
     return str(value)
 
 
