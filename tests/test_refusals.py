@@ -234,7 +234,7 @@ def test_an_export_that_fails_leaves_nothing_in_the_way_of_another(result, tmp_p
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("recordings.export.bundle.write_ply", full)
+        patch.setattr("recordings.export.point_files.write_ply", full)
         assert roverflow("export", result, folder) == 1
     assert "No space left on device" in capsys.readouterr().err
     assert not folder.exists()

@@ -20,6 +20,10 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("result", type=Path, metavar="OUT.mcap")
     sub.add_argument("folder", type=Path, metavar="DIR", help="folder for the files, made where it is missing")
     sub.add_argument("--frames", action="store_true", help="maps and points of every frame, not the regional map")
+    sub.add_argument(
+        "--map", action="append", default=[], metavar="STREAM", dest="maps",
+        help="an elevation or navigation map of the pipeline by its stream's name, not the regional one",
+    )  # fmt: skip
 
 
 def run(options: argparse.Namespace) -> int:
@@ -33,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
     lost, made = Counter[str](), not options.folder.exists()
     try:
         with writing(options.folder):
-            files = export(options.result, options.folder, options.frames, lost)
+            files = export(options.result, options.folder, options.frames, lost, options.maps)
     except BaseException:  # a partial export looks like a whole one, and blocks the next attempt
         for part in [options.folder] if made else list(options.folder.iterdir()):
             if part.is_dir():

@@ -1,18 +1,19 @@
-"""A result log as files: the regional map whole, or every frame's own maps and points.
+"""A result log as files: one map of the whole traverse, or the maps and points of every frame.
 
-The log is read as any consumer would, once, frame by frame; the regional map is put together of the windows that the
-frames gave, in memory that grows with the ground seen and not with the rectangle about it.
+The log is read once, frame by frame. A regional map is put together from the windows that the frames updated, in memory
+that grows with the mapped ground and not with the rectangle around it.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from itertools import chain, count, groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,39 +22,110 @@ from recordings.atomic_write import written
 from recordings.errors import LogError, said
 from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
-from recordings.export.mosaic import RIM, STRIP, Mosaic
-from recordings.export.ply import COLOURS, write_ply
-from recordings.mcap.file import iter_decoded
+from recordings.export.mosaic import RIM_WIDTH, STRIP_ROWS, Mosaic
+from recordings.export.point_files import CELL_COLOR, add_colors, write_cells, write_points
+from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
-from recordings.ros2.from_msg import transform_of
 from recordings.scoring.result_log import without_results
 from recordings.sinks.colormaps import hillshade
-from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, PixelOrigin, Tiles, Transform
+from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Tiles
 
-REGION = ("/nav/regional_map", "/nav/regional_navigation_map")
-FRAME = ("/nav/elevation_map", "/nav/navigation_map")
 POINTS = "/nav/points"
-# As in other hillshades: the sun in the north-west, 45 degrees high, for a picture whose upper edge is north.
+_SCHEMAS = {"elevation": "grid_map_msgs/msg/GridMap", "navigation": "nav_msgs/msg/OccupancyGrid"}
+# The sun of other hillshades: in the north-west, 45 degrees high, where north is the picture's upper edge.
 _NORTH_WEST = np.array([-0.5, 0.5, np.sqrt(0.5)])
-_COLOUR = np.dtype([("sigma", "f4"), ("rgb", "u1", (3,)), ("seen", "u1")])
-_LONGEST = 100  # bytes of the name of a file that a log chooses
-_CENTRES = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
-_POINTS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+_MAX_NAME_BYTES = 100  # of a file that is named after a layer or a frame of reference
 
 
-def export(result: Path, out: Path, frames: bool = False, lost: Counter[str] | None = None) -> list[Path]:
-    """Write the regional map of a result log into the folder `out`, or with `frames` the maps of every frame into a
-    folder each; returns the files.
+class MapTopics(NamedTuple):
+    """The topics of maps on one grid: an elevation map, a navigation map or both."""
 
-    With `lost`, what is left of a damaged log is exported, and why messages were lost is counted there. Raises LogError
-    where the log cannot be read, or holds no such map.
+    elevation: str | None
+    navigation: str | None
+
+
+REGIONAL = MapTopics("/nav/regional_map", "/nav/regional_navigation_map")
+FRAME = MapTopics("/nav/elevation_map", "/nav/navigation_map")
+
+
+def export(
+    result: Path, out: Path, frames: bool = False, lost: Counter[str] | None = None, maps: Collection[str] = ()
+) -> list[Path]:
+    """Write maps of a result log into a folder: GeoTIFF, PNG hillshade, PGM with YAML, PLY.
+
+    Parameters
+    ----------
+    result
+        The log that a run wrote.
+    out
+        The folder.
+    frames
+        Write the maps and points of every frame, a folder each, instead of the regional map.
+    lost
+        If given, a damaged log is exported as far as it is readable, and the reasons of losses are counted here.
+    maps
+        Streams to write instead of the regional map: an elevation map, a navigation map or one of each on the same
+        grid. Maps in frame `level` are written for every frame.
+
+    Returns
+    -------
+    list[Path]
+        The files.
+
+    Raises
+    ------
+    LogError
+        If the log is unreadable or has no such map.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from recordings.export.bundle import export
+    >>> export(Path("out.mcap"), Path("maps"), maps=["regional_map"])  # doctest: +SKIP
     """
-    return _export_frames(result, out, lost) if frames else _export_region(result, out, lost)
+    if not maps:
+        topics = FRAME if frames else REGIONAL
+    else:
+        topics = _topics_of(result, maps)
+        frames = frames or _is_in_level(result, topics, lost)
+    if frames:
+        return _export_frames(result, out, lost, topics, points=not maps)
+    return _export_region(result, out, lost, topics)
 
 
-def _messages(result: Path, lost: Counter[str] | None, *topics: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    """(stamp, topic -> message) of every frame; under "level" where the frame `level` lies in another."""
-    wanted = iter_decoded(result, [*topics, "/tf"], lost)
+def _topics_of(result: Path, maps: Collection[str]) -> MapTopics:
+    """The topics of the streams `maps`."""
+    with McapFile(result) as log:
+        channels = [log.channel(number) for number in log.index.channels if log.count({number})]
+        schemas = {channel.topic: getattr(log.schema(channel), "name", "") for channel in channels}
+    reasons = {f"{topic}/reason" for topic in schemas}
+    streams = {
+        topic.removeprefix("/nav/"): schema
+        for topic, schema in sorted(schemas.items())
+        if topic.startswith("/nav/") and topic not in reasons and schema in _SCHEMAS.values()
+    }
+    for name in maps:
+        if name not in streams:
+            near = get_close_matches(name, streams, n=1)
+            meant = f"; did you mean '{near[0]}'?" if near else ""
+            raise LogError(f"{result} contains no map '{name}', only {', '.join(streams) or 'none at all'}{meant}")
+    found = {kind: [name for name in maps if streams[name] == schema] for kind, schema in _SCHEMAS.items()}
+    for kind, names in found.items():
+        if len(names) > 1:
+            raise LogError(f"{' and '.join(names)} are both {kind} maps; export one at a time")
+    return MapTopics(*(f"/nav/{names[0]}" if names else None for names in found.values()))
+
+
+def _is_in_level(result: Path, topics: MapTopics, lost: Counter[str] | None) -> bool:
+    """Whether the maps are in frame `level`."""
+    counted_later = None if lost is None else Counter[str]()
+    first = next(iter_decoded(result, [topic for topic in topics if topic], counted_later), None)
+    return first is not None and first[2].header.frame_id == LEVEL_FRAME
+
+
+def _messages(result: Path, lost: Counter[str] | None, *topics: str | None) -> Iterator[tuple[int, dict[str, Any]]]:
+    """(stamp, topic -> message) of every frame; "level" is the transform of frame `level`."""
+    wanted = iter_decoded(result, [*(topic for topic in topics if topic), "/tf"], lost)
     for stamp, group in groupby(wanted, key=lambda item: item[1]):
         frame: dict[str, Any] = {}
         for topic, _, message in group:
@@ -62,88 +134,114 @@ def _messages(result: Path, lost: Counter[str] | None, *topics: str) -> Iterator
                 continue
             for item in message.transforms:
                 if item.child_frame_id == LEVEL_FRAME:
-                    frame["level"] = transform_of(item)
+                    frame["level"] = ros2.transform_of(item)
         yield stamp, frame
 
 
 @dataclass(eq=False)
-class _RegionExport:
-    """The regional map in one frame of reference, as far as it has been read."""
+class _MapFiles:
+    """Maps on one grid, as far as they have been read."""
 
-    terrain: Mosaic
+    rim: float
+    elevation: Mosaic | None = None
     navigation: Mosaic | None = None
-    colours: Tiles = field(default_factory=lambda: Tiles(_COLOUR))
-    last: int = 0
+    colors: Tiles = field(default_factory=lambda: Tiles(CELL_COLOR))
+    stamp: int = 0
 
-    def write(self, out: Path) -> list[Path]:
-        about = f"roverflow: local frame '{self.terrain.frame_id}', metres, z up; up to {self.last} ns"
-        files = _write_maps(out, self.terrain, self.navigation, about)
-        return [*files, _write(out / "points.ply", _write_cells, self.terrain, self.colours, about)]
-
-
-def _export_region(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
-    """The regional map in `out`; where it began anew in further frames of reference, a folder for each in `out`."""
-    regions: dict[str, _RegionExport] = {}
-    for stamp, frame in _messages(result, lost, *REGION, POINTS):
-        if REGION[0] in frame:
-            given = _read(ros2.read_grid_map, frame[REGION[0]], result)
-            region = regions.setdefault(given.frame_id, _RegionExport(_terrain_mosaic(given, RIM)))
-            region.last = stamp
-            _lay_terrain(region.terrain, given)
+    def add(self, result: Path, topics: MapTopics, stamp: int, frame: dict[str, Any]) -> None:
+        """Add the maps of a frame."""
+        self.stamp = stamp
+        if topics.elevation in frame:
+            terrain: ElevationMap = _read(ros2.read_grid_map, frame[topics.elevation], result)
+            fills = dict.fromkeys(terrain.layers, np.float32(np.nan))
+            self.elevation = self.elevation or Mosaic(terrain.resolution, terrain.frame_id, fills, self.rim)
+            self.elevation.add(terrain.layers, np.isfinite(terrain.layers["elevation"]), terrain)
             if POINTS in frame and "level" in frame:
                 points = _read(_fields_of, frame[POINTS], result)
-                _colour(region.colours, points, frame["level"], given.resolution)
-            if REGION[1] in frame:
-                cells = _read(ros2.read_occupancy_grid, frame[REGION[1]], result)
-                region.navigation = region.navigation or _navigation_mosaic(cells, RIM)
-                _lay_navigation(region.navigation, cells)
+                add_colors(self.colors, points, frame["level"], terrain.resolution)
+        if topics.navigation in frame:
+            cells: NavigationMap = _read(ros2.read_occupancy_grid, frame[topics.navigation], result)
+            fill = {"cells": np.int8(Cell.UNKNOWN)}
+            self.navigation = self.navigation or Mosaic(cells.resolution, cells.frame_id, fill, self.rim)
+            self.navigation.add({"cells": cells.cells}, cells.cells != Cell.UNKNOWN, cells)
+
+    def close(self) -> bool:
+        """Whether any cell is known; the maps are cut to those, the navigation map as the elevation map."""
+        bounds = self.elevation or self.navigation
+        if bounds is None or not bounds.close():
+            return False
+        return self.navigation is None or self.navigation.close(like=bounds)
+
+    def write(self, folder: Path, time: str) -> list[Path]:
+        """A GeoTIFF of each layer, the hillshade with its world file, and the navigation map with its YAML."""
+        files = []
+        if (terrain := self.elevation) is not None:
+            about = _about(terrain.frame_id, time, self.stamp)
+            for layer, name in file_names(terrain.fills).items():
+                files.append(_write(folder / f"{name}.tif", write_geotiff, terrain, layer, about))
+            files.append(_write(folder / "hillshade.png", _write_hillshade, terrain))
+            files.append(_write(folder / "hillshade.pgw", _write_world_file, terrain))
+        if self.navigation is not None:
+            files.append(_write(folder / "navigation_map.pgm", write_pgm, self.navigation, "cells"))
+            files.append(_write(folder / "navigation_map.yaml", write_yaml, "navigation_map.pgm", self.navigation))
+        return files
+
+
+def _export_region(result: Path, out: Path, lost: Counter[str] | None, topics: MapTopics) -> list[Path]:
+    """The regional map in `out`; if it was reset, a folder in `out` for each frame of reference."""
+    regions: dict[str, _MapFiles] = {}
+    leading = topics.elevation or topics.navigation
+    for stamp, frame in _messages(result, lost, *topics, POINTS):
+        if leading in frame:
+            frame_id = frame[leading].header.frame_id
+            regions.setdefault(frame_id, _MapFiles(RIM_WIDTH)).add(result, topics, stamp, frame)
     if not regions:
         _check_damage(result, lost)
-        raise without_results(
-            result, REGION[:1], instead=(*FRAME, POINTS), remedy="add --frames to export the maps of every frame"
-        )
-    known = {name: region for name, region in regions.items() if region.terrain.close()}
+        remedy = "add --frames to export the maps of every frame"
+        raise without_results(result, (str(leading),), instead=(*map(str, FRAME), POINTS), remedy=remedy)
+    known = {name: region for name, region in regions.items() if region.close()}
     if not known:
-        raise LogError(f"no cell of {REGION[0]} in {result} is known: there is nothing to export")
-    if len(known) == 1:
-        return next(iter(known.values())).write(out)
-    folders = file_names(known)
-    return [file for name, region in known.items() for file in region.write(out / folders[name])]
-
-
-def _export_frames(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
-    files: list[Path] = []
-    number = 0
-    for stamp, frame in _messages(result, lost, *FRAME, POINTS):
-        folder, written_before = out / f"frame-{number:04d}-{stamp}", len(files)
-        about = f"roverflow: local frame '{LEVEL_FRAME}', metres, z up; at {stamp} ns"
-        given = frame.get(FRAME[0])
-        terrain = None if given is None else _read(ros2.read_grid_map, given, result)
-        if terrain is not None:
-            mosaic = _terrain_mosaic(terrain, 0.0)
-            _lay_terrain(mosaic, terrain)
-            cells = None
-            if FRAME[1] in frame:
-                navigation = _read(ros2.read_occupancy_grid, frame[FRAME[1]], result)
-                cells = _navigation_mosaic(navigation, 0.0)
-                _lay_navigation(cells, navigation)
-            if mosaic.close():
-                files += _write_maps(folder, mosaic, cells, about)
-        if POINTS in frame:
-            points = _read(_fields_of, frame[POINTS], result)
-            files.append(_write(folder / "points.ply", _write_points, points, about))
-        number += len(files) > written_before
-    if not files:
-        _check_damage(result, lost)
-        raise without_results(result, (*FRAME, POINTS))
+        raise LogError(f"no cell of {leading} in {result} is known: there is nothing to export")
+    folders = {next(iter(known)): ""} if len(known) == 1 else file_names(known)
+    files = []
+    for name, region in known.items():
+        files += region.write(out / folders[name], "up to")
+        if region.elevation is not None:
+            about = _about(name, "up to", region.stamp)
+            path = out / folders[name] / "points.ply"
+            files.append(_write(path, write_cells, region.elevation, region.colors, about))
     return files
 
 
+def _export_frames(result: Path, out: Path, lost: Counter[str] | None, topics: MapTopics, points: bool) -> list[Path]:
+    """The maps of every frame, and its points if `points`, in a folder each."""
+    files: list[Path] = []
+    number = 0
+    for stamp, frame in _messages(result, lost, *topics, POINTS if points else None):
+        folder, written_before = out / f"frame-{number:04d}-{stamp}", len(files)
+        maps = _MapFiles(0.0)
+        maps.add(result, topics, stamp, {topic: frame[topic] for topic in topics if topic in frame})
+        if maps.close():
+            files += maps.write(folder, "at")
+        if POINTS in frame:
+            fields = _read(_fields_of, frame[POINTS], result)
+            files.append(_write(folder / "points.ply", write_points, fields, _about(LEVEL_FRAME, "at", stamp)))
+        number += len(files) > written_before
+    if not files:
+        _check_damage(result, lost)
+        raise without_results(result, [*(topic for topic in topics if topic), *([POINTS] if points else [])])
+    return files
+
+
+def _about(frame_id: str, time: str, stamp: int) -> str:
+    return f"roverflow: local frame '{frame_id}', metres, z up; {time} {stamp} ns"
+
+
 def file_names(names: Iterable[str]) -> dict[str, str]:
-    """For each of the names, which a log may have chosen badly, that of a file: in its folder, and of no other."""
+    """For each name a file name of its own, without characters that lead out of the folder."""
     chosen: dict[str, str] = {}
     for name in names:
-        short = re.sub(r"[^\w.-]", "-", name).encode()[:_LONGEST].decode(errors="ignore")
+        short = re.sub(r"[^\w.-]", "-", name).encode()[:_MAX_NAME_BYTES].decode(errors="ignore")
         plain = short.lstrip(".") or "unnamed"
         others = {other.casefold() for other in chosen.values()}
         numbered = (f"{plain}{number}" for number in chain([""], (f"-{number}" for number in count(2))))
@@ -152,14 +250,14 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
 
 
 def _check_damage(result: Path, lost: Counter[str] | None) -> None:
-    """Raise LogError if it is damage that left nothing to export."""
+    """Raise LogError if damage left nothing to export."""
     for why in lost or ():
         raise LogError(f"{result}: {why}; nothing that is left of it can be exported, run the traverse again")
 
 
 def _fields_of(cloud: Any) -> dict[str, Array]:
-    """The fields of a PointCloud2 that says where its points are. Raises ValueError for another."""
-    fields = ros2.read_point_cloud(cloud)
+    """The fields of a PointCloud2. Raises ValueError if it has no x, y and z."""
+    fields: dict[str, Array] = ros2.read_point_cloud(cloud)
     if lacking := {"x", "y", "z"} - fields.keys():
         raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
     return fields
@@ -172,51 +270,20 @@ def _read(reader: Callable[[Any], Any], message: Any, result: Path) -> Any:
         raise LogError(f"{result}: a {message.__msgtype__} in it is not one: {said(error)}") from error
 
 
-def _terrain_mosaic(terrain: ElevationMap, rim: float) -> Mosaic:
-    return Mosaic(terrain.resolution, terrain.frame_id, dict.fromkeys(terrain.layers, np.float32(np.nan)), rim)
-
-
-def _lay_terrain(mosaic: Mosaic, terrain: ElevationMap) -> None:
-    known = np.isfinite(terrain.layers["elevation"])
-    mosaic.lay(terrain.layers, known, terrain.resolution, terrain.origin, terrain.frame_id)
-
-
-def _navigation_mosaic(navigation: NavigationMap, rim: float) -> Mosaic:
-    return Mosaic(navigation.resolution, navigation.frame_id, {"cells": np.int8(Cell.UNKNOWN)}, rim)
-
-
-def _lay_navigation(mosaic: Mosaic, navigation: NavigationMap) -> None:
-    known = navigation.cells != Cell.UNKNOWN
-    mosaic.lay({"cells": navigation.cells}, known, navigation.resolution, navigation.origin, navigation.frame_id)
-
-
 def _write(path: Path, write: Callable[..., Any], *arguments: Any) -> Path:
-    """Write a file that is whole or not there, its folder made where it is missing."""
+    """Write a whole file or none, and its folder where it is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with written(path) as temporary:
         write(temporary, *arguments)
     return path
 
 
-def _write_maps(folder: Path, terrain: Mosaic, navigation: Mosaic | None, about: str) -> list[Path]:
-    """A GeoTIFF of each layer, the hillshade with its world file, and the navigation map with its YAML."""
-    names = file_names(terrain.fills)
-    files = [_write(folder / f"{names[layer]}.tif", write_geotiff, terrain, layer, about) for layer in terrain.fills]
-    files.append(_write(folder / "hillshade.png", _write_hillshade, terrain))
-    files.append(_write(folder / "hillshade.pgw", _write_world_file, terrain))
-    if navigation is not None:
-        navigation.close(like=terrain)
-        files.append(_write(folder / "navigation_map.pgm", write_pgm, navigation, "cells"))
-        files.append(_write(folder / "navigation_map.yaml", write_yaml, "navigation_map.pgm", navigation))
-    return files
-
-
 def _write_hillshade(path: Path, terrain: Mosaic) -> None:
-    """1 to 255, bright where the sun falls in steeply, and 0 where nothing is known."""
+    """1 to 255, brightest where the sun is perpendicular, and 0 where nothing is known."""
     shades = np.zeros(terrain.shape, np.uint8)
     rows = terrain.shape[0]
-    for low in range(0, rows, STRIP):
-        high = min(rows, low + STRIP)
+    for low in range(0, rows, STRIP_ROWS):
+        high = min(rows, low + STRIP_ROWS)
         # With a row on either side, so that slopes are those of the whole map.
         block = terrain.block("elevation", low - 1, 0, high - low + 2, terrain.shape[1])
         lit = np.where(np.isfinite(block), 1 + 254 * hillshade(block, terrain.resolution, _NORTH_WEST), 0)
@@ -230,71 +297,3 @@ def _write_world_file(path: Path, terrain: Mosaic) -> None:
     (x, y), step, rows = terrain.origin, terrain.resolution, terrain.shape[0]
     lines = (step, 0.0, 0.0, -step, x + step / 2, y + (rows - 0.5) * step)
     path.write_text("".join(f"{value:.9f}\n" for value in lines))
-
-
-def _vertex(place: list[tuple[str, str]], coloured: bool, sure: bool) -> np.dtype[np.void]:
-    return np.dtype([*place, *(COLOURS if coloured else []), *([("sigma", "<f4")] if sure else [])])
-
-
-def _write_points(path: Path, points: dict[str, Array], about: str) -> None:
-    """All points of a frame; `source` tells which are measured (1), of a plane (2) and filled (3)."""
-    place = [*_POINTS, *([("source", "u1")] if "source" in points else [])]
-    dtype = _vertex(place, "colors" in points, "sigma" in points)
-    vertices = np.empty(len(points["x"]), dtype)
-    for name in ("x", "y", "z", "source", "sigma"):
-        if name in points:
-            vertices[name] = points[name]
-    for channel, (name, _) in enumerate(COLOURS if "colors" in points else []):
-        vertices[name] = points["colors"][:, channel]
-    write_ply(path, dtype, [vertices], about)
-
-
-def _colour(colours: Tiles, points: dict[str, Array], level: Transform, resolution: float) -> None:
-    """Keep, for every cell, the colour of the point in it whose depth is known best."""
-    if "source" in points:  # a guess colours nothing
-        points = {name: values[points["source"] == PixelOrigin.MEASURED] for name, values in points.items()}
-    if "colors" not in points or "sigma" not in points or not len(points["x"]):
-        return
-    x, y, _ = level(np.column_stack([points["x"], points["y"], points["z"]])).T
-    col, row = (np.floor(place / resolution).astype(np.int64) for place in (x, y))
-    first_row, first_col = int(row.min()), int(col.min())
-    shape = int(row.max()) - first_row + 1, int(col.max()) - first_col + 1
-    cell = (row - first_row) * shape[1] + col - first_col
-    order = np.lexsort((points["sigma"], cell))
-    best = order[np.unique(cell[order], return_index=True)[1]]
-    block = colours.read(first_row, first_col, *shape).reshape(-1)
-    place = cell[best]
-    better = (block["seen"][place] == 0) | (points["sigma"][best] < block["sigma"][place])
-    place, best = place[better], best[better]
-    block["sigma"][place], block["rgb"][place], block["seen"][place] = points["sigma"][best], points["colors"][best], 1
-    changed = np.zeros(len(block), bool)
-    changed[place] = True
-    colours.write(first_row, first_col, block.reshape(shape), changed.reshape(shape))
-
-
-def _write_cells(path: Path, terrain: Mosaic, colours: Tiles, about: str) -> None:
-    """One point for every known cell: its centre and elevation, the surest colour seen in it, and its sigma."""
-    coloured, sure = bool(colours.tiles), "variance" in terrain.fills
-    dtype = _vertex(_CENTRES, coloured, sure)
-
-    def parts() -> Iterator[Array]:
-        rows, cols = terrain.shape
-        first_col, first_row = (round(corner / terrain.resolution) for corner in terrain.origin)
-        for low in range(0, rows, STRIP):
-            count = min(STRIP, rows - low)
-            elevation = terrain.block("elevation", low, 0, count, cols)
-            known = np.isfinite(elevation)
-            row, col = np.nonzero(known)
-            vertices = np.empty(len(row), dtype)
-            vertices["x"] = (first_col + col + 0.5) * terrain.resolution
-            vertices["y"] = (first_row + low + row + 0.5) * terrain.resolution
-            vertices["z"] = elevation[known]
-            if sure:
-                vertices["sigma"] = np.sqrt(terrain.block("variance", low, 0, count, cols)[known])
-            if coloured:
-                rgb = colours.read(first_row + low, first_col, count, cols)["rgb"][known]
-                for place, (name, _) in enumerate(COLOURS):
-                    vertices[name] = rgb[:, place]
-            yield vertices
-
-    write_ply(path, dtype, parts(), about)

@@ -1,7 +1,7 @@
 """PGM and YAML as nav2_map_server and ROS 1 map_server read them in trinary mode: first row largest y.
 
-Unknown is written as gray 205, an occupancy of 1 - 205/255 = 0.196. A reader takes what is below free_thresh for free,
-so any threshold above that (0.25 used to be Nav2's own) would turn unknown ground into free ground.
+Unknown is gray 205, an occupancy of 1 - 205/255 = 0.196. Occupancy below free_thresh is free, so a higher threshold
+(such as Nav2's former 0.25) would turn unknown ground into free ground.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 
 
 def write_pgm(path: Path, mosaic: Mosaic, layer: str) -> None:
-    """Write the picture of a layer of `Cell` codes."""
+    """Write a layer of `Cell` codes."""
     rows, cols = mosaic.shape
     with path.open("wb") as file:
         file.write(f"P5\n{cols} {rows}\n255\n".encode())
@@ -27,7 +27,7 @@ def write_pgm(path: Path, mosaic: Mosaic, layer: str) -> None:
 
 
 def write_yaml(path: Path, picture: str, mosaic: Mosaic) -> None:
-    """Write the file that map_server is given. picture: name of the PGM beside it."""
+    """Write the file that map_server opens. picture: name of the PGM beside it."""
     x, y = mosaic.origin
     path.write_text(
         f"# frame_id: {mosaic.frame_id}\n"

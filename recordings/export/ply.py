@@ -1,4 +1,4 @@
-"""PLY, binary little-endian: points as vertices with colours and the standard deviation that the log gives them."""
+"""PLY, binary little-endian: points as vertices with colours and standard deviations."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 
 from stages.data import Array
 
-COLOURS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 _NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
 
 def write_ply(path: Path, dtype: np.dtype[np.void], parts: Iterable[Array], comment: str) -> None:
     """Write vertices.
 
-    dtype: a property each field; parts: structured arrays (n,) of it; comment: one line, ASCII. The number of points
-    stands in the header, before the points, so it is filled in at the end.
+    dtype: one property per field; parts: structured arrays (n,) of it; comment: one line of ASCII. The header contains
+    the number of points, so it is filled in at the end.
     """
     with path.open("wb") as file:
         place, count = _begin(file, dtype, comment), 0
@@ -30,7 +30,7 @@ def write_ply(path: Path, dtype: np.dtype[np.void], parts: Iterable[Array], comm
 
 
 def _begin(file: BinaryIO, dtype: np.dtype[np.void], comment: str) -> int:
-    """Write the header; returns where the number of points belongs."""
+    """Write the header; returns the offset of the number of points."""
     fields = [(name, _NAMES[dtype[name].str]) for name in dtype.names or ()]
     file.write(f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex ".encode("ascii", "replace"))
     place = file.tell()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,7 @@ def result(tmp_path: Path) -> Path:
     return path
 
 
-def test_gdal_finds_every_height_at_its_place_and_nothing_in_the_hole(result: Path, tmp_path: Path) -> None:
+def test_gdal_reads_every_height_at_its_place_and_no_data_in_the_hole(result: Path, tmp_path: Path) -> None:
     export(result, tmp_path / "out")
     with rasterio.open(tmp_path / "out" / "elevation.tif") as file:
         assert file.bounds == pytest.approx((-1.0, 1.0, 4.0, 4.0))
@@ -92,7 +93,7 @@ def test_gdal_finds_every_height_at_its_place_and_nothing_in_the_hole(result: Pa
         assert [file.xy(row, col) for row, col in np.argwhere(np.isnan(heights))] == [pytest.approx((1.05, 3.05))]
 
 
-def test_every_layer_is_a_file_and_the_newer_window_lies_on_top(result: Path, tmp_path: Path) -> None:
+def test_every_layer_is_a_file_and_newer_windows_replace_older_ones(result: Path, tmp_path: Path) -> None:
     files = export(result, tmp_path / "out")
     names = {"elevation.tif", "variance.tif", "last.tif", "hillshade.png", "hillshade.pgw", "points.ply",
              "navigation_map.pgm", "navigation_map.yaml"}  # fmt: skip
@@ -105,7 +106,7 @@ def test_every_layer_is_a_file_and_the_newer_window_lies_on_top(result: Path, tm
     assert set(np.unique(last)) == {0, 1}
 
 
-def test_what_a_window_says_at_its_rim_gives_way_to_what_one_says_in_its_middle(tmp_path: Path) -> None:
+def test_the_rim_of_a_window_does_not_replace_the_middle_of_another(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
         for frame, (corner, wrong) in enumerate([((0.0, 0.0), 0.0), ((3.0, 0.0), 9.0)]):
@@ -131,7 +132,7 @@ def as_map_server_reads(yaml_file: Path) -> tuple[Array, float, list[float]]:
     return cells[::-1], about["resolution"], about["origin"]
 
 
-def test_map_server_reads_free_hazard_and_unknown_where_they_are(result: Path, tmp_path: Path) -> None:
+def test_map_server_reads_free_hazard_and_unknown_at_their_places(result: Path, tmp_path: Path) -> None:
     export(result, tmp_path / "out")
     cells, resolution, origin = as_map_server_reads(tmp_path / "out" / "navigation_map.yaml")
     assert (resolution, origin) == (STEP, pytest.approx([-1.0, 1.0, 0.0]))
@@ -141,7 +142,7 @@ def test_map_server_reads_free_hazard_and_unknown_where_they_are(result: Path, t
     np.testing.assert_array_equal(cells, expected)
 
 
-def test_a_ply_reader_finds_each_cell_with_its_surest_colour(result: Path, tmp_path: Path) -> None:
+def test_each_cell_in_the_ply_has_the_colour_of_its_best_point(result: Path, tmp_path: Path) -> None:
     export(result, tmp_path / "out")
     data = plyfile.PlyData.read(str(tmp_path / "out" / "points.ply"))
     assert "local frame 'odom'" in data.comments[0]
@@ -157,7 +158,7 @@ def test_a_ply_reader_finds_each_cell_with_its_surest_colour(result: Path, tmp_p
     assert colours == {(1.05, 2.05): (10, 220, 30), (0.45, 2.05): (7, 8, 250)}
 
 
-def test_the_hillshade_is_lit_from_the_north_west_and_placed_by_its_world_file(tmp_path: Path) -> None:
+def test_the_hillshade_has_light_from_the_north_west_and_a_world_file(tmp_path: Path) -> None:
     x, y = np.meshgrid((np.arange(60) + 0.5) * STEP, (np.arange(40) + 0.5) * STEP)
     mound = np.exp(-((x - 4) ** 2 + (y - 1) ** 2)).astype(np.float32)
     mound[0, 0] = np.nan
@@ -180,7 +181,7 @@ def test_the_hillshade_is_lit_from_the_north_west_and_placed_by_its_world_file(t
     assert shade.min(where=np.isfinite(mound[::-1]), initial=255) >= 1
 
 
-def test_the_maps_and_points_of_every_frame_are_exported_on_request(result: Path, tmp_path: Path) -> None:
+def test_frames_exports_the_maps_and_points_of_every_frame(result: Path, tmp_path: Path) -> None:
     files = export(result, tmp_path / "out", frames=True)
     folders = sorted({file.parent.name for file in files})
     assert folders == [f"frame-{number:04d}-{START + number}" for number in (0, 1)]
@@ -216,7 +217,7 @@ def test_a_map_far_from_its_frame_s_origin_keeps_its_place(tmp_path: Path) -> No
         assert file.bounds == pytest.approx((*corner, corner[0] + 0.2, corner[1] + 0.2), abs=1e-6, rel=0)
 
 
-def test_a_log_without_a_regional_map_says_what_to_add(tmp_path: Path) -> None:
+def test_a_log_without_a_regional_map_names_the_remedy(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
         writer.write("/nav/points", ros2.point_cloud(cloud(0)), START)
@@ -227,7 +228,7 @@ def test_a_log_without_a_regional_map_says_what_to_add(tmp_path: Path) -> None:
     assert points.name == "points.ply"
 
 
-def test_what_is_left_of_a_cut_log_is_exported_and_the_loss_told(tmp_path: Path) -> None:
+def test_the_readable_part_of_a_cut_log_is_exported(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
         for frame, corner in enumerate([(-1.0, 1.0), (0.0, 1.0)]):
@@ -248,7 +249,7 @@ def test_what_is_left_of_a_cut_log_is_exported_and_the_loss_told(tmp_path: Path)
 
 
 @pytest.mark.parametrize("frames", [False, True])
-def test_a_log_that_no_run_wrote_is_not_called_a_result(tmp_path: Path, frames: bool) -> None:
+def test_a_log_without_nav_topics_is_refused(tmp_path: Path, frames: bool) -> None:
     path = tmp_path / "raw.mcap"
     with Ros2Writer(path) as writer:
         writer.write("/lidar/points", ros2.point_cloud(cloud(0)), START)
@@ -266,13 +267,13 @@ def regional_log(path: Path, *maps: tuple[str, float]) -> Path:
     return path
 
 
-def test_maps_that_change_their_grid_on_the_way_are_not_mixed(tmp_path: Path) -> None:
+def test_maps_of_different_grids_are_refused(tmp_path: Path) -> None:
     path = regional_log(tmp_path / "out.mcap", ("odom", STEP), ("odom", 2 * STEP))
-    with pytest.raises(LogError, match=r"the maps change on the way: elevation at 0\.2 m in 'odom' after"):
+    with pytest.raises(LogError, match=r"the maps of the log differ: elevation at 0\.2 m in 'odom' after"):
         export(path, tmp_path / "out")
 
 
-def test_a_map_torn_apart_by_a_pose_that_jumped_is_refused_before_it_fills_the_disk(tmp_path: Path) -> None:
+def test_a_map_of_a_pose_that_jumped_is_refused_before_it_fills_the_disk(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
         for frame, place in enumerate((0.0, 50_000.0)):
@@ -280,12 +281,12 @@ def test_a_map_torn_apart_by_a_pose_that_jumped_is_refused_before_it_fills_the_d
                 START + frame, {"elevation": np.ones((3, 3), np.float32)}, STEP, (place,) * 2, "odom"
             )
             writer.write("/nav/regional_map", ros2.grid_map(terrain), START + frame)
-    with pytest.raises(LogError, match=r"'odom' reaches over 50000\.3 x 50000\.3 m, .*add --frames"):
+    with pytest.raises(LogError, match=r"'odom' is 50000\.3 x 50000\.3 m, .*add --frames"):
         export(path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_region_that_began_anew_in_another_frame_has_a_folder_of_its_own(tmp_path: Path) -> None:
+def test_a_regional_map_that_was_reset_has_a_folder_per_frame_id(tmp_path: Path) -> None:
     names = ("visual_odom", "visual_odom/2")
     export(regional_log(tmp_path / "out.mcap", *((name, STEP) for name in names)), tmp_path / "out")
     for number, folder in enumerate(("visual_odom", "visual_odom-2")):
@@ -293,14 +294,14 @@ def test_a_region_that_began_anew_in_another_frame_has_a_folder_of_its_own(tmp_p
             assert np.unique(file.read(1)[np.isfinite(file.read(1))]) == [number]
 
 
-def test_a_file_that_cannot_be_written_is_named_and_nothing_half_is_left(result: Path, tmp_path: Path) -> None:
+def test_an_unwritable_file_is_named_and_no_partial_file_is_left(result: Path, tmp_path: Path) -> None:
     (tmp_path / "out" / "variance.tif").mkdir(parents=True)
     with pytest.raises(LogError, match=r"cannot write .*variance\.tif: it is a folder"):
         export(result, tmp_path / "out")
     assert not list((tmp_path / "out").glob("*.partial"))
 
 
-def test_the_names_that_a_log_chooses_lead_nowhere_and_to_no_one_file_twice():
+def test_file_names_stay_in_the_folder_and_are_unique():
     named = file_names(
         ["elevation", "../../etc", "/abs", "..", "", ".", "a/b", "a-b", "A-B", "x" * 300, "nul\0", "höhe", "漢" * 120]
     )
@@ -311,3 +312,25 @@ def test_the_names_that_a_log_chooses_lead_nowhere_and_to_no_one_file_twice():
         assert (Path("out") / name).resolve().parent == Path("out").resolve()
         assert 0 < len(name.encode()) < 120
         assert not name.startswith(".")
+
+
+def test_maps_are_exported_by_the_names_of_their_streams(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    elevation, navigation = window(0, (0.0, 2.0), (20, 30))
+    with Ros2Writer(path) as writer:
+        writer.write("/nav/sparse/map", ros2.grid_map(elevation), START)
+        writer.write("/nav/sparse/cells", ros2.occupancy_grid(navigation), START)
+        writer.write("/nav/sparse/cells/reason", ros2.reason_map(navigation), START)
+        own = replace(navigation, frame_id="level")
+        writer.write("/nav/frame_cells", ros2.occupancy_grid(own), START)
+    both = export(path, tmp_path / "both", maps=["sparse/map", "sparse/cells"])
+    assert {"elevation.tif", "hillshade.png", "navigation_map.pgm", "points.ply"} <= {file.name for file in both}
+    for name, folder in (("sparse/cells", "cells"), ("frame_cells", f"frames/frame-0000-{START}")):
+        files = export(path, tmp_path / folder.partition("/")[0], maps=[name])
+        assert files == [tmp_path / folder / f"navigation_map.{suffix}" for suffix in ("pgm", "yaml")]
+    assert files[0].read_bytes() == (tmp_path / "both" / "navigation_map.pgm").read_bytes()
+    meant = r"no map 'sparse_map', only frame_cells, sparse/cells, sparse/map; did you mean 'sparse/map'\?"
+    with pytest.raises(LogError, match=meant):
+        export(path, tmp_path / "none", maps=["sparse_map"])
+    with pytest.raises(LogError, match="sparse/cells and frame_cells are both navigation maps"):
+        export(path, tmp_path / "none", maps=["sparse/cells", "frame_cells"])

@@ -89,7 +89,7 @@ def test_near_is_red_far_is_blue_unknown_is_neither() -> None:
     assert tuple(picture[20, 4]) == colormaps.UNKNOWN_RGB
 
 
-def test_the_log_gives_the_first_middle_and_last_frame(result: Path, tmp_path: Path) -> None:
+def test_the_first_middle_and_last_frame_are_drawn(result: Path, tmp_path: Path) -> None:
     written = draw(result, tmp_path / "pictures")
     assert [path.name for path in written] == [
         f"frame-{n:04d}-{name}.png" for n in (0, 2, 4) for name in ("disparity", "elevation", "navigation")
@@ -117,7 +117,7 @@ def test_a_log_without_results_is_named(tmp_path: Path) -> None:
         draw(path, tmp_path)
 
 
-def test_nothing_known_is_still_a_picture() -> None:
+def test_a_map_without_known_cells_is_drawn() -> None:
     nothing = np.full((ROWS, COLS), np.nan, np.float32)
     page = elevation_picture(ElevationMap(START, {"elevation": nothing}, 0.5, (0.0, -1.5), LEVEL_FRAME))
     assert (cells_of(page)[:-1] == colormaps.UNKNOWN_RGB).all()
@@ -168,7 +168,7 @@ def test_sixteen_bit_images_keep_their_contrast() -> None:
     assert colormaps.top_eight_bits(eight, bright)[0] is eight
 
 
-def test_a_picture_leaves_out_what_lies_behind_the_rover_unless_something_is_known_there():
+def test_unknown_ground_behind_the_rover_is_not_drawn():
     elevation = np.full((4, 80), np.nan, np.float32)
     elevation[1, 50] = 1.0
     terrain = ElevationMap(0, {"elevation": elevation}, 0.05, (-2.0, 0.0), "level")
@@ -183,11 +183,11 @@ def test_a_picture_leaves_out_what_lies_behind_the_rover_unless_something_is_kno
 
 
 @pytest.mark.parametrize(("value", "said"), [(-0.0, "0"), (-5.55e-17, "0"), (-0.25, "-0.25"), (112.0, "112")])
-def test_a_scale_names_its_values_in_few_digits_and_has_no_minus_zero(value, said):
+def test_scale_values_have_few_digits_and_no_minus_zero(value, said):
     assert colormaps.format_value(value) == said
 
 
-def test_a_colour_range_is_that_of_the_whole_layer_though_found_from_a_part():
+def test_a_sampled_colour_range_covers_the_whole_layer():
     layer = np.linspace(-1.0, 1.0, 20 * colormaps.MIN_SAMPLES, dtype=np.float32).reshape(-1, 64)
     assert colormaps.value_limits(layer) == pytest.approx((-0.98, 0.98), abs=1e-3)
     assert colormaps.elevation_limits(layer) == pytest.approx((-1.0, 1.0))

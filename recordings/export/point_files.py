@@ -1,0 +1,84 @@
+"""Points of a result log as PLY: the cloud of a frame, and the cells of a regional map with their colors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from recordings.export.mosaic import STRIP_ROWS, Mosaic
+from recordings.export.ply import COLORS, write_ply
+from stages.data import Array, PixelOrigin, Tiles, Transform
+
+CELL_COLOR = np.dtype([("sigma", "f4"), ("rgb", "u1", (3,)), ("seen", "u1")])  # of one cell of a regional map
+_CENTRES = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
+_POINTS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+
+
+def _vertex(place: list[tuple[str, str]], colored: bool, has_sigma: bool) -> np.dtype[np.void]:
+    return np.dtype([*place, *(COLORS if colored else []), *([("sigma", "<f4")] if has_sigma else [])])
+
+
+def write_points(path: Path, points: dict[str, Array], about: str) -> None:
+    """All points of a frame; their `source` is 1 (measured), 2 (plane) or 3 (filled)."""
+    place = [*_POINTS, *([("source", "u1")] if "source" in points else [])]
+    dtype = _vertex(place, "colors" in points, "sigma" in points)
+    vertices = np.empty(len(points["x"]), dtype)
+    for name in ("x", "y", "z", "source", "sigma"):
+        if name in points:
+            vertices[name] = points[name]
+    for channel, (name, _) in enumerate(COLORS if "colors" in points else []):
+        vertices[name] = points["colors"][:, channel]
+    write_ply(path, dtype, [vertices], about)
+
+
+def add_colors(colors: Tiles, points: dict[str, Array], level: Transform, resolution: float) -> None:
+    """Keep, for every cell, the colour of its point with the smallest sigma."""
+    if "source" in points:  # only measured points give a colour
+        points = {name: values[points["source"] == PixelOrigin.MEASURED] for name, values in points.items()}
+    if "colors" not in points or "sigma" not in points or not len(points["x"]):
+        return
+    x, y, _ = level(np.column_stack([points["x"], points["y"], points["z"]])).T
+    col, row = (np.floor(place / resolution).astype(np.int64) for place in (x, y))
+    first_row, first_col = int(row.min()), int(col.min())
+    shape = int(row.max()) - first_row + 1, int(col.max()) - first_col + 1
+    cell = (row - first_row) * shape[1] + col - first_col
+    order = np.lexsort((points["sigma"], cell))
+    best = order[np.unique(cell[order], return_index=True)[1]]
+    block = colors.read(first_row, first_col, *shape).reshape(-1)
+    place = cell[best]
+    better = (block["seen"][place] == 0) | (points["sigma"][best] < block["sigma"][place])
+    place, best = place[better], best[better]
+    block["sigma"][place], block["rgb"][place], block["seen"][place] = points["sigma"][best], points["colors"][best], 1
+    changed = np.zeros(len(block), bool)
+    changed[place] = True
+    colors.write(first_row, first_col, block.reshape(shape), changed.reshape(shape))
+
+
+def write_cells(path: Path, terrain: Mosaic, colors: Tiles, about: str) -> None:
+    """One point for every known cell: its centre and elevation, its colour, and its sigma."""
+    colored, has_sigma = bool(colors.tiles), "variance" in terrain.fills
+    dtype = _vertex(_CENTRES, colored, has_sigma)
+
+    def parts() -> Iterator[Array]:
+        rows, cols = terrain.shape
+        first_col, first_row = (round(corner / terrain.resolution) for corner in terrain.origin)
+        for low in range(0, rows, STRIP_ROWS):
+            count = min(STRIP_ROWS, rows - low)
+            elevation = terrain.block("elevation", low, 0, count, cols)
+            known = np.isfinite(elevation)
+            row, col = np.nonzero(known)
+            vertices = np.empty(len(row), dtype)
+            vertices["x"] = (first_col + col + 0.5) * terrain.resolution
+            vertices["y"] = (first_row + low + row + 0.5) * terrain.resolution
+            vertices["z"] = elevation[known]
+            if has_sigma:
+                vertices["sigma"] = np.sqrt(terrain.block("variance", low, 0, count, cols)[known])
+            if colored:
+                rgb = colors.read(first_row + low, first_col, count, cols)["rgb"][known]
+                for place, (name, _) in enumerate(COLORS):
+                    vertices[name] = rgb[:, place]
+            yield vertices
+
+    write_ply(path, dtype, parts(), about)
