@@ -1,7 +1,7 @@
-"""PNG pictures of a result log: disparity, terrain and navigation map of a few frames, with scales and legends.
+"""PNG pages of a result log: disparity, elevation and navigation map of a few frames, with scales and legends.
 
-The result log is read back as any consumer would read it, so a picture shows what was published. Maps are bird's-eye
-views: x (forward) up, y (left) to the left, with the coordinates of the map's frame at their edges.
+The pages show the messages of the log. Maps are bird's-eye views: x (forward) up, y (left) to the left, with the
+coordinates of the map's frame at their edges.
 """
 
 from __future__ import annotations
@@ -19,42 +19,43 @@ from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupan
 from recordings.sinks import colormaps
 from stages.data import Array, ElevationMap, NavigationMap
 
-MAP_HEIGHT = 900  # px; maps are enlarged by a whole factor to about that
-MARGIN = 64  # px around a picture, for its scales
+MAX_MAP_PX = 900  # maps are enlarged by a whole factor up to that
+MARGIN_PX = 64  # around a picture, for its scales
 INK, PAPER = (38, 40, 46), (250, 250, 248)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def draw(result: Path, out: Path) -> list[Path]:
-    """Write `frame-NNNN-{disparity,elevation,navigation}.png` of the first, middle and last frame of a result log into
-    the folder `out`; returns the files, sorted. Raises LogError where the log holds nothing to draw.
+    """Write `frame-NNNN-{disparity,elevation,navigation}.png` of the first, middle and last frame into `out`.
+
+    Returns the files, sorted. Raises LogError if the log has nothing to draw.
     """
     with McapFile(result) as log:
-        stamps = np.unique(log.times(log.channels_of(PAINTERS))).tolist()
+        stamps = np.unique(log.times(log.channels_of(PAGES))).tolist()
     if not stamps:
-        raise LogError(f"{result} holds none of {', '.join(PAINTERS)}; draw pictures of a result log")
+        raise LogError(f"{result} contains none of {', '.join(PAGES)}; give a result log")
     chosen = {stamps[number]: number for number in (0, len(stamps) // 2, len(stamps) - 1)}
     out.mkdir(parents=True, exist_ok=True)
     written = []
-    for topic, stamp, message in iter_decoded(result, PAINTERS):
+    for topic, stamp, message in iter_decoded(result, PAGES):
         if stamp in chosen:
-            name, paint_message = PAINTERS[topic]
+            name, page_of = PAGES[topic]
             path = out / f"frame-{chosen[stamp]:04d}-{name}.png"
-            _write(path, paint_message(message))
+            _write(path, page_of(message))
             written.append(path)
     return sorted(written)
 
 
-def disparity_picture(disparity: Array) -> Array:
-    """Disparities (H, W), px, NaN = unknown, as an RGB picture with a colour bar."""
+def disparity_page(disparity: Array) -> Array:
+    """Disparities (H, W), px, NaN = unknown, as an RGB page with a colour bar."""
     limit = colormaps.disparity_limit(disparity)
     page = _page(colormaps.disparity_colors(disparity, limit), "disparity, px")
     _bar(page, 0.0, limit, cv2.COLORMAP_TURBO)
     return page
 
 
-def elevation_picture(terrain: ElevationMap) -> Array:
-    """Shaded relief of a terrain as an RGB picture with coordinates and a colour bar."""
+def elevation_page(terrain: ElevationMap) -> Array:
+    """Shaded relief of a terrain as an RGB page with coordinates and a colour bar."""
     terrain = colormaps.terrain_ahead(terrain)
     low, high = colormaps.elevation_limits(terrain.layers["elevation"])
     rgb = colormaps.elevation_colors(terrain, (low, high))
@@ -63,8 +64,8 @@ def elevation_picture(terrain: ElevationMap) -> Array:
     return page
 
 
-def navigation_picture(navigation: NavigationMap) -> Array:
-    """A navigation map as an RGB picture with coordinates and a legend."""
+def navigation_page(navigation: NavigationMap) -> Array:
+    """A navigation map as an RGB page with coordinates and a legend."""
     navigation = colormaps.navigation_ahead(navigation)
     rgb = colormaps.legend_colors(navigation.cells, colormaps.CELL_LEGEND)
     title = f"navigation map ({navigation.frame_id})"
@@ -73,32 +74,32 @@ def navigation_picture(navigation: NavigationMap) -> Array:
     return page
 
 
-PAINTERS: Mapping[str, tuple[str, Callable[[Any], Array]]] = {
-    "/nav/disparity": ("disparity", lambda message: disparity_picture(read_disparity(message))),
-    "/nav/elevation_map": ("elevation", lambda message: elevation_picture(read_grid_map(message))),
-    "/nav/navigation_map": ("navigation", lambda message: navigation_picture(read_occupancy_grid(message))),
+PAGES: Mapping[str, tuple[str, Callable[[Any], Array]]] = {
+    "/nav/disparity": ("disparity", lambda message: disparity_page(read_disparity(message))),
+    "/nav/elevation_map": ("elevation", lambda message: elevation_page(read_grid_map(message))),
+    "/nav/navigation_map": ("navigation", lambda message: navigation_page(read_occupancy_grid(message))),
 }
 
 
 def _page(picture: Array, title: str) -> Array:
-    """The picture (H, W, 3) on paper, with room at the right for a colour bar or legend."""
+    """The picture (H, W, 3) with a margin, and room at the right for a colour bar or legend."""
     height, width = picture.shape[:2]
-    page = np.full((height + 2 * MARGIN, width + 4 * MARGIN, 3), PAPER, np.uint8)
-    page[MARGIN : MARGIN + height, MARGIN : MARGIN + width] = picture
-    _text(page, title, (MARGIN, MARGIN - 20), 0.8)
+    page = np.full((height + 2 * MARGIN_PX, width + 4 * MARGIN_PX, 3), PAPER, np.uint8)
+    page[MARGIN_PX : MARGIN_PX + height, MARGIN_PX : MARGIN_PX + width] = picture
+    _text(page, title, (MARGIN_PX, MARGIN_PX - 20), 0.8)
     return page
 
 
 def _map_page(rgb: Array, resolution: float, origin: tuple[float, float], title: str) -> Array:
-    """A painted grid (rows, cols, 3) as a bird's-eye view, with x at its left and y below it, at every second metre."""
+    """A grid (rows, cols, 3) as a bird's-eye view, with x at its left and y below it at every second metre."""
     rows, cols = rgb.shape[:2]
-    zoom = max(1, MAP_HEIGHT // max(rows, cols))
+    zoom = max(1, MAX_MAP_PX // max(rows, cols))
     page = _page(colormaps.birds_eye(rgb).repeat(zoom, 0).repeat(zoom, 1), title)
-    bottom, right = MARGIN + cols * zoom, MARGIN + rows * zoom
+    bottom, right = MARGIN_PX + cols * zoom, MARGIN_PX + rows * zoom
     for x in _ticks(origin[0], cols * resolution):
         row = round(bottom - (x - origin[0]) / resolution * zoom)
-        cv2.line(page, (MARGIN - 8, row), (MARGIN, row), INK, 2)
-        _text(page, f"{x:g}", (MARGIN - 46, row + 6))
+        cv2.line(page, (MARGIN_PX - 8, row), (MARGIN_PX, row), INK, 2)
+        _text(page, f"{x:g}", (MARGIN_PX - 46, row + 6))
     for y in _ticks(origin[1], rows * resolution):
         col = round(right - (y - origin[1]) / resolution * zoom)
         cv2.line(page, (col, bottom), (col, bottom + 8), INK, 2)
@@ -117,8 +118,8 @@ def _ticks(start: float, length: float) -> Array:
 
 def _bar(page: Array, low: float, high: float, palette: int) -> None:
     """A vertical colour bar with five values, and the colour of unknown below it."""
-    height, width = page.shape[0] - 2 * MARGIN, page.shape[1]
-    left, top, length = width - 2 * MARGIN - 32, MARGIN, height * 3 // 4
+    height, width = page.shape[0] - 2 * MARGIN_PX, page.shape[1]
+    left, top, length = width - 2 * MARGIN_PX - 32, MARGIN_PX, height * 3 // 4
     ramp = colormaps.apply_palette(np.linspace(high, low, length), low, high, palette)
     page[top : top + length, left : left + 28] = ramp[:, None]
     for share in np.linspace(0.0, 1.0, 5):
@@ -128,9 +129,9 @@ def _bar(page: Array, low: float, high: float, palette: int) -> None:
 
 
 def _legend(page: Array, legend: Mapping[int, tuple[str, colormaps.Rgb]]) -> None:
-    left = page.shape[1] - 2 * MARGIN - 32
+    left = page.shape[1] - 2 * MARGIN_PX - 32
     for place, (name, rgb) in enumerate(legend.values()):
-        _swatch(page, (left, MARGIN + 44 * place), name, rgb)
+        _swatch(page, (left, MARGIN_PX + 44 * place), name, rgb)
 
 
 def _swatch(page: Array, corner: tuple[int, int], name: str, rgb: colormaps.Rgb) -> None:

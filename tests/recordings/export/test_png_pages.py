@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.errors import LogError
-from recordings.export.png_pages import MARGIN, disparity_picture, draw, elevation_picture, navigation_picture
+from recordings.export.png_pages import MARGIN_PX, disparity_page, draw, elevation_page, navigation_page
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
 from recordings.sinks import colormaps
@@ -60,12 +60,12 @@ def result(tmp_path: Path) -> Path:
 
 def cells_of(page: Array) -> Array:
     """The colours at the middles of the cells of a painted map, (COLS, ROWS, 3): x downwards, y to the left."""
-    zoom = (page.shape[0] - 2 * MARGIN) // COLS
-    return page[MARGIN + zoom // 2 :: zoom, MARGIN + zoom // 2 :: zoom][:COLS, :ROWS]
+    zoom = (page.shape[0] - 2 * MARGIN_PX) // COLS
+    return page[MARGIN_PX + zoom // 2 :: zoom, MARGIN_PX + zoom // 2 :: zoom][:COLS, :ROWS]
 
 
 def test_ahead_is_up_and_left_is_left() -> None:
-    picture = cells_of(navigation_picture(navigation()))
+    picture = cells_of(navigation_page(navigation()))
     expected = np.full((COLS, ROWS, 3), FREE)
     expected[0, 0] = HAZARD
     expected[:, -1] = UNKNOWN
@@ -75,14 +75,14 @@ def test_ahead_is_up_and_left_is_left() -> None:
 
 
 def test_terrain_brightens_with_height_and_holes_stay_holes() -> None:
-    picture = cells_of(elevation_picture(terrain())).astype(int)
+    picture = cells_of(elevation_page(terrain())).astype(int)
     assert tuple(picture[COLS - 1 - 4, ROWS - 1 - 3]) == colormaps.UNKNOWN_RGB
     green = picture[1:-1, 0, 1]  # viridis is greener the higher; the ramp rises ahead, which is up
     assert (np.diff(green) < 0).all()
 
 
 def test_near_is_red_far_is_blue_unknown_is_neither() -> None:
-    picture = disparity_picture(disparity().pixels)[MARGIN:, MARGIN:]
+    picture = disparity_page(disparity().pixels)[MARGIN_PX:, MARGIN_PX:]
     near, far = picture[46, 40].astype(int), picture[8, 40].astype(int)
     assert near[0] > near[2]
     assert far[2] > far[0]
@@ -100,8 +100,8 @@ def test_a_picture_from_the_log_is_the_picture_of_the_data(result: Path, tmp_pat
     """Through GridMap and OccupancyGrid, whose cells run in other directions, nothing is turned round."""
     files = {path.name: cv2.imread(str(path)) for path in draw(result, tmp_path)}
     pictures = {
-        "disparity": disparity_picture(disparity().pixels), "elevation": elevation_picture(terrain()),
-        "navigation": navigation_picture(navigation()),
+        "disparity": disparity_page(disparity().pixels), "elevation": elevation_page(terrain()),
+        "navigation": navigation_page(navigation()),
     }  # fmt: skip
     for name, picture in pictures.items():
         file = files[f"frame-0000-{name}.png"]
@@ -113,15 +113,17 @@ def test_a_log_without_results_is_named(tmp_path: Path) -> None:
     path = tmp_path / "raw.mcap"
     with Ros2Writer(path) as log:
         log.write("/elsewhere", grid_map(terrain()), START)
-    with pytest.raises(LogError, match=r"raw\.mcap holds none of /nav/disparity"):
+    with pytest.raises(LogError, match=r"raw\.mcap contains none of /nav/disparity"):
         draw(path, tmp_path)
 
 
 def test_a_map_without_known_cells_is_drawn() -> None:
     nothing = np.full((ROWS, COLS), np.nan, np.float32)
-    page = elevation_picture(ElevationMap(START, {"elevation": nothing}, 0.5, (0.0, -1.5), LEVEL_FRAME))
+    page = elevation_page(ElevationMap(START, {"elevation": nothing}, 0.5, (0.0, -1.5), LEVEL_FRAME))
     assert (cells_of(page)[:-1] == colormaps.UNKNOWN_RGB).all()
-    assert (disparity_picture(nothing)[MARGIN : MARGIN + ROWS, MARGIN : MARGIN + COLS] == colormaps.UNKNOWN_RGB).all()
+    assert (
+        disparity_page(nothing)[MARGIN_PX : MARGIN_PX + ROWS, MARGIN_PX : MARGIN_PX + COLS] == colormaps.UNKNOWN_RGB
+    ).all()
 
 
 def test_light_comes_from_ahead_on_the_left() -> None:
