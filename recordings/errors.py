@@ -1,4 +1,4 @@
-"""The exceptions of this room: a recording that cannot be read or written, said in a sentence a user can act on."""
+"""The exceptions of this folder: a recording that cannot be read or written."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ class LogError(Exception):
 
 
 class UnwritableError(LogError):
-    """A place that cannot be written, or is full."""
+    """An output path that cannot be written, or a full disk."""
 
 
-def said(error: BaseException) -> str:
-    """The first line of what an exception says."""
+def sentence_of(error: BaseException) -> str:
+    """The first line of an exception's message, or the name of its type."""
     return str(error).split("\n")[0] or type(error).__name__

@@ -150,6 +150,6 @@ def test_a_baseline_of_zero_that_no_transform_mends_is_one_sentence(traverse: Pa
     log = rewrite(traverse, tmp_path / "log.mcap", change)
     assert roverflow("run", log, "-o", tmp_path / "out.mcap", "--no-rrd") == 2
     said = capsys.readouterr().err
-    assert "does not tell the baseline" in said
+    assert "does not contain the baseline" in said
     assert said.count("\n") == 1
     assert not (tmp_path / "out.mcap").exists()

@@ -22,7 +22,7 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from recordings.mcap.file import McapFile, iter_decoded
-from recordings.mcap.index import Raw
+from recordings.mcap.index import RawMessage
 from recordings.ros2.from_msg import read_disparity, stamp_of
 from recordings.simulator import Simulation
 from recordings.simulator.traverse import level_pose
@@ -59,9 +59,9 @@ def test_a_run_notes_once_which_streams_go_by_the_time_of_the_log(traverse, tmp_
 
     log, summary = rewrite(traverse, tmp_path / "log.mcap", unstamped), tmp_path / "out.json"
     assert roverflow("run", log, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--summary", summary) == 0
-    said = {"severity": "note", "sentence": "header stamps are 0: log times are used"}
+    said = {"severity": "note", "sentence": "the header stamps are 0, so log times are used"}
     assert json.loads(summary.read_text())["findings"]["odometry"] == said
-    assert capsys.readouterr().out.count("odometry: header stamps are 0: log times are used") == 1
+    assert capsys.readouterr().out.count("odometry: the header stamps are 0, so log times are used") == 1
 
 
 def test_every_known_disparity_says_whether_it_was_measured_or_guessed(result):
@@ -291,7 +291,7 @@ def test_what_a_full_disk_took_is_kept_and_so_is_the_result_before(traverse, tmp
     assert said.out.startswith("INCOMPLETE: ")
     (kept,) = set(tmp_path.iterdir()) - {out}
     with McapFile(kept) as log:
-        held = [item for item in log.messages(set(log.index.channels)) if isinstance(item, Raw)]
+        held = [item for item in log.messages(set(log.index.channels)) if isinstance(item, RawMessage)]
         topics = {log.channel(item.channel).topic for item in held}
     assert f"File too large (the {len(held)} messages that it took are in {kept}); " in said.err
     assert said.err.count("\n") == 1

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from recordings.atomic_write import written
-from recordings.errors import LogError, said
+from recordings.errors import LogError, sentence_of
 from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM_WIDTH, STRIP_ROWS, Mosaic
@@ -267,7 +267,7 @@ def _read(reader: Callable[[Any], Any], message: Any, result: Path) -> Any:
     try:
         return reader(message)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-        raise LogError(f"{result}: a {message.__msgtype__} in it is not one: {said(error)}") from error
+        raise LogError(f"{result}: a {message.__msgtype__} in it is not one: {sentence_of(error)}") from error
 
 
 def _write(path: Path, write: Callable[..., Any], *arguments: Any) -> Path:

@@ -1,7 +1,7 @@
-"""Unpacks the chunks of an MCAP file, and finds chunks by their look where the records before them are damaged.
+"""Decompresses the chunks of an MCAP file, and finds chunks by their byte pattern where the file is damaged.
 
-A chunk states how many bytes it unpacks to, and no more than that is ever unpacked: one that claims little and holds
-much is broken, not a way to fill the memory.
+A chunk states its uncompressed size. No more than that is ever decompressed, so a small damaged chunk cannot fill the
+memory.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 
-from recordings.mcap.index import RECORD, read
+from recordings.mcap.index import RECORD, read_at
 
-LARGEST = 1 << 32  # bytes; a larger chunk is not read
-HEAD = 128  # bytes of a chunk record that tell how long it is
+MAX_CHUNK_BYTES = 1 << 32
+CHUNK_HEAD_BYTES = 128  # of a chunk record; they contain its length
 
 _CHUNK = struct.Struct("<QQQII")  # start time, end time, size, CRC, length of the compression's name
-_PADDING = 64  # bytes that may follow what a chunk states
-_BLOCK = 1 << 20
-_LOOK = re.compile(rb"\x06(?=.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}))", re.DOTALL)
+_MAX_PADDING_BYTES = 64  # that may follow a chunk's stated content
+_BLOCK_BYTES = 1 << 20
+_CHUNK_PATTERN = re.compile(rb"\x06(?=.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}))", re.DOTALL)
 
 
 def is_chunk(head: bytes) -> bool:
-    """Whether a record that begins with these bytes (`HEAD` of them) is a chunk as long as its parts say."""
+    """Whether `head` (`CHUNK_HEAD_BYTES` bytes) begins a chunk record whose length matches that of its parts."""
     if len(head) < RECORD.size + _CHUNK.size or head[0] != Opcode.CHUNK:
         return False
     length = RECORD.unpack_from(head)[1]
@@ -36,35 +36,35 @@ def is_chunk(head: bytes) -> bool:
     if stated_at + 8 > len(head):
         return False
     (packed,) = struct.unpack_from("<Q", head, stated_at)
-    return bool(0 <= length - (_CHUNK.size + name_length + 8 + packed) <= _PADDING)
+    return bool(0 <= length - (_CHUNK.size + name_length + 8 + packed) <= _MAX_PADDING_BYTES)
 
 
-def next_chunk(file: BinaryIO, position: int, size: int) -> int | None:
-    """Where the next chunk begins that looks whole, at or behind `position`; None where there is none."""
+def find_chunk(file: BinaryIO, position: int, size: int) -> int | None:
+    """The offset of the next complete chunk at or after `position`; None if there is none."""
     while position < size:
-        block = read(file, position, _BLOCK + HEAD)
-        for match in _LOOK.finditer(block):
+        block = read_at(file, position, _BLOCK_BYTES + CHUNK_HEAD_BYTES)
+        for match in _CHUNK_PATTERN.finditer(block):
             at = match.start()
-            if is_chunk(block[at : at + HEAD]):
+            if is_chunk(block[at : at + CHUNK_HEAD_BYTES]):
                 end = position + at + RECORD.size + RECORD.unpack_from(block, at)[1]
                 if end <= size:
                     return position + at
-        position += _BLOCK
+        position += _BLOCK_BYTES
     return None
 
 
-def start_time(content: bytes) -> int:
+def chunk_start_time(content: bytes) -> int:
     """The log time of a chunk's first message, ns, as its record states it."""
     return int(_CHUNK.unpack_from(content)[0])
 
 
-def unpacked(content: bytes) -> bytes:
-    """The records of a chunk record, decompressed, size and CRC checked. Raises where it is not what it states."""
+def unpack_chunk(content: bytes) -> bytes:
+    """The decompressed records of a chunk. Raises ValueError where the size or the CRC does not match."""
     _, _, size, checksum, _ = _CHUNK.unpack_from(content)
-    compression, packed, length = _packed(content)
+    compression, packed, length = _split_chunk(content)
     if len(packed) != length:
-        raise ValueError(f"{len(packed)} of {length} bytes are there")
-    data = _decompressed(compression, packed, size)
+        raise ValueError(f"only {len(packed)} of {length} bytes are present")
+    data = _decompress(compression, packed, size)
     if len(data) != size:
         more = "more than" if len(data) > size else f"{len(data)} bytes, not"
         raise ValueError(f"it unpacks to {more} {size}")
@@ -73,16 +73,16 @@ def unpacked(content: bytes) -> bytes:
     return data
 
 
-def unpacked_start(content: bytes) -> bytes:
-    """As much of a cut chunk as can still be decompressed; there is no CRC for a part."""
-    compression, packed, _ = _packed(content)
-    return _decompressed(compression, packed, _CHUNK.unpack_from(content)[2])
+def unpack_cut_chunk(content: bytes) -> bytes:
+    """The part of a cut chunk that can still be decompressed. Its CRC cannot be checked."""
+    compression, packed, _ = _split_chunk(content)
+    return _decompress(compression, packed, _CHUNK.unpack_from(content)[2])
 
 
-def _decompressed(compression: str, packed: memoryview, size: int) -> bytes:
-    """What `packed` holds, but at most one byte more than `size`."""
-    if size > LARGEST:
-        raise ValueError(f"it says that it unpacks to {size} bytes, more than a chunk may ({LARGEST})")
+def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
+    """At most size + 1 bytes of the decompressed content."""
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"it states an uncompressed size of {size} bytes; the limit is {MAX_CHUNK_BYTES}")
     if not compression:
         return bytes(packed[: size + 1])
     if not packed:
@@ -92,11 +92,11 @@ def _decompressed(compression: str, packed: memoryview, size: int) -> bytes:
             return bytes(stream.read(size + 1))
     if compression == "lz4":
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, size + 1))
-    raise ValueError(f"compression '{compression}' is not known, only zstd, lz4 and none are")
+    raise ValueError(f"unknown compression '{compression}' (supported: zstd, lz4, none)")
 
 
-def _packed(content: bytes) -> tuple[str, memoryview, int]:
-    """Compression, the compressed bytes, and how many they should be."""
+def _split_chunk(content: bytes) -> tuple[str, memoryview, int]:
+    """The compression's name, the compressed bytes, and their stated number."""
     name_end = _CHUNK.size + _CHUNK.unpack_from(content)[-1]
     (length,) = struct.unpack_from("<Q", content, name_end)
     view = memoryview(content)

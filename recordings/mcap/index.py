@@ -1,6 +1,7 @@
-"""What lies where in an MCAP file, and from when: found from its summary, where that is whole (else `mcap_walk` does).
+"""The index of an MCAP file: where its chunks and messages are, and from what time.
 
-Both ways fill an `Index`; only the walk knows the time of every message.
+`index_from_summary` reads it from a complete summary section; otherwise `recordings.mcap.walk` builds it. Only the walk
+knows the time of every message.
 """
 
 from __future__ import annotations
@@ -22,65 +23,43 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
-MAGIC = b"\x89MCAP0\r\n"
-BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError, OSError)
+from recordings.errors import sentence_of
 
-LAST_TIME = (1 << 63) - 1  # ns; a log time after it is damage, which no clock can show
-SETTLED = 1_000_000_000  # ns; stamps are before log times: so much later none is of before the clock was set back
-LEAP = 10_000_000_000  # ns; a message that is so far ahead of those before and behind it is damage, no clock's doing
-JITTER = 100_000_000  # ns; messages of a channel may be logged in another order than they were written by so much
+MAGIC = b"\x89MCAP0\r\n"
+PARSE_ERRORS = (
+    McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError, OSError,
+)  # fmt: skip
+
+MAX_LOG_TIME = (1 << 63) - 1  # ns; a later log time is damaged
+SETTLING_NS = 1_000_000_000  # after the clock was set back, messages are lost until it is this far beyond its old time
+MAX_LEAP_NS = 10_000_000_000  # a single message this far ahead of both its neighbours is damaged
+MAX_JITTER_NS = 100_000_000  # by so much, messages of a channel may be logged out of order
 
 RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER_LENGTH = 20
-_SECTION = 1 << 30  # bytes; of a longer summary, or header, not all is read
+_MAX_SUMMARY_BYTES = 1 << 30  # of a summary or header that is read
 _TAIL = RECORD.size + _FOOTER_LENGTH + len(MAGIC)
 
 
-T = TypeVar("T", "Raw", "Loose")
-
-
-class Raw(NamedTuple):
-    """One message as it lies in the file. log_time: ns; data: its bytes, a view of the chunk it came in."""
+class RawMessage(NamedTuple):
+    """One message as stored. log_time: ns; data: its bytes, a view of its chunk."""
 
     channel: int
     log_time: int
     data: memoryview
 
 
-class Clock(NamedTuple):
-    """The recorder's clock as a message shows it, and those of its channel that precede it in the file.
-
-    latest: the latest log time of them, ns; back: by how much the clock was set back, ns, until it is `SETTLED` beyond
-    that time (then 0); before: the latest without the last of them.
-    """
-
-    latest: int = 0
-    back: int = 0
-    before: int = 0
-
-    def then(self, log_time: int) -> Clock:
-        """The clock as the next message shows it."""
-        if log_time > LAST_TIME:
-            return self
-        fall = self.latest - log_time
-        if fall <= (-SETTLED if self.back else JITTER):
-            return Clock(max(self.latest, log_time), 0, self.latest)
-        if not self.back and self.before < log_time and self.latest - self.before > LEAP:  # the last one is wrong
-            return Clock(log_time, 0, self.before)
-        return Clock(self.latest, max(self.back, fall), self.before)
-
-
-class Lost(NamedTuple):
-    """Messages that are gone: of which channel (None: not known), from when (log time, ns), and why."""
+class LostMessage(NamedTuple):
+    """One or more messages that cannot be read. channel: None if unknown; log_time: ns, of the first."""
 
     channel: int | None
     log_time: int
     reason: str
 
 
-class Loose(NamedTuple):
-    """Where a message outside the chunks lies: its data's offset and size, bytes."""
+class UnchunkedMessage(NamedTuple):
+    """The place of a message outside any chunk: offset and size of its data, bytes."""
 
     channel: int
     log_time: int
@@ -88,40 +67,67 @@ class Loose(NamedTuple):
     size: int
 
 
+T = TypeVar("T", RawMessage, UnchunkedMessage)
+
+
+class Clock(NamedTuple):
+    """The recorder's clock by the messages of one channel up to some place in the file.
+
+    latest: the latest log time, ns; set_back: by how much the clock was set back, ns, 0 once it is `SETTLING_NS` beyond
+    `latest`; previous: `latest` before the last message.
+    """
+
+    latest: int = 0
+    set_back: int = 0
+    previous: int = 0
+
+    def advanced(self, log_time: int) -> Clock:
+        """The clock after the channel's next message."""
+        if log_time > MAX_LOG_TIME:
+            return self
+        fall = self.latest - log_time
+        if fall <= (-SETTLING_NS if self.set_back else MAX_JITTER_NS):
+            return Clock(max(self.latest, log_time), 0, self.latest)
+        last_was_damaged = self.previous < log_time and self.latest - self.previous > MAX_LEAP_NS
+        if last_was_damaged and not self.set_back:
+            return Clock(log_time, 0, self.previous)
+        return Clock(self.latest, max(self.set_back, fall), self.previous)
+
+
 @dataclass
 class Index:
-    """Where things are in a file.
+    """The index of a file.
 
-    chunks: with the channels that each holds (none listed: not known); rescued: messages of a chunk that is cut, each
-    with its clock; lost: what is damaged; expected: how many messages the file's own statistics count by channel;
-    counts: of chunks, channels and schemas, by the same. Filled only where the file was `walked`: times: log times by
-    channel, in file order; clocks: by channel; before: offset of a chunk -> what `clocks` were where it begins.
+    chunks: each with its channels (none listed: unknown); rescued: messages of a cut chunk, each with its clock; lost:
+    the damage found; stated_counts: messages by channel, stated_records: number of chunks, channels and schemas, both
+    from the file's statistics. Only with `walked`: times: log times by channel, in file order; clocks: by channel;
+    clocks_before: chunk offset -> the clocks where the chunk begins; latest: the last log time, ns.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
-    loose: list[Loose] = field(default_factory=list)
-    rescued: list[tuple[Raw, Clock]] = field(default_factory=list)
-    lost: list[Lost] = field(default_factory=list)
+    unchunked: list[UnchunkedMessage] = field(default_factory=list)
+    rescued: list[tuple[RawMessage, Clock]] = field(default_factory=list)
+    lost: list[LostMessage] = field(default_factory=list)
     times: dict[int, array[int]] = field(default_factory=dict)
     clocks: dict[int | None, Clock] = field(default_factory=lambda: defaultdict(Clock))
-    before: dict[int, dict[int | None, Clock]] = field(default_factory=dict)
-    expected: dict[int, int] = field(default_factory=dict)
-    counts: tuple[int, int, int] | None = None
+    clocks_before: dict[int, dict[int | None, Clock]] = field(default_factory=dict)
+    stated_counts: dict[int, int] = field(default_factory=dict)
+    stated_records: tuple[int, int, int] | None = None
     profile: str = ""
     walked: bool = False
-    latest: int = 0  # the last log time seen, ns
+    latest: int = 0
 
-    def seen(self, channel: int, log_time: int) -> Clock:
+    def count_message(self, channel: int, log_time: int) -> Clock:
         """Count one message; returns the clock of its channel."""
         self.times.setdefault(channel, array("Q")).append(log_time)
-        clock = self.clocks[channel] = self.clocks[channel].then(log_time)
+        clock = self.clocks[channel] = self.clocks[channel].advanced(log_time)
         self.latest = max(self.latest, clock.latest)
         return clock
 
     def define(self, opcode: int, content: bytes | memoryview) -> None:
-        """Take note of a schema or channel; other records do not matter."""
+        """Store a schema or a channel; other records are ignored."""
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(_stream(content))
             _check_read(schema, content)
@@ -131,80 +137,80 @@ class Index:
             _check_read(channel, content)
             self.channels[channel.id] = channel
 
-    def lose(self, reason: str, log_time: int | None = None) -> None:
-        """Note damage whose messages are not known; without a time, behind all that was seen."""
-        self.lost.append(Lost(None, self.latest if log_time is None else log_time, reason))
+    def note_damage(self, reason: str, log_time: int | None = None) -> None:
+        """Note damage whose messages are unknown. Without a log time it is placed after all messages so far."""
+        self.lost.append(LostMessage(None, self.latest if log_time is None else log_time, reason))
 
 
 def _check_read(record: Schema | Channel, content: bytes | memoryview) -> None:
-    """Raise ValueError if a definition is not what its bytes say: the reader takes a cut string for a short one."""
+    """Raise ValueError if a definition does not match its bytes: the reader accepts a cut string as a short one."""
     builder: Any = RecordBuilder()
     record.write(builder)
     written = builder.end()[RECORD.size :]
     if written != bytes(content[: len(written)]):  # padding may follow
-        raise ValueError("a definition that ends before its time")
+        raise ValueError("a definition is cut short")
 
 
-def from_summary(file: BinaryIO, size: int) -> Index | None:
-    """The index that the file carries itself, or None where it has none that is sure to describe the whole file."""
-    index = summary(file, size)
-    if index is None or index.counts is None:
+def index_from_summary(file: BinaryIO, size: int) -> Index | None:
+    """The index in the file's summary; None unless it surely describes the whole file."""
+    index = read_summary(file, size)
+    if index is None or index.stated_records is None:
         return None
-    chunks, channels, schemas = index.counts
+    chunks, channels, schemas = index.stated_records
     whole = (
         chunks == len(index.chunks) > 0
-        and index.expected  # statistics may leave these counts out
+        and index.stated_counts  # statistics may leave these counts out
         and channels == len(index.channels)
         and schemas == len(index.schemas)
         and all(chunk.message_index_offsets.keys() <= index.channels.keys() for chunk in index.chunks)
     )
     if not whole:
         return None
-    with suppress(*BROKEN):  # without its header a log can be read as well
-        _, length = RECORD.unpack(read(file, len(MAGIC), RECORD.size))
-        index.profile = profile_of(read(file, len(MAGIC) + RECORD.size, min(length, _SECTION)))
+    with suppress(*PARSE_ERRORS):  # a log without its header can still be read
+        _, length = RECORD.unpack(read_at(file, len(MAGIC), RECORD.size))
+        index.profile = profile_of(read_at(file, len(MAGIC) + RECORD.size, min(length, _MAX_SUMMARY_BYTES)))
     return index
 
 
 def profile_of(content: bytes) -> str:
-    """The profile that a header record names."""
+    """The profile in a header record."""
     return str(Header.read(_stream(content)).profile)
 
 
-def summary(file: BinaryIO, size: int) -> Index | None:
-    """What the summary section says, None where there is none or its CRC does not match."""
+def read_summary(file: BinaryIO, size: int) -> Index | None:
+    """The content of the summary section; None if there is none or its CRC does not match."""
     if size < len(MAGIC) + _TAIL:
         return None
-    tail = read(file, size - _TAIL, _TAIL)
+    tail = read_at(file, size - _TAIL, _TAIL)
     if tail[-len(MAGIC) :] != MAGIC or RECORD.unpack_from(tail) != (Opcode.FOOTER, _FOOTER_LENGTH):
         return None
     footer = Footer.read(_stream(tail[RECORD.size : -len(MAGIC)]))
     if not len(MAGIC) < footer.summary_start < size - _TAIL:
         return None
     length = size - _TAIL - footer.summary_start
-    if length > _SECTION:
+    if length > _MAX_SUMMARY_BYTES:
         return None
-    section = read(file, footer.summary_start, length)
+    section = read_at(file, footer.summary_start, length)
     if footer.summary_crc and crc32(tail[: RECORD.size + 16], crc32(section)) != footer.summary_crc:
         return None
     index = Index()
     try:
-        for opcode, content in records(section):
+        for opcode, content in iter_records(section):
             if opcode == Opcode.CHUNK_INDEX:
                 index.chunks.append(ChunkIndex.read(_stream(content)))
             elif opcode == Opcode.STATISTICS:
                 statistics = Statistics.read(_stream(content))
-                index.counts = statistics.chunk_count, statistics.channel_count, statistics.schema_count
-                index.expected = dict(statistics.channel_message_counts)
+                index.stated_records = statistics.chunk_count, statistics.channel_count, statistics.schema_count
+                index.stated_counts = dict(statistics.channel_message_counts)
             else:
                 index.define(opcode, content)
-    except BROKEN:
+    except PARSE_ERRORS:
         return None
     return index
 
 
-def read(file: BinaryIO, offset: int, size: int) -> bytes:
-    """At most `size` bytes from `offset`; none where the file does not reach so far."""
+def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
+    """At most `size` bytes from `offset`; none beyond the end of the file."""
     there = os.fstat(file.fileno()).st_size - offset
     if there <= 0:
         return b""
@@ -212,34 +218,43 @@ def read(file: BinaryIO, offset: int, size: int) -> bytes:
     return file.read(min(size, there))
 
 
-def records(section: bytes, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
-    """(opcode, content) of the records of a section. One that ends early raises, or with `whole` off is left out."""
+def iter_records(section: bytes, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
+    """(opcode, content) of each record of a section. A cut record raises ValueError; without `whole` it is left out."""
     view, position = memoryview(section), 0
     while position < len(view):
         after = position + RECORD.size
         length = RECORD.unpack_from(view, position)[1] if after <= len(view) else len(view)
         if after + length > len(view):
             if whole:
-                raise ValueError("a record ends behind its section")
+                raise ValueError("a record is longer than its section")
             return
         yield view[position], view[after : after + length]
         position = after + length
 
 
-def raw(content: memoryview) -> Raw:
-    """The message of a message record."""
+def parse_message(content: memoryview) -> RawMessage:
+    """The message in a message record."""
     channel, _, log_time, _ = MESSAGE.unpack_from(content)
-    return Raw(channel, log_time, content[MESSAGE.size :])
+    return RawMessage(channel, log_time, content[MESSAGE.size :])
 
 
-def in_order(message: T, clocks: Iterable[Clock]) -> T | Lost:
-    """A message, as a `Lost` if by one of the clocks the time at which it was logged had been before."""
-    fall = max((clock.back for clock in clocks if clock.back and message.log_time < clock.latest + SETTLED), default=0)
+def reject_set_back(message: T, clocks: Iterable[Clock]) -> T | LostMessage:
+    """The message, or a `LostMessage` if one of the clocks was set back and had shown the message's log time before."""
+    falls = (clock.set_back for clock in clocks if clock.set_back and message.log_time < clock.latest + SETTLING_NS)
+    fall = max(falls, default=0)
     if not fall:
         return message
-    back = f"by {fall / 1e9:.3g} s or more, and was not yet 1 s beyond where it had been"
-    remedy = "if no clock was set and the log is only written in another order, `mcap sort` mends it"
-    return Lost(message.channel, message.log_time, f"the log's clock was set back {back}; {remedy}")
+    return LostMessage(
+        message.channel,
+        message.log_time,
+        f"the log's clock was set back by at least {fall / 1e9:.3g} s and is not yet 1 s beyond its old time; "
+        "if the clock was right and the log is only written in another order, `mcap sort` repairs it",
+    )
+
+
+def lost_chunk(offset: int, error: Exception) -> str:
+    """The sentence for a chunk that cannot be unpacked."""
+    return f"the chunk at byte {offset} is broken and its messages are lost ({sentence_of(error)})"
 
 
 def _stream(content: bytes | memoryview) -> ReadDataStream:

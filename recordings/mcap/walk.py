@@ -1,8 +1,8 @@
-"""Indexes an MCAP file that carries no index, or a broken one, by walking through all of it once.
+"""Indexes an MCAP file without a valid summary by walking through all of its records once.
 
-Each record is looked at only as far as it matters, so memory holds one chunk. The walk goes on behind a broken chunk,
-rescues what a cut one still holds, and where nothing is a record any more goes on at the next chunk that looks whole;
-each loss is noted.
+Of each record only the needed part is read, so memory holds one chunk. The walk continues after a broken chunk and
+rescues the messages that a cut chunk still contains. After other damage it continues at the next complete chunk. Each
+loss is noted.
 """
 
 from __future__ import annotations
@@ -16,56 +16,65 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
 from flow.contracts import counted
-from recordings.errors import said
-from recordings.mcap.chunk import HEAD, LARGEST, is_chunk, next_chunk, start_time, unpacked, unpacked_start
+from recordings.errors import sentence_of
+from recordings.mcap.chunk import (
+    CHUNK_HEAD_BYTES,
+    MAX_CHUNK_BYTES,
+    chunk_start_time,
+    find_chunk,
+    is_chunk,
+    unpack_chunk,
+    unpack_cut_chunk,
+)
 from recordings.mcap.index import (
-    BROKEN,
     MAGIC,
     MESSAGE,
+    PARSE_ERRORS,
     RECORD,
     Index,
-    Loose,
+    UnchunkedMessage,
+    iter_records,
+    lost_chunk,
+    parse_message,
     profile_of,
-    raw,
-    read,
-    records,
-    summary,
+    read_at,
+    read_summary,
 )
 
-_PRIVATE = 0x80  # from here on, opcodes are free for private use
-_LONGEST = {Opcode.CHUNK: LARGEST, Opcode.MESSAGE: MESSAGE.size, Opcode.ATTACHMENT: 0}  # bytes that are looked at
-_DEFINITION = 1 << 24  # bytes; of any other record
-_RESCUE = 1 << 26  # bytes; of what may have been a chunk
-_BLOCK = 1 << 20
+_MIN_PRIVATE_OPCODE = 0x80
+_MAX_READ_BYTES = {Opcode.CHUNK: MAX_CHUNK_BYTES, Opcode.MESSAGE: MESSAGE.size, Opcode.ATTACHMENT: 0}  # of a record
+_MAX_RECORD_BYTES = 1 << 24  # of any other record
+_MAX_RESCUE_BYTES = 1 << 26  # of what may have been a chunk
+_BLOCK_BYTES = 1 << 20
 
 
 def walk(file: BinaryIO, size: int) -> Index:
-    """The index of a file, from its data section."""
-    own = summary(file, size) or Index()  # what it defines may be lost in the data section
-    index = Index(own.schemas, own.channels, expected=own.expected, walked=True)
+    """Build the index of a file from its data section."""
+    own = read_summary(file, size) or Index()  # its definitions may be lost in the data section
+    index = Index(own.schemas, own.channels, stated_counts=own.stated_counts, walked=True)
     position, before = len(MAGIC), 0
-    checksum: int | None = crc32(MAGIC)  # None: bytes were passed over
+    checksum: int | None = crc32(MAGIC)  # None: bytes were skipped
     while True:
-        head = read(file, position, HEAD)
+        head = read_at(file, position, CHUNK_HEAD_BYTES)
         opcode, length = RECORD.unpack_from(head) if len(head) >= RECORD.size else (0, 0)
         is_record = opcode != Opcode.CHUNK or is_chunk(head)
         if opcode == 0 or length > size - position - RECORD.size or not is_record:
-            found = next_chunk(file, position + 1, size)
+            found = find_chunk(file, position + 1, size)
             _note_damage(index, file, position, found, size)
             if found is None:
                 return index
             position, before, checksum = found, opcode or int(Opcode.CHUNK), None
             continue
-        content = read(file, position + RECORD.size, min(length, _LONGEST.get(opcode, _DEFINITION)))
-        if opcode == Opcode.DATA_END and 4 <= length < MESSAGE.size:  # a longer one was once something else
+        content = read_at(file, position + RECORD.size, min(length, _MAX_READ_BYTES.get(opcode, _MAX_RECORD_BYTES)))
+        if opcode == Opcode.DATA_END and 4 <= length < MESSAGE.size:  # a longer one was another record
             if checksum is not None and struct.unpack_from("<I", content)[0] not in (0, checksum):
-                index.lose("the CRC of the data section does not match: messages in it were changed, not known which")
+                index.note_damage("the CRC of the data section does not match: some of its messages were changed")
             _note_rest(index, file, position, size)
             return index
         try:
             _note(index, opcode, content, length, position, before)
-        except BROKEN as error:
-            index.lose(f"the record at byte {position} is broken ({said(error)})")
+        except PARSE_ERRORS as error:
+            index.note_damage(f"the record at byte {position} is broken ({sentence_of(error)})")
         if checksum is not None:
             checksum = crc32(content, crc32(head[: RECORD.size], checksum))
             checksum = _checksum(file, position + RECORD.size + len(content), length - len(content), checksum)
@@ -73,23 +82,25 @@ def walk(file: BinaryIO, size: int) -> Index:
 
 
 def _checksum(file: BinaryIO, position: int, length: int, checksum: int) -> int:
-    """The CRC, continued over so many bytes from `position`."""
-    for start in range(0, length, _BLOCK):
-        checksum = crc32(read(file, position + start, min(_BLOCK, length - start)), checksum)
+    """The CRC, continued over `length` bytes from `position`."""
+    for start in range(0, length, _BLOCK_BYTES):
+        checksum = crc32(read_at(file, position + start, min(_BLOCK_BYTES, length - start)), checksum)
     return checksum
 
 
 def _note(index: Index, opcode: int, content: bytes, length: int, position: int, before: int) -> None:
-    """Take note of one record of the data section. content: its start; before: the opcode of the one before it.
+    """Note one record of the data section. content: its start; before: the opcode of the record before it.
 
-    A record that cannot be where it is was something else before it was damaged, perhaps messages: that raises.
+    Raises ValueError for a record in an impossible place: it is damaged, and may have contained messages.
     """
     if opcode == Opcode.CHUNK:
         _note_chunk(index, content, position)
     elif opcode == Opcode.MESSAGE:
         channel, _, log_time, _ = MESSAGE.unpack_from(content)
-        index.loose.append(Loose(channel, log_time, position + RECORD.size + MESSAGE.size, length - MESSAGE.size))
-        index.seen(channel, log_time)
+        index.unchunked.append(
+            UnchunkedMessage(channel, log_time, position + RECORD.size + MESSAGE.size, length - MESSAGE.size)
+        )
+        index.count_message(channel, log_time)
     elif opcode == Opcode.HEADER and before == 0:
         index.profile = profile_of(content)
     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -98,16 +109,15 @@ def _note(index: Index, opcode: int, content: bytes, length: int, position: int,
         (listed,) = struct.unpack_from("<I", content, 2)
         if before not in (Opcode.CHUNK, Opcode.MESSAGE_INDEX) or listed % 16 or listed > length - 6:
             raise ValueError("a message index without its chunk")
-    elif opcode not in (Opcode.ATTACHMENT, Opcode.METADATA) and opcode < _PRIVATE:
-        raise ValueError(f"a record of kind {opcode} has no place there")
+    elif opcode not in (Opcode.ATTACHMENT, Opcode.METADATA) and opcode < _MIN_PRIVATE_OPCODE:
+        raise ValueError(f"a record of opcode {opcode} is not allowed there")
 
 
 def _note_chunk(index: Index, content: bytes, position: int) -> None:
     try:
-        inside = list(records(unpacked(content)))
-    except BROKEN as error:
-        reason = f"the chunk at byte {position} is broken and its messages are lost ({said(error)})"
-        index.lose(reason, start_time(content))
+        inside = list(iter_records(unpack_chunk(content)))
+    except PARSE_ERRORS as error:
+        index.note_damage(lost_chunk(position, error), chunk_start_time(content))
         return
     offsets, times, before = {}, [], index.clocks.copy()
     for opcode, record in inside:
@@ -115,7 +125,7 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
             channel, _, log_time, _ = MESSAGE.unpack_from(record)
             offsets[channel] = 0
             times.append(log_time)
-            index.seen(channel, log_time)
+            index.count_message(channel, log_time)
         else:
             index.define(opcode, record)
     if times:
@@ -125,39 +135,39 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
             message_start_time=min(times), uncompressed_size=0,
         )  # fmt: skip
         index.chunks.append(chunk)
-        index.before[position] = before
+        index.clocks_before[position] = before
 
 
 def _note_rest(index: Index, file: BinaryIO, position: int, size: int) -> None:
-    """Note what follows the log whose data section ends at `position`, as where files were put one behind another."""
-    for start in range(position, size, _BLOCK):
-        place = read(file, start, _BLOCK + len(MAGIC) - 1).find(MAGIC)
+    """Note the bytes after the end of the log, as when log files were concatenated."""
+    for start in range(position, size, _BLOCK_BYTES):
+        place = read_at(file, start, _BLOCK_BYTES + len(MAGIC) - 1).find(MAGIC)
         end = start + place + len(MAGIC)
         if place >= 0:
             if end < size:
-                unread = f"the log ends at byte {end}, and {size - end} bytes behind that are not read"
-                index.lose(f"{unread}; give each log by itself")
+                unread = f"the log ends at byte {end}, and the {size - end} bytes after it are not read"
+                index.note_damage(f"{unread}; give each log as its own file")
             return
 
 
 def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None, size: int) -> None:
-    """Note that no record is at `position`; rescue what there still is if it was a chunk.
+    """Note that there is no record at `position`, and rescue the messages of a damaged chunk.
 
-    found: where reading goes on, None where it does not.
+    found: where the walk continues; None at the end of the file.
     """
     end = size if found is None else found
-    is_cut = is_chunk(read(file, position, HEAD))
-    record = read(file, position, min(end - position, LARGEST if is_cut else _RESCUE))
+    is_cut = is_chunk(read_at(file, position, CHUNK_HEAD_BYTES))
+    record = read_at(file, position, min(end - position, MAX_CHUNK_BYTES if is_cut else _MAX_RESCUE_BYTES))
     if record[:1] == bytes([Opcode.CHUNK]):
-        with suppress(*BROKEN):  # nothing more is to be had then
-            for opcode, content in records(unpacked_start(record[RECORD.size :]), whole=False):
+        with suppress(*PARSE_ERRORS):  # nothing more can be rescued then
+            for opcode, content in iter_records(unpack_cut_chunk(record[RECORD.size :]), whole=False):
                 if opcode == Opcode.MESSAGE:
-                    message = raw(content)
-                    index.rescued.append((message, index.seen(message.channel, message.log_time)))
+                    message = parse_message(content)
+                    index.rescued.append((message, index.count_message(message.channel, message.log_time)))
                 else:
                     index.define(opcode, content)
     if found is None:
         held = counted(sum(map(len, index.times.values())), "message")
-        index.lose(f"the log is cut or damaged at byte {position} of {size}; before that it holds {held}")
+        index.note_damage(f"the log is cut or damaged at byte {position} of {size}; before that it contains {held}")
     else:
-        index.lose(f"the log is damaged at byte {position}: what is between there and byte {found} may be lost")
+        index.note_damage(f"the log is damaged from byte {position} to byte {found}; messages there may be lost")

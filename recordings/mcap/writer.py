@@ -1,7 +1,7 @@
-"""Writes ROS 2 messages into an MCAP log that has its name only when it is whole.
+"""Writes ROS 2 messages into an MCAP log.
 
-Its one trick: a large message is a chunk of its own, so whoever wants only the small topics (tilt, calibration,
-transforms) decompresses no images.
+A large message gets a chunk of its own, so a reader of the small topics (tilt, calibration, transforms) decompresses no
+images. The log gets its name when it is complete.
 """
 
 from __future__ import annotations
@@ -19,15 +19,28 @@ from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 from recordings.ros2.cdr import LAST_STAMP, TYPES
 
-LARGE = 64 * 1024  # bytes; from here a message gets a chunk of its own
+MIN_OWN_CHUNK_BYTES = 64 * 1024  # of a message that gets a chunk of its own
 COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
 
 
 class Ros2Writer:
-    """Writes messages as `ros2msg` / CDR, log time = publish time = stamp. Same calls, same bytes.
+    """Writes messages as `ros2msg` / CDR, with log time = publish time = stamp. Same calls, same bytes.
 
-    Use as a context manager: leaving it closes the log, leaving it by an exception discards it. keep: if the place is
-    full, or fails otherwise, keep under another name what it holds by then. compression: lz4, zstd or none.
+    Use it as a context manager: it closes the log at the end, and discards it after an exception.
+
+    Parameters
+    ----------
+    path : Path
+        The log.
+    keep : bool
+        If the disk is full or writing fails, keep the messages so far under another name.
+    compression : str
+        lz4, zstd or none.
+
+    Raises
+    ------
+    UnwritableError
+        If the log cannot be written.
     """
 
     def __init__(self, path: Path, keep: bool = False, compression: str = "zstd") -> None:
@@ -43,19 +56,19 @@ class Ros2Writer:
 
     @property
     def closed(self) -> bool:
-        """Whether the log is finished, or discarded."""
+        """Whether the log is finished or discarded."""
         return self._file.closed
 
     def write(self, topic: str, message: Any, stamp: int) -> None:
-        """Append one message; the topic's channel is registered by its first message and keeps that type."""
+        """Append one message at `stamp`, ns. All messages of a topic have the same type."""
         kind = message.__msgtype__
         if not 0 <= stamp < LAST_STAMP:
-            raise ValueError(f"{kind} for {topic}: a stamp of {stamp} ns cannot be written; give ns since 1970")
+            raise ValueError(f"{kind} for {topic}: the stamp {stamp} ns is outside ROS time; give ns since 1970")
         data = TYPES.serialize_cdr(message, kind)
         try:
             channel = self._channel(topic, kind)
             count = self._counts[topic] = self._counts.get(topic, 0) + 1
-            large = len(data) >= LARGE
+            large = len(data) >= MIN_OWN_CHUNK_BYTES
             if large:
                 self._writer.flush()
             self._writer.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=count)
@@ -84,10 +97,10 @@ class Ros2Writer:
             raise self._unwritable(error) from error
 
     def abort(self) -> None:
-        """Discard what was written so far; a log that was at `path` before stays. After `close`, does nothing."""
+        """Discard the log; an earlier file at `path` stays. After `close`, does nothing."""
         if self._file.closed:
             return
-        with suppress(OSError):  # what could not be flushed is being discarded
+        with suppress(OSError):  # it is discarded anyway
             self._file.close()
         self._partial.unlink(missing_ok=True)
 
@@ -108,18 +121,18 @@ class Ros2Writer:
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind]), kind
         channel, have = self._channels[topic]
         if have != kind:
-            raise ValueError(f"topic {topic} holds {have}, so {kind} cannot be written to it")
+            raise ValueError(f"topic {topic} has the type {have}, so {kind} cannot be written to it")
         return channel
 
     def _unwritable(self, error: OSError) -> LogError:
-        """Close what is half there, keep it if it shall be and holds anything, and say so."""
+        """Close the unfinished log and return the error; with `keep`, a log with messages stays."""
         held = 0
-        with suppress(OSError):  # what could not be flushed is lost
+        with suppress(OSError):  # the unflushed rest is lost
             self._file.close()
         if self._keep:
             with suppress(LogError), McapFile(self._partial) as log:
                 held = log.count(set(log.index.channels))
         if not held:
             self._partial.unlink(missing_ok=True)
-        kept = f" (the {counted(held, 'message')} that it took are in {self._partial})" if held else ""
+        kept = f" (its first {counted(held, 'message')} are in {self._partial})" if held else ""
         return unwritable(self.path, error.strerror or str(error), kept)

@@ -21,7 +21,7 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from recordings.errors import LogError
-from recordings.mcap.chunk import LARGEST
+from recordings.mcap.chunk import MAX_CHUNK_BYTES
 
 GRID_MAP = """\
 std_msgs/Header header
@@ -109,7 +109,7 @@ def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable
     return lambda data: store.deserialize_cdr(plain(data), name)
 
 
-def plain(data: bytes | memoryview, size: int = LARGEST) -> bytes | memoryview:
+def plain(data: bytes | memoryview, size: int = MAX_CHUNK_BYTES) -> bytes | memoryview:
     """The first `size` bytes, at least, of a message, or all of them. rosbag2 may have compressed each by itself, which
     nothing but the message tells."""
     if data[: len(_PACKED)] != _PACKED:

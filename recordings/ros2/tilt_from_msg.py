@@ -36,7 +36,7 @@ def _tilt(message: Any, log_time: int, up: Array) -> Tilt:
 
 
 @dataclass(frozen=True)
-class Angle:
+class AngleField:
     """Where an angle stands in a message and what it means: field path ("vector.x"), unit, and sign (+1 or -1)."""
 
     field: str
@@ -71,7 +71,7 @@ def _kind(value: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Angles:
+class PlainAngles:
     """How bare pitch and roll make a direction, in a sensor frame x forward, y left, z up.
 
     A positive pitch has the nose up, a positive roll the left side up (both after `sign`). model "axis": the angles of
@@ -79,8 +79,8 @@ class Angles:
     turns about the pitched x axis.
     """
 
-    pitch: Angle
-    roll: Angle
+    pitch: AngleField
+    roll: AngleField
     model: Literal["axis", "euler"]
 
     def check(self, message: Any) -> None:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings.errors import LogError, said
+from recordings.errors import LogError, sentence_of
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.scoring import metrics as measures
@@ -92,7 +92,7 @@ def score(result: Path, truth: Path) -> Score:
             tally.add(stamp, frame)
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
             where = f"{result} or {truth} holds something at {stamp} ns"
-            raise LogError(f"{where} that cannot be scored: {said(error)}; record it again") from error
+            raise LogError(f"{where} that cannot be scored: {sentence_of(error)}; record it again") from error
     return tally.score()
 
 

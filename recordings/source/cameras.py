@@ -1,5 +1,4 @@
-"""The two cameras of an MCAP log: their first calibrations, and whether frames can be made of their images, as far as
-some of them show."""
+"""The two cameras of a log: their first calibrations, and whether a few of their images can be read and paired."""
 
 from __future__ import annotations
 
@@ -18,21 +17,22 @@ CAMERAS = ("left", "right")
 
 
 @dataclass(frozen=True)
-class Info:
-    """The first CameraInfo of a camera: its topic, the calibration, the camera's frame (its images', where it has none
-    itself)."""
+class CalibrationTopic:
+    """The first CameraInfo of a camera. frame_id: its frame, or that of its images if it has none."""
 
     topic: str
     model: CameraModel
     frame_id: str
 
 
-def first_infos(messages: DecodedTopics, chosen: Mapping[str, str]) -> tuple[dict[str, Info], dict[str, str]]:
-    """Side -> its first CameraInfo, and side -> why that cannot be read; neither where a topic is lacking.
+def first_calibrations(
+    messages: DecodedTopics, chosen: Mapping[str, str]
+) -> tuple[dict[str, CalibrationTopic], dict[str, str]]:
+    """Side -> its first CameraInfo, and side -> why it cannot be read; both empty if a topic is missing.
 
     chosen: role (left, right, left_info, right_info) -> topic.
     """
-    infos, unread = dict[str, Info](), dict[str, str]()
+    infos, unread = dict[str, CalibrationTopic](), dict[str, str]()
     if any(role not in chosen for side in CAMERAS for role in (side, f"{side}_info")):
         return infos, unread
     for side in CAMERAS:
@@ -41,13 +41,12 @@ def first_infos(messages: DecodedTopics, chosen: Mapping[str, str]) -> tuple[dic
         if isinstance(info, LogError):
             unread[side] = f"the calibration on {topic} cannot be read: {info}"
         else:
-            infos[side] = Info(topic, info[0], info[1] or messages.frame_of(chosen[side]))
+            infos[side] = CalibrationTopic(topic, info[0], info[1] or messages.frame_of(chosen[side]))
     return infos, unread
 
 
-def unread_images(messages: DecodedTopics, topics: Mapping[str, str], sides: Collection[str]) -> dict[str, str]:
-    """Which of the sides have a first image in an encoding that cannot be read, and what to do: the others are in it,
-    too. topics: side -> topic of its images."""
+def unreadable_images(messages: DecodedTopics, topics: Mapping[str, str], sides: Collection[str]) -> dict[str, str]:
+    """Side -> why its images cannot be read, by the encoding of the first one. topics: side -> topic of its images."""
     unread = dict[str, str]()
     for side in sides:
         why = messages.first(topics[side], unread_encoding)
@@ -56,51 +55,55 @@ def unread_images(messages: DecodedTopics, topics: Mapping[str, str], sides: Col
     return unread
 
 
-def unfit_images(messages: DecodedTopics, topics: Mapping[str, str], infos: Mapping[str, Info]) -> dict[str, str]:
-    """Which sides have images that cannot be read wherever one looks, or of which the first and the last do not fit
-    their calibration or each other, and why: so hardly any frame could be made."""
-    first = _misfits({side: _pixels(messages, topics[side]) for side in CAMERAS}, topics, infos)
+def mismatched_images(
+    messages: DecodedTopics, topics: Mapping[str, str], infos: Mapping[str, CalibrationTopic]
+) -> dict[str, str]:
+    """Side -> why hardly any frame could be made of its images.
+
+    They cannot be read anywhere in the log, or the first and the last do not fit the calibration or the other side.
+    """
+    first = _mismatches({side: _pixels(messages, topics[side]) for side in CAMERAS}, topics, infos)
     if not first:
         return {}
-    last = _misfits({side: _pixels(messages, topics[side], last=True) for side in CAMERAS}, topics, infos)
+    last = _mismatches({side: _pixels(messages, topics[side], last=True) for side in CAMERAS}, topics, infos)
     return {side: why for side, why in first.items() if side in last}
 
 
 def _pixels(messages: DecodedTopics, topic: str, last: bool = False) -> Array | LogError | None:
-    """The first image that can be decoded, or the last; else why not; None where nothing is known."""
+    """The first (or last) image that can be decoded, or the last error; None without messages."""
     found = None
-    for found in (messages.last if last else messages.some)(topic, pixels_of):
+    for found in (messages.last if last else messages.sample)(topic, pixels_of):
         if not isinstance(found, LogError):
             break
     return found
 
 
-def _misfits(
-    images: Mapping[str, Array | LogError | None], topics: Mapping[str, str], infos: Mapping[str, Info]
+def _mismatches(
+    images: Mapping[str, Array | LogError | None], topics: Mapping[str, str], infos: Mapping[str, CalibrationTopic]
 ) -> dict[str, str]:
-    """Side -> why there is no image, or it does not fit its calibration or that of the other side."""
-    said = dict[str, str]()
+    """Side -> why its image cannot be read, or does not fit its calibration or the other side."""
+    reasons = dict[str, str]()
     for side, pixels in images.items():
         topic, info = topics[side], infos[side]
         if isinstance(pixels, LogError):
-            said[side] = f"{topic}: {pixels}"
+            reasons[side] = f"{topic}: {pixels}"
         elif pixels is not None and pixels.shape[:2] != (info.model.height, info.model.width):
-            said[side] = (
-                f"the images on {topic} are {pixels.shape[1]}x{pixels.shape[0]}, but {info.topic}, its binning and "
-                f"region of interest counted, is the calibration of images of {info.model.width}x{info.model.height}; "
-                f"set '{side}_info' of the source to that of these, or record it"
+            reasons[side] = (
+                f"the images on {topic} are {pixels.shape[1]}x{pixels.shape[0]}, but the calibration on {info.topic} "
+                f"is for {info.model.width}x{info.model.height} (after binning and region of interest); "
+                f"set '{side}_info' of the source to the matching CameraInfo, or record it"
             )
     left, right = (images[side] for side in CAMERAS)
-    if said or not isinstance(left, np.ndarray) or not isinstance(right, np.ndarray):
-        return said
+    if reasons or not isinstance(left, np.ndarray) or not isinstance(right, np.ndarray):
+        return reasons
     if _kind(left) != _kind(right):
         one, other = topics["left"], topics["right"]
         why = f"the images on {one} are {_kind(left)}, those on {other} {_kind(right)}; record both alike"
-        said.update(left=why, right=why)
-    return said
+        reasons.update(left=why, right=why)
+    return reasons
 
 
 def _kind(pixels: Array) -> str:
-    """What the two images of a frame have in common, in words."""
+    """The properties in which the two images of a frame must agree."""
     kind = "gray" if pixels.ndim == 2 else "colour"
     return f"{pixels.shape[1]}x{pixels.shape[0]} {kind} of {8 * pixels.itemsize} bit"

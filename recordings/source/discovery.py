@@ -1,8 +1,8 @@
 """Finds which topics of a log are the stereo pair, its calibrations, the inclinometer and the pose.
 
-By schema first, then by name: two image topics are a pair where exchanging left and right in one name gives the other.
-It never guesses: where candidates are equal or of different cameras, or none is there, the answer is a sentence that
-names them and the setting that decides.
+Topics are chosen by schema, then by name: two image topics are a pair if exchanging left and right in one name gives
+the other. Nothing is guessed. If candidates are equally good or missing, a sentence names them and the setting that
+decides.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ BARE_TILT = "geometry_msgs/msg/Vector3Stamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSES = (ODOMETRY, "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs/msg/PoseStamped")
 
-# What names the left camera, and what names its partner.
+# (pattern of the left side in a topic's name, replacement for the right side)
 SIDES = (
     (re.compile("left"), "right"),
     (re.compile("Left"), "Right"),
@@ -33,14 +33,14 @@ SIDES = (
     (re.compile(r"(?<!\d)0(?!\d)"), "1"),
 )
 _TRANSPORTS = re.compile(r"/(compressed|compressedDepth|ffmpeg|theora)$")
-_TRUTH = "/truth/"  # the simulator's ground truth, used only where the settings name some of it
-_RESULTS = "/nav/"  # where an earlier run has written; a pose there is not taken for a sensor's unless told
+_TRUTH = "/truth/"  # the simulator's ground truth, used only if a setting names it
+_RESULTS = "/nav/"  # results of an earlier run; a pose there is used only if a setting names it
 _OTHER_IMAGES = re.compile(r"compressedDepth$|(^|[/_])(depth|disparity|mask|truth|confidence|theora)([/_]|$)")
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic that can be decoded. schema: full ROS 2 name; messages: how many the log holds."""
+    """A topic that can be decoded. schema: full ROS 2 name; messages: their number."""
 
     name: str
     schema: str
@@ -48,16 +48,16 @@ class Topic:
 
 
 @dataclass
-class Topics:
-    """What was found: the topic of each role (left, right, left_info, right_info, inclinometer, odometry), and for
-    each stream without one, why, and what to do; for each setting that names a topic the log does not have, that."""
+class DiscoveredTopics:
+    """chosen: role (left, right, left_info, right_info, inclinometer, odometry) -> topic; missing: stream -> reason and
+    remedy; refused: setting that names a topic the log does not have -> reason."""
 
     chosen: dict[str, str] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
 
     def refuse(self, stream: str, setting: str, why: str) -> None:
-        """Note that a stream is missing because of a setting of the user's, for which nothing may stand in."""
+        """Note that a stream is missing because of a user's setting; nothing replaces it."""
         self.missing[stream] = self.refused[setting] = why
 
 
@@ -65,33 +65,32 @@ def discover(
     topics: Sequence[Topic],
     settings: LogSettings,
     frame_of: Callable[[str], str],
-    untilted: Callable[[str], str | None],
-    unplaced: Callable[[str], str | None],
-) -> Topics:
-    """The topics of each role.
+    no_tilt_reason: Callable[[str], str | None],
+    no_pose_reason: Callable[[str], str | None],
+) -> DiscoveredTopics:
+    """Find the topic of each role.
 
-    settings: with the topics that the user named; frame_of: topic -> the frame_id of its messages; untilted: Imu topic
-    -> why it has no orientation, None where it has; unplaced: topic of transforms -> why they tell no pose of the
-    rover, None where they do.
+    settings: the topics named by the user; frame_of: topic -> the frame_id of its messages; no_tilt_reason: Imu topic
+    -> why it has no orientation; no_pose_reason: topic of transforms -> why they are not the rover's pose.
     """
-    told = (
+    named = (
         settings.left, settings.right, settings.left_info, settings.right_info, settings.inclinometer,
         settings.odometry,
     )  # fmt: skip
-    if not any(name.startswith(_TRUTH) for name in told if name is not None):
+    if not any(name.startswith(_TRUTH) for name in named if name is not None):
         topics = [topic for topic in topics if not topic.name.startswith(_TRUTH)]
-    found = Topics()
+    found = DiscoveredTopics()
     _find_images(topics, settings, found)
     for side in ("left", "right"):
         if side in found.chosen:
             _find_info(topics, settings, side, frame_of, found)
-    _find_tilt(topics, settings, untilted, found)
-    _find_pose(topics, settings, unplaced, found)
+    _find_tilt(topics, settings, no_tilt_reason, found)
+    _find_pose(topics, settings, no_pose_reason, found)
     return found
 
 
 def partners(name: str) -> list[str]:
-    """The names that the right camera may have if `name` is the left one's, the likeliest first."""
+    """The possible names of the right topic for a left topic `name`, the likeliest first."""
     found: list[str] = []
     for word, other in SIDES:
         if matches := list(word.finditer(name)):
@@ -100,18 +99,18 @@ def partners(name: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _find_images(topics: Sequence[Topic], settings: LogSettings, found: Topics) -> None:
+def _find_images(topics: Sequence[Topic], settings: LogSettings, found: DiscoveredTopics) -> None:
     images = [topic for topic in topics if topic.schema in IMAGES]
     names = {topic.name for topic in images}
     for side, given in (("left", settings.left), ("right", settings.right)):
         if given is not None and given not in names:
             found.refuse(side, side, _not_there(side, given, "image", images))
         elif given is not None and settings.left == settings.right:
-            found.refuse(side, side, f"the source's 'left' and 'right' are both set to {given}; set one to the other's")
+            found.refuse(side, side, f"the source's 'left' and 'right' are both set to {given}; set two topics")
     if found.missing:
         return
-    told = settings.left or settings.right  # then only its partner can be the other
-    candidates = [topic for topic in images if topic.messages and (told or not _OTHER_IMAGES.search(topic.name))]
+    named = settings.left or settings.right  # then only its partner can be the other one
+    candidates = [topic for topic in images if topic.messages and (named or not _OTHER_IMAGES.search(topic.name))]
     if settings.left and settings.right:
         found.chosen.update(left=settings.left, right=settings.right)
         return
@@ -127,13 +126,13 @@ def _find_images(topics: Sequence[Topic], settings: LogSettings, found: Topics) 
         silent = _listed([topic for topic in images if not topic.messages and not _OTHER_IMAGES.search(topic.name)])
         unread = f": no message of {silent} can be read" if silent else ""
         why = {
-            0: f"the log has no camera image (sensor_msgs/Image or CompressedImage){unread}; give one that has",
-            1: f"the log has one image topic only ({listed}), stereo needs two{unread}",
-        }.get(len(candidates), f"no two image topics are named like a left and a right one ({listed})")
+            0: f"the log has no camera images (sensor_msgs/Image or CompressedImage){unread}; give a log with images",
+            1: f"the log has only one image topic ({listed}), but stereo needs two{unread}",
+        }.get(len(candidates), f"no two image topics have names of a left and a right camera ({listed})")
         remedy = "; set 'left' and 'right' of the source to the topics" if len(candidates) > 1 else ""
         found.missing.update(left=why + remedy, right=why + remedy)
         return
-    cameras = dict.fromkeys(map(_camera, pairs))  # topics of two cameras are not better or worse than each other
+    cameras = dict.fromkeys(map(_camera, pairs))  # two stereo cameras are equally good
     equal = [pair for camera in cameras for pair in _best([pair for pair in pairs if _camera(pair) == camera])]
     if len(equal) > 1:
         listed = ", ".join(f"{left.name} with {right.name}" for left, right in equal)
@@ -144,7 +143,7 @@ def _find_images(topics: Sequence[Topic], settings: LogSettings, found: Topics) 
 
 
 def _camera(pair: tuple[Topic, Topic]) -> str:
-    """What names the stereo camera itself: the start that both names share, "/front/" or "/cam"."""
+    """The name of the stereo camera: the common start of both topics, "/front/" or "/cam"."""
     shared = takewhile(lambda letters: letters[0] == letters[1], zip(pair[0].name, pair[1].name, strict=False))
     return "".join(letter for letter, _ in shared)
 
@@ -161,12 +160,12 @@ def _rank(pair: tuple[Topic, Topic]) -> tuple[bool, bool, bool]:
 
 
 def looks_rectified(topic: str) -> bool:
-    """Whether an image topic calls itself rectified, as image_proc names its output."""
+    """Whether a topic is named rectified, as image_proc names its output."""
     return re.search(r"(^|[/_])rect(ified)?([/_]|$)", topic) is not None
 
 
 def _find_info(
-    topics: Sequence[Topic], settings: LogSettings, side: str, frame_of: Callable[[str], str], found: Topics
+    topics: Sequence[Topic], settings: LogSettings, side: str, frame_of: Callable[[str], str], found: DiscoveredTopics
 ) -> None:
     infos = [topic for topic in topics if topic.schema == INFO and topic.messages]
     given = getattr(settings, f"{side}_info")
@@ -184,9 +183,9 @@ def _find_info(
             found.chosen[f"{side}_info"] = name
             return
     pairs = [(left, right) for left in sorted(names) for right in partners(left) if right in names]
-    alike = [pair[side == "right"] for pair in pairs if frame_of(image) == frame_of(pair[side == "right"]) != ""]
-    if len(alike) == 1:
-        found.chosen[f"{side}_info"] = alike[0]
+    matching = [pair[side == "right"] for pair in pairs if frame_of(image) == frame_of(pair[side == "right"]) != ""]
+    if len(matching) == 1:
+        found.chosen[f"{side}_info"] = matching[0]
         return
     listed = f"the log's CameraInfo topics are {_listed(infos)}" if infos else "the log has no CameraInfo"
     remedy = f"set '{side}_info' of the source" if infos else "record it, or add it to the log"
@@ -194,7 +193,7 @@ def _find_info(
 
 
 def _find_tilt(
-    topics: Sequence[Topic], settings: LogSettings, untilted: Callable[[str], str | None], found: Topics
+    topics: Sequence[Topic], settings: LogSettings, no_tilt_reason: Callable[[str], str | None], found: DiscoveredTopics
 ) -> None:
     given, bare_angles = settings.inclinometer, settings.angles() is not None
     if given is not None:
@@ -209,7 +208,7 @@ def _find_tilt(
         return
     bare = [topic for topic in topics if topic.schema == BARE_TILT and topic.messages]
     candidates = bare if bare_angles else [topic for topic in topics if topic.schema in TILTS and topic.messages]
-    useless = {topic.name: why for topic in candidates if topic.schema == IMU and (why := untilted(topic.name))}
+    useless = {topic.name: why for topic in candidates if topic.schema == IMU and (why := no_tilt_reason(topic.name))}
     useful = [topic for topic in candidates if topic.name not in useless]
     named = [topic for topic in useful if re.search("inclin|tilt", topic.name, re.IGNORECASE)]
     choice = named or useful
@@ -219,23 +218,24 @@ def _find_tilt(
     if len(choice) > 1:
         why = f"several topics could be the inclinometer ({_listed(choice)}); set 'inclinometer' of the source"
     elif candidates:
-        why = f"{_listed(candidates)} holds no orientation ({next(iter(useless.values()))}); record one that does"
+        reason = next(iter(useless.values()))
+        why = f"{_listed(candidates)} contains no orientation ({reason}); record one that does"
     elif bare:
         why = _undefined(bare[0])
     else:
-        why = "the log has no tilt (an Imu with orientation, a QuaternionStamped); set 'inclinometer' of the source"
+        why = "the log has no tilt (an Imu with orientation or a QuaternionStamped); set 'inclinometer' of the source"
     found.missing["inclinometer"] = why
 
 
 def _undefined(topic: Topic) -> str:
     return (
-        f"{topic.name} is a {topic.schema}, which does not say what its numbers mean; "
+        f"{topic.name} is a {topic.schema}, whose numbers have no defined meaning; "
         "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source"
     )
 
 
 def _find_pose(
-    topics: Sequence[Topic], settings: LogSettings, unplaced: Callable[[str], str | None], found: Topics
+    topics: Sequence[Topic], settings: LogSettings, no_pose_reason: Callable[[str], str | None], found: DiscoveredTopics
 ) -> None:
     poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
     if settings.odometry is not None:
@@ -243,7 +243,7 @@ def _find_pose(
         candidates = poses + [topic for topic in moving if topic.messages]
         if settings.odometry not in {topic.name for topic in candidates}:
             found.refuse("odometry", "odometry", _not_there("odometry", settings.odometry, "pose", candidates))
-        elif settings.odometry in {topic.name for topic in moving} and (why := unplaced(settings.odometry)):
+        elif settings.odometry in {topic.name for topic in moving} and (why := no_pose_reason(settings.odometry)):
             found.refuse("odometry", "odometry", f"the source's 'odometry' is set to {settings.odometry}, where {why}")
         else:
             found.chosen["odometry"] = settings.odometry
@@ -252,15 +252,15 @@ def _find_pose(
     if len(choice) == 1:
         found.chosen["odometry"] = choice[0].name
     elif choice:
-        found.missing["odometry"] = f"several odometries ({_listed(choice)}); set 'odometry' of the source"
+        found.missing["odometry"] = f"several topics are odometry ({_listed(choice)}); set 'odometry' of the source"
     else:
         other = f" (there is {_listed(poses)}; set 'odometry' of the source to use it)" if poses else ""
-        found.missing["odometry"] = f"the log has no nav_msgs/Odometry of a sensor{other}"
+        found.missing["odometry"] = f"the log has no nav_msgs/Odometry from a sensor{other}"
 
 
 def _not_there(setting: str, given: str, kind: str, topics: Sequence[Topic]) -> str:
     listed = f"its {kind} topics are {_listed(topics)}" if topics else f"it has no {kind} topic that can be decoded"
-    return f"the source's '{setting}' is set to {given}, which is not such a topic of the log ({listed})"
+    return f"the source's '{setting}' is set to {given}, which is not a suitable topic of the log ({listed})"
 
 
 def _listed(topics: Sequence[Topic]) -> str:

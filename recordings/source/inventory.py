@@ -1,5 +1,4 @@
-"""What a log holds, for `roverflow info`: topics, rates and gaps, calibration, transforms, how many frames would pair
-up, how much of the traverse has a tilt, what is missing and what is damaged."""
+"""The inventory of a log for `roverflow info`: topics, calibration, pairs, tilts, missing streams and damage."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.contracts import counted
-from recordings.mcap.index import Lost
+from recordings.mcap.index import LostMessage
 from recordings.source.cameras import CAMERAS
 from recordings.source.log import McapLog
 from recordings.source.topics import peek_stamp
@@ -20,14 +19,21 @@ Stamps = NDArray[np.int64]
 
 
 def describe(log: McapLog, slop: int = 5_000_000, max_gap: int | None = 200_000_000) -> dict[str, Any]:
-    """The inventory of a log, as plain JSON values.
+    """The inventory of a log as plain JSON values.
 
-    slop: largest difference between the stamps of the two images of a frame, ns; max_gap: largest distance between the
-    tilts around a frame, ns, None: they are not counted. Only stamps count here: a run waits for none that is logged
-    too late.
+    Pairs and tilts are counted by their stamps alone; a run may also lose messages that were logged too late.
+
+    Parameters
+    ----------
+    log : McapLog
+        An opened log.
+    slop : int
+        Largest difference between the stamps of the two images of a frame, ns.
+    max_gap : int or None
+        Largest distance between the two tilts around a frame, ns; None: do not count them.
     """
-    opening, lost = log.opening, log.file.index.lost
-    damage = sorted({item.reason for item in lost} | {str(problem) for _, problem in opening.problems})
+    resolution, lost = log.resolution, log.file.index.lost
+    damage = sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems})
     stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
     stamps["inclinometer"] = _tilts(log, damage)
     left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
@@ -51,60 +57,66 @@ def describe(log: McapLog, slop: int = 5_000_000, max_gap: int | None = 200_000_
             "with_tilt": None if max_gap is None else _tilted(left, tilts, max_gap),
             "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
         },
-        "transforms": opening.static.listed(),
+        "transforms": resolution.static.listed(),
         "mount": _mount(log),
-        "missing": dict(opening.lacking),
-        "undecodable": opening.undecodable,
+        "missing": dict(resolution.unavailable),
+        "undecodable": resolution.undecodable,
         "damage": list(dict.fromkeys(damage)),
     }
 
 
 def format_description(description: dict[str, Any]) -> str:
-    """The inventory as lines for a terminal."""
+    """Format the inventory for a terminal."""
     d = description
-    how = "indexed, its chunks are not checked" if d["indexed"] else "no index"
+    how = "indexed (chunk CRCs not verified yet)" if d["indexed"] else "no valid index (read through)"
     lines = [f"{d['path']}: {d['duration_s']:.3f} s, {d['size_bytes'] / 1e6:.1f} MB, {how}", ""]
-    rows = [("topic", "schema", "messages", "Hz", "gap", "stream")]
-    roles = {topic: stream for stream, topic in d["streams"].items()}
-    for topic in d["topics"]:
-        hz = "" if topic["hz"] is None else f"{topic['hz']:.2f}"
-        gap = "" if topic["largest_gap_s"] is None else f"{topic['largest_gap_s']:.3f} s"
-        name = topic["topic"]
-        rows.append((name, topic["schema"], str(topic["messages"]), hz, gap, roles.get(name, "")))
-    widths = [max(len(row[column]) for row in rows) for column in range(6)]
-    for row in rows:
-        cells = [
-            cell.rjust(w) if 2 <= n <= 4 else cell.ljust(w) for n, (cell, w) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  ".join(cells).rstrip())
-    lines.append("")
+    lines += [*_table(d["topics"], d["streams"]), ""]
     if camera := d["calibration"]:
         state = "rectified" if camera["rectified"] else "not rectified"
         lines.append(
-            f"camera: {camera['width']}x{camera['height']}, fx {camera['fx']:.3f} px, "
+            f"camera: {camera['width']}x{camera['height']} px, fx {camera['fx']:.3f} px, "
             f"baseline {camera['baseline']:.4f} m, {state}, frame '{camera['frame_id']}'"
         )
         lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
     if all(side in d["streams"] for side in CAMERAS):
-        frames = d["frames"]
-        paired = (
-            f"frames: by their stamps, {counted(frames['pairs'], 'pair')} within {frames['slop_s'] * 1e3:g} ms of "
-            f"{frames['left']} left and {counted(frames['right'], 'right image')}"
-        )
-        if frames["with_tilt"] is not None:
-            gap = f"at most {frames['tilt_gap_s'] * 1e3:g} ms apart"
-            paired += f"; tilts around {frames['with_tilt']} of the left ones, {gap}"
-        lines.append(paired)
+        lines.append(_frame_line(d["frames"]))
     if d["mount"]:
-        down = "unknown" if d["mount"]["base"] is None else f"in '{d['mount']['base']}' at {d['mount']['position']}"
-        lines.append(f"mount: camera {down}")
+        base, position = d["mount"]["base"], d["mount"]["position"]
+        lines.append("mount: camera position unknown" if base is None else f"mount: camera in '{base}' at {position} m")
     lines += [f"transform: {transform}" for transform in d["transforms"]]
     for why in dict.fromkeys(d["missing"].values()):
         lines.append(f"missing: {', '.join(stream for stream in d['missing'] if d['missing'][stream] == why)}: {why}")
-    lines += [f"note: {stream}: {said}" for stream, said in d["notes"].items()]
+    lines += [f"note: {stream}: {note}" for stream, note in d["notes"].items()]
     lines += [d["undecodable"]] if d["undecodable"] else []
-    lines += [f"damaged: {what}" for what in _grouped(d["damage"])]
+    lines += [f"damaged: {damage}" for damage in _grouped(d["damage"])]
     return "\n".join(lines)
+
+
+def _table(topics: list[dict[str, Any]], streams: dict[str, str]) -> list[str]:
+    rows = [("topic", "schema", "messages", "Hz", "largest gap", "stream")]
+    roles = {topic: stream for stream, topic in streams.items()}
+    for topic in topics:
+        hz = "" if topic["hz"] is None else f"{topic['hz']:.2f}"
+        gap = "" if topic["largest_gap_s"] is None else f"{topic['largest_gap_s']:.3f} s"
+        name = topic["topic"]
+        rows.append((name, topic["schema"], str(topic["messages"]), hz, gap, roles.get(name, "")))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    aligned = [str.ljust, str.ljust, str.rjust, str.rjust, str.rjust, str.ljust]
+    return [
+        "  ".join(align(cell, width) for align, cell, width in zip(aligned, row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def _frame_line(frames: dict[str, Any]) -> str:
+    line = (
+        f"frames: {counted(frames['pairs'], 'stereo pair')} with stamps within {frames['slop_s'] * 1e3:g} ms, from "
+        f"{counted(frames['left'], 'left image')} and {counted(frames['right'], 'right image')}"
+    )
+    if frames["with_tilt"] is None:
+        return line
+    gap = f"{frames['tilt_gap_s'] * 1e3:g} ms"
+    return f"{line}; {counted(frames['with_tilt'], 'left image')} between tilts at most {gap} apart"
 
 
 def _topics(log: McapLog) -> list[dict[str, Any]]:
@@ -128,21 +140,21 @@ def _topics(log: McapLog) -> list[dict[str, Any]]:
 
 
 def _grouped(damage: list[str]) -> list[str]:
-    """The sentences; of those about single messages that differ in numbers alone, how many there are, and the first."""
+    """The sentences; those about single messages that differ only in numbers are counted."""
     groups: dict[str, list[str]] = {}
     for what in damage:
-        alike = re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", what) if re.search(r" at \d+ ns\b", what) else what
-        groups.setdefault(alike, []).append(what)
-    return [f"{len(alike)} alike, first: {alike[0]}" if len(alike) > 1 else alike[0] for alike in groups.values()]
+        pattern = re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", what) if re.search(r" at \d+ ns\b", what) else what
+        groups.setdefault(pattern, []).append(what)
+    return [f"{len(same)} similar, first: {same[0]}" if len(same) > 1 else same[0] for same in groups.values()]
 
 
 def _stamps(log: McapLog, stream: str, damage: list[str]) -> list[int]:
-    """The stamps of a camera's images, ns, without decoding them; what is lost goes to `damage`."""
+    """The stamps of a camera's images, ns, without decoding them; losses are added to `damage`."""
     if stream not in log.topics:
         return []
     topic, stamps = log.topics[stream], []
     for raw in log.file.messages(log.channels(stream)):
-        if not isinstance(raw, Lost):
+        if not isinstance(raw, LostMessage):
             stamps.append(peek_stamp(raw.data) or raw.log_time)
         elif raw.channel is not None:
             damage.append(f"{topic} at {raw.log_time} ns: {raw.reason}")
@@ -150,7 +162,7 @@ def _stamps(log: McapLog, stream: str, damage: list[str]) -> list[int]:
 
 
 def _tilts(log: McapLog, damage: list[str]) -> list[int]:
-    """The stamps of the tilts, ns; what cannot be read goes to `damage`."""
+    """The stamps of the tilts, ns; errors are added to `damage`."""
     stamps = []
     for _, stream, item in log.events(("inclinometer",)):
         if isinstance(item, Tilt):
@@ -161,16 +173,15 @@ def _tilts(log: McapLog, damage: list[str]) -> list[int]:
 
 
 def _distinct(log: McapLog, stream: str, damage: list[str], stamps: list[int]) -> Stamps:
-    """The stamps, sorted, each once; that some are repeated goes to `damage`."""
+    """The sorted unique stamps; repeated ones are noted in `damage`."""
     distinct = np.unique(np.array(stamps, np.int64))
     if repeated := len(stamps) - distinct.size:
-        of = f"{repeated} of {len(stamps)}"
-        damage.append(f"{log.topics[stream]}: messages that repeat a stamp, which a run drops: {of}")
+        damage.append(f"{log.topics[stream]}: {repeated} of {len(stamps)} messages repeat a stamp; a run drops them")
     return distinct
 
 
 def _pairs(left: Stamps, right: Stamps, slop: int) -> int:
-    """How many left images have a right one within the slop, each right image used once."""
+    """The number of left images with a right one within the slop; each right image is used once."""
     pairs = place = 0
     for stamp in left.tolist():
         while place < right.size and right[place] < stamp - slop:
@@ -181,7 +192,7 @@ def _pairs(left: Stamps, right: Stamps, slop: int) -> int:
 
 
 def _tilted(left: Stamps, tilt: Stamps, max_gap: int) -> int:
-    """How many left images have the stamp of a tilt, or lie between two that are close enough to interpolate."""
+    """The number of left images at the stamp of a tilt, or between two that are close enough to interpolate."""
     if not tilt.size:
         return 0
     after = np.searchsorted(tilt, left)
@@ -192,9 +203,9 @@ def _tilted(left: Stamps, tilt: Stamps, max_gap: int) -> int:
 
 
 def _calibration(log: McapLog) -> dict[str, Any] | None:
-    if log.opening.cameras is None:
+    if log.resolution.cameras is None:
         return None
-    left, right = log.opening.cameras
+    left, right = log.resolution.cameras
     camera = StereoCamera.from_models(left.model, right.model, left.image_frame, left.rectified)
     names = ("width", "height", "fx", "fy", "cx", "cy", "cx_right", "baseline", "frame_id")
     values = {name: getattr(camera, name) for name in names}
@@ -202,7 +213,7 @@ def _calibration(log: McapLog) -> dict[str, Any] | None:
 
 
 def _mount(log: McapLog) -> dict[str, Any] | None:
-    mount = log.opening.mount
+    mount = log.resolution.mount
     if mount is None:
         return None
     base = mount.base_from_camera

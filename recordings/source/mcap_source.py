@@ -1,7 +1,4 @@
-"""An MCAP log as a pipeline's source.
-
-`open` gives the log (`mcap_log`), whose opening (`mcap_opening`) says for each stream that it cannot give why not.
-"""
+"""An MCAP log as a pipeline's source."""
 
 from __future__ import annotations
 
@@ -19,7 +16,16 @@ from stages.data import CameraImage, Mount, Pose, Tilt
 
 @dataclass(frozen=True)
 class McapSource(LogSettings):
-    """A log's two cameras, its tilt and pose, and how they sit on the rover; the settings say where they are."""
+    """The streams of an MCAP log: two cameras, tilt, pose, and the mount of the camera on the rover.
+
+    `help(LogSettings)` describes the settings.
+
+    Examples
+    --------
+    >>> source = McapSource(left="/front/left/image_rect", right="/front/right/image_rect")
+    >>> sorted(source.streams)
+    ['inclinometer', 'left', 'mount', 'odometry', 'right']
+    """
 
     streams: ClassVar[Mapping[str, type]] = {
         "left": CameraImage,
@@ -30,11 +36,26 @@ class McapSource(LogSettings):
     }
 
     def open(self, path: Path, start: float | None = None, end: float | None = None) -> McapLog:
-        """The log at `path`, from `start` to before `end` (seconds after its first message).
+        """Open a log; use the result as a context manager.
 
-        Raises LogError where it cannot be read at all; what it lacks is told by its `missing`.
+        Parameters
+        ----------
+        path : Path
+            The MCAP file.
+        start, end : float, optional
+            The part to read, from `start` to before `end`, seconds after the first message.
+
+        Returns
+        -------
+        McapLog
+            `missing` gives the reason for each stream that the log does not contain.
+
+        Raises
+        ------
+        LogError
+            If the file cannot be read at all, or the range contains nothing.
         """
         for name, seconds in (("start", start), ("end", end)):
             if seconds is not None and not math.isfinite(seconds):
-                raise LogError(f"{name} must be a number of seconds after the log's first message, not {seconds}")
+                raise LogError(f"{name} must be in seconds after the log's first message, not {seconds}")
         return McapLog(Path(path), self, start, end)

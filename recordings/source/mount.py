@@ -1,4 +1,4 @@
-"""How the camera sits on the rover."""
+"""How the camera sits on the rover: relative to its base frame and to its inclinometer."""
 
 from __future__ import annotations
 
@@ -12,50 +12,50 @@ from recordings.source.calibration import Camera
 from recordings.source.transforms import TransformTree
 from stages.data import Array, Mount, Pose
 
-EVER = 0  # ns, the stamp of what holds throughout: frames may be before the log's first message, or of another clock
+STATIC_STAMP = 0  # ns; a mount holds for the whole log, whose frames may have stamps of another clock
 
 
-def mounted(
-    camera: Camera, inclinometer: str, base: str, frames: TransformTree, given: Sequence[float] | None
-) -> Mount:
-    """How the left camera sits on the rover.
+def mount_of(camera: Camera, inclinometer: str, base: str, tree: TransformTree, given: Sequence[float] | None) -> Mount:
+    """The mount of the left camera.
 
-    inclinometer, base: their frames; given: quaternion xyzw that turns inclinometer into left rectified camera
-    coordinates, where the user gave it. Raises LogError where nothing tells that rotation.
+    inclinometer, base: their frames; given: the user's quaternion xyzw from inclinometer to left rectified camera
+    coordinates. Raises LogError where that rotation is unknown.
     """
-    based = frames.between(base, camera.frame_id)
-    base_from_camera = based.after(camera.image) if based is not None else None
-    return Mount(EVER, _camera_from_inclinometer(camera, inclinometer, frames, given), base_from_camera)
+    to_base = tree.between(base, camera.frame_id)
+    base_from_camera = to_base.after(camera.image) if to_base is not None else None
+    return Mount(STATIC_STAMP, _camera_from_inclinometer(camera, inclinometer, tree, given), base_from_camera)
 
 
-def rovers(pose: Pose, camera: Camera, base: str, frames: TransformTree) -> Pose:
-    """A pose as that of the frame `base`, or where the camera does not sit on that, of the camera's rectified image; as
-    it is where no static transform tells how they sit on the frame whose pose it is."""
-    told = pose.child_frame_id
-    if told in (base, camera.image_frame):
+def pose_of_base(pose: Pose, camera: Camera, base: str, tree: TransformTree) -> Pose:
+    """The pose of the frame `base`, or of the camera's rectified image where nothing joins the camera and `base`.
+
+    A pose of a frame that no static transform joins to them is returned as it is.
+    """
+    of = pose.child_frame_id
+    if of in (base, camera.image_frame):
         return pose
-    if told != camera.frame_id and frames.between(base, camera.frame_id) is not None:
-        part = frames.between(told, base)
+    if of != camera.frame_id and tree.between(base, camera.frame_id) is not None:
+        part = tree.between(of, base)
     else:
-        on_camera = frames.between(told, camera.frame_id)
-        part = None if on_camera is None else on_camera.after(camera.image)
+        to_camera = tree.between(of, camera.frame_id)
+        part = None if to_camera is None else to_camera.after(camera.image)
     return pose if part is None else pose.of(part)
 
 
 def _camera_from_inclinometer(
-    camera: Camera, inclinometer: str, frames: TransformTree, given: Sequence[float] | None
+    camera: Camera, inclinometer: str, tree: TransformTree, given: Sequence[float] | None
 ) -> Array:
     if given is not None:
         return np.asarray(Rotation.from_quat(given).as_matrix())
-    placed = frames.between(camera.frame_id, inclinometer)
-    if placed is None:
+    transform = tree.between(camera.frame_id, inclinometer)
+    if transform is None:
         raise LogError(
-            f"no static transform joins the camera ({_frame(camera.frame_id)}) and the inclinometer "
-            f"({_frame(inclinometer)}); "
+            f"no static transform joins the camera ({_quoted(camera.frame_id)}) and the inclinometer "
+            f"({_quoted(inclinometer)}); "
             "record /tf_static, or set 'camera_from_inclinometer' (quaternion x, y, z, w) of the source"
         )
-    return np.asarray(camera.model.r @ placed.rotation)
+    return np.asarray(camera.model.r @ transform.rotation)
 
 
-def _frame(name: str) -> str:
-    return f"'{name}'" if name else "whose frame_id is empty"
+def _quoted(frame: str) -> str:
+    return f"'{frame}'" if frame else "whose frame_id is empty"

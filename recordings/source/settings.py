@@ -1,4 +1,4 @@
-"""How the streams of a log are found and read, as a pipeline file may set it."""
+"""The settings of a source in a pipeline file: the topics of its streams and their meaning."""
 
 from __future__ import annotations
 
@@ -8,23 +8,38 @@ from dataclasses import dataclass
 from typing import Any
 
 from recordings.ros2.from_msg import frame_name
-from recordings.ros2.tilt_from_msg import Angle, Angles
+from recordings.ros2.tilt_from_msg import AngleField, PlainAngles
 
 
 @dataclass(frozen=True)
 class LogSettings:
-    """Where the streams of a log are. Topic names are found by schema and name unless given.
+    """The topics of a log and the meaning of its angles. Topics are found by schema and name unless given.
 
-    left, right: image topics; left_info, right_info: their CameraInfo; inclinometer: Imu, QuaternionStamped, or with
-    the angle settings any message; odometry: Odometry, PoseStamped, PoseWithCovarianceStamped, or the
-    TFMessage that places base_frame.
+    Parameters
+    ----------
+    left, right : str, optional
+        Image topics.
+    left_info, right_info : str, optional
+        Their CameraInfo topics.
+    inclinometer : str, optional
+        Topic of an Imu or QuaternionStamped; with `pitch`, `roll` and `tilt_model`, of any message.
+    odometry : str, optional
+        Topic of an Odometry, PoseStamped, PoseWithCovarianceStamped, or the TFMessage that places `base_frame`.
+    pitch, roll : mapping, optional
+        The fields of an inclinometer with plain angles, {field: vector.x, unit: deg | rad, sign: 1 | -1} each. Its
+        frame is x forward, y left, z up. With sign 1 a positive pitch is nose up, a positive roll left side up.
+    tilt_model : str, optional
+        "axis": the angles of the sensor's axes to the horizon. "euler": Euler angles.
+    camera_from_inclinometer : tuple of float, optional
+        Quaternion x, y, z, w from inclinometer to left camera (x right, y down, z forward), for a log without
+        static transforms.
+    base_frame : str
+        The rover's frame.
 
-    pitch, roll: for an inclinometer that gives bare angles, {field: vector.x, unit: deg | rad, sign: 1 | -1} each, and
-    tilt_model: "axis" (angles of its axes to the horizon) or "euler"; its frame is x forward, y left, z up, and with
-    sign 1 a positive pitch has the nose up, a positive roll the left side up.
-
-    camera_from_inclinometer: quaternion x, y, z, w from inclinometer to left camera (x right, y down, z forward), for a
-    log without static transforms. base_frame: the rover's frame.
+    Raises
+    ------
+    ValueError
+        If a setting is invalid, or `pitch`, `roll` and `tilt_model` are not given together.
     """
 
     left: str | None = None
@@ -46,20 +61,18 @@ class LogSettings:
         if given is not None and not _is_unit_quaternion(given):
             raise ValueError(f"McapSource.camera_from_inclinometer must be a unit quaternion x, y, z, w, not {given!r}")
 
-    def angles(self) -> Angles | None:
-        """How bare angles are read; None where the settings do not speak of them. Raises ValueError for half of it."""
+    def angles(self) -> PlainAngles | None:
+        """The meaning of plain angles; None if not set. Raises ValueError if only a part is set."""
         given = {"pitch": self.pitch, "roll": self.roll, "tilt_model": self.tilt_model}
         if not any(value is not None for value in given.values()):
             return None
         for name, value in given.items():
             if value is None:
-                raise ValueError(
-                    f"McapSource needs '{name}' as well: bare angles are given by pitch, roll and tilt_model"
-                )
+                raise ValueError(f"McapSource needs '{name}': plain angles need pitch, roll and tilt_model")
         if self.tilt_model not in ("axis", "euler"):
             raise ValueError(f"McapSource.tilt_model must be axis or euler, not {self.tilt_model}")
         model: Any = self.tilt_model
-        return Angles(_angle("pitch", self.pitch), _angle("roll", self.roll), model)
+        return PlainAngles(_angle("pitch", self.pitch), _angle("roll", self.roll), model)
 
 
 def _is_unit_quaternion(given: Any) -> bool:
@@ -69,7 +82,7 @@ def _is_unit_quaternion(given: Any) -> bool:
     return numbers and len(given) == 4 and abs(math.hypot(*given) - 1) < 1e-3
 
 
-def _angle(name: str, given: Any) -> Angle:
+def _angle(name: str, given: Any) -> AngleField:
     if not isinstance(given, Mapping):
         raise ValueError(f"McapSource.{name} must be a mapping of field, unit and sign, not {given!r}")
     valid: dict[str, tuple[Any, ...]] = {"field": (), "unit": ("deg", "rad"), "sign": (1, -1)}
@@ -83,4 +96,4 @@ def _angle(name: str, given: Any) -> Angle:
             )
         if choices and given[key] not in choices:
             raise ValueError(f"McapSource.{name}.{key} must be {' or '.join(map(str, choices))}, not {given[key]!r}")
-    return Angle(str(given["field"]), given["unit"], int(given["sign"]))
+    return AngleField(str(given["field"]), given["unit"], int(given["sign"]))

@@ -1,4 +1,4 @@
-"""The static transforms of a log, as a graph of frames."""
+"""The static transforms of a log: the tf tree."""
 
 from __future__ import annotations
 
@@ -12,20 +12,38 @@ from recordings.errors import LogError
 from recordings.ros2.from_msg import transform_of
 from stages.data import Transform
 
-# A camera's axes (x right, y down, z forward) in the rover's (x forward, y left, z up), when it looks straight ahead.
+# The axes of a camera (x right, y down, z forward) that looks straight ahead, in the rover's (x forward, y left, z up).
 BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-_SAME = 1e-6  # m and matrix elements; two transforms of the same frames that differ by more contradict each other
+TRANSFORM_ATOL = 1e-6  # m and matrix elements; two transforms that differ by more contradict each other
 
 
 @dataclass
 class TransformTree:
-    """The static transforms of a log, as a graph in which any two connected frames have a transform."""
+    """Static transforms, by which any two connected frames have a transform.
+
+    Examples
+    --------
+    >>> from recordings.ros2.to_msg import transform_message
+    >>> to_mast = Transform("base_link", "mast", np.eye(3), np.array([0.0, 0.0, 1.5]))
+    >>> to_camera = Transform("mast", "camera", np.eye(3), np.array([0.1, 0.0, 0.0]))
+    >>> tree = TransformTree()
+    >>> for message in transform_message([(to_mast, 0), (to_camera, 0)]).transforms:
+    ...     tree.add(message)
+    >>> tree.between("base_link", "camera").translation.tolist()
+    [0.1, 0.0, 1.5]
+    """
 
     edges: dict[str, dict[str, Transform]] = field(default_factory=dict)
     parents: dict[str, str] = field(default_factory=dict)
 
     def add(self, message: Any) -> None:
-        """Add a geometry_msgs/TransformStamped. Raises LogError, and keeps what is there, where it contradicts that."""
+        """Add a geometry_msgs/TransformStamped.
+
+        Raises
+        ------
+        LogError
+            If it contradicts the transforms so far, which are kept.
+        """
         transform = transform_of(message)
         parent, child = transform.parent, transform.child
         known = self.between(parent, child)
@@ -35,12 +53,22 @@ class TransformTree:
             self.edges.setdefault(parent, {})[child] = transform
             self.edges.setdefault(child, {})[parent] = transform.inverse()
             self.parents[child] = parent
-        elif not _same(known, transform):
+        elif not _are_same(known, transform):
             raise LogError(f"the transform '{parent}' <- '{child}' contradicts an earlier one; the earlier one is used")
 
     def between(self, parent: str, child: str) -> Transform | None:
-        """The transform from `child` to `parent`, along the fewest steps; None where nothing connects them, or one has
-        no name."""
+        """The transform from `child` to `parent` by the shortest path.
+
+        Parameters
+        ----------
+        parent, child : str
+            Names of frames.
+
+        Returns
+        -------
+        Transform or None
+            None if nothing connects the frames, or a name is empty.
+        """
         if not parent or not child:
             return None
         before, queue = {child: child}, deque([child] if parent in self.edges else [])
@@ -62,6 +90,6 @@ class TransformTree:
         return sorted(f"{parent} <- {child}" for child, parent in self.parents.items())
 
 
-def _same(one: Transform, other: Transform) -> bool:
+def _are_same(one: Transform, other: Transform) -> bool:
     off = max(np.abs(one.rotation - other.rotation).max(), np.abs(one.translation - other.translation).max())
-    return bool(off <= _SAME)
+    return bool(off <= TRANSFORM_ATOL)

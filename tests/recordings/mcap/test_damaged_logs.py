@@ -24,9 +24,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.mcap.chunk import unpacked
+from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
-from recordings.mcap.index import MAGIC, Index, Lost
+from recordings.mcap.index import MAGIC, Index, LostMessage
 from recordings.source.inventory import format_description
 from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, inventory_of, items_of, rewritten
 
@@ -151,11 +151,11 @@ def test_damage_that_took_all_images_is_told_as_that(sample: Path, tmp_path: Pat
     damaged.write_bytes(content)
     with McapSource().open(damaged) as log:
         assert log.missing["left"].startswith(
-            "the log has no camera image (sensor_msgs/Image or CompressedImage): "
-            f"no message of {LEFT}, {RIGHT} can be read; give one that has "
+            "the log has no camera images (sensor_msgs/Image or CompressedImage): "
+            f"no message of {LEFT}, {RIGHT} can be read; give a log with images "
             f"(messages were lost: the chunk at byte {broken[0]} is broken and its messages are lost"
         )
-        assert log.opening.lacking["left"].endswith("give one that has")
+        assert log.resolution.unavailable["left"].endswith("give a log with images")
 
 
 def test_a_record_with_a_broken_length_costs_what_it_held(
@@ -171,7 +171,7 @@ def test_a_record_with_a_broken_length_costs_what_it_held(
     events = items_of(path)
     losses = [str(item) for _, _, item in events if isinstance(item, Exception)]
     assert losses == [
-        f"damaged.mcap: the log is damaged at byte {chunks[3]}: what is between there and byte {chunks[4]} may be lost"
+        f"damaged.mcap: the log is damaged from byte {chunks[3]} to byte {chunks[4]}; messages there may be lost"
     ]
     good = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
     assert good == [essence(item) for _, _, item in whole]  # the chunk itself was whole
@@ -184,7 +184,7 @@ def test_a_broken_length_in_a_large_file_does_not_fill_the_memory(tmp_path: Path
         file.write(MAGIC + record(1, b"\0" * 8) + struct.pack("<BQ", 6, 1 << 40))
         file.truncate(1 << 30)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(LogError, match="holds no messages that can be read: the log is cut or damaged at byte 25"):
+    with pytest.raises(LogError, match="contains no messages that can be read: the log is cut or damaged at byte 25"):
         McapFile(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000  # kB
 
@@ -205,8 +205,8 @@ def test_a_chunk_that_holds_more_than_it_states_is_broken_and_not_unpacked(tmp_p
 
 def test_a_chunk_that_states_more_than_any_may_is_broken() -> None:
     content = struct.pack("<QQQII", 0, 1, 1 << 50, 0, 4) + b"zstd" + struct.pack("<Q", 1) + b"x"
-    with pytest.raises(ValueError, match="more than a chunk may"):
-        unpacked(content)
+    with pytest.raises(ValueError, match="the limit is"):
+        unpack_chunk(content)
 
 
 @pytest.mark.filterwarnings("error")
@@ -232,8 +232,8 @@ def test_a_log_time_that_no_clock_can_show_costs_its_message(
 def test_many_losses_take_their_time_from_the_last_message_before_them() -> None:
     index = Index()
     for time in (5, 9, 7):
-        index.seen(1, time)
-        index.lose("gone")
+        index.count_message(1, time)
+        index.note_damage("gone")
     assert [lost.log_time for lost in index.lost] == [5, 9, 9]
     assert index.latest == 9
 
@@ -258,7 +258,9 @@ def test_what_is_behind_the_end_of_a_log_is_told(
     *events, (_, stream, lost) = items_of(path)
     assert [essence(item) for _, _, item in events] == [essence(item) for _, _, item in whole]
     size = len(first) if second == "log" else 5000
-    said = f"the log ends at byte {len(first)}, and {size} bytes behind that are not read; give each log by itself"
+    said = (
+        f"the log ends at byte {len(first)}, and the {size} bytes after it are not read; give each log as its own file"
+    )
     assert (stream, str(lost)) == ("log", f"log.mcap: {said}")
     assert inventory_of(path)["damage"] == [said]
 
@@ -270,8 +272,8 @@ def test_an_index_that_points_behind_the_end_loses_its_chunk_alone(sample: Path,
         log.index.chunks[2].chunk_start_offset = (1 << 63) - 1
         log.index.chunks[3].chunk_start_offset = 1 << 63
         items = list(log.messages(set(log.index.channels)))
-    assert len([item for item in items if isinstance(item, Lost)]) >= 2
-    assert good > len([item for item in items if not isinstance(item, Lost)]) > good / 2
+    assert len([item for item in items if isinstance(item, LostMessage)]) >= 2
+    assert good > len([item for item in items if not isinstance(item, LostMessage)]) > good / 2
 
 
 @pytest.mark.parametrize(
@@ -281,7 +283,7 @@ def test_an_index_that_points_behind_the_end_loses_its_chunk_alone(sample: Path,
         (b"hello, I am a text file\n", "is not an MCAP log"),
         (b"#ROSBAG V2.0\n....", "is a ROS 1 bag; convert it"),
         (b"SQLite format 3\0....", "is a rosbag2 SQLite bag; convert it"),
-        (b"\x89MCAP0\r\n", "holds no messages that can be read: the log is cut"),
+        (b"\x89MCAP0\r\n", "contains no messages that can be read: the log is cut"),
     ],
 )
 def test_what_is_no_log_is_refused_with_what_it_is(tmp_path: Path, content: bytes, said: str) -> None:
@@ -301,7 +303,7 @@ def test_no_file_a_folder_and_no_messages_are_refused(tmp_path: Path) -> None:
     writer.start()
     writer.finish()
     (tmp_path / "no.mcap").write_bytes(stream.getvalue())
-    with pytest.raises(LogError, match=r"no\.mcap holds no messages"):
+    with pytest.raises(LogError, match=r"no\.mcap contains no messages"):
         McapSource().open(tmp_path / "no.mcap")
 
 
@@ -313,7 +315,7 @@ def test_every_file_of_the_conformance_suite_gives_all_its_messages() -> None:
         read: list[Any] = []
         with suppress(LogError), McapFile(path) as log:
             read = list(log.messages(set(log.index.channels)))
-        assert not [item for item in read if isinstance(item, Lost)], path
+        assert not [item for item in read if isinstance(item, LostMessage)], path
         assert len(read) == wanted, path
         checked += 1
     assert checked == 205
@@ -332,7 +334,7 @@ def test_every_real_log_is_described_or_refused_in_a_sentence() -> None:
         assert not [item for _, _, item in items_of(path) if isinstance(item, Exception)], path
     assert len(paths) >= 232
     assert len(refused) <= len(paths) // 10
-    assert all("holds no messages" in text or "is a ROS 1 bag" in text or "is empty" in text for text in refused)
+    assert all("contains no messages" in text or "is a ROS 1 bag" in text or "is empty" in text for text in refused)
 
 
 def test_the_field_log_has_its_tilt_at_ten_hertz() -> None:
@@ -358,7 +360,7 @@ def test_messages_of_a_channel_that_is_nowhere_defined_are_told(tmp_path: Path) 
     log.write_bytes(content)
     with McapFile(log) as file:
         found = list(file.messages({known}))
-    assert [item.log_time for item in found if not isinstance(item, Lost)] == [1, 3]
-    assert [item.reason for item in found if isinstance(item, Lost)] == [
-        "1 message of channel 999, which the log does not define, cannot be read"
+    assert [item.log_time for item in found if not isinstance(item, LostMessage)] == [1, 3]
+    assert [item.reason for item in found if isinstance(item, LostMessage)] == [
+        "1 message of channel 999 cannot be read: the log does not define it"
     ]

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from recordings import McapSource
-from recordings.mcap.index import JITTER
+from recordings.mcap.index import MAX_JITTER_NS
 from recordings.source import topics as mcap_messages
 from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, inventory_of, items_of, rewritten
 
@@ -40,8 +40,8 @@ def test_what_follows_a_clock_set_back_is_lost_until_that_time_has_come(
     lost = [(time, str(item)) for time, stream, item in events if isinstance(item, Exception) and stream == "left"]
     images = [(time, said) for time, said in lost if said.startswith(f"{LEFT}: ")]
     assert [time for time, _ in images] == [START + number * PERIOD - BACK + 1000 for number in range(FIRST, FRAMES)]
-    said = "the log's clock was set back by 0.15 s or more, and was not yet 1 s beyond where it had been"
-    remedy = "if no clock was set and the log is only written in another order, `mcap sort` mends it"
+    said = "the log's clock was set back by at least 0.15 s and is not yet 1 s beyond its old time"
+    remedy = "if the clock was right and the log is only written in another order, `mcap sort` repairs it"
     assert {told for _, told in images} == {f"{LEFT}: {said}; {remedy}"}
     with McapSource().open(path) as log:
         assert log.file.times(log.channels("left")).tolist() == [START + n * PERIOD + 1000 for n in range(FIRST)]
@@ -96,7 +96,7 @@ def test_a_log_written_topic_by_topic_or_with_jitter_loses_nothing(
         """By topic, and in each the messages two by two in the wrong order."""
         topics = dict.fromkeys(channel.topic for _, channel, _ in messages)
         rows = [[found for found in messages if found[1].topic == topic] for topic in topics]
-        assert max(b[2].log_time - a[2].log_time for row in rows for a, b in pairwise(row)) == JITTER
+        assert max(b[2].log_time - a[2].log_time for row in rows for a, b in pairwise(row)) == MAX_JITTER_NS
         return [row[place] for row in rows for place in sorted(range(len(row)), key=lambda number: number ^ 1)]
 
     events = items_of(rewritten(sample, tmp_path / "log.mcap", order=by_topic, **options))
@@ -107,7 +107,7 @@ def test_a_log_written_topic_by_topic_or_with_jitter_loses_nothing(
 def test_a_clock_set_back_by_all_that_was_recorded_takes_no_sensor(
     sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mcap_messages, "_LOOKED_AT", 1)  # what is lost comes first, and may be more than is looked at
+    monkeypatch.setattr(mcap_messages, "_MAX_SAMPLES", 1)  # what is lost comes first, and may be more than is looked at
 
     def far_back(messages: list[Any]) -> list[Any]:
         for _, _, message in messages:
@@ -145,4 +145,4 @@ def test_static_transforms_hold_whenever_they_were_logged(sample: Path, tmp_path
         return [(schema, channel, nothing), (schema, channel, message), *others]
 
     with McapSource().open(rewritten(sample, tmp_path / "log.mcap", order=late_before)) as log:
-        assert (log.missing, log.opening.problems) == ({}, [])
+        assert (log.missing, log.resolution.problems) == ({}, [])

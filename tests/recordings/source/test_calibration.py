@@ -45,9 +45,9 @@ def turned(axis: str, degrees: float) -> np.ndarray:
 def test_parallel_cameras_beside_each_other_are_rectified_as_they_are(tmp_path: Path, names: tuple[str, str]) -> None:
     beside = Transform("left_optical", "right_optical", np.eye(3), [0.25, 0.001, 0])
     with McapSource().open(single_calibrations(tmp_path / "log.mcap", names, beside)) as log:
-        assert log.opening.cameras is not None
-        assert [camera.rectified for camera in log.opening.cameras] == [True, True]
-        assert log.opening.cameras[1].model.p[0, 3] == pytest.approx(-20 * 0.25)
+        assert log.resolution.cameras is not None
+        assert [camera.rectified for camera in log.resolution.cameras] == [True, True]
+        assert log.resolution.cameras[1].model.p[0, 3] == pytest.approx(-20 * 0.25)
 
 
 @pytest.mark.parametrize(
@@ -65,8 +65,8 @@ def test_cameras_that_are_not_parallel_are_rectified_or_refused_where_called_rec
 ) -> None:
     beside = Transform("left_optical", "right_optical", rotation, place)
     with McapSource().open(single_calibrations(tmp_path / "raw.mcap", RAW, beside, fx)) as log:
-        assert log.opening.cameras is not None
-        left, right = log.opening.cameras
+        assert log.resolution.cameras is not None
+        left, right = log.resolution.cameras
     assert not left.rectified
     assert -right.model.p[0, 3] / right.model.p[0, 0] == pytest.approx(np.linalg.norm(place))
     point = np.array([0.3, -0.2, 4.0])
@@ -76,7 +76,7 @@ def test_cameras_that_are_not_parallel_are_rectified_or_refused_where_called_rec
         rows.append(projected[1] / projected[2])
     assert rows[0] == pytest.approx(rows[1], abs=1e-9)
     with McapSource().open(single_calibrations(tmp_path / "rect.mcap", RECTIFIED, beside, fx)) as log:
-        assert "are called rectified, but the static transform between them says" in log.missing["left"]
+        assert "are rectified by their names, but the cameras are not parallel by" in log.missing["left"]
 
 
 @pytest.mark.parametrize("place", [[0, -0.25, 0], [0, 0.25, 0], [0.15, 0, 0.2], [0, 0, -0.25]])
@@ -107,7 +107,7 @@ def test_exchanged_cameras_are_named_so(tmp_path: Path, names: tuple[str, str]) 
         ({"width": 11}, r"principal point \(11.5, 7.5\) in P of the CameraInfo of .* lies outside its 11x16 images"),
         ({"height": 7}, "lies outside its 24x7 images"),
         ({"width": 0}, "is for images of 0x16"),
-        ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "are those of no camera"),
+        ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "are impossible for a camera"),
     ],
 )
 def test_a_calibration_that_cannot_be_is_told_as_such(tmp_path: Path, values: dict[str, Any], said: str) -> None:
@@ -124,7 +124,7 @@ def test_a_calibration_that_cannot_be_is_told_as_such(tmp_path: Path, values: di
 @pytest.mark.parametrize(
     ("model", "count", "said"),
     [
-        ("fisheye", 4, "cannot be rectified by their CameraInfo: unknown distortion model 'fisheye'"),
+        ("fisheye", 4, "cannot be rectified with their CameraInfo: unknown distortion model 'fisheye'"),
         ("plumb_bob", 3, "a plumb_bob camera has 0 or 4 or 5 or .* coefficients, the calibration has 3"),
         ("plumb_bob", 8, ""),  # as many drivers call a rational polynomial
     ],
@@ -150,8 +150,8 @@ def test_a_calibration_of_the_projection_alone_is_that_of_rectified_images(tmp_p
         if distorted:
             assert "no focal length in K" in log.missing["left"]
         else:
-            assert log.opening.cameras is not None
-            assert all(camera.rectified for camera in log.opening.cameras)
+            assert log.resolution.cameras is not None
+            assert all(camera.rectified for camera in log.resolution.cameras)
 
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
@@ -167,7 +167,7 @@ def test_a_stereo_calibration_whose_projections_differ_is_refused(
         return message
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=names)) as log:
-        assert f"are not those of a rectified pair: {said}" in log.missing["left"]
+        assert f"does not belong to a rectified pair: {said}" in log.missing["left"]
 
 
 def test_lenses_that_leave_no_image_are_refused() -> None:
@@ -224,8 +224,8 @@ def test_a_pose_of_a_part_of_the_rover_is_made_that_of_the_rover_or_of_its_camer
     sits = inclinometer if with_base else on_camera  # the inclinometer, whose pose is logged
     assert [pose.child_frame_id for pose in poses] == [sits.parent] * FRAMES
     for number, pose in enumerate(poses):
-        placed = Transform("odom", sits.parent, Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
-        logged = placed.after(sits)
+        right_in_left = Transform("odom", sits.parent, Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
+        logged = right_in_left.after(sits)
         np.testing.assert_allclose(logged.translation, [number, 2.0, 3.0], atol=1e-9)
         given = Rotation.from_quat(tilt_quaternion(number)).as_matrix()
         np.testing.assert_allclose(logged.rotation, given, atol=1e-9)
@@ -236,8 +236,8 @@ def test_a_pose_of_a_part_of_the_rover_is_made_that_of_the_rover_or_of_its_camer
 
 def test_a_frame_of_the_rover_that_is_set_must_be_one_that_the_camera_sits_on(tmp_path: Path) -> None:
     with McapSource(base_frame="rover").open(write_sample(tmp_path / "log.mcap")) as log:
-        assert log.refused["base_frame"].startswith("the source's 'base_frame' is set to 'rover', which /tf_static")
-        assert "as it does 'base_link'; set it to one of these" in log.refused["base_frame"]
+        assert log.refused["base_frame"].startswith("the source's 'base_frame' is set to 'rover', but /tf_static")
+        assert "joins the camera to 'base_link' only; set it to one of these" in log.refused["base_frame"]
     with McapSource(base_frame="imu_link").open(write_sample(tmp_path / "log.mcap")) as log:
         assert log.refused == {}
 
@@ -269,7 +269,7 @@ def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:
 
     assert TransformTree().between("", "") is None
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        assert log.opening.mount is None
+        assert log.resolution.mount is None
         assert "joins the camera (whose frame_id is empty) and the inclinometer (whose frame_id" in log.missing["mount"]
 
 
@@ -281,7 +281,7 @@ def test_a_calibration_without_a_frame_is_of_its_images_frame(tmp_path: Path) ->
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
-        assert [camera.frame_id for camera in log.opening.cameras or ()] == ["left_optical", "right_optical"]
+        assert [camera.frame_id for camera in log.resolution.cameras or ()] == ["left_optical", "right_optical"]
 
 
 def with_transforms(path: Path, *more: Transform) -> Path:
@@ -307,9 +307,9 @@ def with_transforms(path: Path, *more: Transform) -> Path:
 def test_a_transform_that_cannot_be_is_told_and_the_others_hold(tmp_path: Path, more: Transform, said: str) -> None:
     with McapSource().open(with_transforms(tmp_path / "log.mcap", more)) as log:
         assert log.missing == {}
-        assert log.opening.mount is not None
+        assert log.resolution.mount is not None
         np.testing.assert_allclose(
-            log.opening.mount.camera_from_inclinometer, TRANSFORMS[0].rotation.T @ TRANSFORMS[1].rotation, atol=1e-12
+            log.resolution.mount.camera_from_inclinometer, TRANSFORMS[0].rotation.T @ TRANSFORMS[1].rotation, atol=1e-12
         )
         told = [(stream, item) for _, stream, item in log.events() if isinstance(item, Exception)]
     assert [stream for stream, _ in told] == ["log"]
@@ -348,10 +348,10 @@ def test_a_long_chain_of_transforms_is_followed_either_way():
 def test_a_transform_that_is_told_again_is_no_contradiction(tmp_path: Path) -> None:
     with McapSource().open(with_transforms(tmp_path / "log.mcap", *TRANSFORMS, TRANSFORMS[0].inverse())) as log:
         assert not [item for _, _, item in log.events() if isinstance(item, Exception)]
-        assert log.opening.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]
+        assert log.resolution.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]
 
 
 def test_the_pair_of_the_sample_is_rectified(sample: Path) -> None:
     with McapSource(left=LEFT).open(sample) as log:
-        assert log.opening.cameras is not None
-        np.testing.assert_array_equal(log.opening.cameras[1].model.p, model("right").p)
+        assert log.resolution.cameras is not None
+        np.testing.assert_array_equal(log.resolution.cameras[1].model.p, model("right").p)

@@ -42,10 +42,7 @@ def test_cameras_of_two_places_are_not_better_or_worse_than_each_other(tmp_path:
     with McapSource(right="/front/right/image_raw").open(path) as log:
         assert log.topics["left"] == "/front/left/image_raw"
     with McapSource(left=topics[0], right=topics[0]).open(path) as log:
-        assert (
-            log.refused["right"]
-            == f"the source's 'left' and 'right' are both set to {topics[0]}; set one to the other's"
-        )
+        assert log.refused["right"] == f"the source's 'left' and 'right' are both set to {topics[0]}; set two topics"
     with McapSource(left=topics[2], right=topics[1]).open(path) as log:  # whatever they are called
         assert (log.topics["left"], log.topics["right"]) == (topics[2], topics[1])
 
@@ -87,8 +84,8 @@ def test_the_calibration_under_the_image_itself_comes_first(tmp_path: Path) -> N
     topics = {f"/cam/{side}": side for side in ("left", "right")}
     infos = {f"/cam/{side}/camera_info": side for side in topics.values()} | {"/cam/camera_info": "other"}
     with McapSource().open(images(tmp_path / "log.mcap", topics, infos)) as log:
-        assert log.opening.cameras is not None
-        assert [camera.frame_id for camera in log.opening.cameras] == ["left", "right"]
+        assert log.resolution.cameras is not None
+        assert [camera.frame_id for camera in log.resolution.cameras] == ["left", "right"]
 
 
 def test_a_navigation_camera_is_a_camera(tmp_path: Path) -> None:
@@ -163,7 +160,7 @@ def test_a_pose_of_something_the_camera_is_not_known_to_sit_on_is_not_taken(tmp_
         return message
 
     with McapSource(odometry=given).open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        said = "/odom is the pose of 'foot', and nothing tells how the camera 'left_optical' sits on it"
+        said = "/odom is the pose of 'foot', but no static transform joins it to the camera 'left_optical'"
         assert said in log.missing["odometry"]
         assert ("odometry" in log.refused) == (given is not None)
 
@@ -188,7 +185,7 @@ def test_an_imu_without_a_single_unit_quaternion_is_no_inclinometer(tmp_path: Pa
         return message
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        said = f"{TILT} holds no orientation (the quaternion of the inclinometer is not a rotation: [0.0, 0.0"
+        said = f"{TILT} contains no orientation (the quaternion of the inclinometer is not a rotation: [0.0, 0.0"
         assert said in log.missing["inclinometer"]
 
 
@@ -210,7 +207,7 @@ def test_an_imu_that_is_nonsense_for_long_is_still_an_inclinometer(tmp_path: Pat
             message.orientation_covariance = np.full(9, -1.0)
         return message
 
-    monkeypatch.setattr("recordings.source.topics._LOOKED_AT", 1)
+    monkeypatch.setattr("recordings.source.topics._MAX_SAMPLES", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
 

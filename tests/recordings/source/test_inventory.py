@@ -61,8 +61,8 @@ def test_the_text_names_every_topic_its_stream_and_what_is_missing(tmp_path: Pat
     line = next(line for line in text.splitlines() if line.startswith(LEFT))
     assert line.split() == [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100", "s", "left"]
     assert "missing: odometry: the log has no nav_msgs/Odometry" in text
-    frames = "frames: by their stamps, 5 pairs within 5 ms of 5 left and 5 right images"
-    assert f"{frames}; tilts around 5 of the left ones, at most 200 ms apart" in text
+    frames = "frames: 5 stereo pairs with stamps within 5 ms, from 5 left images and 5 right images"
+    assert f"{frames}; 5 left images between tilts at most 200 ms apart" in text
 
 
 def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: Path) -> None:
@@ -79,8 +79,11 @@ def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: P
     assert frames["with_tilt"] == 2  # the first and the last frame, which have a tilt of their own
     wider = inventory_of(path, slop=6_000_000, max_gap=400_000_000)
     assert (wider["frames"]["pairs"], wider["frames"]["with_tilt"]) == (FRAMES, FRAMES)
-    assert "5 pairs within 6 ms of 5 left and 5 right images; tilts around 5 of the left" in format_description(wider)
-    assert "of the left ones, at most 400 ms apart" in format_description(wider)
+    text = format_description(wider)
+    assert (
+        "5 stereo pairs with stamps within 6 ms, from 5 left images and 5 right images; 5 left images between" in text
+    )
+    assert "tilts at most 400 ms apart" in text
 
 
 def test_repeated_stamps_count_once_and_are_told(tmp_path: Path) -> None:
@@ -93,7 +96,7 @@ def test_repeated_stamps_count_once_and_are_told(tmp_path: Path) -> None:
     frames = described["frames"]
     assert (frames["left"], frames["right"]) == (FRAMES, FRAMES)
     assert (frames["pairs"], frames["with_tilt"]) == (FRAMES - 1, FRAMES - 1)
-    said = "messages that repeat a stamp, which a run drops: 1 of 5"
+    said = "1 of 5 messages repeat a stamp; a run drops them"
     assert described["damage"] == [f"{topic}: {said}" for topic in (LEFT, RIGHT, TILT)]
 
 
@@ -115,7 +118,7 @@ def test_tilts_that_cannot_be_read_are_told_in_a_line_with_the_first_of_them(tmp
     assert len(described["damage"]) == FRAMES - 1
     (line,) = (line for line in format_description(described).splitlines() if line.startswith("damaged"))
     assert line.startswith(
-        f"damaged: 4 alike, first: {TILT} at {START + PERIOD} ns: the quaternion of the inclinometer"
+        f"damaged: 4 similar, first: {TILT} at {START + PERIOD} ns: the quaternion of the inclinometer"
     )
 
 
@@ -128,8 +131,8 @@ def test_streams_whose_headers_have_no_stamp_are_told_to_go_by_the_time_of_the_l
     described = inventory_of(write_sample(tmp_path / "log.mcap", edit))
     assert list(described["notes"]) == ["left", "odometry"]
     assert [line for line in format_description(described).splitlines() if line.startswith("note: ")] == [
-        "note: left: header stamps are 0: log times are used",
-        "note: odometry: header stamps are 0: log times are used",
+        "note: left: the header stamps are 0, so log times are used",
+        "note: odometry: the header stamps are 0, so log times are used",
     ]
 
 
@@ -160,7 +163,7 @@ def test_a_calibration_that_may_be_of_another_image_size_is_doubted(tmp_path: Pa
         (
             0.0, 0.3,
             (
-                "the baseline of 0.3 m is that of the static transform 'left_optical' <- 'right_optical': "
+                "the baseline of 0.3 m comes from the static transform 'left_optical' <- 'right_optical', because "
                 "P[0,3] of both CameraInfo is 0"
             ),
         ),
@@ -183,7 +186,7 @@ def test_a_baseline_that_is_told_twice_or_by_the_transform_alone_is_noted(
     path = write_sample(tmp_path / "log.mcap", edit)
     described = inventory_of(path)
     assert described["calibration"]["baseline"] == pytest.approx(told or told_by_transform)
-    unstamped = "header stamps are 0: log times are used"
+    unstamped = "the header stamps are 0, so log times are used"
     assert described["notes"] == {"right": f"{unstamped}; {note}" if note else unstamped}
     assert f"note: right: {described['notes']['right']}" in format_description(described).splitlines()
 
@@ -195,7 +198,7 @@ def test_a_missing_right_calibration_is_said_in_whole_sentences(tmp_path: Path) 
     why = f"no CameraInfo belongs to {RIGHT} ({listed}); set 'right_info'"
     assert [line.partition(" of the source")[0] for line in text.splitlines() if line.startswith("missing")] == [
         f"missing: right: {why}",
-        f"missing: mount: without a calibrated pair of cameras there is no mount: {why}",
+        f"missing: mount: the mount needs a calibrated pair of cameras: {why}",
     ]
 
 
@@ -211,7 +214,7 @@ def test_topics_that_cannot_be_decoded_are_listed_once(tmp_path: Path) -> None:
 def test_one_is_not_many(tmp_path: Path) -> None:
     edit = lambda topic, number, message: None if number else message  # noqa: E731
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
-    assert "1 pair within 5 ms of 1 left and 1 right image; tilts around 1 of the left" in text
+    assert "1 stereo pair with stamps within 5 ms, from 1 left image and 1 right image; 1 left image between" in text
 
 
 def test_damage_is_told(tmp_path: Path) -> None:
@@ -230,5 +233,5 @@ def test_an_imu_without_orientation_is_not_taken_for_an_inclinometer(tmp_path: P
         return message
 
     description = inventory_of(write_sample(tmp_path / "log.mcap", edit))
-    assert "holds no orientation" in description["missing"]["inclinometer"]
+    assert "contains no orientation" in description["missing"]["inclinometer"]
     assert description["frames"]["with_tilt"] == 0

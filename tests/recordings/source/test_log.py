@@ -145,7 +145,7 @@ def test_a_tilt_of_another_sensor_than_the_mounts_is_lost(tmp_path: Path) -> Non
     events = items_of(write_sample(tmp_path / "log.mcap", edit))
     lost = [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]
     assert [(time, stream) for time, stream, _ in lost] == [(START + 3 * PERIOD, "inclinometer")]
-    assert "its frame is 'other_imu', but the mount was found for 'imu_link'" in lost[0][2]
+    assert "its frame is 'other_imu', but the mount is that of 'imu_link'" in lost[0][2]
 
 
 @pytest.mark.parametrize(("topic", "stream"), [(TILT, "inclinometer"), (LEFT, "left"), (INFO, "left")])
@@ -162,7 +162,7 @@ def test_messages_of_a_topic_in_another_encoding_are_told_with_their_number(
         losses = [(name, str(item)) for _, name, item in log.events() if isinstance(item, Exception)]
     assert [name for name, _ in losses] == [stream]
     assert f"{topic}: 2 messages of its channel" in losses[0][1]
-    assert "in 'json', not in 'cdr'" in losses[0][1]
+    assert "in 'json', not in the 'cdr'" in losses[0][1]
     described = inventory_of(path)
     counts = [(item["encoding"], item["messages"]) for item in described["topics"] if item["topic"] == topic]
     assert sorted(counts) == [("cdr", 3), ("json", 2)]
@@ -240,4 +240,4 @@ def test_a_ros_1_bag_is_refused_with_the_command_that_converts_it(tmp_path: Path
 
 def test_messages_still_in_the_encoding_of_ros_1_are_refused_with_that_command(sample: Path, tmp_path: Path) -> None:
     with McapSource().open(copied(sample, tmp_path / "log.mcap", lambda *of: ("ros1", of[2]))) as log:
-        assert "in 'ros1', not in 'cdr' as those of ROS 2; convert the bag itself: rosbags-co" in log.missing["left"]
+        assert "in 'ros1', not in the 'cdr' of ROS 2; convert the bag itself: rosbags-co" in log.missing["left"]

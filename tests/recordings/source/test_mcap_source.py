@@ -127,7 +127,7 @@ def test_a_range_holds_whole_frames_and_the_tilts_around_them(sample: Path) -> N
     stamps = {s: [i.stamp - START for _, stream, i in events if stream == s] for s in ("left", "right", "inclinometer")}
     assert stamps["left"] == stamps["right"] == [PERIOD, 2 * PERIOD]
     assert stamps["inclinometer"] == [number * PERIOD for number in range(FRAMES)]
-    with pytest.raises(LogError, match=r"sample\.mcap is 0\.400 s long; start 9 s is behind its end"):
+    with pytest.raises(LogError, match=r"sample\.mcap is 0\.400 s long; start 9 s is after its end"):
         McapSource().open(sample, start=9)
     with pytest.raises(LogError, match=r"start 0\.3 s is not before end 0\.2 s"):
         McapSource().open(sample, start=0.3, end=0.2)
@@ -150,16 +150,16 @@ def change(topic: str, **values: Any) -> Any:
 @pytest.mark.parametrize(
     ("edit", "stream", "said"),
     [
-        (drop("/stereo/right"), "right", f"the log has one image topic only \\({LEFT}\\), stereo needs two"),
+        (drop("/stereo/right"), "right", f"the log has only one image topic \\({LEFT}\\), but stereo needs two"),
         (drop("/stereo"), "left", "the log has no camera image"),
         (drop(INFO), "left", f"no CameraInfo belongs to {LEFT} .*; set 'left_info' of the source"),
         (drop(TILT), "inclinometer", "the log has no tilt"),
-        (drop(TILT), "mount", "without an inclinometer there is no mount"),
+        (drop(TILT), "mount", "the mount needs an inclinometer"),
         (drop("/tf_static"), "mount", r"no static transform joins the camera \('left_optical'\) and the inclinometer"),
         (drop("/odom"), "odometry", "the log has no nav_msgs/Odometry"),
-        (change(TILT, orientation_covariance=np.full(9, -1.0)), "inclinometer", "holds no orientation"),
+        (change(TILT, orientation_covariance=np.full(9, -1.0)), "inclinometer", "contains no orientation"),
         (change("/stereo/right/camera_info", p=np.hstack([model().k, np.zeros((3, 1))]).reshape(-1)), "left",
-         "does not tell the baseline"),
+         "does not contain the baseline"),
         (change("/stereo/right/camera_info", p=np.hstack([model().k, [[5.0], [0], [0]]]).reshape(-1)), "left",
          f"the baseline is -0.25 m, so {LEFT} is the right camera"),
         (change(INFO, k=np.zeros(9), p=np.zeros(12)), "left", "is not calibrated"),
@@ -208,7 +208,7 @@ def test_two_equal_pairs_are_not_chosen_between_but_named(sample: Path, tmp_path
     with McapSource(left="/front/left/image_rect").open(both) as log:
         assert log.topics["right"] == "/front/right/image_rect"
         assert "left" not in log.missing
-    assert "which is not such a topic of the log" in missing(both, McapSource(left="/nope"))["left"]
+    assert "which is not a suitable topic of the log" in missing(both, McapSource(left="/nope"))["left"]
 
 
 def test_baseline_and_rectification_of_two_single_calibrations_come_from_their_transform(tmp_path: Path) -> None:
@@ -285,7 +285,7 @@ def test_a_camera_whose_images_are_all_broken_is_missing_before_the_run(
             message.data = message.data[:-5]
         return message
 
-    monkeypatch.setattr("recordings.source.topics._LOOKED_AT", 1)
+    monkeypatch.setattr("recordings.source.topics._MAX_SAMPLES", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert list(log.missing) == (["right"] if whole is None else [])
         if whole is None:
@@ -317,8 +317,8 @@ def cropped(message: Any) -> Any:
         (
             LEFT, cropped,
             {
-                "left": f"the images on {LEFT} are 24x14, but {INFO}, its binning and region of interest counted, is "
-                "the calibration of images of 24x16; set 'left_info' of the source to that of these, or record it"
+                "left": f"the images on {LEFT} are 24x14, but the calibration on {INFO} is for 24x16 (after binning "
+                "and region of interest); set 'left_info' of the source to the matching CameraInfo, or record it"
             },
         ),
     ],
@@ -363,8 +363,8 @@ def test_bare_angles_are_read_as_the_settings_say(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings_", "said"),
     [
-        ({"pitch": PITCH}, "needs 'roll' as well"),
-        ({"pitch": PITCH, "roll": ROLL}, "needs 'tilt_model' as well"),
+        ({"pitch": PITCH}, "needs 'roll'"),
+        ({"pitch": PITCH, "roll": ROLL}, "needs 'tilt_model'"),
         ({"pitch": PITCH, "roll": {"field": "vector.y", "sign": 1}, "tilt_model": "axis"}, "roll lacks 'unit'"),
         ({"pitch": PITCH, "roll": {**ROLL, "unit": "grad"}, "tilt_model": "axis"}, "roll.unit must be deg or rad"),
         ({"pitch": PITCH, "roll": ROLL, "tilt_model": "best"}, "tilt_model must be axis or euler"),
@@ -393,7 +393,7 @@ def test_a_stamp_of_zero_is_the_time_of_logging(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bounds", [{"start": float("nan")}, {"end": float("inf")}])
 def test_a_range_without_numbers_is_refused(sample: Path, bounds: dict[str, float]) -> None:
-    with pytest.raises(LogError, match="must be a number of seconds after the log's first message, not"):
+    with pytest.raises(LogError, match="must be in seconds after the log's first message, not"):
         McapSource().open(sample, **bounds)
 
 
