@@ -12,13 +12,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
 from flow.contracts import Absent, Loss, LossReason
+from flow.parameters import check_parameters, parameter
 from flow.runtime.graph import hints_of
 from flow.runtime.ledger import failure
+
+__all__ = ["interpolate", "latest", "nearest", "pair"]  # as pipeline files name them
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,8 @@ Answer = Token | Loss
 Answers = Iterable[Answer]
 
 
-def _parameter(default: int | None, help: str) -> Any:
-    return field(default=default, metadata={"help": help, "unit": "ns", "low": 0})
+def _duration(default: int | None, help: str) -> Any:
+    return parameter(default, help, unit="ns", low=0)
 
 
 def _time(nanoseconds: int) -> str:
@@ -54,11 +57,14 @@ class Pair:
     of the streams; the pair carries the left's stamp.
     """
 
-    slop: int = _parameter(5_000_000, "largest difference between the two stamps")
-    patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for a partner")
+    slop: int = _duration(5_000_000, "largest difference between the two stamps")
+    patience: int = _duration(1_000_000_000, "how long on the log's clock to wait for a partner")
 
     ports = ("left", "right")
     clock = None  # pairs are the beat of a clock of their own
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
 
     @staticmethod
     def output(kinds: dict[str, type]) -> type:
@@ -138,6 +144,9 @@ class _Sampler:
     clock = "at"
     patience: int
 
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
     def output(self, kinds: dict[str, type]) -> type:
         """The type of the samples."""
         return kinds["stream"]
@@ -168,9 +177,9 @@ class Interpolate(_Sampler):
     `smoothed(samples, stamp)`; as far on one side as on the other, so that nothing lags.
     """
 
-    max_gap: int = _parameter(200_000_000, "largest distance between the two neighbours")
-    patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for the later neighbour")
-    smooth: int = _parameter(0, "how far from the stamp samples take part; 0: the two neighbours")
+    max_gap: int = _duration(200_000_000, "largest distance between the two neighbours")
+    patience: int = _duration(1_000_000_000, "how long on the log's clock to wait for the later neighbour")
+    smooth: int = _duration(0, "how far from the stamp samples take part; 0: the two neighbours")
 
     @property
     def reach(self) -> int:
@@ -214,8 +223,8 @@ class Interpolate(_Sampler):
 class Nearest(_Sampler):
     """The sample of `stream` nearest to each stamp of `at`, at most `slop` away."""
 
-    slop: int = _parameter(50_000_000, "largest distance from the stamp")
-    patience: int = _parameter(1_000_000_000, "how long on the log's clock to wait for a nearer sample")
+    slop: int = _duration(50_000_000, "largest distance from the stamp")
+    patience: int = _duration(1_000_000_000, "how long on the log's clock to wait for a nearer sample")
 
     def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         before, after = _neighbours(samples, stamp)
@@ -234,8 +243,8 @@ class Nearest(_Sampler):
 class Latest(_Sampler):
     """The last sample of `stream` at or before each stamp of `at`, of those that the log has brought by then."""
 
-    max_age: int | None = _parameter(None, "oldest sample that still counts; none: any age")
-    patience: int = _parameter(0, "how long on the log's clock to wait for samples that are logged late")
+    max_age: int | None = _duration(None, "oldest sample that still counts; none: any age")
+    patience: int = _duration(0, "how long on the log's clock to wait for samples that are logged late")
 
     def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
         before, after = _neighbours(samples, stamp)

@@ -30,7 +30,7 @@ def parameter(
     Parameters
     ----------
     default
-        The value where none is given.
+        The value where none is given; `dataclasses.MISSING` for a required parameter.
     help
         Its meaning, as `roverflow stages` prints it.
     unit
@@ -99,6 +99,7 @@ def coerced(value: Any, kind: Any, known: Field[Any]) -> Any:
         return _number(value, kind, known)
     if not isinstance(value, kind):
         raise ValueError(f"expected {kind.__name__}, not {value!r}")
+    check(value, known)
     return value
 
 

@@ -402,10 +402,7 @@ def test_a_pipe_is_no_log(tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe")
     for command in (("run", tmp_path / "pipe", "-o", tmp_path / "out.mcap"), ("info", tmp_path / "pipe")):
         assert roverflow(*command) == 2
-        assert (
-            "pipe is a pipe or a device; give a .mcap file"
-            in capsys.readouterr().err
-        )
+        assert "pipe is a pipe or a device; give a .mcap file" in capsys.readouterr().err
 
 
 def test_a_pipeline_whose_aliases_hold_each_other_is_refused_at_once(tmp_path, capsys):

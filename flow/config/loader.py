@@ -9,9 +9,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from flow.config.node_spec import NodeSpec, mapping, place_at_fault
+from flow.config.node_spec import NodeSpec, mapping, place_at_fault, type_name
 from flow.config.yaml_tree import Value, nearest, read, settled
 from flow.errors import UsageError
 from flow.runtime.graph import (
@@ -36,7 +36,7 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
 
     overrides: settings of the command line (see `flow.config.yaml_tree.settled`), applied before anything is checked.
     """
-    path = _find(name)
+    path = pipeline_file(name)
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -52,8 +52,8 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     return _graph(path, text, settled(tree, overrides))
 
 
-def _find(name: str) -> Path:
-    """The file of a pipeline."""
+def pipeline_file(name: str) -> Path:
+    """The file of the pipeline `name`, which `load` accepts; a copy of it loads from any folder."""
     if name in shipped():
         return SHIPPED / f"{name}.yaml"
     if Path(name).is_file():
@@ -156,7 +156,7 @@ def _node(name: str, entry: NodeSpec, inputs: dict[str, str], kinds: dict[str, t
     for port, stream in inputs.items():
         if not accepts(wanted[port], kinds[stream]):
             raise entry.place_of(port).error(
-                f"{entry.use} takes {_shown(wanted[port])} as '{port}', but '{stream}' is {kinds[stream].__name__}"
+                f"{entry.use} takes {type_name(wanted[port])} as '{port}', but '{stream}' is {kinds[stream].__name__}"
             )
     optional = entry.item.value.get("optional", Value(False, entry.place))
     if not isinstance(optional.value, bool):
@@ -201,10 +201,3 @@ def _check_streams(sink: Any, entry: NodeSpec, graph: Graph) -> None:
         if why := sink.unwritable(name, kind):
             named = [key for key in keys if name in entry.item.value[key].plain()]
             raise (entry.place_of(named[0]) if named else entry.place).error(why)
-
-
-def _shown(kind: Any) -> str:
-    """A type as pipeline files speak of it: `Tilt`, or `Tilt | Pose`."""
-    if isinstance(kind, type):
-        return kind.__name__.replace("NoneType", "None")
-    return " | ".join(map(_shown, get_args(kind))) or str(kind)

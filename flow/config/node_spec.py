@@ -13,7 +13,7 @@ from flow.parameters import coerced, is_required
 from flow.runtime.graph import YamlLocation, hints_of, is_aligner
 from flow.runtime.ledger import failure
 
-_NEEDED = {  # what a class of that role needs to have
+ROLES = {  # the attributes that a class of that role needs
     "source": ("streams", "open"),
     "sink": ("suffix", "wants", "open", "write", "close"),
     "stage": ("__call__",),
@@ -37,9 +37,8 @@ class NodeSpec:
         if not isinstance(use.value, str) or not all(use.value.split(".")) or "." not in use.value:
             raise use.place.error(f"'use: {use.plain()}' must be a module and a class, such as stages.Match")
         kind = _class(use.value, use.place)
-        for needed in () if role == "stage" and is_aligner(kind) else _NEEDED[role]:
-            if not any(needed in vars(base) for base in kind.__mro__):
-                raise use.place.error(f"{use.value} is no {role}: it has no '{needed}'")
+        if not (role == "stage" and is_aligner(kind)) and (needed := lacking(kind, role)):
+            raise use.place.error(f"{use.value} is no {role}: it has no '{needed[0]}'")
         return cls(item, use.value, kind)
 
     @property
@@ -75,7 +74,7 @@ def _constructed(kind: type, name: str, given: Mapping[str, Value], place: YamlL
     for key, value in given.items():
         if key not in parameters:
             raise value.place.error(f"{name} has no parameter '{key}'{nearest(key, parameters)}")
-        inner = _dataclass_of(hints[key])
+        inner = dataclass_of(hints[key])
         if inner is not None and isinstance(value.value, dict):
             values[key] = _constructed(inner, f"{name}.{key}", value.value, value.place)
         elif inner is not None and value.value is not None:
@@ -97,7 +96,7 @@ def _constructed(kind: type, name: str, given: Mapping[str, Value], place: YamlL
         raise at.error(str(error) if isinstance(error, ValueError) else failure(error)) from error
 
 
-def _dataclass_of(hint: Any) -> type | None:
+def dataclass_of(hint: Any) -> type | None:
     """The dataclass that a parameter is annotated with, also beside None."""
     for kind in get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,):
         if isinstance(kind, type) and is_dataclass(kind):
@@ -126,6 +125,21 @@ def _class(use: str, place: YamlLocation) -> type:
     listed = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
     known = [n for n in listed if is_dataclass(getattr(module, n, None))]
     raise place.error(f"'{module_name}' has no '{name}' that a pipeline can use{nearest(name, known)}")
+
+
+def lacking(kind: type, role: str) -> list[str]:
+    """The attributes that a class lacks for a role."""
+    return [name for name in ROLES[role] if not any(name in vars(base) for base in kind.__mro__)]
+
+
+def type_name(kind: Any) -> str:
+    """A type in messages: `Tilt`, `Tilt | Pose` or `list of float`."""
+    if get_origin(kind) in (Union, UnionType):
+        return " | ".join(map(type_name, get_args(kind)))
+    if get_origin(kind) is tuple:
+        return f"list of {type_name(get_args(kind)[0])}"
+    kind = get_origin(kind) or kind
+    return kind.__name__.replace("NoneType", "None") if isinstance(kind, type) else str(kind)
 
 
 def mapping(item: Value, what: str) -> dict[str, Value]:

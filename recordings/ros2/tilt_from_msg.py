@@ -6,11 +6,12 @@ become a direction by the model that the pipeline file names.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from typing import Any, Literal
 
 import numpy as np
 
+from flow.parameters import check_parameters, parameter
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_of, rotation_of, stamp_or
 from stages.data import Array, Tilt
@@ -37,11 +38,14 @@ def _tilt(message: Any, log_time: int, up: Array) -> Tilt:
 
 @dataclass(frozen=True)
 class AngleField:
-    """Where an angle stands in a message and what it means: field path ("vector.x"), unit, and sign (+1 or -1)."""
+    """An angle in a message: the path of its field, its unit and its sign."""
 
-    field: str
-    unit: Literal["deg", "rad"]
-    sign: int
+    field: str = parameter(MISSING, "path of the field in the message, such as vector.x")
+    unit: str = parameter(MISSING, "unit of its numbers", choices=("deg", "rad"))
+    sign: int = parameter(MISSING, "1: positive is nose up (pitch) or left side up (roll)", choices=(1, -1))
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
 
     def __call__(self, message: Any) -> float:
         """The angle in radians, in our sense of sign."""

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from flow.contracts import FrameRecord, Loss
+from flow.parameters import check_parameters, parameter
 from recordings.errors import LogError
 from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
 from recordings.ros2.plain import message_of
@@ -51,15 +52,6 @@ class McapSink:
     Every type of item has a standard form (see docs/results.md). A stream of a type without one is refused when the
     pipeline is loaded.
 
-    Parameters
-    ----------
-    results
-        Streams to write. The run leaves no log if it makes none of them.
-    also
-        Further streams to write.
-    compression
-        Of the log: lz4, zstd or none. zstd takes a fifth less room than lz4 and twice the time.
-
     Examples
     --------
     >>> from recordings import McapSink
@@ -70,12 +62,14 @@ class McapSink:
     "McapSink cannot write 'sharpness': complex has no standard form; leave it out of 'also'"
     """
 
-    results: tuple[str, ...] = (
-        "disparity", "points", "elevation_map", "navigation_map", "pose", "regional_map", "regional_navigation_map",
-    )  # fmt: skip
-
-    also: tuple[str, ...] = ()
-    compression: str = "lz4"
+    results: tuple[str, ...] = parameter(
+        ("disparity", "points", "elevation_map", "navigation_map", "pose", "regional_map", "regional_navigation_map"),
+        "streams to write; the run leaves no log if it makes none of them",
+    )
+    also: tuple[str, ...] = parameter((), "further streams to write")
+    compression: str = parameter(
+        "lz4", "of the log; zstd takes a fifth less room than lz4 and twice the time", choices=tuple(COMPRESSIONS)
+    )
 
     suffix = ".mcap"
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
@@ -86,8 +80,7 @@ class McapSink:
     empty: bool = field(default=False, init=False, repr=False)  # whether none of the streams to write had an item
 
     def __post_init__(self) -> None:
-        if self.compression not in COMPRESSIONS:
-            raise ValueError(f"McapSink.compression must be one of {', '.join(COMPRESSIONS)}, not '{self.compression}'")
+        check_parameters(self)
 
     def wants(self, stream: str, kind: Any) -> bool:
         """Whether the sink writes a stream of this name and type."""

@@ -20,6 +20,7 @@ import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
 from flow.contracts import FrameRecord, Loss, counted
+from flow.parameters import check_parameters, parameter
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
 from recordings.errors import LogError
 from recordings.sinks.blueprint import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, ViewSpec, blueprint
@@ -42,15 +43,6 @@ class RerunSink:
     A type of `stages.data` is drawn by its logger. Of other types, images, numbers, texts, points, and tables and
     dataclasses of these are drawn.
 
-    Parameters
-    ----------
-    application_id
-        Recordings of one application share the layout that the viewer saves.
-    max_points
-        Of a cloud every n-th point is drawn, at most so many. The cloud in the result log is whole.
-    jpeg_quality
-        Of the camera images, 1 to 100.
-
     Examples
     --------
     >>> from recordings import RerunSink
@@ -58,17 +50,14 @@ class RerunSink:
     True
     """
 
-    application_id: str = "roverflow"
-    max_points: int = 50_000
-    jpeg_quality: int = 80
+    application_id: str = parameter("roverflow", "recordings of one application share the layout that the viewer saves")
+    max_points: int = parameter(50_000, "most points drawn of a cloud; the cloud in the result log is whole", low=1)
+    jpeg_quality: int = parameter(80, "of the camera images", low=1, high=100)
 
     suffix = ".rrd"
 
     def __post_init__(self) -> None:
-        if self.max_points < 1:
-            raise ValueError(f"RerunSink.max_points must be at least 1, not {self.max_points}")
-        if not 1 <= self.jpeg_quality <= 100:
-            raise ValueError(f"RerunSink.jpeg_quality must be 1 to 100, not {self.jpeg_quality}")
+        check_parameters(self)
         self._closed = True
 
     def wants(self, stream: str, kind: Any) -> bool:

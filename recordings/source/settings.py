@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from flow.parameters import check_parameters, parameter
 from recordings.ros2.from_msg import frame_name
 from recordings.ros2.tilt_from_msg import AngleField, PlainAngles
 
@@ -15,46 +15,39 @@ from recordings.ros2.tilt_from_msg import AngleField, PlainAngles
 class LogSettings:
     """The topics of a log and the meaning of its angles. Topics are found by schema and name unless given.
 
-    Parameters
-    ----------
-    left, right : str, optional
-        Image topics.
-    left_info, right_info : str, optional
-        Their CameraInfo topics.
-    inclinometer : str, optional
-        Topic of an Imu or QuaternionStamped; with `pitch`, `roll` and `tilt_model`, of any message.
-    odometry : str, optional
-        Topic of an Odometry, PoseStamped, PoseWithCovarianceStamped, or the TFMessage that places `base_frame`.
-    pitch, roll : mapping, optional
-        The fields of an inclinometer with plain angles, {field: vector.x, unit: deg | rad, sign: 1 | -1} each. Its
-        frame is x forward, y left, z up. With sign 1 a positive pitch is nose up, a positive roll left side up.
-    tilt_model : str, optional
-        "axis": the angles of the sensor's axes to the horizon. "euler": Euler angles.
-    camera_from_inclinometer : tuple of float, optional
-        Quaternion x, y, z, w from inclinometer to left camera (x right, y down, z forward), for a log without
-        static transforms.
-    base_frame : str
-        The rover's frame.
-
     Raises
     ------
     ValueError
         If a setting is invalid, or `pitch`, `roll` and `tilt_model` are not given together.
     """
 
-    left: str | None = None
-    right: str | None = None
-    left_info: str | None = None
-    right_info: str | None = None
-    inclinometer: str | None = None
-    odometry: str | None = None
-    pitch: Mapping[str, Any] | None = None
-    roll: Mapping[str, Any] | None = None
-    tilt_model: str | None = None
-    camera_from_inclinometer: tuple[float, ...] | None = None
-    base_frame: str = "base_link"
+    left: str | None = parameter(None, "topic of the left images")
+    right: str | None = parameter(None, "topic of the right images")
+    left_info: str | None = parameter(None, "topic of the left camera's CameraInfo")
+    right_info: str | None = parameter(None, "topic of the right camera's CameraInfo")
+    inclinometer: str | None = parameter(
+        None, "topic of an Imu or QuaternionStamped; with pitch, roll and tilt_model, of any message"
+    )
+    odometry: str | None = parameter(
+        None,
+        "topic of an Odometry, PoseStamped, PoseWithCovarianceStamped, or the TFMessage that places base_frame",
+    )
+    pitch: AngleField | None = parameter(None, "field of the pitch, for an inclinometer with plain angles")
+    roll: AngleField | None = parameter(None, "field of the roll, for an inclinometer with plain angles")
+    tilt_model: str | None = parameter(
+        None,
+        "axis: plain angles are those of the sensor's axes to the horizon; euler: Euler angles",
+        choices=("axis", "euler"),
+    )
+    camera_from_inclinometer: tuple[float, ...] | None = parameter(
+        None,
+        "quaternion x, y, z, w from inclinometer to left camera (x right, y down, z forward), "
+        "for a log without static transforms",
+    )
+    base_frame: str = parameter("base_link", "the rover's frame")
 
     def __post_init__(self) -> None:
+        check_parameters(self)
         object.__setattr__(self, "base_frame", frame_name(self.base_frame))
         self.angles()
         given = self.camera_from_inclinometer
@@ -69,10 +62,8 @@ class LogSettings:
         for name, value in given.items():
             if value is None:
                 raise ValueError(f"McapSource needs '{name}': plain angles need pitch, roll and tilt_model")
-        if self.tilt_model not in ("axis", "euler"):
-            raise ValueError(f"McapSource.tilt_model must be axis or euler, not {self.tilt_model}")
         model: Any = self.tilt_model
-        return PlainAngles(_angle("pitch", self.pitch), _angle("roll", self.roll), model)
+        return PlainAngles(self.pitch, self.roll, model)  # type: ignore[arg-type]  # none of them is None
 
 
 def _is_unit_quaternion(given: Any) -> bool:
@@ -80,20 +71,3 @@ def _is_unit_quaternion(given: Any) -> bool:
         isinstance(value, int | float) and not isinstance(value, bool) for value in given
     )
     return numbers and len(given) == 4 and abs(math.hypot(*given) - 1) < 1e-3
-
-
-def _angle(name: str, given: Any) -> AngleField:
-    if not isinstance(given, Mapping):
-        raise ValueError(f"McapSource.{name} must be a mapping of field, unit and sign, not {given!r}")
-    valid: dict[str, tuple[Any, ...]] = {"field": (), "unit": ("deg", "rad"), "sign": (1, -1)}
-    for key in given:
-        if key not in valid:
-            raise ValueError(f"McapSource.{name} has no '{key}'; it has field, unit and sign")
-    for key, choices in valid.items():
-        if key not in given:
-            raise ValueError(
-                f"McapSource.{name} lacks '{key}'" + (f" ({' or '.join(map(str, choices))})" if choices else "")
-            )
-        if choices and given[key] not in choices:
-            raise ValueError(f"McapSource.{name}.{key} must be {' or '.join(map(str, choices))}, not {given[key]!r}")
-    return AngleField(str(given["field"]), given["unit"], int(given["sign"]))

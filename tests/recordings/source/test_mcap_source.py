@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from recordings import McapSource
 from recordings.errors import LogError
 from recordings.ros2.cdr import make
+from recordings.ros2.tilt_from_msg import AngleField
 from recordings.ros2.to_msg import header, transform_message
 from stages.data import CameraImage, Mount, Transform
 from tests.recordings.sample_log import (
@@ -343,8 +344,7 @@ def bare(tmp_path: Path, x: float, y: float) -> Path:
     return write_sample(tmp_path / "bare.mcap", edit)
 
 
-PITCH = {"field": "vector.x", "unit": "deg", "sign": 1}
-ROLL = {"field": "vector.y", "unit": "deg", "sign": -1}
+PITCH, ROLL = AngleField("vector.x", "deg", 1), AngleField("vector.y", "deg", -1)
 
 
 def test_bare_angles_are_not_guessed(tmp_path: Path) -> None:
@@ -365,9 +365,7 @@ def test_bare_angles_are_read_as_the_settings_say(tmp_path: Path) -> None:
     [
         ({"pitch": PITCH}, "needs 'roll'"),
         ({"pitch": PITCH, "roll": ROLL}, "needs 'tilt_model'"),
-        ({"pitch": PITCH, "roll": {"field": "vector.y", "sign": 1}, "tilt_model": "axis"}, "roll lacks 'unit'"),
-        ({"pitch": PITCH, "roll": {**ROLL, "unit": "grad"}, "tilt_model": "axis"}, "roll.unit must be deg or rad"),
-        ({"pitch": PITCH, "roll": ROLL, "tilt_model": "best"}, "tilt_model must be axis or euler"),
+        ({"pitch": PITCH, "roll": ROLL, "tilt_model": "best"}, "tilt_model must be one of axis, euler"),
         ({"camera_from_inclinometer": (1.0, 1.0, 0.0, 0.0)}, "must be a unit quaternion"),
         ({"camera_from_inclinometer": 1}, "must be a unit quaternion"),
         ({"camera_from_inclinometer": "abcd"}, "must be a unit quaternion"),

@@ -1,0 +1,150 @@
+"""What a pipeline can use: stages, aligners, the source and the sinks, with their inputs and parameters."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Iterator
+from dataclasses import Field, dataclass, fields, is_dataclass
+from importlib import import_module
+from typing import Any
+
+from flow.config.node_spec import ROLES, dataclass_of, lacking, type_name
+from flow.config.yaml_tree import nearest
+from flow.errors import UsageError
+from flow.parameters import is_required
+from flow.runtime.graph import hints_of, is_aligner, ports_of
+from flow.units import as_written
+
+MODULES = ("flow.align", "stages", "recordings")  # whose classes a pipeline file names without a path of its own
+
+
+@dataclass(frozen=True)
+class ParameterReference:
+    """One parameter, its values as a pipeline file writes them; name: "rover.max_step" for a key of a mapping."""
+
+    name: str
+    type: str
+    meaning: str
+    unit: str
+    low: str
+    high: str
+    default: str
+    choices: tuple[str, ...]
+
+    @property
+    def range(self) -> str:
+        """The valid values in words; empty where any value of the type is valid."""
+        if self.choices:
+            return ", ".join(self.choices)
+        if self.low and self.high:
+            low = self.low.removesuffix(f" {self.unit}") if self.high.endswith(f" {self.unit}") else self.low
+            return f"{low} to {self.high}"
+        return f"at least {self.low}" if self.low else f"at most {self.high}" if self.high else ""
+
+
+@dataclass(frozen=True)
+class NodeReference:
+    """A class that a pipeline can use. role: "stage", "aligner", "source" or "sink"; inputs: port -> type."""
+
+    use: str
+    role: str
+    summary: str
+    inputs: dict[str, str]
+    optional_inputs: tuple[str, ...]
+    output: str
+    parameters: tuple[ParameterReference, ...]
+
+
+def stage_reference(name: str | None = None) -> list[NodeReference]:
+    """The stages, aligners, source and sinks of the product, or the one called `name`.
+
+    Parameters
+    ----------
+    name
+        As in a pipeline file, "stages.Match", or without its module, "Match".
+
+    Raises
+    ------
+    UsageError
+        If nothing has that name; the sentence contains the nearest one.
+    """
+    found = {use: kind for module in MODULES for use, kind in _usable(module)}
+    if name is not None:
+        matching = {use: kind for use, kind in found.items() if name in (use, use.rpartition(".")[2])}
+        if not matching:
+            meant = nearest(name, [*found, *(use.rpartition(".")[2] for use in found)])
+            raise UsageError(f"no stage, aligner, source or sink is called '{name}'{meant}")
+        found = matching
+    return [_reference(use, kind) for use, kind in found.items()]
+
+
+def _usable(module_name: str) -> Iterator[tuple[str, type]]:
+    """The classes of a module that can stand under `use`, by that name."""
+    module = import_module(module_name)
+    for name in getattr(module, "__all__", ()):
+        kind = getattr(module, name)
+        if isinstance(kind, type) and is_dataclass(kind) and _role(kind) and _is_documented(kind):
+            yield f"{module_name}.{name}", kind
+
+
+def _is_documented(kind: type) -> bool:
+    """Whether its fields are parameters: those of a data type are not."""
+    return all("help" in known.metadata for known in fields(kind) if known.init)
+
+
+def _role(kind: type) -> str:
+    """What a pipeline can use a class as; empty for a class that it cannot use."""
+    if is_aligner(kind):
+        return "aligner"
+    return next((role for role in ROLES if not lacking(kind, role)), "")
+
+
+def _reference(use: str, kind: type) -> NodeReference:
+    role = _role(kind)
+    ports, optional = ports_of(kind) if role in ("stage", "aligner") else ({}, set())
+    inputs = {port: "any stream" if role == "aligner" else type_name(hint) for port, hint in ports.items()}
+    output = type_name(hints_of(kind.__call__)["return"]) if role == "stage" else ""
+    summary = inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
+    return NodeReference(use, role, summary, inputs, tuple(sorted(optional)), output, tuple(_parameters(kind)))
+
+
+def _parameters(kind: type, prefix: str = "") -> Iterator[ParameterReference]:
+    """The parameters of a class, those of a dataclass among them one by one."""
+    hints = hints_of(kind)
+    for known in (item for item in fields(kind) if item.init):
+        inner = dataclass_of(hints[known.name])
+        if inner is not None:
+            yield from _parameters(inner, f"{prefix}{known.name}.")
+        else:
+            yield _parameter(prefix + known.name, hints[known.name], known)
+
+
+def _parameter(name: str, hint: Any, known: Field[Any]) -> ParameterReference:
+    about = known.metadata
+    unit, low, high = about.get("unit", ""), about.get("low"), about.get("high")
+    default = "required" if is_required(known) else _written(known.default, unit)
+    return ParameterReference(
+        name=name,
+        type=type_name(hint),
+        meaning=about.get("help", ""),
+        unit=unit,
+        low="" if low is None else _written(low, unit),
+        high="" if high is None else _written(high, unit),
+        default=default,
+        choices=tuple(map(str, about.get("choices") or ())),
+    )
+
+
+def _written(value: Any, unit: str) -> str:
+    """A default or a limit as a pipeline file writes it."""
+    if isinstance(value, bool) or value is None:
+        return {True: "true", False: "false", None: "none"}[value]
+    if isinstance(value, tuple):
+        return f"[{', '.join(_written(item, unit) for item in value)}]"
+    if not isinstance(value, int | float):
+        return str(value)
+    if unit == "rad":
+        value = math.radians(float(f"{math.degrees(value):.4g}"))
+    text = as_written(value, unit)
+    return text if text[-1].isalpha() or not unit or not value else f"{text} {unit}"
