@@ -16,8 +16,8 @@ from types import ModuleType
 from typing import Any
 
 from flow.cli import demo, export, graph, import_images, import_middlebury, info, run, score, simulate
+from flow.cli.replay import product_version
 from flow.errors import FAILED, INTERRUPTED, UNUSABLE, RoverflowError
-from flow.runtime.replay import product_version
 from recordings.errors import LogError, UnwritableError
 
 COMMANDS: dict[str, ModuleType] = {

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from flow.contracts import LossReason, Verdict, counted
+from flow.contracts import LossReason, Severity, Verdict, counted
 from flow.errors import COMPLETE, INCOMPLETE, INTERRUPTED
-from flow.runtime.findings import NOTE, WARNING, lines
+from flow.runtime.findings import lines
 
 
 def say(text: str) -> None:
@@ -50,7 +50,7 @@ def report(summary: dict[str, Any]) -> None:
     """Print the summary of a run."""
     say(headline(summary))
     found = [summary["surveys"], summary["findings"]]
-    for line in [line for part in found for line in lines(part, NOTE)]:
+    for line in [line for part in found for line in lines(part, Severity.NOTE)]:
         say(f"  {line}")
     for reason, number in summary["drops"].items():
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
@@ -59,5 +59,5 @@ def report(summary: dict[str, Any]) -> None:
         say(f"  {path} was not written because the run produced no results. --summary FILE lists the losses.")
     for path in map(Path, summary["outputs"]):
         say(f"  wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
-    for line in [line for part in found for line in lines(part, WARNING)]:
+    for line in [line for part in found for line in lines(part, Severity.WARNING)]:
         say(f"WARNING: {line}")

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from flow.cli.arguments import seconds, workers
 from flow.cli.outputs import add_pipeline_options, check_outputs, write_text
+from flow.cli.replay import as_json, replay
 from flow.cli.report import exit_code, headline, report, say
 from flow.errors import SinkError
-from flow.runtime.replay import as_json, replay
 from recordings.errors import UnwritableError
 
 HELP = "replay a log through a pipeline"

@@ -1,12 +1,12 @@
-"""The scheduler: a fixed pool of workers that always takes the most downstream work there is.
+"""The engine: a fixed pool of workers that always takes the most downstream work there is.
 
-A frame is one stamp of the pipeline's clock. For every frame each stream gets exactly one value: an item, or `Absent`
-with the ledger entry of its loss, which passes straight through everything downstream. So no one ever waits for what
-will not come, and frames admitted = frames delivered to every sink.
+A frame is one stamp of the pipeline's clock. Every stream gets exactly one value for it: an item, or `Absent` with the
+ledger's entry about the loss, which passes through everything downstream. So nobody waits for an item that cannot come,
+and every admitted frame reaches every sink. An item is freed as soon as all stages and sinks that read it are done.
 
-Each stage has a bounded inbox, the frames whose inputs are all there or being made. A stage starts only when the
-inboxes it delivers to have room; only the oldest frame in flight is let through a full one. Since that frame waits for
-nobody else, the engine cannot lock up, and since downstream work goes first, few frames are in flight at a time.
+Each stage has a bounded inbox: the frames whose inputs are there or being made. A stage starts only when the inboxes
+that take its output have room; only the oldest frame in flight may enter a full one. That frame waits for no other, so
+the engine cannot deadlock. Downstream work goes first, so few frames are in flight at a time.
 """
 
 from __future__ import annotations
@@ -26,11 +26,14 @@ from flow.runtime.ledger import Ledger, failure
 
 @dataclass(eq=False)
 class _Frame:
+    """A frame in flight. values: stream -> item, Absent, or None where the item was freed; coming: its streams that are
+    there or being made; begun, done: the work on it."""
+
     index: int
     stamp: int
     values: dict[str, Any]
     entries: list[Loss]
-    coming: set[str]  # streams that are there or being made
+    coming: set[str]
     seconds: dict[str, float] = field(default_factory=dict)
     begun: set[_Work] = field(default_factory=set)
     done: set[_Work] = field(default_factory=set)
@@ -38,10 +41,15 @@ class _Frame:
 
 @dataclass(eq=False)
 class _Work:
-    """A node of the schedule: a stage, or a sink (`output` is then None)."""
+    """A stage, or a sink (`output` is then None).
+
+    inputs: the streams that must be there before it starts; reads: those of them whose items it uses; consumers: what
+    waits for its output; inbox: indices of frames; next: the frame that an ordered work takes next.
+    """
 
     name: str
     inputs: tuple[str, ...]
+    reads: tuple[str, ...]
     output: str | None
     ordered: bool
     run: Callable[[_Frame], Any]
@@ -53,8 +61,20 @@ class _Work:
 class Engine:
     """Runs stages and sinks over frames.
 
-    stages: in topological order; sinks: name -> (sink, the streams it is given); capacity: of each inbox, frames.
-    `states` maps the streams of the stages with state to the states of this run.
+    Parameters
+    ----------
+    stages
+        In topological order.
+    sinks
+        Name -> (sink, the streams it gets).
+    ledger
+        Gets an entry for every loss.
+    workers
+        Number of threads.
+    capacity
+        Frames that an inbox holds.
+    on_frame
+        Called after every frame, with whether all of its streams are there.
     """
 
     def __init__(
@@ -64,21 +84,25 @@ class Engine:
         ledger: Ledger,
         workers: int = 2,
         capacity: int = 2,
-        on_frame: Callable[[bool], None] = lambda whole: None,
+        on_frame: Callable[[bool], None] = lambda complete: None,
     ) -> None:
         self._ledger, self._capacity, self._on_frame = ledger, capacity, on_frame
         self._condition = threading.Condition()
         self._frames: deque[_Frame] = deque()
-        self.states = start(stages)
+        self.states = start(stages)  # stream -> state of its stage, of this run
         self._work = [self._stage_work(node) for node in stages]
         self._work += [self._sink_work(name, sink, streams) for name, (sink, streams) in sinks.items()]
         for work in self._work:
             work.consumers = [other for other in self._work if work.output in other.inputs]
+        self._readers: dict[str, list[_Work]] = {}
+        for work in self._work:
+            for stream in work.reads:
+                self._readers.setdefault(stream, []).append(work)
         self._closed = self._over = False
         self._writing = 0  # workers inside a sink
-        self._telling = threading.Lock()
+        self._reporting = threading.Lock()
         self.failure: tuple[str, BaseException] | None = None
-        self.admitted = self.through = self.whole = 0
+        self.admitted = self.through = self.complete = 0
         self.late_entries: list[Loss] = []  # losses of the frames that did not get through
         self.seconds = dict.fromkeys((work.name for work in self._work), 0.0)
         self._threads = [
@@ -90,7 +114,7 @@ class Engine:
     def admit(
         self, stamp: int, values: dict[str, Any], entries: Iterable[Loss], stop: Callable[[], bool] = lambda: False
     ) -> bool:
-        """Take a frame in, waiting for room; False if the engine failed or `stop()` became true before there was any.
+        """Take in a frame as soon as there is room; False if the engine fails or `stop()` is true before that.
 
         Stamps must increase. values: stream -> item or Absent, for every stream that no stage makes.
         """
@@ -106,16 +130,17 @@ class Engine:
                 return False
             self.admitted += 1
             self._frames.append(frame)
+            self._free(frame, tuple(values))
             self._pass_absence(frame)
-            retired = list(self._retire())  # a frame that has nothing to work on is through at once
+            retired = list(self._retire())  # a frame without work is through at once
             self._condition.notify_all()
-        self._tell(retired)
+        self._report(retired)
         return True
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait until every frame is through (or the engine failed, or `stop()`), then end the workers.
+        """Wait until every frame is through, the engine has failed, or `stop()` is true; then end the workers.
 
-        After `stop()` only those are waited for that are inside a sink; what the others still do is lost.
+        After `stop()`, only workers inside a sink may finish; what the others still do is lost.
         """
         with self._condition:
             while self._frames and not self.failure and not stop():
@@ -130,7 +155,7 @@ class Engine:
         with self._condition:
             self._over = True
             for frame in self._frames:
-                detail = "the run ended before it was through"
+                detail = "the run ended before the frame was through"
                 entry = self._ledger.add(Loss("frame", frame.stamp, "engine", LossReason.ABANDONED, detail))
                 self.late_entries += [*frame.entries, entry]
 
@@ -146,7 +171,7 @@ class Engine:
                     self._condition.wait()
                     task = self._next_task()
             work, frame = task
-            value, seconds = None, time.perf_counter()
+            seconds = time.perf_counter()
             try:
                 value = work.run(frame)
             except BaseException as error:
@@ -161,55 +186,58 @@ class Engine:
                     frame.seconds[work.name] = seconds
                     self.seconds[work.name] += seconds
                     retired = self._deliver(work, frame, value)
-                except BaseException as error:  # a worker must not die unheard
+                except BaseException as error:  # a worker must not die silently
                     self.failure = self.failure or (work.name, error)
                 self._condition.notify_all()
-            self._tell(retired)
+            del work, frame, task, value  # a worker that waits must keep no item
+            self._report(retired)
 
-    def _tell(self, retired: list[bool]) -> None:
-        """Report progress, outside the lock; a progress display that fails is not worth a run."""
-        for whole in retired:
-            with self._telling, suppress(Exception):
-                self._on_frame(whole)
+    def _report(self, retired: list[bool]) -> None:
+        """Report progress, outside the lock. A progress display that fails must not stop the run."""
+        for complete in retired:
+            with self._reporting, suppress(Exception):
+                self._on_frame(complete)
 
     def _next_task(self) -> tuple[_Work, _Frame] | None:
-        """The most downstream work that is ready and has room for its result; of one node, the oldest frame's."""
+        """The most downstream work that is ready and has room for its result, on the oldest frame possible."""
         if self._closed or self.failure:
             return None
         for work in reversed(self._work):
-            for frame in self._frames if work.inbox else ():
-                if frame.index not in work.inbox or not self._ready(work, frame):
-                    continue
-                if self._has_room(work.consumers, frame):
-                    frame.begun.add(work)
-                    work.inbox.discard(frame.index)
-                    if work.output:
-                        frame.coming.add(work.output)
-                        self._expect(frame, work.consumers)
-                    else:
-                        self._writing += 1
-                    return work, frame
+            if work.inbox:
+                for frame in self._frames:
+                    if self._ready(work, frame) and self._has_room(work.consumers, frame):
+                        self._begin(work, frame)
+                        return work, frame
         return None
 
+    def _begin(self, work: _Work, frame: _Frame) -> None:
+        frame.begun.add(work)
+        work.inbox.discard(frame.index)
+        if work.output:
+            frame.coming.add(work.output)
+            self._expect(frame, work.consumers)
+        else:
+            self._writing += 1
+
     def _ready(self, work: _Work, frame: _Frame) -> bool:
-        if work.ordered and frame.index != work.next:
+        if frame.index not in work.inbox or (work.ordered and frame.index != work.next):
             return False
         return all(stream in frame.values for stream in work.inputs)
 
     def _has_room(self, consumers: Iterable[_Work], frame: _Frame) -> bool:
-        """Whether all `consumers` can take what comes for `frame`; the oldest frame always has right of way."""
+        """Whether the inboxes of all `consumers` have room for `frame`; the oldest frame always has right of way."""
         if not self._frames or frame is self._frames[0]:
             return True
         return all(len(c.inbox) < self._capacity or frame.index in c.inbox for c in consumers)
 
     def _expect(self, frame: _Frame, nodes: Iterable[_Work]) -> None:
-        """Note `frame` in the inbox of those of the nodes whose inputs are all there or being made."""
+        """Put `frame` into the inboxes of those nodes whose inputs are all there or being made."""
         for work in nodes:
             if work not in frame.begun and frame.coming.issuperset(work.inputs):
                 work.inbox.add(frame.index)
 
     def _deliver(self, work: _Work, frame: _Frame, value: Any) -> list[bool]:
-        """Put a result in its place; for each frame that is now through, whether it is whole."""
+        """Store the result of a work; returns for each frame that is now through whether it is complete."""
         if isinstance(value, BaseException):
             if work.output is None:
                 self.failure = self.failure or (work.name, value)
@@ -226,11 +254,19 @@ class Engine:
 
     def _complete(self, work: _Work, frame: _Frame) -> None:
         frame.done.add(work)
+        self._free(frame, work.reads if work.output is None else (*work.reads, work.output))
         while work.ordered and any(f.index == work.next and work in f.done for f in self._frames):
             work.next += 1
 
+    def _free(self, frame: _Frame, streams: Iterable[str]) -> None:
+        """Let go of the items that no work on the frame will read any more. An Absent stays, to mark the frame."""
+        for stream in streams:
+            unread = frame.done.issuperset(self._readers.get(stream, ()))
+            if unread and stream in frame.values and not isinstance(frame.values[stream], Absent):
+                frame.values[stream] = None
+
     def _pass_absence(self, frame: _Frame) -> None:
-        """Give every stage whose inputs are there but not whole its absent output (stages are in topological order)."""
+        """Make the output of every stage with an absent input absent (stages are in topological order)."""
         for work in self._work:
             if work.output is None or work in frame.begun:
                 continue
@@ -244,26 +280,27 @@ class Engine:
         self._expect(frame, self._work)
 
     def _retire(self) -> Iterator[bool]:
-        """Let go of the frames, oldest first, that are through."""
+        """Drop the frames that are through, oldest first; yields whether each is complete."""
         while self._frames and len(self._frames[0].done) == len(self._work):
             frame = self._frames.popleft()
-            whole = not self.failure and not any(isinstance(value, Absent) for value in frame.values.values())
+            complete = not self.failure and not any(isinstance(value, Absent) for value in frame.values.values())
             self.through += 1
-            self.whole += whole
-            yield whole
+            self.complete += complete
+            yield complete
 
     # -- the work itself, outside the lock -------------------------------------------------------------------
 
     def _stage_work(self, node: Node) -> _Work:
-        own = {"state": self.states[node.name]} if node.stateful else {}
+        state = {"state": self.states[node.name]} if node.stateful else {}
+        streams = tuple(node.inputs.values())
 
         def run(frame: _Frame) -> Any:
-            value = node.actor(**{port: frame.values[stream] for port, stream in node.inputs.items()}, **own)
+            value = node.actor(**{port: frame.values[stream] for port, stream in node.inputs.items()}, **state)
             if not is_item(value, node.output):
                 raise TypeError(f"{node.use} returned {type(value).__name__}, not {node.output.__name__}")
             return value
 
-        return _Work(node.name, tuple(node.inputs.values()), node.name, node.stateful, run)
+        return _Work(node.name, streams, streams, node.name, node.stateful, run)
 
     def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> _Work:
         order = {work.name: index for index, work in enumerate(self._work)}
@@ -276,6 +313,6 @@ class Engine:
                 queues = {work.name: len(work.inbox) for work in self._work if work.output}
             sink.write(FrameRecord(frame.index, frame.stamp, items, entries, seconds, queues))
 
-        # A sink waits for every stream of the frame, also those it is not given: only then are the entries complete.
+        # A sink waits for every stream of the frame, even those it does not get: only then are the entries complete.
         every = tuple(dict.fromkeys([*streams, *(work.name for work in self._work if work.output)]))
-        return _Work(name, every, None, True, run)
+        return _Work(name, every, tuple(streams), None, True, run)

@@ -1,54 +1,49 @@
-"""What there is to say of a whole run or log, a sentence for a stream: a note, or a warning that must not be missed.
-
-A warning is no loss: it changes neither the ledger nor the verdict. Findings are plain dictionaries with a "severity"
-and a "sentence", as the summary has them.
-"""
+"""The findings of a run: what was left out, and what its stages found in the whole log."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+from flow.contracts import Finding, Severity
 from flow.runtime.graph import Graph
 from flow.runtime.ledger import failure
 
-Finding = dict[str, str]
 
-NOTE, WARNING = "note", "warning"
-
-
-def finding(severity: str, sentence: str) -> Finding:
-    """One finding, as the summary has it."""
-    return {"severity": severity, "sentence": sentence}
+def warning(sentence: str) -> Finding:
+    """A finding that results may be wrong."""
+    return Finding(sentence, Severity.WARNING)
 
 
-def plain(said: Any) -> Finding:
-    """A finding out of what a stage returns: an object with `severity` and `sentence`; what is none, or has a severity
-    that is none, is a warning that says so."""
-    if not (hasattr(said, "severity") and hasattr(said, "sentence")):
-        return finding(WARNING, f"its finding must have a severity and a sentence, or be None, not {said!r:.80}")
-    severity, sentence = str(said.severity), str(said.sentence)
-    if severity not in (NOTE, WARNING):
-        wrong = f"a {type(said).__name__}'s severity must be {NOTE} or {WARNING}, not '{severity}'"
-        severity, sentence = WARNING, f"{sentence} ({wrong})"
-    return finding(severity, sentence)
+def checked(returned: Any) -> Finding | None:
+    """What a stage returned as its finding. Anything but a Finding or None becomes a warning about it."""
+    if returned is None:
+        return None
+    if not isinstance(returned, Finding):
+        return warning(f"the stage must return a flow.contracts.Finding or None, not {returned!r:.80}")
+    if returned.severity not in tuple(Severity):
+        levels = " or ".join(Severity)
+        return warning(f"{returned.sentence} (a Finding's severity must be {levels}, not '{returned.severity}')")
+    return returned
 
 
 def findings(graph: Graph, states: Mapping[str, Any]) -> dict[str, Finding]:
-    """What there is to say at the end of a run: what was left out, and what the `finding(state)` of stages returns."""
-    said = {name: finding(NOTE, f"left out: {why}") for name, why in graph.left_out.items()}
+    """Stream -> finding at the end of a run: why it was left out, or what `finding(state)` of its stage returns."""
+    found: dict[str, Finding | None] = {name: Finding(f"left out: {why}") for name, why in graph.left_out.items()}
     for node in graph.stages:
-        if not (node.stateful and hasattr(node.actor, "finding")):
-            continue
-        try:
-            returned = node.actor.finding(states[node.name])
-            if returned is not None:
-                said[node.name] = plain(returned)
-        except Exception as error:  # no reason to leave the outputs open
-            said[node.name] = finding(WARNING, failure(error))
-    return said
+        if node.stateful and hasattr(node.actor, "finding"):
+            try:
+                found[node.name] = checked(node.actor.finding(states[node.name]))
+            except Exception as error:  # must not leave the outputs open
+                found[node.name] = warning(failure(error))
+    return {name: finding for name, finding in found.items() if finding is not None}
 
 
-def lines(found: Mapping[str, Finding], severity: str) -> list[str]:
-    """The findings of this severity, a line each."""
+def as_dicts(found: Mapping[str, Finding]) -> dict[str, dict[str, str]]:
+    """Findings as the summary holds them, in plain JSON values."""
+    return {name: finding.as_dict() for name, finding in found.items()}
+
+
+def lines(found: Mapping[str, Mapping[str, str]], severity: str) -> list[str]:
+    """The findings of a summary that have this severity, one line each."""
     return [f"{name}: {item['sentence']}" for name, item in found.items() if item["severity"] == severity]

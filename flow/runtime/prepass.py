@@ -1,59 +1,83 @@
-"""The survey: stages that want to see frames of the whole log before the run are shown some, and then stay fixed.
+"""The pre-pass: before a run, a stage may look at frames from the whole log and fix its own parameters.
 
-So a result depends on no order of frames, and on no part of the log that a run is restricted to.
+The run then uses the fixed stage for every frame. So a result depends neither on the order of the frames nor on the
+part of the log that is run.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from flow.contracts import Absent, Event
-from flow.runtime.findings import WARNING, Finding, finding, plain
+from flow.contracts import Absent, Event, Finding
+from flow.runtime.findings import checked, warning
 from flow.runtime.frame_assembler import FrameAssembler
 from flow.runtime.graph import Graph, Node
 from flow.runtime.ledger import Ledger, failure
 
-EXCERPTS = 9
+EXCERPTS = 9  # stretches of the log, one frame from each
 
-# (how many, of which source streams) -> the stretches of the log
-Excerpts = Callable[[int, set[str]], Iterable[Iterable[Event]]]
+Sample = dict[str, Any]  # stream -> item, of one frame
+Excerpts = Callable[[int, set[str]], Iterable[Iterable[Event]]]  # (number, source streams) -> stretches of the log
 
 
-def surveyed(graph: Graph, excerpts: Excerpts) -> tuple[Graph, dict[str, Finding]]:
-    """The graph with its surveying stages fixed, and what each found (stream -> finding).
+@dataclass(frozen=True)
+class Prepass:
+    """A graph ready to run. findings: by stream; fixed: "stream.parameter" -> the value that the pre-pass gave it."""
 
-    A stage surveys if its `surveys` is true; its `survey` takes what `__call__` takes, of several frames each, and
-    returns the stage to run and what it found, None if nothing. `excerpts(count, streams)` gives that many stretches
-    of the log, spread over all of it; the first whole frame of each is taken. Raises PipelineError where a stage that
-    remembers frames is needed for it.
+    graph: Graph
+    findings: dict[str, Finding] = field(default_factory=dict)
+    fixed: dict[str, Any] = field(default_factory=dict)
+
+
+def prepass(graph: Graph, excerpts: Excerpts) -> Prepass:
+    """Let the surveying stages of a graph see nine frames of the log, and fix them.
+
+    A stage surveys if its `surveys` is true. Its `survey` has the ports of `__call__`, and gets a list for each. It
+    returns the stage to run and its finding, or None. Raises PipelineError where a survey depends on a stage with
+    state: that stage would have to see every frame.
     """
-    nodes, findings = list(graph.nodes), dict[str, Finding]()
-    if not any(_surveys(node) for node in nodes):
-        return graph, findings
-    needed = _upstream(nodes)
-    samples = _samples(replace(graph, nodes=tuple(node for node in nodes if node.name in needed)), excerpts)
-    left = sum(map(_surveys, nodes))
-    for place, node in enumerate(nodes):
-        if node.aligns or node.name not in needed:
-            continue
+    if not any(_surveys(node) for node in graph.nodes):
+        return Prepass(graph)
+    upstream = _upstream(graph.nodes)
+    needed = [node for node in graph.nodes if node.name in upstream]
+    for node in needed:
         if node.stateful:
-            raise node.place.error(f"'{node.name}' remembers frames, so nothing that depends on it can survey the log")
+            raise node.place.error(f"'{node.name}' has state, so no stage that depends on it can survey the log")
+    samples = _samples(replace(graph, nodes=tuple(needed)), excerpts)
+    nodes = {node.name: node for node in graph.nodes}
+    findings, fixed = dict[str, Finding](), dict[str, Any]()
+    for node in needed:
         if _surveys(node):
-            given = {port: [sample[stream] for sample in samples] for port, stream in node.inputs.items()}
-            try:
-                actor, said = node.actor.survey(**given)
-                if said is not None:
-                    findings[node.name] = plain(said)
-            except Exception as error:  # the stage then has no more to go by than each frame
-                actor = node.actor
-                findings[node.name] = finding(WARNING, f"could not survey the log: {failure(error)}")
-            nodes[place] = node = replace(node, actor=actor)
-            left -= 1
-        if left:
-            _advance(node, samples)
-    return replace(graph, nodes=tuple(nodes)), findings
+            actor, finding = _survey(node, samples)
+            nodes[node.name] = replace(node, actor=actor)
+            fixed |= {f"{node.name}.{name}": value for name, value in _changed(node.actor, actor).items()}
+            if finding is not None:
+                findings[node.name] = finding
+        if not node.aligns and any(node.name in other.inputs.values() for other in needed):
+            _advance(nodes[node.name], samples)
+    return Prepass(replace(graph, nodes=tuple(nodes.values())), findings, fixed)
+
+
+def _survey(node: Node, samples: Sequence[Sample]) -> tuple[Any, Finding | None]:
+    """The stage to run in place of a surveying one, and its finding."""
+    inputs = {port: [sample[stream] for sample in samples] for port, stream in node.inputs.items()}
+    try:
+        actor, returned = node.actor.survey(**inputs)
+        return actor, checked(returned)
+    except Exception as error:  # the stage then works on each frame without the survey
+        return node.actor, warning(f"the survey of the log failed: {failure(error)}")
+
+
+def _changed(before: Any, after: Any) -> dict[str, Any]:
+    """The parameters of a stage that a survey changed, as plain JSON values."""
+    values = {item.name: getattr(after, item.name) for item in fields(after) if item.init}
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in values.items()
+        if value != getattr(before, name, None)
+    }
 
 
 def _surveys(node: Node) -> bool:
@@ -63,15 +87,15 @@ def _surveys(node: Node) -> bool:
 def _upstream(nodes: Sequence[Node]) -> set[str]:
     """The surveying nodes and all that they depend on."""
     needed = {node.name for node in nodes if _surveys(node)}
-    for node in reversed(nodes):  # nodes stand after their inputs
+    for node in reversed(nodes):  # every node comes after its inputs
         if node.name in needed:
             needed.update(node.inputs.values())
     return needed
 
 
-def _samples(graph: Graph, excerpts: Excerpts) -> list[dict[str, Any]]:
-    """The streams that no stage makes, of the first whole frame of each excerpt."""
-    samples = dict[int, dict[str, Any]]()
+def _samples(graph: Graph, excerpts: Excerpts) -> list[Sample]:
+    """The first complete frame of each excerpt, in stamp order, before any stage."""
+    samples = dict[int, Sample]()
     for events in excerpts(EXCERPTS, graph.source_streams):
         for frame in FrameAssembler(graph, Ledger()).frames(events):
             if not any(isinstance(value, Absent) for value in frame.values.values()):
@@ -80,10 +104,10 @@ def _samples(graph: Graph, excerpts: Excerpts) -> list[dict[str, Any]]:
     return [samples[stamp] for stamp in sorted(samples)]
 
 
-def _advance(node: Node, samples: list[dict[str, Any]]) -> None:
-    """Add the output of a stage to the samples; one that it fails on is no sample any more."""
+def _advance(node: Node, samples: list[Sample]) -> None:
+    """Add the output of a stage to the samples; drop a sample on which it fails."""
     for sample in list(samples):
         try:
             sample[node.name] = node.actor(**{port: sample[stream] for port, stream in node.inputs.items()})
-        except Exception:  # the run will meet it again, and enter it in its ledger
+        except Exception:  # the run meets this frame again, and its ledger reports it
             samples.remove(sample)

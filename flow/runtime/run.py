@@ -1,77 +1,30 @@
-"""One run: a log through a graph into sinks, with its summary and verdict, whatever happens on the way."""
+"""One run: a log through a graph into sinks, with its summary and verdict, whatever fails on the way."""
 
 from __future__ import annotations
 
 import resource
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-from flow.contracts import Event, Log, Sink, Verdict
+from flow.contracts import Event, Finding, Log, Sink, Verdict
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.runtime.engine import Engine
-from flow.runtime.findings import NOTE, WARNING, Finding, finding, findings
+from flow.runtime.findings import as_dicts, findings, warning
 from flow.runtime.frame_assembler import FrameAssembler
 from flow.runtime.graph import Graph
+from flow.runtime.interrupts import Stop
 from flow.runtime.ledger import Ledger, failure
-from flow.runtime.prepass import surveyed
-
-
-class Stop:
-    """What interrupts ask for: the first to finish the frames in flight, the second to abandon them too."""
-
-    def __init__(self) -> None:
-        self._requests = 0
-        self.reading = False  # whether the log is being read, where an exception does no harm
-
-    def request(self) -> None:
-        """One more interrupt."""
-        self._requests += 1
-
-    def finishing(self) -> bool:
-        """Whether no new frame shall start."""
-        return self._requests >= 1
-
-    def abandoning(self) -> bool:
-        """Whether even the frames in flight shall not be waited for."""
-        return self._requests >= 2
-
-
-@contextmanager
-def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
-    """Send SIGINT, SIGTERM and SIGHUP to `stop` instead of raising in the middle of something; SIGHUP only where it is
-    not ignored, as under nohup."""
-
-    def request(number: int, frame: FrameType | None) -> None:
-        stop.request()
-        said = "abandoning the frames in flight" if stop.abandoning() else "interrupted: finishing the frames in flight"
-        with suppress(Exception):  # a terminal that is gone, or is being written to, must not tear the run
-            tell(said)
-        if stop.abandoning() and stop.reading:
-            raise KeyboardInterrupt  # out of a source that does not answer
-
-    in_main = threading.current_thread() is threading.main_thread()  # only there can signals be caught
-    signals = [signal.SIGINT, signal.SIGTERM] if in_main else []
-    if in_main and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        signals.append(signal.SIGHUP)
-    before = {number: signal.signal(number, request) for number in signals}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+from flow.runtime.prepass import Prepass, prepass
 
 
 @dataclass
 class _Outputs:
-    """The sinks of a run, each with its path and the streams it is given; and what went wrong with them."""
+    """The sinks of a run. sinks: sink class -> (sink, its streams); paths: sink class -> its file; errors: by sink."""
 
     sinks: dict[str, tuple[Sink, list[str]]]
     paths: Mapping[str, Path]
@@ -79,8 +32,16 @@ class _Outputs:
     withheld: list[str] = field(default_factory=list)
     errors: list[tuple[str, BaseException]] = field(default_factory=list)
 
+    @classmethod
+    def of(cls, graph: Graph, paths: Mapping[str, Path]) -> _Outputs:
+        """The sinks that have a path. A graph's sink is configuration, so each run opens a copy of its own."""
+        sinks = {use: replace(sink) for use, sink in graph.sinks if use in paths}
+        kinds = graph.frame_streams.items()
+        wanted = {use: [name for name, kind in kinds if sink.wants(name, kind)] for use, sink in sinks.items()}
+        return cls({use: (sink, wanted[use]) for use, sink in sinks.items()}, paths)
+
     def open(self, kinds: Mapping[str, type], about: Mapping[str, str]) -> bool:
-        """Open all; False if one could not be."""
+        """Open all sinks; False if one fails, and then none stays open."""
         for use, (sink, streams) in self.sinks.items():
             try:
                 sink.open(self.paths[use], {stream: kinds[stream] for stream in streams}, about)
@@ -92,9 +53,9 @@ class _Outputs:
         return True
 
     def discard(self, only_empty: bool = False) -> None:
-        """Give up what is open, so that an output of an earlier run stays; a sink that cannot is closed later.
+        """Discard what is open, so that an existing file stays. A sink without `discard` is closed later instead.
 
-        only_empty: of sinks that can tell, those that were given nothing to keep.
+        only_empty: discard only sinks that report to be empty.
         """
         for use in tuple(self.opened):
             sink = self.sinks[use][0]
@@ -102,11 +63,11 @@ class _Outputs:
             if discard is not None and (not only_empty or getattr(sink, "empty", False)):
                 self.opened.remove(use)
                 self.withheld.append(use)
-                with suppress(Exception):  # why it is given up is what to tell of
+                with suppress(Exception):  # the reason for discarding is what the run must report
                     discard()
 
     def close(self, summary: dict[str, Any]) -> None:
-        """Close what is open; raises SinkError if anything went wrong with any sink."""
+        """Close what is open; raises SinkError if any sink has failed."""
         for use in self.opened:
             try:
                 self.sinks[use][0].close(summary)
@@ -114,10 +75,12 @@ class _Outputs:
                 self.errors.append((use, error))
         if self.errors:
             use, cause = self.errors[0]
-            if use not in self.paths:  # no output's fault
+            if use not in self.paths:  # the error is not one of a sink
                 raise cause
             failed = {use for use, _ in self.errors}
-            kept = "".join(f"; {self.paths[use]} has what came before" for use in self.opened if use not in failed)
+            kept = "".join(
+                f"; {self.paths[use]} contains the frames before it" for use in self.opened if use not in failed
+            )
             sentence = f"{use.rpartition('.')[2]} could not write {self.paths[use]}: {cause}{kept}"
             raise SinkError(sentence, summary | {"verdict": str(Verdict.INCOMPLETE), "failure": sentence}) from cause
 
@@ -130,48 +93,69 @@ def run(
     workers: int = 2,
     about: Mapping[str, str] | None = None,
     stop: Stop | None = None,
-    on_frame: Callable[[bool], None] = lambda whole: None,
+    on_frame: Callable[[bool], None] = lambda complete: None,
 ) -> dict[str, Any]:
-    """Run an opened log through `graph`; returns the summary.
+    """Run an opened log through a graph, and return the summary.
 
-    outputs: sink class, as the pipeline names it -> the path it writes to; sinks without a path stay unused.
-    Raises UsageError where the log lacks what the graph needs, SinkError where an output failed; every output is
-    closed and readable by then. A run of which no frame gets through leaves no output, and those of an earlier run as
-    they are, as far as its sinks can `discard`; so it is with a sink that is `empty` at the end. Of the summary's
-    wall_seconds, start_seconds were over before the first frame.
+    The graph stays as it is: it can be run again, or in several threads at once. If no frame gets through, or a sink is
+    `empty` at the end, sinks that can `discard` write nothing and leave existing files alone.
+
+    Parameters
+    ----------
+    outputs
+        Sink class, as the pipeline names it -> the path it writes to. Sinks without a path are not used.
+    workers
+        Threads that run the stages.
+    about
+        What the sinks record about the run, such as versions.
+    stop
+        Requests to stop the run early.
+    on_frame
+        Called after every frame, with whether all of its streams are there.
+
+    Returns
+    -------
+    dict
+        Verdict, counts, times, findings and losses, in plain JSON values; "entries" holds the losses after the last
+        frame as objects, for sinks.
+
+    Raises
+    ------
+    UsageError
+        The log lacks a stream that the graph needs.
+    SinkError
+        An output could not be written. All outputs are closed by then.
     """
     graph = fitted(graph, log)
     stop, ledger = stop or Stop(), Ledger()
     wall, cpu = time.perf_counter(), time.process_time()
-    surveys = dict[str, Finding]()
+    prepared = Prepass(graph)
     with suppress(_StoppedError):
-        graph, surveys = surveyed(graph, lambda *which: (_read(part, stop) for part in log.excerpts(*which)))
-    streams = graph.frame_streams
-    # A sink of the graph is configuration; the copy that is opened belongs to this run.
-    used = {use: replace(sink) for use, sink in graph.sinks if use in outputs}
-    wanted = {use: [name for name, kind in streams.items() if sink.wants(name, kind)] for use, sink in used.items()}
-    sinks = _Outputs({use: (sink, wanted[use]) for use, sink in used.items()}, outputs)
-    feeder, started, finished = FrameAssembler(graph, ledger), 0.0, False
+        prepared = prepass(graph, lambda *which: (_read(part, stop) for part in log.excerpts(*which)))
+    graph = prepared.graph
+    sinks = _Outputs.of(graph, outputs)
+    assembler, started, at_end = FrameAssembler(graph, ledger), 0.0, False
     engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
     try:
-        said = "\n".join(f"{name}: {found['sentence']}" for name, found in surveys.items())
-        if not stop.finishing() and sinks.open(streams, {**(about or {}), "surveys": said}):
+        surveys = "\n".join(f"{name}: {finding.sentence}" for name, finding in prepared.findings.items())
+        if not stop.finishing() and sinks.open(graph.frame_streams, {**(about or {}), "surveys": surveys}):
             started = time.perf_counter() - wall
-            finished = _feed(feeder, _read(log.events(graph.source_streams), stop), engine, stop)
+            at_end = _feed(assembler, _read(log.events(graph.source_streams), stop), engine, stop)
     finally:
         engine.finish(stop.abandoning)
         sinks.errors += [engine.failure] if engine.failure else []
         times = {"wall_seconds": time.perf_counter() - wall, "start_seconds": started}
         times["cpu_seconds"] = time.process_time() - cpu
-        whole = finished and engine.whole == engine.admitted and not len(ledger) and not sinks.errors
+        complete = at_end and engine.complete == engine.admitted and not len(ledger) and not sinks.errors
         sinks.discard(only_empty=engine.through > 0)
         summary = {
-            "verdict": str(Verdict.COMPLETE if whole else Verdict.INCOMPLETE),
+            "verdict": str(Verdict.COMPLETE if complete else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
             "pipeline": graph.name,
-            **_counted(feeder, engine, ledger, times),
-            "surveys": surveys,
-            "findings": _notes(log, graph) | findings(graph, engine.states),
+            **_counts(assembler, engine, ledger, times),
+            "surveys": as_dicts(prepared.findings),
+            "fixed": prepared.fixed,
+            "findings": as_dicts(_notes(log, graph) | findings(graph, engine.states)),
             "outputs": [str(outputs[use]) for use in sinks.opened],
             "withheld": [str(outputs[use]) for use in sinks.withheld],
         }
@@ -190,30 +174,30 @@ def fitted(graph: Graph, log: Log) -> Graph:
 
 
 def _notes(log: Log, graph: Graph) -> dict[str, Finding]:
-    """What the log says of the streams that the graph reads."""
+    """The log's notes about the streams that the graph reads."""
     try:
-        return {name: finding(NOTE, why) for name, why in log.notes().items() if name in graph.source_streams}
-    except Exception as error:  # no reason to leave the outputs open
-        return {"log": finding(WARNING, failure(error))}
+        return {name: Finding(note) for name, note in log.notes().items() if name in graph.source_streams}
+    except Exception as error:  # must not leave the outputs open
+        return {"log": warning(failure(error))}
 
 
 class _StoppedError(Exception):
-    """Leaves the log in the middle; the aligners then draw no conclusion from its end."""
+    """Ends the reading of a log before its end, so that aligners do not treat the place as the end of the log."""
 
 
-def _feed(feeder: FrameAssembler, events: Iterable[Event], engine: Engine, stop: Stop) -> bool:
-    """Admit the frames of the log; False if it was stopped, or an output failed, before the log's end."""
+def _feed(assembler: FrameAssembler, events: Iterable[Event], engine: Engine, stop: Stop) -> bool:
+    """Admit the frames of the log; False if the run was stopped, or an output failed, before the end of the log."""
     with suppress(_StoppedError):
-        for frame in feeder.frames(events):
+        for frame in assembler.frames(events):
             if not engine.admit(frame.stamp, frame.values, frame.entries, stop.finishing):
-                feeder.give_back(frame)
+                assembler.give_back(frame)
                 return False
         return True
     return False
 
 
 def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
-    """The events of a log; a source that breaks down ends the log with its exception, and a stop in the middle."""
+    """The events of a log until it ends or the run is stopped; an exception of the source becomes the last event."""
     log_time, source, broken = 0, iter(events), False
     while not broken:
         try:
@@ -223,7 +207,7 @@ def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
             return
         except KeyboardInterrupt:
             raise _StoppedError from None
-        except Exception as error:  # the rest of the log is lost, what was read of it is not
+        except Exception as error:  # the rest of the log is lost; the events before it are kept
             event, broken = (log_time, "log", error), True
         finally:
             stop.reading = False
@@ -239,18 +223,18 @@ def _peak_memory_mb() -> float:
     return round(peak * (1 if sys.platform == "darwin" else 1024) / 1e6, 1)
 
 
-def _counted(feeder: FrameAssembler, engine: Engine, ledger: Ledger, times: dict[str, float]) -> dict[str, Any]:
-    """Of the summary, what is counted and timed."""
+def _counts(assembler: FrameAssembler, engine: Engine, ledger: Ledger, times: dict[str, float]) -> dict[str, Any]:
+    """The counts and times of the summary. start_seconds is the part of wall_seconds before the first frame."""
     return {
         "frames_in": engine.admitted,
-        "frames_out": engine.whole,
-        "frames_through": engine.through,  # whole or not
+        "frames_out": engine.complete,
+        "frames_through": engine.through,  # with and without losses
         "drops": ledger.counts(),
-        "messages": dict(sorted(feeder.messages.items())),
+        "messages": dict(sorted(assembler.messages.items())),
         "seconds": {name: round(value, 6) for name, value in engine.seconds.items()},
         **{name: round(value, 6) for name, value in times.items()},
-        "frames_per_second": round(engine.whole / times["wall_seconds"], 4),
+        "frames_per_second": round(engine.complete / times["wall_seconds"], 4),
         "peak_memory_mb": _peak_memory_mb(),
         "ledger": [entry.as_dict() for entry in ledger.entries],
-        "entries": [*engine.late_entries, *feeder.late_entries],
+        "entries": [*engine.late_entries, *assembler.late_entries],
     }

@@ -2,6 +2,7 @@
 
 import threading
 import time
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -12,7 +13,7 @@ from flow.contracts import Absent, Loss, LossReason
 from flow.runtime.engine import Engine
 from flow.runtime.graph import Node, YamlLocation
 from flow.runtime.ledger import Ledger
-from tests.flow.toys import MS, PIPELINE, Couple, Keep, Number, graph, replayed, traverse
+from tests.flow.toys import MS, PIPELINE, Couple, Keep, Number, Scale, graph, replayed, traverse
 
 
 def test_every_stream_of_every_frame_arrives_in_stamp_order(tmp_path):
@@ -90,6 +91,27 @@ def test_inboxes_stay_bounded_when_the_end_of_the_line_is_slow(tmp_path):
     helper.join()
     assert most[0] <= 2 * (len(pipeline.stages) + 1) + 3
     assert [record.index for record in sink.records] == list(range(60))
+
+
+def test_an_item_is_freed_once_its_last_reader_is_done(tmp_path, monkeypatch):
+    scale, made, alive = Scale.__call__, [], []
+
+    def noted(self, couple):
+        result = scale(self, couple)
+        made.append(weakref.ref(result))
+        return result
+
+    class Looking(Keep):
+        def write(self, record):
+            alive.extend(reference() for reference in made)
+            super().write(record)
+
+    monkeypatch.setattr(Scale, "__call__", noted)
+    engine = Engine(graph(tmp_path).stages, {"sum": (sink := Looking(), ["sum"])}, Ledger(), workers=1)
+    engine.admit(0, frame(1), [])
+    engine.finish()
+    assert alive == [None, None]
+    assert (list(sink.values("sum").values()), engine.complete) == ([5.0], 1)
 
 
 class SlowAdd:
@@ -179,7 +201,7 @@ def test_what_a_frame_lost_before_it_was_abandoned_is_told_and_what_becomes_of_i
     for thread in threading.enumerate():
         if thread.name.startswith("worker-"):
             thread.join(5)
-    abandoned = Loss("frame", 0, "engine", LossReason.ABANDONED, "the run ended before it was through")
+    abandoned = Loss("frame", 0, "engine", LossReason.ABANDONED, "the run ended before the frame was through")
     assert engine.late_entries == [lost, abandoned]
     assert set(ledger.entries) == {lost, abandoned}
     assert (told, engine.through) == ([], 0)
@@ -244,7 +266,7 @@ def test_whatever_the_graph_and_whatever_fails_every_frame_arrives_as_computed_b
         assert engine.admit(frame, {"entry": entry or Couple(frame, 0.0)}, [])
     engine.finish()
     expected = [({}, 1) if frame in lost else by_hand(flow, frame) for frame in range(12)]
-    assert engine.whole == sum(len(values) == len(flow) for values, _ in expected)
+    assert engine.complete == sum(len(values) == len(flow) for values, _ in expected)
     assert len(ledger) == sum(failures for _, failures in expected)
     for keep, _ in keeps.values():
         assert [record.index for record in keep.records] == list(range(12))

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from flow.cli.report import headline, report
-from flow.contracts import Finding
-from flow.runtime.findings import plain
+from flow.contracts import Finding, Severity
+from flow.runtime.findings import checked
 from flow.runtime.run import run
 from tests.flow.toys import Log, graph, replayed, traverse
 
@@ -23,7 +23,7 @@ def printed(folder, frames, capsys):
 def test_a_note_is_one_of_the_lines_and_a_warning_the_last(tmp_path, capsys):
     assert printed(tmp_path, 5, capsys)[1:] == ["  total: the sum is 20.0"]
     verdict, *more = printed(tmp_path, 6, capsys)
-    assert verdict.startswith("COMPLETE: 6 of 6 frames whole")
+    assert verdict.startswith("COMPLETE: 6 of 6 frames complete")
     assert more == ["WARNING: total: the sum is 30.0"]
 
 
@@ -33,10 +33,12 @@ def said_of(**changes):
 
 
 def test_the_verdict_says_what_was_lost_in_the_same_line():
-    assert said_of(verdict="COMPLETE") == "COMPLETE: 18 of 18 frames whole"
-    assert said_of(drops={"unmatched": 2}) == "INCOMPLETE: 18 frames whole, 2 losses: 2 unmatched"
+    assert said_of(verdict="COMPLETE") == "COMPLETE: 18 of 18 frames complete"
+    assert said_of(drops={"unmatched": 2}) == "INCOMPLETE: 18 frames complete, 2 losses: 2 unmatched"
     lost = {"failed": 1, "unreadable": 2}
-    assert said_of(frames_out=17, drops=lost) == "INCOMPLETE: 17 of 18 frames whole, 3 losses: 1 failed, 2 unreadable"
+    assert (
+        said_of(frames_out=17, drops=lost) == "INCOMPLETE: 17 of 18 frames complete, 3 losses: 1 failed, 2 unreadable"
+    )
     assert said_of(interrupted=True, frames_in=1, frames_out=1) == "INCOMPLETE: interrupted after 1 frame"
 
 
@@ -45,7 +47,7 @@ def test_frames_that_the_user_gave_up_are_no_losses_of_the_log():
     assert stopped == "INCOMPLETE: interrupted after 15 of 18 frames, 3 abandoned"
     stopped = said_of(interrupted=True, frames_out=14, drops={"abandoned": 3, "failed": 1})
     assert stopped == "INCOMPLETE: interrupted after 14 of 18 frames, 3 abandoned, 1 loss: 1 failed"
-    assert said_of(interrupted=True, verdict="COMPLETE") == "COMPLETE: 18 of 18 frames whole"
+    assert said_of(interrupted=True, verdict="COMPLETE") == "COMPLETE: 18 of 18 frames complete"
 
 
 def test_what_a_stage_found_is_said_at_the_end_to_the_user_and_to_the_sinks(tmp_path):
@@ -65,13 +67,13 @@ def test_a_finding_that_breaks_down_costs_the_run_nothing(tmp_path):
     assert found["sentence"].startswith("RuntimeError: unlucky (toys.py, line ")
 
 
-def test_a_finding_that_is_none_is_a_warning_that_says_so():
-    said = plain("the mount is loose")
-    assert said["severity"] == "warning"
-    assert said["sentence"] == "its finding must have a severity and a sentence, or be None, not 'the mount is loose'"
+def test_what_is_no_finding_becomes_a_warning():
+    wrong = "the stage must return a flow.contracts.Finding or None, not 'the mount is loose'"
+    assert checked("the mount is loose") == Finding(wrong, Severity.WARNING)
+    assert checked(None) is None
 
 
-@pytest.mark.parametrize("said", [Finding("warning", "the mount is loose"), Finding("the mount is loose", "warn")])
-def test_a_finding_of_no_severity_that_there_is_is_a_warning_that_says_what_is_wrong(said):
-    wrong = f"a Finding's severity must be note or warning, not '{said.severity}'"
-    assert plain(said) == {"severity": "warning", "sentence": f"{said.sentence} ({wrong})"}
+@pytest.mark.parametrize("found", [Finding("warning", "the mount is loose"), Finding("the mount is loose", "warn")])
+def test_a_finding_of_unknown_severity_becomes_a_warning(found):
+    wrong = f"(a Finding's severity must be note or warning, not '{found.severity}')"
+    assert checked(found) == Finding(f"{found.sentence} {wrong}", Severity.WARNING)

@@ -8,7 +8,8 @@ import pytest
 from flow.config.loader import load
 from flow.contracts import Finding
 from flow.errors import PipelineError
-from flow.runtime.run import Stop, run
+from flow.runtime.interrupts import Stop
+from flow.runtime.run import run
 from tests.flow.toys import Couple, Keep, Log, Number
 
 PIPELINE = """
@@ -112,7 +113,7 @@ def test_a_survey_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(Centre, "survey", lambda self, couple: 1 // 0)
     summary, _ = result_of(tmp_path, Excerpted(EVENTS, [(0, 6)]))
     assert summary["surveys"]["centred"]["severity"] == "warning"
-    assert said(summary).startswith("could not survey the log: ZeroDivisionError: ")
+    assert said(summary).startswith("the survey of the log failed: ZeroDivisionError: ")
     assert summary["drops"] == {"failed": 8}  # this stage cannot do without
 
 
@@ -120,7 +121,7 @@ def test_a_stage_that_remembers_cannot_stand_before_a_survey(tmp_path):
     file = tmp_path / "p.yaml"
     remembering = (PIPELINE % "").replace("toys.Scale, couple: pair, factor: 2 m, bad: []", "toys.Total, couple: pair")
     file.write_text(remembering)
-    with pytest.raises(PipelineError, match=r"p\.yaml:5: 'scaled' remembers frames"):
+    with pytest.raises(PipelineError, match=r"p\.yaml:5: 'scaled' has state"):
         run(load(str(file)), Excerpted(EVENTS, [(0, 6)]), {})
 
 
@@ -130,3 +131,8 @@ def test_an_interrupt_during_the_survey_ends_the_run_before_any_output_is_begun(
     summary, sink = result_of(tmp_path, Excerpted(EVENTS, [(0, 6)]), stop=stop)
     assert (summary["interrupted"], summary["frames_in"], summary["verdict"]) == (True, 0, "INCOMPLETE")
     assert (summary["outputs"], sink.summary) == ([], None)
+
+
+def test_the_summary_names_the_parameters_that_a_survey_fixed(tmp_path):
+    summary, _ = result_of(tmp_path, Excerpted(EVENTS, [(0, 6)]))
+    assert summary["fixed"] == {"centred.mean": 2.0}

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from flow.errors import SinkError, UsageError
 from flow.runtime.frame_assembler import FrameAssembler
+from flow.runtime.interrupts import Stop, interrupts
 from flow.runtime.ledger import Ledger
-from flow.runtime.run import Stop, interrupts, run
+from flow.runtime.run import run
 from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, Text, graph, replayed, replayed_log, traverse
 
 

@@ -1,12 +1,10 @@
-"""A log through a pipeline as one asks for it on the command line: files in, files out, a bar on the terminal.
-
-The rest of the runtime knows no paths of pipelines, no terminal and no libraries whose threads must be held back.
-"""
+"""Replays a log through a pipeline for the command line: files in, files out, a progress bar on the terminal."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -27,18 +25,16 @@ def replay(
     end: float | None = None,
 ) -> dict[str, Any]:
     """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary."""
-    import cv2
-    from threadpoolctl import threadpool_limits
     from tqdm import tqdm
 
     from flow.config import loader as pipelines
-    from flow.runtime.run import Stop, interrupts, run
+    from flow.runtime.interrupts import Stop, interrupts
+    from flow.runtime.run import run
 
     graph = pipelines.load(pipeline, overrides)
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
-    cv2.setNumThreads(1)  # frames in flight fill the cores, not threads inside one call
     stop = Stop()
-    with graph.source.open(log, start=start, end=end) as opened, threadpool_limits(1):
+    with graph.source.open(log, start=start, end=end) as opened, _one_thread_per_call():
         about = {
             "roverflow": product_version(),
             "pipeline": graph.text,
@@ -48,13 +44,14 @@ def replay(
             "end": "" if end is None else repr(float(end)),
             **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
         }
-        about = {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}  # odd names of files
+        # A file name may hold bytes that are not UTF-8.
+        about = {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}
         with tqdm(total=opened.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
             drops = 0
 
-            def on_frame(whole: bool) -> None:
+            def on_frame(complete: bool) -> None:
                 nonlocal drops
-                drops += not whole
+                drops += not complete
                 bar.set_postfix(dropped=drops, refresh=False)
                 bar.update()
 
@@ -63,19 +60,34 @@ def replay(
     return as_json(summary | {"overrides": list(overrides)})
 
 
+@contextmanager
+def _one_thread_per_call() -> Iterator[None]:
+    """Let OpenCV, BLAS and OpenMP use one thread in each call: frames in flight fill the cores."""
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
 def _outputs(graph: Graph, paths: Mapping[str, Path | None]) -> dict[str, Path]:
-    """Sink -> the path that it writes to, by what its files end in; those without one stay unused."""
+    """Sink class -> the path that it writes to, by the suffix of its files; a sink without a path is not used."""
     endings = [sink.suffix for _, sink in graph.sinks]
     for use, sink in graph.sinks:
         if sink.suffix not in paths:
-            raise UsageError(f"{use} writes {sink.suffix} files, and a run has outputs for {' and '.join(paths)} only")
+            raise UsageError(f"{use} writes {sink.suffix} files, but a run writes only {' and '.join(paths)} files")
         if endings.count(sink.suffix) > 1:
-            raise UsageError(f"several sinks write {sink.suffix} files, and a run has one output for them; leave one")
+            raise UsageError(f"several sinks write {sink.suffix} files, but a run writes only one; keep one")
     return {use: path for use, sink in graph.sinks if (path := paths[sink.suffix]) is not None}
 
 
 def as_json(summary: dict[str, Any]) -> dict[str, Any]:
-    """A run's summary without the ledger's entry objects; "ledger" has them as plain values."""
+    """The summary of a run without the entry objects for sinks; "ledger" holds them as plain values."""
     return {name: value for name, value in summary.items() if name != "entries"}
 
 
