@@ -94,7 +94,7 @@ def test_inboxes_stay_bounded_when_the_end_of_the_line_is_slow(tmp_path):
 
 
 def test_an_item_is_freed_once_its_last_reader_is_done(tmp_path, monkeypatch):
-    scale, made, alive = Scale.__call__, [], []
+    stages, scale, made, alive = graph(tmp_path).stages, Scale.__call__, [], []
 
     def noted(self, couple):
         result = scale(self, couple)
@@ -107,7 +107,7 @@ def test_an_item_is_freed_once_its_last_reader_is_done(tmp_path, monkeypatch):
             super().write(record)
 
     monkeypatch.setattr(Scale, "__call__", noted)
-    engine = Engine(graph(tmp_path).stages, {"sum": (sink := Looking(), ["sum"])}, Ledger(), workers=1)
+    engine = Engine(stages, {"sum": (sink := Looking(), ["sum"])}, Ledger(), workers=1)
     engine.admit(0, frame(1), [])
     engine.finish()
     assert alive == [None, None]
