@@ -148,7 +148,7 @@ class Match(Stage):
                 np.copyto(layer, known, where=taken)
         if self.max_depth:  # what bounds the range reaches a little beyond
             beyond = found.pixels < self._reach(frame.camera)
-            for layer, unknown in zip(layers, (np.nan, PixelOrigin.UNKNOWN, 0), strict=True):
+            for layer, unknown in zip(layers, (np.nan, PixelOrigin.OUT_OF_RANGE, 0), strict=True):
                 layer[beyond] = unknown
         return Disparity(frame.stamp, *layers, camera=frame.camera)
 
@@ -161,11 +161,15 @@ class Match(Stage):
         return whole_range(rows, len(search))
 
     def _excluded(self, prior: Disparity, search: range, where: SearchWindows | list[Range]) -> Array:
-        """Where the prior shows that the match is not in the range, or with `search_radius` none to look for, (H, W)
-        bool."""
+        """Why pixels are excluded from the search, (H, W) uint8: codes of `PixelOrigin`, 0 where they are searched.
+
+        The prior shows that their match is not in the range. With `search_radius`, pixels without a prior are excluded
+        too, for the prior's own reason where it has one.
+        """
         if isinstance(where, SearchWindows):
-            guided: Array = (prior.pixels >= search.start - BEYOND) & (prior.pixels < prior.pixels.shape[1])
-            return ~guided
+            guided = (prior.pixels >= search.start - BEYOND) & (prior.pixels < prior.pixels.shape[1])
+            reason = np.where(prior.source > PixelOrigin.FILLED, prior.source, np.uint8(PixelOrigin.OUT_OF_RANGE))
+            return np.where(guided, np.uint8(0), reason)
         excluded = np.empty(prior.pixels.shape, bool)
         for each in where:
             rows, first = slice(each.top, each.end), search.start + each.first
@@ -173,7 +177,7 @@ class Match(Stage):
             if first > self.min_disparity:
                 excluded[rows] |= prior.pixels[rows] < first - BEYOND
         excluded &= prior.source == PixelOrigin.MEASURED
-        return excluded
+        return excluded * np.uint8(PixelOrigin.OUT_OF_RANGE)
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
         height, width = frame.left.shape[:2]

@@ -66,14 +66,15 @@ class MatchOpenCV(Stage):
     def __call__(self, frame: StereoFrame) -> Disparity:
         check_rectified(self, frame)
         left, right = eight_bit(frame.left, frame.right)
-        pixels = self._matched(left, right) if self.color else self._matched(gray(left), gray(right))
-        pixels[_texture(gray(left), self.block_size) <= self.min_texture] = np.nan
-        known = np.isfinite(pixels)
-        source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
-        return Disparity(frame.stamp, pixels, source, _agreement(pixels, known), camera=frame.camera)
+        pixels, source = self._matched(left, right) if self.color else self._matched(gray(left), gray(right))
+        bare = _texture(gray(left), self.block_size) <= self.min_texture
+        pixels[bare], source[bare] = np.nan, PixelOrigin.BLANK
+        return Disparity(frame.stamp, pixels, source, _agreement(pixels, np.isfinite(pixels)), camera=frame.camera)
 
-    def _matched(self, left: Array, right: Array) -> Array:
-        """The disparity image (H, W) float32, NaN where the match failed or lies outside the right image."""
+    def _matched(self, left: Array, right: Array) -> tuple[Array, Array]:
+        """The disparity image (H, W) float32, NaN where the match failed or lies outside the right image, and its
+        source. StereoSGBM does not report why the uniqueness or left-right check failed: that is UNKNOWN.
+        """
         height, width = left.shape[:2]
         if min(height, width) < SMALLEST_SIDE:
             raise StageError(f"MatchOpenCV: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
@@ -88,13 +89,22 @@ class MatchOpenCV(Stage):
             minDisparity=self.min_disparity, numDisparities=levels, blockSize=self.block_size,
             P1=max(1, round(self.p1 * scale)), P2=round(self.p2 * scale), disp12MaxDiff=self.lr_tolerance,
             preFilterCap=self.prefilter_cap, uniquenessRatio=self.uniqueness,
-            speckleWindowSize=self.max_speckle_size, speckleRange=self.speckle_range, mode=MODES[self.paths],
+            speckleWindowSize=0, mode=MODES[self.paths],
         )  # fmt: skip
-        sixteenths = matcher.compute(left, right)[:, before : before + width]
+        sixteenths, lowest = matcher.compute(left, right), 16 * self.min_disparity
+        source = np.where(sixteenths < lowest, np.uint8(PixelOrigin.UNKNOWN), np.uint8(PixelOrigin.SPECKLE))
+        if self.max_speckle_size:  # as StereoSGBM does it
+            cv2.filterSpeckles(sixteenths, lowest - 16, self.max_speckle_size, 16 * self.speckle_range)
+        sixteenths, source = (layer[:, before : before + width] for layer in (sixteenths, source))
         pixels: Array = sixteenths.astype(np.float32) / F32(16)
         partner = np.arange(width, dtype=np.float32) - pixels
-        pixels[(sixteenths < 16 * self.min_disparity) | (partner < 0) | (partner > width - 1)] = np.nan
-        return pixels
+        found, in_view = sixteenths >= lowest, (partner >= 0) & (partner <= width - 1)
+        # The columns whose partners lie outside the right image at every disparity are out of view as well.
+        unseen = (found & ~in_view) | (np.arange(width) < self.min_disparity)
+        unseen |= np.arange(width) > width - 1 + self.min_disparity + levels - 1
+        source = np.select([unseen, found], [np.uint8(PixelOrigin.OUT_OF_VIEW), np.uint8(PixelOrigin.MEASURED)], source)
+        pixels[~(found & in_view)] = np.nan
+        return pixels, source
 
 
 def _texture(image: Array, block: int) -> Array:

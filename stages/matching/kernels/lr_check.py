@@ -9,7 +9,7 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, PixelOrigin, known
 
 F32 = np.float32
-UNKNOWN = int(PixelOrigin.UNKNOWN)
+LEFT_RIGHT = int(PixelOrigin.LEFT_RIGHT)
 _known = part(known)
 Layers = tuple[Array, Array, Array]
 
@@ -46,18 +46,19 @@ def _drop(
                 there = last - np.int64(partner)
                 differs = _known(backward_source[y, there]) and abs(backward[y, there] - d) > tolerance
             left_pixels[y, x] = F32(np.nan) if differs else d
-            left_source[y, x] = UNKNOWN if differs else source[y, x]
+            left_source[y, x] = LEFT_RIGHT if differs else source[y, x]
             left_confidence[y, x] = F32(0) if differs else confidence[y, x]
 
 
 def drop_contradicted_reference(found: Layers, backward: Layers, tolerance: float, largest: float) -> Layers:
     """`drop_contradicted` in plain numpy."""
-    pixels, source, confidence = found
+    pixels = found[0]
     theirs = np.where(known(backward[1]), backward[0], F32(np.nan))[:, ::-1]
     partner = np.rint(np.arange(pixels.shape[1]) - pixels.astype(np.float64))
     inside = (partner >= 0) & (partner < pixels.shape[1])
     asked = np.take_along_axis(theirs, np.where(inside, partner, 0).astype(int), axis=1)
     with np.errstate(invalid="ignore"):
         wrong = inside & (pixels <= largest) & (np.abs(asked - pixels) > F32(tolerance))
-    kept = np.where(wrong, F32(np.nan), pixels), np.where(wrong, UNKNOWN, source), np.where(wrong, F32(0), confidence)
-    return kept[0], kept[1].astype(np.uint8), kept[2]
+    left = [layer.copy() for layer in found]
+    left[0][wrong], left[1][wrong], left[2][wrong] = np.nan, LEFT_RIGHT, 0
+    return left[0], left[1], left[2]

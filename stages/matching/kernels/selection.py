@@ -28,8 +28,12 @@ from stages.compiled.simd import (
     store,
     where_less,
 )  # fmt: skip
-from stages.data import Array
+from stages.data import Array, PixelOrigin
 from stages.matching.kernels.sgm_params import SgmParams
+
+MEASURED, OUT_OF_VIEW, OUT_OF_RANGE, LEFT_RIGHT, UNIQUENESS = (
+    np.uint8(PixelOrigin[name]) for name in ("MEASURED", "OUT_OF_VIEW", "OUT_OF_RANGE", "LEFT_RIGHT", "UNIQUENESS")
+)
 
 
 @part
@@ -84,15 +88,16 @@ def find_partners(winner, right, partners):
 
 
 @part
-def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):
-    """Disparities of a row, to a fraction of a pixel, where the winner can be believed, and the evidence for them.
+def fit_row(winner, votes, partners, first, top, rule, pixels, evidence, source):
+    """Disparities of a row, to a fraction of a pixel, where the winner is reliable, the evidence, and the reasons.
 
     winner, votes, partners: of `find_winners` and `find_partners`; first: (W,) int32, disparity of the first lane;
-    top: the last lane that is a disparity; rule: `SgmParams`; into pixels (W,) float32, px, NaN = unknown, and
-    evidence (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown.
+    top: the last lane that is a disparity; rule: `SgmParams`; into pixels (W,) float32, px, NaN = unknown; evidence
+    (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown; source (W,) uint8: codes of
+    `PixelOrigin`, the first check that fails.
 
     A winner at an end of the search range, or with a neighbour outside the right image, is none: its lines would lean
-    on a sum that says nothing, and the smallest may lie beyond.
+    on a sum that means nothing, and the smallest may lie beyond.
     """
     columns = winner.size
     last, top = np.int32(columns - 1), np.int32(top)
@@ -104,15 +109,21 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence):
         partner = np.int32(np.int32(x) - first[x] - d)
         apart = abs(np.int32(np.int32(partners[x]) - d))
         lead = np.int32(next_best - low)
-        sound = (d > 0) & (d < top) & (partner > 0) & (partner < last) & (apart <= tolerance) & (lead > margin)
+        in_view, in_range = (partner > 0) & (partner < last), (d > 0) & (d < top)
+        unique, agreed = lead > margin, apart <= tolerance
+        sound = in_view & in_range & unique & agreed
         rise = max(np.int32(max(lower, upper) - low), np.int32(1))
         value = np.float32(first[x] + d) + np.float32(lower - upper) / np.float32(rise + rise)
         pixels[x] = value if sound else np.float32(np.nan)
         evidence[x] = np.uint8(lead) if sound else np.uint8(0)
+        reason = MEASURED if agreed else LEFT_RIGHT
+        reason = reason if unique else UNIQUENESS
+        reason = reason if in_range else OUT_OF_RANGE
+        source[x] = reason if in_view else OUT_OF_VIEW
 
 
-def select_reference(total: Array, first: Array, lowest: int, n: int, rule: SgmParams) -> tuple[Array, Array]:
-    """Disparities and evidence of a row in plain numpy.
+def select_reference(total: Array, first: Array, lowest: int, n: int, rule: SgmParams) -> tuple[Array, Array, Array]:
+    """Disparities, evidence and source of a row in plain numpy.
 
     total: (W, m) the sums of all paths, from disparity `lowest` on, 255 where not searched; first: (W,) the disparity
     of the first of the n that are searched.
@@ -123,16 +134,24 @@ def select_reference(total: Array, first: Array, lowest: int, n: int, rule: SgmP
     for r in range(columns):
         seen = [(sums[r + d, d - lowest], d) for d in range(lowest, lowest + disparities) if 0 <= r + d < columns]
         right[r] = min(seen)[1] if seen else lowest
-    pixels, evidence = np.full(columns, np.nan, np.float32), np.zeros(columns, np.uint8)
+    pixels, evidence, source = np.full(columns, np.nan, np.float32), *np.zeros((2, columns), np.uint8)
     for x in range(columns):
         d = int(np.argmin(sums[x]))
         lane, partner = d + lowest - first[x], x - lowest - d
-        if not (0 < lane < n - 1 and 0 < partner < columns - 1):
+        if not 0 < partner < columns - 1:
+            source[x] = PixelOrigin.OUT_OF_VIEW
+            continue
+        if not 0 < lane < n - 1:
+            source[x] = PixelOrigin.OUT_OF_RANGE
             continue
         low, before, after = sums[x, d], sums[x, d - 1], sums[x, d + 1]
         lead = min([255, *sums[x, : d - 1], *sums[x, d + 2 :]]) - low
-        if abs(right[partner] - d - lowest) <= rule.consistency and lead > rule.uniqueness:
+        if lead <= rule.uniqueness:
+            source[x] = PixelOrigin.UNIQUENESS
+        elif abs(right[partner] - d - lowest) > rule.consistency:
+            source[x] = PixelOrigin.LEFT_RIGHT
+        else:
             rise = max(max(before, after) - low, 1)
             pixels[x] = np.float32(lowest + d) + np.float32(before - after) / np.float32(2 * rise)
-            evidence[x] = lead
-    return pixels, evidence
+            evidence[x], source[x] = lead, PixelOrigin.MEASURED
+    return pixels, evidence, source

@@ -27,7 +27,7 @@ from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace, Workspaces
 from stages.data import Array
 from stages.matching.kernels.aggregation import aggregate_row
-from stages.matching.kernels.blank_windows import blank_windows, drop_blank
+from stages.matching.kernels.blank_windows import contrast, drop_unmatchable
 from stages.matching.kernels.gradient import smoothed_costs
 from stages.matching.kernels.matching_inputs import MatchingInputs, describe
 from stages.matching.kernels.row_ranges import Range, lanes_for, move_paths, within
@@ -37,13 +37,14 @@ from stages.matching.kernels.sgm_params import SgmParams
 from stages.matching.kernels.speckles import drop_speckles
 
 _workspaces = Workspaces()
+Layers = tuple[Array, Array, Array]  # disparities, evidence, source
 
 
 class Matches(NamedTuple):
     """What `match` finds, (H, W) each."""
 
     pixels: Array  # float32, px, NaN = unknown
-    source: Array  # uint8: 1 where known, else 0, as `stages.data.Source`
+    source: Array  # uint8, codes of `PixelOrigin`
     confidence: Array  # float32
 
 
@@ -69,47 +70,47 @@ def match(
     """Disparities of a rectified pair of gray images.
 
     left, right: (H, W) uint8; prior: of `prior.prior_costs`, from where each pixel's search begins, or None; search:
-    where, and what for; excluded: (H, W) bool, pixels that have no match in the range, or None; threads: more than 2
-    have nothing to do; memory: bytes that the sums of paths may take.
+    where, and what for; excluded: (H, W) uint8, why a pixel has no match in the range (a code of `PixelOrigin`, or 0),
+    or None; threads: more than 2 have nothing to do; memory: bytes that the sums of paths may take.
     """
-    pixels, evidence = np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8)
+    pixels, evidence, source = (np.empty(left.shape, kind) for kind in (np.float32, np.uint8, np.uint8))
+    layers = pixels, evidence, source
+    if excluded is None:
+        excluded = np.empty((0, 0), np.uint8)
     both = shared_by(threads)
     with _workspaces.one() as space:
         if isinstance(search, SearchWindows):
             seen = rule._replace(minimum=0)
             search_around(
-                describe(left, right, seen, search.width, prior, both), rule, search, pixels, evidence, space, both
+                describe(left, right, seen, search.width, prior, both), rule, search, layers, space, both
             )  # fmt: skip
         else:
-            _search_rows(left, right, rule, prior, search, memory, pixels, evidence, space, both)
+            _search_rows(left, right, rule, prior, search, memory, layers, space, both)
 
         def drop(first: int, end: int) -> None:
-            unmatched = blank_windows(left, first, end)
-            if excluded is not None:
-                unmatched |= excluded[first:end]
-            drop_blank(unmatched, blank_windows(right, first, end), pixels[first:end], evidence[first:end])
+            rows = (layer[first:end] for layer in (excluded, *layers))
+            drop_unmatchable(contrast(left, first, end), contrast(right, first, end), *rows)
 
         by_bands(both, len(left), drop)
-        drop_speckles(pixels, evidence, rule.speckle_range, rule.speckle_size, space, both)
-    return Matches(pixels, (evidence > 0).view(np.uint8), cv2.LUT(evidence, rule.calibration))
+        drop_speckles(pixels, evidence, source, rule.speckle_range, rule.speckle_size, space, both)
+    return Matches(pixels, source, cv2.LUT(evidence, rule.calibration))
 
 
 def _search_rows(
     left: Array, right: Array, rule: SgmParams, prior: tuple[Array, Array] | None, ranges: list[Range], memory: int,
-    pixels: Array, evidence: Array, space: Workspace, both: Fork,
+    layers: Layers, space: Workspace, both: Fork,
 ) -> None:  # fmt: skip
-    """Fill in disparities and evidence; what that takes but the workspace is given back."""
+    """Fill in disparities, evidence and source; what that takes but the workspace is given back."""
     pair = describe(left, right, rule, Width(lanes_for(rule.disparities)), prior, both)
-    upper, lower = _halves(pair, rule, space, ranges, memory, pixels, evidence)
+    upper, lower = _halves(pair, rule, space, ranges, memory, layers)
     both(upper.arrive, lower.arrive)
     both(lambda: upper.cross(lower), lambda: lower.cross(upper))
 
 
 @kernel
-def _sweep(
-    pair, rule, pixels, evidence, width, scratch, first_lane, top, paths, y, end, step, sums, origin, stride, final
-):
+def _sweep(pair, rule, layers, width, scratch, first_lane, top, paths, y, end, step, sums, origin, stride, final):
     """Rows y to end (exclusive) in steps of 1 or -1; the sums of row y are at (y - origin) * stride of `sums`."""
+    pixels, evidence, source = layers
     if rule.gradient:
         for ahead in (y - step, y):  # smoothed_costs needs the column sums of two rows before it can begin
             smoothed_costs(pair, rule.unseen, first_lane, ahead, scratch.column_sums, scratch.costs, width)
@@ -126,7 +127,8 @@ def _sweep(
             )
             find_partners(scratch.winner, scratch.right, scratch.partners)
             fit_row(
-                scratch.winner, scratch.votes, scratch.partners, scratch.first, top, rule, pixels[y], evidence[y]
+                scratch.winner, scratch.votes, scratch.partners, scratch.first, top, rule, pixels[y], evidence[y],
+                source[y],
             )  # fmt: skip
         y += step
 
@@ -137,11 +139,10 @@ def _halves(
     space: Workspace,
     ranges: list[Range],
     memory: int,
-    pixels: Array,
-    evidence: Array,
+    layers: Layers,
 ) -> list[_Half]:
     """Both halves of the image, in stripes whose sums take no more than `memory` bytes together."""
-    height, columns = pixels.shape
+    height, columns = layers[0].shape
     size = columns * max(each.width.lanes for each in ranges)
     middle = height // 2
     largest = height - middle
@@ -150,7 +151,7 @@ def _halves(
     heads = 0 if stripe == largest else -(-largest // stripe)
     moves = 2 if len(ranges) > 1 else 0  # of paths, from one range to another
     space.reserve(2 * (size * (10 + stripe + 3 * (heads + moves)) + 64 * (8 + heads + moves)))
-    sweep = functools.partial(_sweep, pair, rule, pixels, evidence)
+    sweep = functools.partial(_sweep, pair, rule, layers)
     rows = range(middle), range(height - 1, middle - 1, -1)
     return [_Half(part, stripe, heads > 0, space, sweep, ranges, columns, rule) for part in rows]
 

@@ -86,17 +86,17 @@ def search_around(
     pair: MatchingInputs,
     rule: SgmParams,
     windows: SearchWindows,
-    pixels: Array,
-    evidence: Array,
+    layers: tuple[Array, Array, Array],
     space: Workspace,
     both: Fork,
 ) -> None:
-    """Fill in disparities (H, W) float32, px, NaN = unknown, and the evidence for them, (H, W) uint8.
+    """Write disparities, evidence and source of all pixels into `layers`.
 
+    layers: (H, W) each, float32, px, NaN = unknown; uint8; uint8, codes of `PixelOrigin`;
     pair: of a rule whose minimum is 0, with the prior's costs from the beginning of each window on.
     """
     first, width = windows
-    height, columns = pixels.shape
+    height, columns = first.shape
     size, slots = columns * width.lanes, _slots(columns, width.lanes)
     space.reserve(2 * (height * size + 64) + 14 * (slots + 64))
     costs, sums = (space.array((height, size), np.uint8) for _ in range(2))
@@ -105,7 +105,7 @@ def search_around(
     make = functools.partial(_costs, pair, rule, width, first, costs)
     arrive = functools.partial(_arrive, pair.steps, rule, width, first, costs, sums)
     lanes = int(first.min()), int(first.max())
-    cross = functools.partial(_cross, pair.steps, rule, width, first, costs, sums, *lanes, pixels, evidence)
+    cross = functools.partial(_cross, pair.steps, rule, width, first, costs, sums, *lanes, layers)
     both(lambda: make(upper, one), lambda: make(lower, other))
     both(lambda: arrive(upper, 1, one), lambda: arrive(lower, -1, other))
     both(lambda: cross(lower, 1, one), lambda: cross(upper, -1, other))
@@ -244,10 +244,12 @@ def _next_from(row, place, cost, p1, p2, width):
 
 
 @kernel
-def _cross(steps, rule, width, first, costs, sums, lowest, highest, pixels, evidence, span, step, rows):
-    """Disparities and evidence of rows span[0] to span[1] (exclusive), into which a sweep goes on that has come with
-    the paths in `rows`; the sums of the other are there. As `selection` finds and checks them."""
-    n, columns = lanes_in(width), first.shape[1]
+def _cross(steps, rule, width, first, costs, sums, lowest, highest, layers, span, step, rows):
+    """Disparities, evidence and source of rows span[0] to span[1] (exclusive), as `selection` finds and checks them.
+
+    A sweep that arrives with the paths in `rows` continues into these rows. The sums of the other sweep are there.
+    """
+    (pixels, evidence, source), n, columns = layers, lanes_in(width), first.shape[1]
     total, best = np.empty(columns * n, np.uint8), np.empty(columns + n, np.uint8)
     order = np.arange(highest - lowest + n).astype(np.uint16)
     chosen = np.zeros(columns + n, np.uint16)  # by the right image's pixels, backwards, less `lowest`
@@ -272,12 +274,14 @@ def _cross(steps, rule, width, first, costs, sums, lowest, highest, pixels, evid
             store(best, right, lesser(both, known))
         for x in range(columns):
             partners[x] = chosen[columns - 1 - x + begin[x] + winner[x]] + lowest - begin[x]
-        fit_row(winner, votes, partners, begin, n - 1, rule, pixels[y], evidence[y])
+        fit_row(winner, votes, partners, begin, n - 1, rule, pixels[y], evidence[y], source[y])
 
 
-def search_around_reference(pair: MatchingInputs, rule: SgmParams, windows: SearchWindows) -> tuple[Array, Array]:
-    """Disparities and evidence as of `search_around`, in plain numpy: in volumes of all disparities of any window, with
-    255 for those that are not in the pixel's own."""
+def search_around_reference(pair: MatchingInputs, rule: SgmParams, windows: SearchWindows) -> list[Array]:
+    """The layers of `search_around` in plain numpy.
+
+    It works in volumes of all disparities of any window, with 255 for disparities outside the pixel's own window.
+    """
     first, n = windows.first, windows.width.lanes
     lanes = first[..., np.newaxis] - first.min() + np.arange(n)
     searched = np.zeros((*first.shape, int(lanes.max()) + 1), bool)
@@ -290,10 +294,8 @@ def search_around_reference(pair: MatchingInputs, rule: SgmParams, windows: Sear
     np.put_along_axis(costs, lanes, np.minimum(np.take_along_axis(costs, lanes, axis=2) + pull, 255), axis=2)
     sums = sum(aggregate_reference(pair.steps, rule, costs, searched, sign) for sign in (1, -1))
     total = np.where(searched, np.minimum(sums, 255), 255)
-    pixels, evidence = np.empty(first.shape, np.float32), np.empty(first.shape, np.uint8)
-    for y in range(first.shape[0]):
-        pixels[y], evidence[y] = select_reference(total[y], first[y], int(first.min()), n, rule)
-    return pixels, evidence
+    rows = [select_reference(total[y], first[y], int(first.min()), n, rule) for y in range(first.shape[0])]
+    return [np.stack(layer) for layer in zip(*rows, strict=True)]
 
 
 def _raw_costs_reference(pair: MatchingInputs, rule: SgmParams, first: Array, n: int) -> Array:

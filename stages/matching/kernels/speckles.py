@@ -17,15 +17,17 @@ from stages.compiled.jit import kernel
 from stages.compiled.parallel import Fork, by_bands, in_turn
 from stages.compiled.union_find import join, root
 from stages.compiled.workspace import Workspace
-from stages.data import Array
+from stages.data import Array, PixelOrigin
+
+SPECKLE = int(PixelOrigin.SPECKLE)
 
 
 def drop_speckles(
-    disparity: Array, evidence: Array, step: float, largest: int, space: Workspace, both: Fork = in_turn
+    disparity: Array, evidence: Array, source: Array, step: float, largest: int, space: Workspace, both: Fork = in_turn
 ) -> None:
-    """Set patches of at most `largest` pixels to NaN, and their evidence to 0, in place.
+    """Set patches of at most `largest` pixels to NaN, their evidence to 0 and their source to SPECKLE, in place.
 
-    disparity: (H, W) float32, px, NaN = unknown; evidence: (H, W) uint8; step: px; space: where the runs are kept;
+    disparity: (H, W) float32, px, NaN = unknown; evidence, source: (H, W) uint8; step: px; space: memory for the runs;
     both: calls two functions, on one thread or two.
     """
     if largest == 0:
@@ -41,7 +43,8 @@ def drop_speckles(
         bands[first] = _find_runs(disparity, first, end, limit, runs, seams, goes_on), seams
 
     def drop(first: int, _: int) -> None:
-        _drop(disparity.reshape(-1), evidence.reshape(-1), runs, first * columns, bands[first][0], largest)
+        layers = disparity.reshape(-1), evidence.reshape(-1), source.reshape(-1)
+        _drop(*layers, runs, first * columns, bands[first][0], largest)
 
     by_bands(both, len(disparity), find)
     for upper, lower in itertools.pairwise(sorted(bands)):
@@ -108,7 +111,7 @@ def _join_bands(disparity, y, step, runs, above, below):
 
 
 @kernel
-def _drop(pixels, strength, runs, first, last, largest):
+def _drop(pixels, strength, source, runs, first, last, largest):
     start, end, parent, area = runs
     for run in range(first, last):
         patch = run
@@ -116,10 +119,10 @@ def _drop(pixels, strength, runs, first, last, largest):
             patch = parent[patch]
         if area[patch] <= largest:
             for i in range(start[run], end[run]):
-                pixels[i], strength[i] = np.nan, 0
+                pixels[i], strength[i], source[i] = np.nan, 0, SPECKLE
 
 
-def drop_speckles_reference(disparity: Array, evidence: Array, step: float, largest: int) -> None:
+def drop_speckles_reference(disparity: Array, evidence: Array, source: Array, step: float, largest: int) -> None:
     """`drop_speckles` by the connected components of a graph of pixels."""
     index = np.arange(disparity.size).reshape(disparity.shape)
     with np.errstate(invalid="ignore"):
@@ -130,4 +133,4 @@ def drop_speckles_reference(disparity: Array, evidence: Array, step: float, larg
     graph = coo_array((np.ones(len(first), np.uint8), (first, second)), shape=(index.size, index.size))
     labels = connected_components(graph, directed=False)[1].reshape(disparity.shape)
     small = (np.bincount(labels.ravel())[labels] <= largest) & np.isfinite(disparity)
-    disparity[small], evidence[small] = np.nan, 0
+    disparity[small], evidence[small], source[small] = np.nan, 0, SPECKLE

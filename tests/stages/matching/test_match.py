@@ -22,10 +22,12 @@ from tests.bench.stereo_scores import load_scene, rows_filled
 from tests.stages.matching.test_match_opencv import frame_of, slanted_pair, textured
 
 ROOT = Path(__file__).parents[3]
+REASONS = range(PixelOrigin.OUT_OF_VIEW, PixelOrigin.BLANK + 1)
+LAYERS = "pixels", "source", "confidence"
 
 
 def same(one, other):
-    return all(getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in ("pixels", "confidence"))
+    return all(getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in LAYERS)
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +146,7 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
     for minimum in (-9, 0, 7):
         result = Match(disparities=32, min_disparity=minimum)(frame_of(image, image))
         assert np.isnan(result.pixels).all()
-        assert (result.source == PixelOrigin.UNKNOWN).all()
+        assert (result.source == PixelOrigin.BLANK).all()
         assert (result.confidence == 0).all()
 
 
@@ -164,6 +166,7 @@ def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, dispariti
     assert (result.pixels[known] >= minimum).all()
     assert (result.pixels[known] <= minimum + disparities - 1).all()
     assert np.array_equal(result.source == PixelOrigin.MEASURED, known)
+    assert np.isin(result.source[~known], REASONS).all()
     assert (result.confidence[known] > 0).all()
     assert (result.confidence[~known] == 0).all()
     assert same(result, replace(match, threads=2)(frame_of(left, right)))
@@ -218,7 +221,7 @@ def test_turning_the_images_upside_down_turns_the_result():
     frame, _ = slanted_pair(height=97, width=150)
     result = Match(disparities=40)(frame)
     turned = Match(disparities=40)(frame_of(frame.left[::-1].copy(), frame.right[::-1].copy()))
-    assert same(result, replace(turned, pixels=turned.pixels[::-1], confidence=turned.confidence[::-1]))
+    assert same(result, replace(turned, **{name: getattr(turned, name)[::-1] for name in LAYERS}))
 
 
 def test_a_prior_decides_where_the_images_do_not():

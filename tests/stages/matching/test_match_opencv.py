@@ -87,7 +87,7 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
     image = np.full((64, 96), level, dtype)
     result = MatchOpenCV(disparities=32)(frame_of(image, image))
     assert np.isnan(result.pixels).all()
-    assert (result.source == PixelOrigin.UNKNOWN).all()
+    assert (result.source == PixelOrigin.BLANK).all()
     assert (result.confidence == 0).all()
 
 

@@ -46,7 +46,7 @@ def test_enlarging_doubles_disparities_between_pixels_of_one_surface_only():
     pixels = ((8 + 0.1 * (2 * y + 0.5)) / 2).astype(np.float32)
     pixels[:, 40:] += 20
     pixels[10:20, 10:20] = np.nan
-    source = np.where(np.isnan(pixels), PixelOrigin.UNKNOWN, PixelOrigin.PLANE).astype(np.uint8)
+    source = np.where(np.isnan(pixels), PixelOrigin.SPECKLE, PixelOrigin.PLANE).astype(np.uint8)
     large = Upsample()(frame, Disparity(7, pixels, source, np.full(pixels.shape, 0.7, np.float32)))
     assert large.pixels.shape == truth.shape
     known = np.isfinite(large.pixels)
@@ -56,6 +56,7 @@ def test_enlarging_doubles_disparities_between_pixels_of_one_surface_only():
     assert np.nanmax(np.abs(large.pixels - truth)[far]) < 0.11
     assert np.nanmax(np.abs(large.pixels - truth - 40)[near]) < 0.11
     assert (large.source[known] == PixelOrigin.PLANE).all()
+    assert (large.source[~known] == PixelOrigin.SPECKLE).all()
 
 
 def test_swapping_twice_is_the_frame_itself_and_disparities_stay():
@@ -77,7 +78,7 @@ def test_contradictions_equal_the_reference(height, width, tolerance, seed, thre
     rng = np.random.default_rng(seed)
     maps = rng.uniform(-3, 9, (2, height, width)).astype(np.float32)
     maps[rng.random(maps.shape) < 0.2] = np.nan
-    sources, worth = rng.integers(0, 4, maps.shape, np.uint8), rng.random(maps.shape).astype(np.float32)
+    sources, worth = rng.integers(0, 11, maps.shape, np.uint8), rng.random(maps.shape).astype(np.float32)
     found, backward = zip(maps, sources, worth, strict=True)
     for largest in (np.inf, 5.0):
         left = drop_contradicted(found, backward, tolerance, largest, threads)
@@ -93,7 +94,7 @@ def test_what_the_right_image_sees_otherwise_is_unknown():
     given = Disparity(1, pixels, np.ones((2, 40), np.uint8), np.full((2, 40), 0.9, np.float32))
     checked = LeftRightCheck()(given, Disparity(1, backward, given.source, given.confidence))
     assert np.argwhere(np.isnan(checked.pixels)).tolist() == [[0, 20]]
-    assert (checked.source[0, 20], checked.confidence[0, 20]) == (PixelOrigin.UNKNOWN, 0)
+    assert (checked.source[0, 20], checked.confidence[0, 20]) == (PixelOrigin.LEFT_RIGHT, 0)
     beyond = LeftRightCheck(disparities=4)(given, Disparity(1, backward, given.source, given.confidence))
     assert np.isfinite(beyond.pixels).all()  # 5 px was not searched for from the right
 

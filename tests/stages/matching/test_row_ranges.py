@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from stages.compiled.simd import Width
 from stages.data import Disparity, PixelOrigin
 from stages.matching.kernels.aggregation import aggregate_reference
-from stages.matching.kernels.blank_windows import blank_windows, drop_blank
+from stages.matching.kernels.blank_windows import contrast, drop_unmatchable_reference
 from stages.matching.kernels.census import census_costs_reference
 from stages.matching.kernels.gradient import smoothed_costs_reference
 from stages.matching.kernels.matching_inputs import describe
@@ -127,18 +127,22 @@ def test_disparities_are_those_of_a_search_that_lacks_the_rest_of_the_range(
     for each in ranges:
         searched[each.top : each.end, :, each.first : each.first + each.width.lanes] = True
     down, up = (aggregate_reference(pair.steps, rule, costs, searched, sign, beside=False) for sign in (1, -1))
-    pixels, evidence = np.empty(truth.shape, np.float32), np.empty(truth.shape, np.uint8)
+    pixels, evidence, source = (np.empty(truth.shape, kind) for kind in (np.float32, np.uint8, np.uint8))
     for each in ranges:
         n, least = min(each.width.lanes, disparities), minimum + each.first
         total = np.minimum(down + up, 255)[:, :, each.first : each.first + n]
         for y in range(each.top, each.end):
-            pixels[y], evidence[y] = select_reference(total[y], np.full(columns, least), least, n, rule)
-    drop_blank(*(blank_windows(image, 0, len(image)) for image in (left, right)), pixels, evidence)
+            row = select_reference(total[y], np.full(columns, least), least, n, rule)
+            pixels[y], evidence[y], source[y] = row
+    contrasts = (contrast(image, 0, len(image)) for image in (left, right))
+    drop_unmatchable_reference(*contrasts, np.empty((0, 0), np.uint8), pixels, evidence, source)
     np.testing.assert_array_equal(found.pixels, pixels)
+    np.testing.assert_array_equal(found.source, source)
     np.testing.assert_array_equal(found.confidence, rule.calibration[evidence])
     for threads, memory in ((2, 1 << 30), (1, 1), (2, 1)):
         again = match(left, right, rule, guide, ranges, None, threads, memory)
         np.testing.assert_array_equal(again.pixels, found.pixels)
+        np.testing.assert_array_equal(again.source, found.source)
         np.testing.assert_array_equal(again.confidence, found.confidence)
 
 

@@ -9,6 +9,8 @@ from numba import njit
 from stages.compiled.parallel import shared_by
 from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace
+from stages.data import PixelOrigin
+from stages.matching.kernels.blank_windows import drop_unmatchable, drop_unmatchable_reference
 from stages.matching.kernels.row_ranges import lanes_for
 from stages.matching.kernels.selection import find_partners, find_winners, fit_row, select_reference
 from stages.matching.kernels.speckles import drop_speckles, drop_speckles_reference
@@ -16,10 +18,10 @@ from tests.stages.matching.test_census import rule_of
 
 
 @njit
-def select(total, beyond, guard, step, winner, votes, right, partners, first, rule, pixels, evidence, width):
+def select(total, beyond, guard, step, winner, votes, right, partners, first, rule, layers, width):
     find_winners(total, beyond, guard, step, winner, votes, right, width)
     find_partners(winner, right, partners)
-    fit_row(winner, votes, partners, first, rule.disparities - 1, rule, pixels, evidence)
+    fit_row(winner, votes, partners, first, rule.disparities - 1, rule, *layers)
 
 
 @pytest.mark.parametrize("disparities", [9, 64, 90, 300])
@@ -39,14 +41,14 @@ def test_a_row_is_selected_as_by_the_reference_in_either_direction(disparities, 
     index = np.uint8 if lanes <= 256 else np.uint16
     for step in (1, -1):
         rows = np.empty(columns, np.int16), np.empty((4, columns), np.uint16), np.empty(columns + lanes, index)
-        pixels, evidence = np.empty(columns, np.float32), np.empty(columns, np.uint8)
+        layers = tuple(np.empty(columns, kind) for kind in (np.float32, np.uint8, np.uint8))
         partners, first = np.empty(columns, np.int16), np.full(columns, minimum, np.int32)
         flat = np.append(total.ravel(), np.zeros(64, np.uint8))
-        select(flat, beyond, guard, step, *rows, partners, first, rule, pixels, evidence, width)
-        assert np.array_equal(pixels, expected[0], equal_nan=True)
-        assert np.array_equal(evidence, expected[1])
+        select(flat, beyond, guard, step, *rows, partners, first, rule, layers, width)
+        for ours, plain in zip(layers, expected, strict=True):
+            np.testing.assert_array_equal(ours, plain)
     if disparities >= 64 and minimum == 0:
-        assert np.isfinite(pixels).sum() > 40
+        assert np.isfinite(layers[0]).sum() > 40
 
 
 @settings(max_examples=60, deadline=None)
@@ -56,11 +58,29 @@ def test_speckles_are_the_small_components_of_a_graph(height, columns, largest, 
     disparity = rng.integers(0, 4, (height, columns)).astype(np.float32)
     disparity[rng.random(disparity.shape) < 0.2] = np.nan
     evidence = np.where(np.isfinite(disparity), 9, 0).astype(np.uint8)
-    wanted, wanted_evidence = disparity.copy(), evidence.copy()
-    drop_speckles_reference(wanted, wanted_evidence, 1.0, largest)
+    source = np.where(evidence > 0, PixelOrigin.MEASURED, PixelOrigin.LEFT_RIGHT).astype(np.uint8)
+    wanted = disparity.copy(), evidence.copy(), source.copy()
+    drop_speckles_reference(*wanted, 1.0, largest)
     for threads in (1, 2):
-        found, found_evidence = disparity.copy(), evidence.copy()
+        found = disparity.copy(), evidence.copy(), source.copy()
         both = shared_by(threads)
-        drop_speckles(found, found_evidence, 1.0, largest, Workspace(), both)
-        assert np.array_equal(found, wanted, equal_nan=True)
-        assert np.array_equal(found_evidence, wanted_evidence)
+        drop_speckles(*found, 1.0, largest, Workspace(), both)
+        for ours, plain in zip(found, wanted, strict=True):
+            np.testing.assert_array_equal(ours, plain)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 12), st.integers(1, 30), st.booleans(), st.integers(0, 2**32 - 1))
+def test_excluded_and_blank_pixels_are_dropped_as_by_the_reference(height, columns, excludes, seed):
+    rng = np.random.default_rng(seed)
+    shape = height, columns
+    contrasts = rng.integers(0, 3, (2, *shape)).astype(np.uint8)
+    excluded = rng.choice(np.array([0, 5, 6], np.uint8), shape if excludes else (0, 0))
+    evidence = rng.integers(0, 3, shape).astype(np.uint8)
+    pixels = np.where(evidence > 0, rng.uniform(-3, 9, shape), np.nan).astype(np.float32)
+    source = np.where(evidence > 0, 1, 7).astype(np.uint8)
+    wanted, found = ([layer.copy() for layer in (pixels, evidence, source)] for _ in range(2))
+    drop_unmatchable_reference(*contrasts, excluded, *wanted)
+    drop_unmatchable(*contrasts, excluded, *found)
+    for ours, plain in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(ours, plain)
