@@ -36,6 +36,7 @@ from stages.matching.match_health import CheckMatches
 from stages.matching.match_opencv import MatchOpenCV
 from stages.matching.pyramid import Halve, SwapViews, Upsample
 from stages.rectification.rectify import Rectify
+from stages.refinement.paper import RefinePaper
 from stages.refinement.refine import Refine
 from stages.terrain.binarise import Binarise
 from stages.terrain.dem import Voxelise
@@ -69,6 +70,7 @@ __all__ = [
     "PoseFilter",
     "Rectify",
     "Refine",
+    "RefinePaper",
     "Reproject",
     "Rover",
     "StereoCamera",

@@ -139,7 +139,7 @@ def part_of_range(part: int) -> Chain:
 
 def by_rows(streams: dict[str, Any], case: Case) -> Disparity:
     """`rover` with holes filled along their rows, from the farther end, without asking the image."""
-    found = refined("checked_again", fill="none")(streams, case)
+    found = refined("checked_again", fill=False)(streams, case)
     return replace(found, pixels=rows_filled(found.pixels))
 
 
@@ -180,9 +180,7 @@ VARIANTS: dict[str, Chain] = {
     "rover without surfaces": refined("checked_again", surface_size=0),
     "rover, planes draw more: 0.7": refined("checked_again", plane_weight=0.7),
     "rover, planes draw less: 0.3": refined("checked_again", plane_weight=0.3),
-    "rover, planes replace matches": refined("checked_again", max_correction=1000, plane_weight=1, min_inlier_share=0),
     "rover, holes filled along rows": by_rows,
-    "rover, holes filled by WLS": refined("checked_again", fill="wls"),
     "rover, bilateral radius 6": refined("checked_again", bilateral_radius=6),
     "rover, edges of radius 5": refined("checked_again", edge_radius=5),
     "rover, 64 planes tried": refined("checked_again", hypotheses=64),

@@ -27,18 +27,20 @@ from stages.refinement.kernels.plane_fit import Planes, fit_planes
 from stages.refinement.kernels.region_merging import surfaces
 from stages.refinement.kernels.slic import superpixels
 from stages.refinement.kernels.subpixel import fit_brightness
-from stages.refinement.kernels.valid_extent import Extent, extent, within_reach
-from stages.refinement.kernels.wls import smooth
+from stages.refinement.kernels.valid_extent import Extent, extent
 from stages.stage import Stage, check_joined, check_same_time, parameter
 
 F32 = np.float32
+SATURATION_LEVEL = 250  # 8-bit level from which an even patch is saturated, a sky for example
+MAX_CORRECTION = 1.0  # px; a match farther from its median or plane stays as it is
+INLIER_DISTANCE = 0.5  # px, from a plane
+MIN_INLIER_SHARE, MIN_VALID_SHARE = 0.8, 0.6  # of a superpixel with an accepted plane; a surface needs half the matches
+MAX_GRADIENT = 0.5  # px/px, of an accepted plane
 EVEN = 6  # gray levels within a census window that a camera's noise and compression make of one
 COMPACTNESS = 10.0  # SLIC's weight of position against colour, CIELAB units
-SMOOTHING, EDGE = 8000.0, 1.0  # the paper's: lambda of the WLS; gray levels over which its coupling falls to 1/e
 BILATERAL_GRAY, BILATERAL_DISPARITY = 10.0, 1.0  # scales of the bilateral filter, gray levels and px
 JUMP = 2.0  # px, between neighbours, beyond which there is an edge of depth
 JUMP_GRAY = 10.0  # gray levels over which a neighbour's weight falls to 1/e there
-LEAST_WEIGHT = 0.05  # of a match that was let in, however low its confidence
 # Measured with the pipeline `rover` by tests/study.py: the mean of eight Middlebury scenes and of simulated frames.
 TRUST = Trust(
     agreed=(0.88, 0.98, 0.998), alone=(0.62, 0.86, 0.97), replaced=0.81, plane=0.79, mismatch=0.72, occlusion=0.66
@@ -50,43 +52,29 @@ class Refine(Stage):
     """A denser and smoother disparity image, with the superpixels it was made with.
 
     Only MEASURED pixels are matches; all others count as holes. First brightness tells their fraction of a pixel, which
-    matching draws to 0. What then moves by at most `inlier_distance` stays MEASURED, where the images bear it out;
+    matching draws to 0. What then moves by at most INLIER_DISTANCE stays MEASURED, where the images bear it out;
     where they do not, as in a noisy sky, it becomes FILLED.
     A match that moves farther has been replaced by what lies about it: it becomes PLANE, as a hole that a plane fills.
     Without planes, `plane_weight` 0 and no `plane_fill`, no superpixels are made.
-    With `fill` background the other holes are filled from what lies about them and looks like them, from the farther
-    surface where there are two; with wls by the confidence-weighted smoother. The confidence is the share of pixels of
-    that origin that were right within 1 px.
+    With `fill` the other holes are filled from what lies about them and looks like them, from the farther surface where
+    there are two. The confidence is the share of pixels of that origin that were right within 1 px.
     """
 
     min_confidence: float = parameter(0.5, "confidence below which a match is treated as unknown", low=0, high=1)
-    saturation_level: int = parameter(
-        250, "level of a colour from which an even patch is burnt out, a sky say, and matches nothing; 256 = never",
-        low=0, high=256,
-    )  # fmt: skip
     subpixel_radius: int = parameter(
         2, "radius of the windows by which brightness tells the fraction of a pixel of a match, 0 = not asked",
         unit="px", low=0, high=16,
     )  # fmt: skip
     median_size: int = parameter(5, "side of the median filter over matches, 0 = none", unit="px", choices=(0, 3, 5))
-    max_correction: float = parameter(
-        1.0, "distance up to which a match moves to its median or plane; a farther one stays", unit="px", low=0
-    )
     superpixels: int = parameter(4000, "number of superpixels aimed at", low=1)
     min_superpixel_size: int = parameter(
         300, "pixels that a superpixel shall have on average; a small image gets fewer", unit="px", low=1
     )
     surface_size: int = parameter(16, "superpixels in a surface, the larger support of planes; 0 = none", low=0)
-    inlier_distance: float = parameter(0.5, "deviation from a plane that makes an outlier", unit="px", low=0.01)
     hypotheses: int = parameter(16, "planes tried per segment", low=1)
-    min_inlier_share: float = parameter(0.8, "least share of inliers for a plane to be accepted", low=0, high=1)
-    min_valid_share: float = parameter(
-        0.6, "least share of matched pixels for a plane to be accepted, in a surface half of it", low=0, high=1
-    )
-    max_gradient: float = parameter(0.5, "steepest disparity gradient of an accepted plane", unit="px/px", low=0)
     plane_weight: float = parameter(0.5, "weight of the plane against a match near to it", low=0, high=1)
     plane_fill: bool = parameter(True, "whether an accepted plane also fills the holes of its segment")
-    fill: str = parameter("background", "how the other holes are filled", choices=("background", "wls", "none"))
+    fill: bool = parameter(True, "whether the remaining holes are filled from the background")
     max_fill_distance: float = parameter(
         64.0, "distance from which a hole is still filled; what is hidden here, from any", unit="px", low=0
     )
@@ -112,23 +100,21 @@ class Refine(Stage):
         guide, right = gray(image), gray(other)
         matches, weights = trusted_matches(
             disparity.pixels, disparity.source, disparity.confidence, self.min_confidence,
-            _burnt_out(frame.left, guide, self.saturation_level, self.threads), self.threads,
+            _burnt_out(frame.left, guide, SATURATION_LEVEL, self.threads), self.threads,
         )  # fmt: skip
         if self.subpixel_radius:
             matches = fit_brightness(guide, right, matches, self.subpixel_radius, self.threads)
-        pixels = (
-            near_median(matches, self.median_size, self.max_correction, self.threads) if self.median_size else matches
-        )
+        pixels = near_median(matches, self.median_size, MAX_CORRECTION, self.threads) if self.median_size else matches
         within, labels, agreed = extent(pixels, self.threads), None, np.zeros(pixels.shape, bool)
         if self.plane_weight or self.plane_fill:
             labels, count = superpixels(image, self._count(pixels.size), COMPACTNESS, threads=self.threads)
             pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
-        filled, kinds = self._filled(pixels, weights, within, image, guide)
+        filled, kinds = self._filled(pixels, within, image)
         guessed = kinds != KEPT
         refined = self._sharpened(self._bilateral(filled, guide), guessed, guide)
         source, confidence = label_origin(
             matches, disparity.confidence, agreed, kinds, refined,
-            self._borne_out(refined, guessed, guide, right), self.inlier_distance, TRUST, self.threads,
+            self._borne_out(refined, guessed, guide, right), INLIER_DISTANCE, TRUST, self.threads,
         )  # fmt: skip
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
 
@@ -140,10 +126,10 @@ class Refine(Stage):
     ) -> tuple[Array, Array]:
         """Matches near their planes drawn towards them, holes filled from them, (H, W) float32; where, (H, W) bool."""
         margin = self.max_extrapolation if self.plane_fill else -1
-        planes = fit_planes(pixels, labels, count, weights, self.hypotheses, self.inlier_distance, seed, self.threads)
-        accepted = self._accepted(planes, self.min_valid_share)
+        planes = fit_planes(pixels, labels, count, weights, self.hypotheses, INLIER_DISTANCE, seed, self.threads)
+        accepted = self._accepted(planes, MIN_VALID_SHARE)
         pixels, agreed = pull_to_planes(
-            pixels, accepted, labels, within, self.max_correction, self.plane_weight, margin, self.threads
+            pixels, accepted, labels, within, MAX_CORRECTION, self.plane_weight, margin, self.threads
         )
         if not self.surface_size:
             return pixels, agreed
@@ -156,11 +142,11 @@ class Refine(Stage):
         sparse[weights[few] == 0] = np.nan  # what the first planes filled is no evidence for the second
         planes = fit_planes(
             sparse, group.take(regions), groups, np.ascontiguousarray(weights[few]), self.hypotheses,
-            self.inlier_distance, seed + 1, self.threads,
+            INLIER_DISTANCE, seed + 1, self.threads,
         )  # fmt: skip
-        accepted = (self._accepted(planes, self.min_valid_share / 2, 2) * [0.5, 0.5, 1])[group]
+        accepted = (self._accepted(planes, MIN_VALID_SHARE / 2, 2) * [0.5, 0.5, 1])[group]
         pixels, again = pull_to_planes(
-            pixels, accepted, labels, within, self.max_correction / 2, self.plane_weight, margin, self.threads
+            pixels, accepted, labels, within, MAX_CORRECTION / 2, self.plane_weight, margin, self.threads
         )
         return pixels, agreed | again
 
@@ -168,23 +154,14 @@ class Refine(Stage):
         """The coefficients (n, 3) of the planes that the evidence supports, of pixels `spacing` px apart; NaN for the
         others."""
         slope = np.hypot(planes.coefficients[:, 0], planes.coefficients[:, 1])
-        supported = (planes.inlier_share >= self.min_inlier_share) & (planes.valid_share >= valid_share)
-        return np.where((supported & (slope <= self.max_gradient * spacing))[:, None], planes.coefficients, np.nan)
+        supported = (planes.inlier_share >= MIN_INLIER_SHARE) & (planes.valid_share >= valid_share)
+        return np.where((supported & (slope <= MAX_GRADIENT * spacing))[:, None], planes.coefficients, np.nan)
 
-    def _filled(
-        self, pixels: Array, confidence: Array, within: Extent, image: Array, guide: Array
-    ) -> tuple[Array, Array]:
+    def _filled(self, pixels: Array, within: Extent, image: Array) -> tuple[Array, Array]:
         """The remaining holes filled as far as evidence reaches, (H, W) float32, and their kinds of `holes`."""
-        if self.fill == "background":
+        if self.fill:
             return fill_holes(pixels, image, within, self.max_fill_distance, self.max_extrapolation, self.threads)
-        hole = np.isnan(pixels)
-        kinds = np.where(hole, np.uint8(OCCLUSION), np.uint8(0))
-        if self.fill == "none":
-            return pixels, kinds
-        weights = np.where(hole, F32(0), np.maximum(confidence, F32(LEAST_WEIGHT)))
-        smoothed = smooth(pixels, weights, guide, SMOOTHING, EDGE)
-        smoothed[~within_reach(pixels, within, self.max_fill_distance, self.max_extrapolation)] = np.nan
-        return np.where(hole, smoothed, pixels), kinds
+        return pixels, np.where(np.isnan(pixels), np.uint8(OCCLUSION), np.uint8(KEPT))
 
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
         if self.bilateral_radius == 0:

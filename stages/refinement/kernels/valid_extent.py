@@ -49,15 +49,6 @@ def extent(disparity: Array, threads: int = 1) -> Extent:
     return found
 
 
-def within_reach(disparity: Array, within: Extent, reach: float, margin: float) -> Array:
-    """Where a pixel is known at most `reach` px away, and `margin` px beyond the evidence at the most, (H, W) bool."""
-    row, column = np.arange(disparity.shape[0])[:, np.newaxis], np.arange(disparity.shape[1])
-    near: Array = cv2.distanceTransform(np.isnan(disparity).astype(np.uint8), cv2.DIST_L2, 5) <= reach
-    near &= (row >= within.top - margin) & (column >= within.first[:, np.newaxis] - margin)
-    near &= column <= within.last[:, np.newaxis] + margin
-    return near
-
-
 @kernel
 def _find_top(known, top):
     missing = top.size

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from stages.data import Disparity, PixelOrigin, StereoCamera, StereoFrame
+from stages.refinement import refine as module
 from stages.refinement.refine import EVEN, Refine, _burnt_out
 from tests.bench.stereo_scores import paper_stages
 
@@ -34,10 +35,9 @@ def box():
     return frame, Disparity(5, pixels, source, confidence, camera=camera), truth.astype(np.float32)
 
 
-@pytest.mark.parametrize("parameters", [{}, {"fill": "wls"}])
-def test_noise_falls_and_holes_close_on_the_right_side_of_edges(box, parameters):
+def test_noise_falls_and_holes_close_on_the_right_side_of_edges(box):
     frame, matches, truth = box
-    refined = Refine(superpixels=200, min_superpixel_size=1, **parameters)(frame, matches)
+    refined = Refine(superpixels=200, min_superpixel_size=1)(frame, matches)
     error = np.abs(refined.pixels - truth)
     measured = np.isfinite(matches.pixels)
     assert np.sqrt(np.mean(error[measured] ** 2)) < 0.5 * np.sqrt(np.mean((matches.pixels - truth)[measured] ** 2))
@@ -86,13 +86,14 @@ def flat_scene(level=8.0):
 
 
 @pytest.mark.parametrize("median", [0, 5])
-def test_a_match_that_is_replaced_is_called_plane_and_loses_its_confidence(median):
+def test_a_match_that_is_replaced_is_called_plane_and_loses_its_confidence(median, monkeypatch):
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80] = 30
     matches = Disparity(5, pixels, source, confidence)
-    replaced = Refine(max_correction=1000, plane_weight=1, min_inlier_share=0, median_size=median, min_correlation=0)(
-        frame, matches
-    )
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "MAX_CORRECTION", 1000.0)
+        patch.setattr(module, "MIN_INLIER_SHARE", 0)
+        replaced = Refine(plane_weight=1, median_size=median, min_correlation=0)(frame, matches)
     assert replaced.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert replaced.source[60, 80] == PixelOrigin.PLANE
     assert replaced.confidence[60, 80] < 0.85
@@ -102,13 +103,13 @@ def test_a_match_that_is_replaced_is_called_plane_and_loses_its_confidence(media
     assert kept.confidence[60, 80] == np.float32(0.97)
 
 
-def test_a_lone_match_has_no_median_and_stays():
+def test_a_lone_match_has_no_median_and_stays(monkeypatch):
+    monkeypatch.setattr(module, "MAX_CORRECTION", 1000.0)
+    monkeypatch.setattr(module, "MIN_INLIER_SHARE", 1)
     frame, pixels, source, confidence = flat_scene(5.0)
     pixels[50:70, 60:100], source[50:70, 60:100] = np.nan, 0
     pixels[60, 80], source[60, 80] = 20, 1
-    refine = Refine(
-        max_correction=1000, fill="none", plane_fill=False, superpixels=1, min_superpixel_size=1, min_inlier_share=1
-    )
+    refine = Refine(fill=False, plane_fill=False, superpixels=1, min_superpixel_size=1)
     refined = refine(frame, Disparity(5, pixels, source, confidence))
     assert refined.pixels[60, 80] == pytest.approx(20, abs=0.01)
 
@@ -117,24 +118,24 @@ def test_a_match_of_little_confidence_counts_as_unknown():
     frame, pixels, source, confidence = flat_scene()
     pixels[30:60, 40:80], confidence[30:60, 40:80] = 40, 0.3
     matches = Disparity(5, pixels, source, confidence)
-    bare = {"fill": "none", "plane_fill": False}
+    bare = {"fill": False, "plane_fill": False}
     doubted = Refine(min_confidence=0.31, **bare)(frame, matches)
     assert np.array_equal(np.isnan(doubted.pixels), confidence < 0.31)
     assert np.isfinite(Refine(min_confidence=0.3, **bare)(frame, matches).pixels).all()
 
 
-def test_a_plane_steeper_than_allowed_fills_nothing():
+def test_a_plane_steeper_than_allowed_fills_nothing(monkeypatch):
     frame, pixels, source, confidence = flat_scene()
     pixels += 0.4 * np.arange(WIDTH, dtype=np.float32)
     hole = np.s_[50:55, 70:75]
     pixels[hole], source[hole] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
-    filled = Refine(superpixels=60, min_superpixel_size=1, fill="none", max_gradient=0.45)(frame, matches)
+    refine = Refine(superpixels=60, min_superpixel_size=1, fill=False)
+    filled = refine(frame, matches)
     assert (filled.source[hole] == PixelOrigin.PLANE).all()
     assert np.abs(filled.pixels[hole] - (8 + 0.4 * np.arange(70, 75))).max() < 0.1
-    assert np.isnan(
-        Refine(superpixels=60, min_superpixel_size=1, fill="none", max_gradient=0.35)(frame, matches).pixels[hole]
-    ).all()
+    monkeypatch.setattr(module, "MAX_GRADIENT", 0.35)
+    assert np.isnan(refine(frame, matches).pixels[hole]).all()
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -144,7 +145,7 @@ def test_a_plane_is_not_followed_beyond_the_range_of_all_matches(side):
     pixels[:, 150:], source[:, 150:] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
     # One superpixel: its plane would go on to the image's right border.
-    filled = Refine(superpixels=1, min_superpixel_size=1, fill="none", median_size=0)(frame, matches)
+    filled = Refine(superpixels=1, min_superpixel_size=1, fill=False, median_size=0)(frame, matches)
     assert np.isfinite(filled.pixels[:, :149]).all()
     assert np.isnan(filled.pixels[:, 151:]).all()
 
@@ -183,9 +184,10 @@ def bits(disparity):
 
 
 @pytest.mark.parametrize(
-    "parameters", [{"surface_size": 0, "superpixels": 200}, {"superpixels": 40, "min_valid_share": 0.95}]
+    ("parameters", "min_valid"), [({"surface_size": 0, "superpixels": 200}, 0.6), ({"superpixels": 40}, 0.95)]
 )
-def test_the_stamp_decides_every_bit(box, parameters):
+def test_the_stamp_decides_every_bit(box, parameters, min_valid, monkeypatch):
+    monkeypatch.setattr(module, "MIN_VALID_SHARE", min_valid)
     frame, matches, _ = box
     # Of one draw another seed makes another plane; so sure of matches, only those of surfaces are accepted.
     refine = Refine(min_superpixel_size=1, hypotheses=1, **parameters)
@@ -203,8 +205,8 @@ def test_two_frames_at_once_give_the_bits_of_one_after_the_other(box):
     turned = replace(matches, **{name: getattr(matches, name)[::-1].copy() for name in FIELDS[:3]})
     upside_down = replace(frame, left=frame.left[::-1].copy(), right=frame.right[::-1].copy())
     jobs = [(frame, matches), (upside_down, turned)] * 6
-    for parameters in ({"threads": 1}, {"threads": 2}, {"fill": "wls"}):
-        refine = Refine(superpixels=200, min_superpixel_size=1, **parameters)
+    for threads in (1, 2):
+        refine = Refine(superpixels=200, min_superpixel_size=1, threads=threads)
         alone = [bits(refine(*job)) for job in jobs[:2]]
         with ThreadPoolExecutor(2) as workers:
             together = [bits(result) for result in workers.map(lambda job, stage=refine: stage(*job), jobs)]
@@ -225,9 +227,9 @@ def test_planes_of_surfaces_reach_where_superpixels_have_no_match():
     truth = pixels[hole].copy()
     pixels[hole], source[hole] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
-    bare = Refine(superpixels=200, min_superpixel_size=1, fill="none", surface_size=0)(frame, matches)
+    bare = Refine(superpixels=200, min_superpixel_size=1, fill=False, surface_size=0)(frame, matches)
     assert np.isnan(bare.pixels[hole]).mean() > 0.5
-    wide = Refine(superpixels=200, min_superpixel_size=1, fill="none", surface_size=50)(frame, matches)
+    wide = Refine(superpixels=200, min_superpixel_size=1, fill=False, surface_size=50)(frame, matches)
     assert (wide.source[hole] == PixelOrigin.PLANE).all()
     assert np.abs(wide.pixels[hole] - truth).max() < 0.05
 
@@ -240,7 +242,7 @@ BARE = {
     "median_size": 0,
     "plane_weight": 0,
     "plane_fill": False,
-    "fill": "none",
+    "fill": False,
 }
 
 
@@ -272,11 +274,13 @@ def test_edges_of_depth_go_where_the_image_has_them(box):
 
 
 # No superpixel with a hole has a plane then, a surface may have: half of it is to be matched.
-SURFACES_ONLY = {"superpixels": 1, "min_superpixel_size": 1, "surface_size": 1, "min_valid_share": 1.0}
+SURFACES_ONLY = {"superpixels": 1, "min_superpixel_size": 1, "surface_size": 1}
 
 
-@pytest.mark.parametrize("parameters", [{**SURFACES_ONLY, "surface_size": 0, "min_valid_share": 0.6}, SURFACES_ONLY])
-def test_a_plane_counts_matches_by_their_confidence(parameters):
+@pytest.mark.parametrize(("surface_size", "min_valid"), [(0, 0.6), (1, 1.0)])
+def test_a_plane_counts_matches_by_their_confidence(surface_size, min_valid, monkeypatch):
+    monkeypatch.setattr(module, "MIN_VALID_SHARE", min_valid)
+    parameters = SURFACES_ONLY | {"surface_size": surface_size}
     frame, pixels, source, confidence = flat_scene()
     doubted = np.random.default_rng(4).random(SHAPE) < 0.5
     pixels[doubted], confidence[doubted] = 8.4, 0.5
@@ -289,13 +293,14 @@ def test_a_plane_counts_matches_by_their_confidence(parameters):
     assert filled.pixels[hole] == pytest.approx(mean, abs=0.01)
 
 
-def test_a_surface_draws_half_as_far_as_a_superpixel_and_what_it_agrees_with_is_worth_more():
+def test_a_surface_draws_half_as_far_and_agreement_is_worth_more(monkeypatch):
+    monkeypatch.setattr(module, "MIN_VALID_SHARE", 1.0)
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80], pixels[60, 90] = 8.4, 8.7
     pixels[30, 30], source[30, 30] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
     steps = {"median_size": 0, "bilateral_radius": 0, "edge_radius": 0, "min_correlation": 0}
-    drawn = Refine(plane_weight=1, max_correction=1, **steps, **SURFACES_ONLY)(frame, matches)
+    drawn = Refine(plane_weight=1, **steps, **SURFACES_ONLY)(frame, matches)
     assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert drawn.pixels[60, 90] == np.float32(8.7)
     assert drawn.confidence[60, 70] > drawn.confidence[60, 90] > 0.9
@@ -308,7 +313,7 @@ def test_what_a_superpixel_filled_is_no_evidence_for_a_surface():
     holes[:, 60:] = True  # the rest is three eighths of the image, and matched by seven tenths
     pixels[holes], source[holes] = np.nan, 0
     refine = Refine(
-        superpixels=48, min_superpixel_size=1, surface_size=48, fill="none", bilateral_radius=0, edge_radius=0
+        superpixels=48, min_superpixel_size=1, surface_size=48, fill=False, bilateral_radius=0, edge_radius=0
     )
     filled = refine(frame, Disparity(5, pixels, source, confidence))
     assert np.isfinite(filled.pixels[:, :59]).mean() > 0.95
@@ -319,41 +324,12 @@ def test_a_match_moves_to_its_median_where_that_is_near():
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80], pixels[60, 100] = 8.9, 11
     bare = {"plane_weight": 0, "surface_size": 0, "bilateral_radius": 0, "edge_radius": 0}
-    moved = Refine(median_size=5, max_correction=1, **bare)(frame, Disparity(5, pixels, source, confidence))
+    moved = Refine(median_size=5, **bare)(frame, Disparity(5, pixels, source, confidence))
     assert (moved.pixels[60, 80], moved.pixels[60, 100]) == (8, 11)
 
 
-def test_wls_counts_matches_by_their_confidence():
-    frame, pixels, source, confidence = flat_scene()
-    hole = np.s_[1:, 70:90]
-    pixels[hole], source[hole], confidence[hole] = np.nan, 0, 0
-    pixels[:, 90:], confidence[:, 90:] = 9, 0.5
-    doubted = Refine(
-        fill="wls", plane_weight=0, plane_fill=False, surface_size=0, median_size=0, bilateral_radius=0, edge_radius=0
-    )
-    middle = doubted(frame, Disparity(5, pixels, source, confidence)).pixels[60, 79:81]
-    equal = np.where(confidence > 0, np.float32(1), np.float32(0))
-    halfway = doubted(frame, Disparity(5, pixels, source, equal)).pixels[60, 79:81]
-    assert halfway == pytest.approx(8.5, abs=0.05)
-    assert (middle < halfway - 0.1).all()
-
-
-def test_wls_fills_no_farther_than_evidence_reaches():
-    frame, pixels, source, confidence = flat_scene()
-    hole = np.s_[30:, 60:150]
-    pixels[hole], source[hole] = np.nan, 0
-    pixels[:20, 10:150], source[:20, 10:150] = np.nan, 0
-    refine = Refine(
-        fill="wls", max_fill_distance=20, max_extrapolation=6, plane_fill=False, bilateral_radius=0, edge_radius=0
-    )
-    known = np.isfinite(refine(frame, Disparity(5, pixels, source, confidence)).pixels)
-    row = known[70].nonzero()[0]
-    assert row.tolist() == [*range(80), *range(130, 160)]
-    assert known[:, 30].nonzero()[0].tolist() == [*range(14, HEIGHT)]
-
-
 @pytest.mark.parametrize(
-    "refine", [Refine(), paper_stages()[1], Refine(fill="none", bilateral_radius=0, edge_radius=0, median_size=0)]
+    "refine", [Refine(), paper_stages()[1], Refine(fill=False, bilateral_radius=0, edge_radius=0, median_size=0)]
 )
 def test_no_match_at_all_stays_no_disparity(box, refine):
     frame, matches, _ = box
@@ -371,7 +347,7 @@ def test_a_disparity_of_another_size_is_refused(box):
         Refine()(frame, small)
 
 
-@pytest.mark.parametrize("parameters", [{}, {"fill": "wls"}, {"surface_size": 0, "median_size": 3}])
+@pytest.mark.parametrize("parameters", [{}, {"surface_size": 0, "median_size": 3}])
 def test_two_threads_give_the_same_bits(box, parameters):
     frame, matches, _ = box
     one, two = (Refine(min_superpixel_size=30, threads=n, **parameters)(frame, matches) for n in (1, 2))
@@ -385,10 +361,12 @@ def test_without_planes_no_superpixels_are_made(box):
         assert Refine(superpixels=200, min_superpixel_size=1, **parameters)(frame, matches).segments.max() > 100
 
 
-def test_what_an_object_hides_is_never_given_the_object(box):
+def test_what_an_object_hides_is_never_given_the_object(box, monkeypatch):
+    monkeypatch.setattr(module, "MIN_INLIER_SHARE", 0)
+    monkeypatch.setattr(module, "MIN_VALID_SHARE", 0)
     frame, matches, truth = box
     # one superpixel over all: its plane would be that of the box or of the ground, wherever there is no match
-    refined = Refine(superpixels=12, min_superpixel_size=1, min_inlier_share=0, min_valid_share=0)(frame, matches)
+    refined = Refine(superpixels=12, min_superpixel_size=1)(frame, matches)
     hidden = np.s_[32:88, 36:58]
     assert (refined.pixels[hidden] < 0.5 * (40 + truth[hidden])).all()
 
@@ -401,7 +379,7 @@ def test_nothing_is_filled_above_all_that_is_known():
     assert np.isfinite(refined.pixels[56:, 30:130]).all()
 
 
-def test_matches_of_a_burnt_out_sky_do_not_count():
+def test_matches_of_a_burnt_out_sky_do_not_count(monkeypatch):
     frame, pixels, source, confidence = flat_scene()
     image = np.dstack([frame.left] * 3)
     image[:50] = (130, 235, 252)
@@ -412,7 +390,8 @@ def test_matches_of_a_burnt_out_sky_do_not_count():
     refined = Refine(max_extrapolation=5)(sky, Disparity(5, pixels, source, confidence))
     assert np.isnan(refined.pixels[:42]).all()  # the last rows show the ground in their windows, and 5 px are margin
     assert (refined.pixels[50:] < 9).all()
-    assert (Refine(saturation_level=256)(sky, Disparity(5, pixels, source, confidence)).pixels[:40] > 50).all()
+    monkeypatch.setattr(module, "SATURATION_LEVEL", 256)
+    assert (Refine()(sky, Disparity(5, pixels, source, confidence)).pixels[:40] > 50).all()
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.refinement.kernels.valid_extent import extent, extent_reference, within_reach
+from stages.refinement.kernels.valid_extent import extent, extent_reference
 
 
 @settings(max_examples=60, deadline=None)
@@ -15,16 +15,6 @@ def test_the_extent_is_that_of_its_reference(height, width, threads, seed):
     disparity = np.where(known, 5, np.nan).astype(np.float32)
     for ours, expected in zip(extent(disparity, threads), extent_reference(disparity), strict=True):
         assert np.array_equal(ours, expected)
-
-
-def test_within_reach_is_near_to_something_known_and_within_the_margin():
-    bay = np.full((30, 50), np.nan, np.float32)
-    bay[12:, 10:40] = bay[0, :45] = 5
-    near = within_reach(bay, extent(bay), reach=3, margin=2)
-    assert near[20].nonzero()[0].tolist() == [*range(8, 42)]
-    wider = within_reach(bay, extent(bay), reach=3, margin=9)
-    assert wider[20].nonzero()[0].tolist() == [*range(7, 43)]
-    assert not wider[1:12].any()  # rows of which nothing is known
 
 
 def test_specks_in_the_sky_are_no_evidence_of_how_far_the_ground_reaches():
