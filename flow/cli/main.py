@@ -15,7 +15,19 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
-from flow.cli import demo, export, graph, import_images, import_middlebury, info, run, score, simulate
+from flow.cli import (
+    demo,
+    export,
+    graph,
+    import_images,
+    import_middlebury,
+    info,
+    pipeline,
+    run,
+    score,
+    simulate,
+    stages,
+)
 from flow.cli.replay import product_version
 from flow.errors import FAILED, INTERRUPTED, UNUSABLE, RoverflowError
 from recordings.errors import LogError, UnwritableError
@@ -25,6 +37,8 @@ COMMANDS: dict[str, ModuleType] = {
     "run": run,
     "info": info,
     "graph": graph,
+    "stages": stages,
+    "pipeline": pipeline,
     "simulate": simulate,
     "score": score,
     "export": export,

@@ -1,0 +1,23 @@
+"""`roverflow pipeline`: prints a pipeline file to start from."""
+
+from __future__ import annotations
+
+import argparse
+
+from flow.cli.report import say
+from flow.errors import COMPLETE
+
+HELP = "print the file of a pipeline: roverflow pipeline rover > mine.yaml"
+
+
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    sub.add_argument("name", metavar="NAME", help="rover, fast, paper, or the path of a YAML file")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the file."""
+    from flow.config.loader import pipeline_file
+
+    say(pipeline_file(options.name).read_text(encoding="utf-8").rstrip("\n"))
+    return COMPLETE
