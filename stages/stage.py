@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import pickle
-from dataclasses import dataclass
+import re
+from dataclasses import Field, dataclass
 from typing import Any
 
 from flow.contracts import StageError
@@ -16,10 +18,23 @@ MAX_CELLS = 4000  # cells, of a map
 
 @dataclass(frozen=True)
 class Stage:
-    """Base of the stages: a frozen dataclass whose fields are its parameters and whose `__call__` is the work."""
+    """Base of the stages: a frozen dataclass whose fields are its parameters and whose `__call__` is the work.
+
+    The docstring of a subclass gets a section Parameters, made from the fields, for `help()`.
+    """
+
+    def __init_subclass__(cls) -> None:
+        rows = [f"{name}\n    {known.metadata['help']}" for name, known in vars(cls).items() if _is_parameter(known)]
+        if cls.__doc__ and rows and "Parameters\n---" not in cls.__doc__:
+            sections = re.split(r"\n\n(?=\w+\n---)", inspect.cleandoc(cls.__doc__))
+            cls.__doc__ = "\n\n".join([sections[0], "\n".join(["Parameters", "----------", *rows]), *sections[1:]])
 
     def __post_init__(self) -> None:
         check_parameters(self)
+
+
+def _is_parameter(item: Any) -> bool:
+    return isinstance(item, Field) and "help" in item.metadata
 
 
 def snapshot(stage: Any, state: Any) -> bytes:

@@ -426,3 +426,25 @@ def test_graph_shows_what_is_set(capsys):
     assert "disparities=128" in drawn
     assert "smooth=100 ms)" in drawn
     assert "max_slope=20 deg)" in drawn
+
+
+def test_stages_lists_every_stage_and_the_parameters_of_one(capsys):
+    assert roverflow("stages") == 0
+    listed = capsys.readouterr().out
+    assert all(f"  {use} " in listed for use in ("stages.Match", "flow.align.pair", "recordings.McapSink"))
+    assert roverflow("stages", "Clean") == 0
+    shown = capsys.readouterr().out
+    assert "max_range = 8 m  (float, 10 cm to 200 m)\n      horizontal range wanted in the map" in shown
+    assert roverflow("stages", "Mtach") == 2
+    assert capsys.readouterr().err.endswith("did you mean 'Match'?\n")
+
+
+@pytest.mark.parametrize("name", ["rover", "fast", "paper"])
+def test_a_printed_pipeline_is_a_pipeline_to_start_from(name, tmp_path, capsys):
+    assert roverflow("pipeline", name) == 0
+    copy = tmp_path / "mine.yaml"
+    copy.write_text(capsys.readouterr().out)
+    assert roverflow("graph", "-p", copy) == 0
+    mine = capsys.readouterr().out.splitlines()
+    assert roverflow("graph", "-p", name) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == mine[1:]
