@@ -32,19 +32,19 @@ def check(found: dict[str, Run], alarms: float, slack: float = 0.0) -> None:
     alarms: how many of the truly safe cells may be called hazards, on ground of any slope to 15 degrees; slack: by how
     much more the intervals may miss where the traverse has few tilts.
     """
-    true, rover = (found[name].tally.measures() for name in ("rover, true disparity and tilt", "rover"))
+    true, rover = (found[name].tally.metrics() for name in ("rover, true disparity and tilt", "rover"))
     heights, intervals, rocks, hazards = (rover[name] for name in ("heights", "intervals", "rocks", "hazards"))
     assert true["heights"]["0-8 m"]["raw"]["rmse"] <= 0.01
     assert heights["0-4 m"]["levelled"]["rmse"] <= 0.02
     assert heights["4-8 m"]["levelled"]["rmse"] <= 0.04
     assert heights["0-8 m"]["completeness"] >= 0.97
     assert heights["0-8 m"]["levelled"]["within_5cm"] >= 0.95
-    assert rover["made_up"]["of_cells"] <= 0.01
+    assert rover["hallucinated"]["of_cells"] <= 0.01
     for interval in (intervals["random"], intervals["total"]):
         assert abs(interval["1"] - 0.68) <= 0.07 + slack
         assert abs(interval["2"] - 0.95) <= 0.04 + slack
-    assert rocks["0.2 m"]["found"] >= 0.98 * rocks["0.2 m"]["in_view"]
-    assert rocks["0.3 m"]["found"] == rocks["0.3 m"]["in_view"]
+    assert rocks["0.2 m"]["detected"] >= 0.98 * rocks["0.2 m"]["visible"]
+    assert rocks["0.3 m"]["detected"] == rocks["0.3 m"]["visible"]
     assert hazards["free_on_rock"] <= 0.002
     assert hazards["rock_false_safe"] <= 0.01
     assert hazards["false_safe"] <= 0.1  # nothing is asked; most are within 2 degrees of the limit
@@ -62,7 +62,7 @@ def traverse_of(seed: int, abundance: float) -> Simulation:
 
 def test_two_frames_have_maps_one_would_drive_on() -> None:
     found = score([traverse_of(11, 0.15)], 15, COMPARED)
-    assert found["rover"].tally.measures()["rocks"]["0.2 m"]["in_view"] >= 1
+    assert found["rover"].tally.metrics()["rocks"]["0.2 m"]["visible"] >= 1
     check(found, alarms=0.08, slack=0.04)
 
 
@@ -91,7 +91,7 @@ def test_the_default_beats_the_paper_from_log_to_score(tmp_path: Path, seed: int
     assert ours["heights"]["0-8 m"]["completeness"] > theirs["heights"]["0-8 m"]["completeness"]
     assert ours["hazards"]["free_on_rock"] < 0.002
     assert ours["hazards"]["rock_false_safe"] < 0.1 * theirs["hazards"]["rock_false_safe"]
-    assert ours["rocks"]["0.2 m"]["found"] > theirs["rocks"]["0.2 m"]["found"]
+    assert ours["rocks"]["0.2 m"]["detected"] > theirs["rocks"]["0.2 m"]["detected"]
     assert ours["rocks"]["0.2 m"]["recall"] == 1.0
 
 

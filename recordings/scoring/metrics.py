@@ -1,8 +1,7 @@
-"""Error measures over arrays: heights, angles, grids laid over each other. Pure functions, no files.
+"""Error metrics over arrays: heights, angles, aligned grids. Pure functions, no files.
 
-What is summed over frames is kept as sums, so that a log of any length takes the memory of one frame and every cell,
-not every frame, counts the same. NaN is "unknown" and never takes part in an error; shares of an empty set are NaN,
-because there is nothing to say.
+Metrics of many frames are kept as sums: a log of any length takes the memory of one frame, and every cell, not every
+frame, counts the same. NaN is unknown and has no error. The share of an empty set is NaN.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ from numpy.typing import ArrayLike
 
 from stages.data import Array, ElevationMap
 
-CLOSE = 0.05  # m, the height error that the Lunar Autonomy Challenge accepts
-NMAD_SCALE = 1.4826  # makes the median deviation of a normal distribution its standard deviation
+MAX_CLOSE_ERROR = 0.05  # m, the height error that the Lunar Autonomy Challenge accepts
+NMAD_SCALE = 1.4826  # from median deviation to standard deviation, for a normal distribution
 NMAD_BIN = 1e-5  # m, to which errors are rounded for their median
-NMAD_REACH = 1.0  # m, beyond which errors are one bin
+MAX_NMAD_ERROR = 1.0  # m; larger errors share a bin
 
 
 def share(part: SupportsFloat, whole: SupportsFloat) -> float:
-    """part / whole, NaN where there is no whole."""
+    """part / whole; NaN for a whole of 0."""
     return float(part) / float(whole) if float(whole) else float("nan")
 
 
@@ -33,37 +32,37 @@ def cell_centres(grid: ElevationMap) -> tuple[Array, Array]:
 
 
 def in_ring(radius: Array, low: float, high: float) -> Array:
-    """Mask of the radii in [low, high): a cell on the border of two rings belongs to the outer one only."""
+    """Mask of the radii in [low, high): a cell on the border of two rings belongs to the outer one."""
     return np.asarray((radius >= low) & (radius < high))
 
 
 class HeightErrors:
     """Statistics of height errors of any number of cells, in the memory of one histogram.
 
-    All but the NMAD come of exact sums. The NMAD comes of errors rounded to `NMAD_BIN` (0.01 mm), which moves it by
-    0.015 mm at most; it is NaN where a median falls beyond `NMAD_REACH` (1 m).
+    The NMAD is computed from errors rounded to 0.01 mm, which changes it by at most 0.015 mm. It is NaN if a median
+    exceeds 1 m. All other metrics are exact.
     """
 
     def __init__(self) -> None:
         self.seen = self.cells = self.close = 0
         self.total = self.absolute = self.squares = 0.0
-        self.half = round(NMAD_REACH / NMAD_BIN)
+        self.half = round(MAX_NMAD_ERROR / NMAD_BIN)
         self.histogram = np.zeros(2 * self.half + 1, np.int64)
 
     def add(self, error: ArrayLike) -> None:
-        """Count errors of any shape, m; NaN = a cell that is seen and not known."""
+        """Count errors of any shape, m; NaN = an unknown cell."""
         values = np.asarray(error, np.float64).ravel()
         self.seen += values.size
         values = values[np.isfinite(values)]
         self.cells += values.size
-        self.close += int(np.count_nonzero(np.abs(values) <= CLOSE))
+        self.close += int(np.count_nonzero(np.abs(values) <= MAX_CLOSE_ERROR))
         self.total += float(values.sum())
         self.absolute += float(np.abs(values).sum())
         self.squares += float(np.square(values).sum())
-        bins = np.rint(np.clip(values, -NMAD_REACH, NMAD_REACH) / NMAD_BIN).astype(np.int64) + self.half
+        bins = np.rint(np.clip(values, -MAX_NMAD_ERROR, MAX_NMAD_ERROR) / NMAD_BIN).astype(np.int64) + self.half
         self.histogram += np.bincount(bins, minlength=self.histogram.size)
 
-    def measures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """cells (known ones), rmse, mae, bias (mean), nmad, m; within_5cm (share)."""
         return {
             "cells": float(self.cells),
@@ -75,20 +74,20 @@ class HeightErrors:
         }
 
     def _nmad(self) -> float:
-        """NMAD_SCALE times the median distance from the median, both medians read off histograms."""
+        """NMAD_SCALE times the median distance from the median, both medians from histograms."""
         if not self.cells:
             return float("nan")
         low, high = _middles(self.histogram)
         middle = low + high  # in half bins, since the median may lie between two
         nearest, farthest = _middles(np.bincount(np.abs(2 * np.arange(2 * self.half + 1) - middle), self.histogram))
-        # An error in an end bin may be any larger one: neither median may be one of those.
+        # An end bin contains all larger errors, so no median may fall into one.
         if low == 0 or high == 2 * self.half or farthest >= 2 * self.half - abs(middle - 2 * self.half):
             return float("nan")
         return NMAD_SCALE * NMAD_BIN * (nearest + farthest) / 4
 
 
 def _middles(counts: Array) -> tuple[int, int]:
-    """The two middle ones of the indices of `counts`, each taken that many times; their mean is the median."""
+    """The two middle values of a histogram, as indices; their mean is the median."""
     below = np.cumsum(counts)
     total = int(below[-1])
     low, high = np.searchsorted(below, [(total - 1) // 2, total // 2], side="right")
@@ -96,10 +95,10 @@ def _middles(counts: Array) -> tuple[int, int]:
 
 
 def without_plane(x: Array, y: Array, error: Array) -> Array:
-    """Errors less their least-squares plane over (x, y): what is left when tilt and offset are forgiven.
+    """Errors minus their least-squares plane over (x, y), which removes an error of tilt and offset.
 
-    error: (rows, cols) m; x: (cols,), y: (rows,) m. NaN errors stay NaN and take no part. Fewer than four known errors
-    leave nothing to compare, so all become NaN.
+    error: (rows, cols) m; x: (cols,), y: (rows,) m. NaN errors stay NaN. With fewer than four known errors
+    all become NaN.
     """
     known = np.isfinite(error)
     if np.count_nonzero(known) < 4:
@@ -111,17 +110,17 @@ def without_plane(x: Array, y: Array, error: Array) -> Array:
 
 
 def angle_between(first: ArrayLike, second: ArrayLike) -> float:
-    """Angle between two vectors (3,), rad, exact for small angles too."""
+    """Angle between two vectors (3,), rad, also exact for small angles."""
     a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
 def aligned(values: Array, origin: tuple[float, float], onto: tuple[int, int], onto_origin: tuple[float, float],
             resolution: float, missing: float) -> Array:  # fmt: skip
-    """A grid laid over another of equal resolution by whole cells: (rows, cols) of `onto`, `missing` where it has none.
+    """A grid moved onto the cells of another one of the same resolution; `missing` where it has none.
 
-    values: (rows, cols); origin, onto_origin: (x, y) of the lower-left corners, m. Raises ValueError where the two
-    grids' cells do not coincide to a hundredth of a cell.
+    values: (rows, cols); origin, onto_origin: (x, y) of the lower-left corners, m. Raises ValueError if the
+    cells of the two grids differ by more than a hundredth of a cell.
     """
     shift = [(mine - theirs) / resolution for mine, theirs in zip(origin, onto_origin, strict=True)]
     column, row = (round(cells) for cells in shift)

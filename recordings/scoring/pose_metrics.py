@@ -1,8 +1,7 @@
-"""How far poses stray from the true ones, as a share of the way driven.
+"""Pose drift: the error of the estimated poses as a share of the distance driven.
 
-Poses of one frame of reference are compared among themselves: place and heading are taken from the first of them, which
-is where the frame has them from, and gravity gives the rest. What is in another frame (`visual_odom/2`, after tracking
-was lost) begins anew, and adds its own error and its own way.
+Poses of one frame of reference are aligned to the truth by position and heading of the first one. A new frame of
+reference (`visual_odom/2`, after tracking was lost) is aligned again; its error and distance are added.
 """
 
 from __future__ import annotations
@@ -19,65 +18,69 @@ from stages.data import Array
 
 @dataclass
 class _Part:
-    """The poses of one frame of reference. turn, shift: from the given frame to the true one; last: the last true
-    place, m; way: m driven; error: m, at the last pose."""
+    """The poses of one frame of reference; rotation and shift lead from it to the true one."""
 
-    turn: Rotation
-    shift: Array
-    last: Array
-    way: float = 0.0
-    error: float = 0.0
+    rotation: Rotation
+    shift: Array  # m
+    last: Array  # m, the last true position
+    distance: float = 0.0  # m driven
+    error: float = 0.0  # m, of the last pose
 
 
 class PoseTally:
-    """Sums up the poses of a run, frame by frame in order; messages are nav_msgs/Odometry."""
+    """Sums up the poses of a run, frame by frame in order, from nav_msgs/Odometry messages."""
 
     def __init__(self) -> None:
         self.parts: dict[str, _Part] = {}
-        self.frames = self.missing = self.strange = 0
-        self.largest = self.heading = 0.0
+        self.frames = self.missing = self.other_body = 0
+        self.max_error = self.max_heading_error = 0.0
 
     def add(self, true: Any, given: Any | None) -> dict[str, float]:
-        """One frame's true pose, and the one that the run gives, None where it lacks one; the frame's own figures."""
+        """Add a frame's true pose and its estimate, None if it has none; returns the frame's own metrics."""
         if given is None or given.child_frame_id != true.child_frame_id:
             self.missing += given is None
-            self.strange += given is not None
+            self.other_body += given is not None
             return {}
-        (place, turn), (true_place, true_turn) = _placed(given), _placed(true)
+        (position, rotation), (true_position, true_rotation) = _pose(given), _pose(true)
         part = self.parts.get(given.header.frame_id)
         if part is None:
-            onto = Rotation.from_euler("z", _heading(true_turn) - _heading(turn))
-            part = _Part(onto, true_place - onto.apply(place), true_place)
+            onto = Rotation.from_euler("z", _heading(true_rotation) - _heading(rotation))
+            part = _Part(onto, true_position - onto.apply(position), true_position)
             self.parts[given.header.frame_id] = part
-        part.way += float(np.linalg.norm(true_place - part.last))
-        part.last = true_place
-        part.error = float(np.linalg.norm(part.turn.apply(place) + part.shift - true_place))
-        off = math.remainder(_heading(part.turn * turn) - _heading(true_turn), 2 * math.pi)
+        part.distance += float(np.linalg.norm(true_position - part.last))
+        part.last = true_position
+        part.error = float(np.linalg.norm(part.rotation.apply(position) + part.shift - true_position))
+        heading = math.remainder(_heading(part.rotation * rotation) - _heading(true_rotation), 2 * math.pi)
         self.frames += 1
-        self.largest, self.heading = max(self.largest, part.error), max(self.heading, abs(off))
-        return {"pose_error": part.error, "pose_heading": off}
+        self.max_error = max(self.max_error, part.error)
+        self.max_heading_error = max(self.max_heading_error, abs(heading))
+        return {"pose_error": part.error, "pose_heading": heading}
 
-    def measures(self) -> dict[str, float] | None:
-        """frames scored, missing ones and those whose pose is not of the body that the truth tells of; parts, frames of
-        reference; way, m; drift: the parts' errors at their ends over their ways; largest, m; heading, rad, largest
-        error. None where no pose was given."""
-        if not self.frames + self.strange:
+    def metrics(self) -> dict[str, float] | None:
+        """The metrics of all poses; None if there was no estimate.
+
+        frames: scored; missing: frames without an estimate; other_body: estimates of another body than the truth's;
+        parts: frames of reference; distance: m driven; drift: the parts' last errors over their distances; max_error:
+        m; max_heading_error: rad.
+        """
+        if not self.frames + self.other_body:
             return None
-        way = sum(part.way for part in self.parts.values())
+        distance = sum(part.distance for part in self.parts.values())
         error = sum(part.error for part in self.parts.values())
         return {
-            "frames": self.frames, "missing": self.missing, "of_another_body": self.strange, "parts": len(self.parts),
-            "way": way, "drift": error / way if way > 0 else math.nan,
-            "largest": self.largest if self.frames else math.nan,
-            "heading": self.heading if self.frames else math.nan,
+            "frames": self.frames, "missing": self.missing, "other_body": self.other_body, "parts": len(self.parts),
+            "distance": distance, "drift": error / distance if distance > 0 else math.nan,
+            "max_error": self.max_error if self.frames else math.nan,
+            "max_heading_error": self.max_heading_error if self.frames else math.nan,
         }  # fmt: skip
 
 
-def _placed(message: Any) -> tuple[Array, Rotation]:
-    place, turn = message.pose.pose.position, message.pose.pose.orientation
-    return np.array([place.x, place.y, place.z]), Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+def _pose(message: Any) -> tuple[Array, Rotation]:
+    position, quaternion = message.pose.pose.position, message.pose.pose.orientation
+    rotation = Rotation.from_quat([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
+    return np.array([position.x, position.y, position.z]), rotation
 
 
-def _heading(turn: Rotation) -> float:
-    forward = turn.apply([1.0, 0.0, 0.0])
+def _heading(rotation: Rotation) -> float:
+    forward = rotation.apply([1.0, 0.0, 0.0])
     return math.atan2(forward[1], forward[0])

@@ -1,4 +1,4 @@
-"""What a log that McapSink wrote tells of its run: which part of a log it took, and why a result is lacking."""
+"""What a result log contains about its run: the part of the input log, and why a result is missing."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from recordings.mcap.file import McapFile
 
 
 def part_run(result: Path, log: Path) -> tuple[float | None, float | None]:
-    """From where and to where the log `log` was run, s after its first message; None where all of it was, or the result
-    does not tell."""
+    """Start and end of the run in its input `log`, s after the first message; None for no limit or if unknown."""
     about: dict[str, str] = {}
     with suppress(McapError, OSError, ValueError, struct.error), result.open("rb") as file:
-        # A header, and what a run says of itself before all else.
+        # The header and the first metadata record.
         for record in islice(StreamReader(file, emit_chunks=True).records, 2):
             about = record.metadata if isinstance(record, Metadata) else {}
         if about.get("log") == log.name.encode("utf-8", "replace").decode():
@@ -31,14 +30,13 @@ def part_run(result: Path, log: Path) -> tuple[float | None, float | None]:
 
 
 def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:
-    """What to say of a log that holds none of the topics `wanted` of a run's results; and the `remedy` if it holds any
-    that would do `instead`."""
+    """The error for a log without any of the result topics `wanted`; with the `remedy` if it has one of `instead`."""
     with McapFile(path) as log:
         topics = sorted({log.channel(n).topic for n in log.index.channels if log.count({n})})
     results = [topic for topic in topics if topic.startswith("/nav/")]
     if not results:
         return LogError(f"{path} is not a result log: it has no /nav topics; give the log that roverflow run wrote")
-    holds = f"no {wanted[0]}" if len(wanted) == 1 else f"none of {', '.join(wanted)}"
-    why = "the run made none, or its McapSink's 'results' leave it out"
+    lacking = f"no {wanted[0]}" if len(wanted) == 1 else f"none of {', '.join(wanted)}"
+    why = "the run produced none, or the 'results' of its McapSink do not name it"
     more = f"; {remedy}" if set(instead) & set(results) else ""
-    return LogError(f"{path} holds {holds}, only {', '.join(results)}: {why}{more}")
+    return LogError(f"{path} contains {lacking}, only {', '.join(results)}: {why}{more}")

@@ -1,10 +1,10 @@
 """Disparity errors as Middlebury counts them (Scharstein et al., GCPR 2014). Pure functions over arrays, no files.
 
-A pixel is scored where its true disparity is known: `nonocc` where both cameras see it, `occluded` where only one does,
-`all` of them; over the whole image, and without the leftmost columns, which have no partner in the right image. Unlike
-Middlebury's own code it does not clip disparities to the search range first, so a value far outside costs all of its
-error. The one trick: every pixel is in one of six disjoint classes, whose sums add up over frames, so that every pixel
-and not every frame counts the same, and any region is a sum of classes.
+A pixel is scored if its true disparity is known: `nonocc` if both cameras see it, `occluded` if only one does, `all` of
+them; over the whole image, and without the leftmost columns, which have no partner in the right image. Unlike
+Middlebury's own code, disparities are not clipped to the search range, so an outlier counts with its full error. The
+one trick: every pixel belongs to one of six disjoint classes. Their sums add up over frames, so every pixel, not every
+frame, counts the same, and any region is a sum of classes.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from stages.data import Array
 
 THRESHOLDS = (0.5, 1.0, 2.0, 4.0)  # px
 SEEN_BY_BOTH, SEEN_BY_ONE, SEEN_BY_NONE = 255, 128, 0  # the codes of an occlusion mask
-CROP_STEP = 16  # columns; the code that the paper released crops by its number of disparities, a multiple of 16
-REGIONS = {"nonocc": (0,), "all": (0, 1, 2), "occluded": (1,)}  # of the classes both, one, neither or not told
+CROP_STEP = 16  # columns; the paper's code crops by its number of disparities, a multiple of 16
+REGIONS = {"nonocc": (0,), "all": (0, 1, 2), "occluded": (1,)}  # of the classes both, one, neither or unknown
 _KINDS, _SIDES = 3, 2  # classes: how many cameras see it, times left or right of the crop
 _SUMS = ("pixels", "known", "absolute", "squares", *(f"over_{limit:g}" for limit in THRESHOLDS))
 
 
 def cropped_columns(disparities: float) -> int:
-    """How many columns a range of `disparities` px takes at the left: rounded up to 16, none of NaN."""
+    """The columns to crop for a range of `disparities` px: rounded up to 16; none for NaN."""
     return CROP_STEP * math.ceil(max(disparities, 0.0) / CROP_STEP) if math.isfinite(disparities) else 0
 
 
 @dataclass(frozen=True, eq=False)
 class StereoErrors:
-    """Sums of disparity errors over any number of frames; the sum of two is that of all their frames.
+    """Sums of disparity errors; two of them can be added.
 
-    sums: name -> (3, 2) float64, over the classes `seen by both, by one, neither or not told` and `left of the crop,
-    right of it`; values, without_truth: estimated disparities, and those of them that have no true one; columns: the
-    widths of the crop that occurred.
+    sums: name -> (3, 2) float64, over the classes (seen by both, by one, by neither or unknown) and (left of the crop,
+    right of it). values: number of estimated disparities; without_truth: those at pixels without a true one. columns:
+    the widths of the crop that occurred.
     """
 
     sums: dict[str, Array] = field(default_factory=lambda: {name: np.zeros((_KINDS, _SIDES)) for name in _SUMS})
@@ -50,7 +50,7 @@ class StereoErrors:
         """The errors of one frame.
 
         estimate, truth: (H, W) px, not finite = unknown; occlusion: (H, W) uint8, 255 seen by both cameras, 0 by none,
-        any other code by one, None where it is not known; columns: how many to crop.
+        any other code by one, None if unknown; columns: to crop.
         """
         scored, given = np.isfinite(truth), np.isfinite(estimate)
         kinds = np.full(truth.shape, 2)
@@ -75,25 +75,24 @@ class StereoErrors:
             self.values + other.values, self.without_truth + other.without_truth, self.columns | other.columns,
         )  # fmt: skip
 
-    def measures(self) -> dict[str, Any]:
-        """Every measure, by name.
+    def metrics(self) -> dict[str, Any]:
+        """All metrics by name.
 
-        whole_image, cropped_image: nonocc, all and occluded, `measures_of` each; the latter also
-        leftmost_columns_cropped (every width that occurred). The measures of nonocc in the whole image stand at the top
-        as well, with values (how many disparities were given), given_occluded (those at pixels that only one camera
-        sees: pixels, share of all values, bad_2 the share of them off by more than 2 px) and given_without_truth (those
-        where no true disparity is known, such as the sky: pixels, share of all values).
+        whole_image, cropped_image: `metrics_of` of nonocc, all and occluded each; cropped_image also has
+        leftmost_columns_cropped. The metrics of nonocc in the whole image are repeated at the top, with values (number
+        of estimates), given_occluded (estimates where only one camera sees: pixels, share of all estimates, bad_2) and
+        given_without_truth (estimates without a true disparity, such as in the sky: pixels, share of all estimates).
         """
         whole = {name: self._region(kinds, slice(None)) for name, kinds in REGIONS.items()}
         cropped = {name: self._region(kinds, slice(1, None)) for name, kinds in REGIONS.items()}
         hidden, columns = float(self.sums["known"][1].sum()), sorted(self.columns)
-        told = float(self.sums["pixels"][1].sum())  # whether anything is known to be occluded
+        occluded = float(self.sums["pixels"][1].sum())
         return {
             **whole["nonocc"],
             "values": float(self.values),
             "given_occluded": {
                 "pixels": hidden,
-                "share": share(hidden, self.values if told else 0),
+                "share": share(hidden, self.values if occluded else 0),
                 "bad_2": whole["occluded"]["bad_2_known"],
             },
             "given_without_truth": {
@@ -104,22 +103,22 @@ class StereoErrors:
         }  # fmt: skip
 
     def _region(self, kinds: tuple[int, ...], sides: slice) -> dict[str, float]:
-        return measures_of({name: float(sums[list(kinds), sides].sum()) for name, sums in self.sums.items()})
+        return metrics_of({name: float(sums[list(kinds), sides].sum()) for name, sums in self.sums.items()})
 
 
-def measures_of(sums: dict[str, float]) -> dict[str, float]:
-    """The measures of summed errors.
+def metrics_of(sums: dict[str, float]) -> dict[str, float]:
+    """The metrics of summed errors.
 
-    pixels (how many have a true value), density (share of them known), bad_T (share in error by more than T px, an
-    unknown pixel being bad), bad_T_known (of the known ones), mae and rmse (px, of the known ones). NaN of nothing.
+    pixels: with a true value; density: share of them with an estimate; bad_T: share with an error above T px or without
+    an estimate; bad_T_known: share of the estimates with such an error; mae, rmse: px, of the estimates.
     """
     pixels, known = sums["pixels"], sums["known"]
-    measures = {"pixels": pixels, "density": share(known, pixels)}
+    metrics = {"pixels": pixels, "density": share(known, pixels)}
     for limit in THRESHOLDS:
         over = sums[f"over_{limit:g}"]
-        measures[f"bad_{limit:g}"] = share(over + pixels - known, pixels)
-        measures[f"bad_{limit:g}_known"] = share(over, known)
-    return measures | {"mae": share(sums["absolute"], known), "rmse": share(sums["squares"], known) ** 0.5}
+        metrics[f"bad_{limit:g}"] = share(over + pixels - known, pixels)
+        metrics[f"bad_{limit:g}_known"] = share(over, known)
+    return metrics | {"mae": share(sums["absolute"], known), "rmse": share(sums["squares"], known) ** 0.5}
 
 
 def _by_class(classes: Array, weights: Array | None = None) -> Array:

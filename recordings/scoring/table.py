@@ -11,19 +11,20 @@ from recordings.scoring.metrics import share
 from recordings.scoring.score import Score
 from recordings.scoring.stereo_metrics import CROP_STEP, REGIONS, THRESHOLDS
 
+REGION_NAMES = {"nonocc": "seen by both", "all": "all", "occluded": "seen by one"}  # cameras
 ROWS = (
-    "DEM RMSE 0-8 m, tilt and all, cm",
-    "levelled RMSE 0-4 m; 4-8 m, cm",
-    "seen cells known; of these within 5 cm, %",
-    "values where nothing could be seen, of values; of all cells, %",
-    "levelled errors within 1; 2 stated random sigmas, %",
-    "raw errors within 1; 2 stated sigmas in all, %",
-    "rocks in view found: 0.2 m; 0.3 m and higher",
-    "rocks of which anything shows found: the same",
-    "free cells on a rock; rock cells called free, %",
-    "false alarms; in the worst 5 degrees of slope to 15, %",
-    "hazard cells (rock or over 20 degrees) found; called free, %",
-    "seen cells left unknown; free cells where nothing could be seen, %",
+    "height RMSE 0-8 m, with tilt and offset errors, cm",
+    "levelled height RMSE, cm: 0-4 m; 4-8 m",
+    "visible cells with a value; of these within 5 cm (levelled), %",
+    "hallucinated cells (no camera could see them), % of filled; of all",
+    "levelled errors within 1; 2 stated random sigmas (ideal 68; 95), %",
+    "raw errors within 1; 2 stated total sigmas (ideal 68; 95), %",
+    "detected rocks, at least half visible: 0.2 m; 0.3 m and higher",
+    "detected rocks, also partly visible ones: 0.2 m; 0.3 m and higher",
+    "free cells on a rock, % of free cells; rock cells called free, %",
+    "false alarms, % of safe cells: all; worst slope bin below 15 deg",
+    "hazard cells (rock or over 20 deg): detected; called free, %",
+    "visible cells left unknown; free cells that no camera could see, %",
 )
 
 
@@ -34,29 +35,29 @@ def format_score(found: Score) -> str:
         parts.append(_disparity_lines(found.disparity))
     if found.terrain is not None:
         parts.append(terrain_lines(found.terrain))
-    parts.append(_pose_lines(found))
+    parts.append(_motion_lines(found))
     return "\n\n".join("\n".join(lines) for lines in parts if lines)
 
 
 def format_brief(found: Score) -> str:
-    """The main figures in a few lines for a terminal."""
+    """The main metrics in a few lines for a terminal."""
     lines = _frame_lines(found)
     if found.disparity is not None:
         seen = found.disparity["whole_image"]["nonocc"]
-        off = f"{_percent(seen['bad_1'])} off by over 1 px, or unknown"
-        lines.append(f"disparity    of what both cameras see, {off}; RMS error {_number(seen['rmse'], 2)} px")
+        bad = f"{_percent(seen['bad_1'])} wrong by over 1 px or unknown"
+        lines.append(f"disparity    {bad} where both cameras see; RMS error {_number(seen['rmse'], 2)} px")
     if found.terrain is not None:
         rings, hazards, rocks = (found.terrain[name] for name in ("heights", "hazards", "rocks"))
         known = _percent(rings["0-8 m"]["completeness"])
         near, far = (_number(100 * rings[ring]["raw"]["rmse"], 1) for ring in ("0-4 m", "0-8 m"))
         recall, missed, alarms = (_percent(hazards[name]) for name in ("recall", "false_safe", "false_alarm"))
-        in_view = (f"{rock['found']:.0f} of {rock['in_view']:.0f}" for rock in rocks.values())
+        detected = [f"{rock['detected']:.0f} of {rock['visible']:.0f}" for rock in rocks.values()]
         lines += [
-            f"elevation    {known} of seen cells known; RMS error {near} cm to 4 m away, {far} cm to 8 m",
-            f"hazards      {recall} of their cells found, {missed} called free; of free cells {alarms} called hazards",
-            f"rocks        {' of 0.2 m and higher in view found, '.join(in_view)} of 0.3 m and higher",
+            f"elevation    {known} of visible cells known; RMS error {near} cm up to 4 m away, {far} cm up to 8 m",
+            f"hazards      {recall} of them detected, {missed} called free; {alarms} of safe cells called hazards",
+            f"rocks        {detected[0]} of 0.2 m and higher detected, {detected[1]} of 0.3 m and higher",
         ]
-    return "\n".join([*lines, *_pose_lines(found)])
+    return "\n".join([*lines, *_motion_lines(found)])
 
 
 def _frame_lines(found: Score) -> list[str]:
@@ -67,34 +68,34 @@ def _frame_lines(found: Score) -> list[str]:
         lines.append(f"missing      {topic}: {len(stamps)} of {counted(found.frames, 'frame')}, scored as all unknown")
     for topic, count in found.unmatched.items():
         lines.append(f"unmatched    {topic}: {counted(count, 'message')} at stamps without truth, not scored")
-    told = [
+    notes = [
         f"not scored   {topic}: {counted(count, 'frame')}: {why}"
         for topic, reasons in found.unscored.items()
         for why, count in reasons.items()
     ]
-    told += [
+    notes += [
         f"lost         {counted(count, 'message')} of {log}: {why}"
         for log, reasons in found.lost.items()
         for why, count in reasons.items()
     ]
-    for line in told:
+    for line in notes:
         lines += wrap(line, 100, subsequent_indent=" " * 13, break_long_words=False, break_on_hyphens=False)
     return lines
 
 
 def _disparity_lines(d: dict[str, Any]) -> list[str]:
     hidden, beyond = d["given_occluded"], d["given_without_truth"]
-    occluded = f"{_percent(hidden['share']):>7} of all values, {_percent(hidden['bad_2'])} of these off by over 2 px"
+    share_hidden, bad = _percent(hidden["share"]), _percent(hidden["bad_2"])
     limits = "".join(f"{f'bad-{limit:g}':>8}" for limit in THRESHOLDS)
     return [
-        "disparity    bad-T: share off by over T px, or unknown; mean and RMS error in px, of the known",
+        "disparity    bad-T: share wrong by over T px, or unknown; mean and RMS error of the known, px",
         f"               whole image       pixels    known |{limits} |    mean     RMS",
         *(_region_line(name, d["whole_image"][name]) for name in REGIONS),
         *(_known_line(name, d["whole_image"][name]) for name in ("nonocc", "all")),
         *_cropped_lines(d["cropped_image"]),
-        "             values given where stereo cannot measure",
-        f"               only one camera sees  {occluded}",
-        f"               no true value         {_percent(beyond['share']):>7} of all values (sky, or not known)",
+        "             estimates where stereo cannot measure",
+        f"               only one camera sees  {share_hidden:>7} of all estimates, {bad} of these wrong by over 2 px",
+        f"               no true value         {_percent(beyond['share']):>7} of all estimates (sky, or no truth)",
     ]
 
 
@@ -103,23 +104,24 @@ def _cropped_lines(cropped: dict[str, Any]) -> list[str]:
     if not any(crops):
         return []
     columns = f"{crops[0]}" if len(crops) == 1 else f"{crops[0]} to {crops[-1]}"
-    title = f"               without the leftmost {columns} columns (the range of the truth, rounded up to {CROP_STEP})"
+    reason = f"true disparity range rounded up to {CROP_STEP}"
+    title = f"               without the leftmost {columns} columns ({reason})"
     return [title, *(_region_line(name, cropped[name]) for name in REGIONS)]
 
 
 def _region_line(name: str, m: dict[str, float]) -> str:
     bad = "".join(f"{_percent(m[f'bad_{limit:g}']):>8}" for limit in THRESHOLDS)
     errors = "".join(f"{_number(m[key], 3):>8}" for key in ("mae", "rmse"))
-    return f"               {name:<12} {m['pixels']:11.0f} {_percent(m['density']):>8} |{bad} |{errors}"
+    return f"               {REGION_NAMES[name]:<12} {m['pixels']:11.0f} {_percent(m['density']):>8} |{bad} |{errors}"
 
 
 def _known_line(name: str, m: dict[str, float]) -> str:
     bad = "".join(f"{_percent(m[f'bad_{limit:g}_known']):>8}" for limit in THRESHOLDS)
-    return f"               {f'{name}, of the known':<33} |{bad} |"
+    return f"               {f'{REGION_NAMES[name]}, of the known ones':<33} |{bad} |"
 
 
 def terrain_figures(found: dict[str, Any]) -> list[str]:
-    """What stands in each of the `ROWS`."""
+    """The values of `ROWS`."""
     heights, hazards, intervals, rocks = (found[name] for name in ("heights", "hazards", "intervals", "rocks"))
     near, far, all_ = (heights[ring] for ring in ("0-4 m", "4-8 m", "0-8 m"))
     worst = [value for name, value in hazards["by_slope"].items() if name != "15-20 deg" and not math.isnan(value)]
@@ -127,11 +129,11 @@ def terrain_figures(found: dict[str, Any]) -> list[str]:
         _cm(all_["raw"]["rmse"]),
         f"{_cm(near['levelled']['rmse'])}; {_cm(far['levelled']['rmse'])}",
         _percents(all_["completeness"], all_["levelled"]["within_5cm"]),
-        _percents(found["made_up"]["of_values"], found["made_up"]["of_cells"]),
+        _percents(found["hallucinated"]["of_values"], found["hallucinated"]["of_cells"]),
         _percents(*intervals["random"].values()),
         _percents(*intervals["total"].values()),
-        "; ".join(f"{rock['found']:.0f} of {rock['in_view']:.0f}" for rock in rocks.values()),
-        "; ".join(f"{rock['glimpsed_found']:.0f} of {rock['glimpsed']:.0f}" for rock in rocks.values()),
+        "; ".join(f"{rock['detected']:.0f} of {rock['visible']:.0f}" for rock in rocks.values()),
+        "; ".join(f"{rock['partly_visible_detected']:.0f} of {rock['partly_visible']:.0f}" for rock in rocks.values()),
         _percents(hazards["free_on_rock"], hazards["rock_false_safe"]),
         _percents(hazards["false_alarm"], max(worst, default=math.nan)),
         _percents(hazards["recall"], hazards["false_safe"]),
@@ -140,12 +142,12 @@ def terrain_figures(found: dict[str, Any]) -> list[str]:
 
 
 def terrain_lines(found: dict[str, Any]) -> list[str]:
-    """The measures of a `TerrainTally` as lines."""
+    """The metrics of a `TerrainTally` as lines."""
     lines = [
-        "terrain      in cells that a pixel of both cameras hits, by distance from base_link; errors in cm",
+        "terrain      heights of cells that both cameras see, by distance from base_link; errors in cm",
         "               distance      cells    known |   RMSE    MAE   bias   NMAD  within 5 cm",
     ]
-    levelled = ["               levelled: the same less the best plane of each frame's errors"]
+    levelled = ["               levelled: minus the best-fit plane of each frame's errors (tilt and offset)"]
     for kind, title in (("raw", []), ("levelled", levelled)):
         lines += title
         for name, ring in found["heights"].items():
@@ -161,8 +163,8 @@ def terrain_lines(found: dict[str, Any]) -> list[str]:
     ]
 
 
-def _pose_lines(found: Score) -> list[str]:
-    return [*_tilt_lines(found), *(place_lines(found.pose) if found.pose is not None else [])]
+def _motion_lines(found: Score) -> list[str]:
+    return [*_tilt_lines(found), *(pose_lines(found.pose) if found.pose is not None else [])]
 
 
 def _tilt_lines(found: Score) -> list[str]:
@@ -174,17 +176,17 @@ def _tilt_lines(found: Score) -> list[str]:
     return lines
 
 
-def place_lines(found: dict[str, float]) -> list[str]:
-    """The measures of a `PoseTally` as lines."""
+def pose_lines(found: dict[str, float]) -> list[str]:
+    """The metrics of a `PoseTally` as lines."""
     lines = []
     if found["frames"]:
         drift = "-" if math.isnan(found["drift"]) else f"{100 * found['drift']:.2f}%"
-        parts = f", in {found['parts']} parts that nothing joins" if found["parts"] > 1 else ""
+        parts = f"; {found['parts']} parts in frames of their own" if found["parts"] > 1 else ""
         lines.append(
-            f"pose         off by {drift} of {found['way']:.2f} m driven, {100 * found['largest']:.1f} cm and "
-            f"{math.degrees(found['heading']):.2f} deg at most{parts}"
+            f"pose         drift {drift} of {found['distance']:.2f} m driven; largest error "
+            f"{100 * found['max_error']:.1f} cm, {math.degrees(found['max_heading_error']):.2f} deg{parts}"
         )
-    for key, why in (("missing", "none is given"), ("of_another_body", "it is not base_link's, as the truth is")):
+    for key, why in (("missing", "the result has no pose"), ("other_body", "it is not of base_link, as the truth is")):
         if found[key]:
             lines.append(f"pose         not scored in {counted(int(found[key]), 'frame')}: {why}")
     return lines

@@ -39,7 +39,7 @@ def load_scene(folder: Path) -> tuple[StereoFrame, Array, Array, int]:
 
 def errors(pixels: Array, truth: Array, mask: Array, margin: int) -> Array:
     """Percent of non-occluded pixels that are bad at 0.5, 1 and 2 px, the same of all, RMS (px), percent known."""
-    found = StereoErrors.of(pixels, truth, mask, margin).measures()["cropped_image"]
+    found = StereoErrors.of(pixels, truth, mask, margin).metrics()["cropped_image"]
     bad = [found[region][f"bad_{limit}"] for region in ("nonocc", "all") for limit in ("0.5", "1", "2")]
     return np.array([*(100 * np.array(bad)), found["all"]["rmse"], 100 * found["all"]["density"]])
 

@@ -157,7 +157,7 @@ def score(simulations: Sequence[Simulation], stride: int, runs: dict[str, str]) 
 
 def figures(run: Run) -> list[str]:
     """The table's column of one run."""
-    return [*terrain_figures(run.tally.measures()), f"{1e3 * float(np.median(run.seconds)):.0f}"]
+    return [*terrain_figures(run.tally.metrics()), f"{1e3 * float(np.median(run.seconds)):.0f}"]
 
 
 def main(given: Sequence[str] | None = None) -> None:
@@ -173,7 +173,7 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--size", type=arguments.size, default=(1280, 960), metavar="WxH", help="of the images")
     parser.add_argument("--runs", nargs="+", choices=[*RUNS, "true"], default=list(RUNS))
     parser.add_argument("--rings", action="store_true", help="the score by distance, too")
-    parser.add_argument("--json", type=Path, help="all measures into this file")
+    parser.add_argument("--json", type=Path, help="all metrics into this file")
     options = parser.parse_args(given)
     cv2.setNumThreads(1)
     keep_freed_memory()  # as a run does
@@ -195,8 +195,8 @@ def main(given: Sequence[str] | None = None) -> None:
             print(f"{label:66}" + "".join(f"{cell:>26}" for cell in cells), flush=True)
         if options.rings:
             for name, run in found.items():
-                print("\n".join(["", name, *terrain_lines(run.tally.measures())]))
-        everything[str(rocks)] = {name: run.tally.measures() for name, run in found.items()}
+                print("\n".join(["", name, *terrain_lines(run.tally.metrics())]))
+        everything[str(rocks)] = {name: run.tally.metrics() for name, run in found.items()}
     if options.json is not None:
         options.json.write_text(json.dumps(everything, indent=2))
 

@@ -132,7 +132,7 @@ def test_the_score_counts_known_errors_exactly(tmp_path: Path) -> None:
     assert "without the leftmost 32 columns" in table
     counted = mask == 255
     bad = 100 * np.sum(counted & (~known | (error > 2))) / counted.sum()
-    assert f"{bad:.2f}%" in next(line for line in table.splitlines() if "nonocc" in line)
+    assert f"{bad:.2f}%" in next(line for line in table.splitlines() if "seen by both" in line)
 
 
 def test_full_and_half_size_names_and_the_other_name_of_the_truth(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Error measures, on cases small enough to work out by hand."""
+"""Error metrics, on cases small enough to work out by hand."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.scoring import metrics as measures
+from recordings.scoring import metrics
 
 NAN = float("nan")
 
 
 def heights(*parts):
-    """The measures of errors added in parts."""
-    errors = measures.HeightErrors()
+    """The metrics of errors added in parts."""
+    errors = metrics.HeightErrors()
     for part in parts:
         errors.add(part)
-    return errors.measures()
+    return errors.metrics()
 
 
 def test_height_errors_by_hand():
@@ -39,12 +39,12 @@ def test_no_heights_have_no_error():
 
 
 @given(st.lists(st.floats(-0.4, 0.4), min_size=1, max_size=60))
-def test_the_nmad_of_a_histogram_is_that_of_the_errors_to_a_hundredth_of_a_millimetre(errors):
+def test_the_nmad_of_the_histogram_is_exact_to_a_hundredth_of_a_mm(errors):
     exact = 1.4826 * np.median(np.abs(np.array(errors) - np.median(errors)))
     assert heights(errors)["nmad"] == pytest.approx(exact, abs=1.5e-5)
 
 
-def test_errors_beyond_the_histogram_count_but_no_median_is_made_up_of_them():
+def test_errors_beyond_the_histogram_make_the_nmad_nan():
     found = heights([0.01, 0.02, 0.03, 5.0])
     assert found["nmad"] == pytest.approx(1.4826 * 0.01)  # median 0.025, deviations .015 .005 .005 and a large one
     assert found["rmse"] == pytest.approx(np.sqrt((0.0001 + 0.0004 + 0.0009 + 25) / 4))
@@ -54,27 +54,27 @@ def test_errors_beyond_the_histogram_count_but_no_median_is_made_up_of_them():
 
 
 def test_height_errors_take_no_more_memory_for_more_frames():
-    errors = measures.HeightErrors()
+    errors = metrics.HeightErrors()
     errors.add(np.zeros(1000))
     before = len(pickle.dumps(errors))
     for _ in range(20):
         errors.add(np.full(100_000, 0.02))
     assert len(pickle.dumps(errors)) < before + 100
-    assert errors.measures()["cells"] == 2_001_000
+    assert errors.metrics()["cells"] == 2_001_000
 
 
 def test_a_cell_on_the_border_of_two_rings_is_in_the_outer_one_only():
     radius = np.array([0.0, 3.999, 4.0, 7.999, 8.0])
-    assert measures.in_ring(radius, 0.0, 4.0).tolist() == [True, True, False, False, False]
-    assert measures.in_ring(radius, 4.0, 8.0).tolist() == [False, False, True, True, False]
+    assert metrics.in_ring(radius, 0.0, 4.0).tolist() == [True, True, False, False, False]
+    assert metrics.in_ring(radius, 4.0, 8.0).tolist() == [False, False, True, True, False]
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-2, 2))
-def test_a_tilted_and_shifted_map_is_perfect_once_its_plane_is_removed(east, north, up):
+def test_without_its_plane_a_tilted_and_shifted_map_has_no_error(east, north, up):
     x, y = np.linspace(-8, 8, 9), np.linspace(-4, 4, 7)
     error = east * x[None, :] + north * y[:, None] + up
     error[2, 3] = NAN
-    left = measures.without_plane(x, y, error)
+    left = metrics.without_plane(x, y, error)
     assert np.isnan(left[2, 3])
     assert np.nanmax(np.abs(left)) < 1e-9
 
@@ -82,17 +82,17 @@ def test_a_tilted_and_shifted_map_is_perfect_once_its_plane_is_removed(east, nor
 def test_a_plane_through_three_cells_proves_nothing():
     error = np.full((3, 3), NAN)
     error[0, 0] = error[1, 1] = error[0, 2] = 1.0
-    assert np.isnan(measures.without_plane(np.arange(3.0), np.arange(3.0), error)).all()
+    assert np.isnan(metrics.without_plane(np.arange(3.0), np.arange(3.0), error)).all()
 
 
 def test_the_angle_between_nearly_equal_directions_keeps_its_digits():
-    assert measures.angle_between([0, 0, 1], [np.sin(1e-9), 0, np.cos(1e-9)]) == pytest.approx(1e-9, rel=1e-6)
-    assert measures.angle_between([0, 0, 2], [3, 0, 0]) == pytest.approx(np.pi / 2)
+    assert metrics.angle_between([0, 0, 1], [np.sin(1e-9), 0, np.cos(1e-9)]) == pytest.approx(1e-9, rel=1e-6)
+    assert metrics.angle_between([0, 0, 2], [3, 0, 0]) == pytest.approx(np.pi / 2)
 
 
 def test_a_grid_lands_on_another_by_its_place_not_by_its_index():
     values = np.arange(6, dtype=np.float32).reshape(2, 3)
-    out = measures.aligned(values, (0.5, -0.5), (3, 3), (0.0, 0.0), 0.5, NAN)
+    out = metrics.aligned(values, (0.5, -0.5), (3, 3), (0.0, 0.0), 0.5, NAN)
     expected = np.full((3, 3), NAN, np.float32)
     expected[0, 1:] = [3, 4]
     np.testing.assert_array_equal(out, expected)
@@ -100,8 +100,8 @@ def test_a_grid_lands_on_another_by_its_place_not_by_its_index():
 
 def test_grids_half_a_cell_apart_do_not_compare():
     with pytest.raises(ValueError, match=r"fraction of a 0\.5 m cell"):
-        measures.aligned(np.zeros((2, 2)), (0.25, 0.0), (2, 2), (0.0, 0.0), 0.5, NAN)
+        metrics.aligned(np.zeros((2, 2)), (0.25, 0.0), (2, 2), (0.0, 0.0), 0.5, NAN)
 
 
 def test_grids_that_do_not_overlap_have_nothing_in_common():
-    assert np.isnan(measures.aligned(np.zeros((2, 2)), (9.0, 9.0), (2, 2), (0.0, 0.0), 0.5, NAN)).all()
+    assert np.isnan(metrics.aligned(np.zeros((2, 2)), (9.0, 9.0), (2, 2), (0.0, 0.0), 0.5, NAN)).all()

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.ros2.to_msg import odometry
 from recordings.scoring.pose_metrics import PoseTally
-from recordings.scoring.table import place_lines
+from recordings.scoring.table import pose_lines
 from stages.data import Pose
 
 
@@ -24,10 +24,10 @@ def tallied(pairs):
     tally = PoseTally()
     for true, given in pairs:
         tally.add(true, given)
-    return tally.measures()
+    return tally.metrics()
 
 
-def test_poses_that_are_only_told_in_another_frame_have_no_error():
+def test_poses_in_another_frame_of_reference_have_no_error():
     turn, shift = Rotation.from_euler("z", 1.1), np.array([5.0, -3.0, 2.0])
     places = np.array([[0, 0, 0], [1, 0.2, 0.1], [2, 1, 0.3]], float)
     found = tallied(
@@ -35,8 +35,8 @@ def test_poses_that_are_only_told_in_another_frame_have_no_error():
         for place, heading in zip(places, (0.0, 0.3, 0.9), strict=True)
     )
     assert found["drift"] == pytest.approx(0, abs=1e-12)
-    assert found["heading"] == pytest.approx(0, abs=1e-12)
-    assert found["way"] == pytest.approx(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    assert found["max_heading_error"] == pytest.approx(0, abs=1e-12)
+    assert found["distance"] == pytest.approx(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
 
 
 def test_the_drift_is_the_last_error_over_the_way_there_and_back():
@@ -46,10 +46,10 @@ def test_the_drift_is_the_last_error_over_the_way_there_and_back():
         (pose([0, 0, 0]), pose([0.04, 0.03, 0], -0.1)),
     ])  # fmt: skip
     assert found["drift"] == pytest.approx(0.05 / 8)
-    assert (found["largest"], found["heading"]) == (pytest.approx(0.5), pytest.approx(0.2))
+    assert (found["max_error"], found["max_heading_error"]) == (pytest.approx(0.5), pytest.approx(0.2))
 
 
-def test_each_part_begins_anew_and_adds_its_own_error_and_way():
+def test_each_part_is_aligned_again_and_adds_its_error_and_distance():
     found = tallied([
         (pose([0, 0, 0]), pose([0, 0, 0], frame="visual_odom")),
         (pose([1, 0, 0]), pose([1.02, 0, 0], frame="visual_odom")),
@@ -59,13 +59,13 @@ def test_each_part_begins_anew_and_adds_its_own_error_and_way():
     ])  # fmt: skip
     assert found["drift"] == pytest.approx((0.02 + 0.06) / (1 + 3))
     assert (found["parts"], found["frames"], found["missing"]) == (2, 4, 1)
-    first, second = place_lines(found)
-    assert "off by 2.00% of 4.00 m driven, 6.0 cm and 0.00 deg at most, in 2 parts that nothing joins" in first
-    assert "not scored in 1 frame: none is given" in second
+    first, second = pose_lines(found)
+    assert "drift 2.00% of 4.00 m driven; largest error 6.0 cm, 0.00 deg; 2 parts in frames of their own" in first
+    assert "not scored in 1 frame: the result has no pose" in second
 
 
 def test_a_pose_of_something_else_is_not_scored():
     assert tallied([(pose([0, 0, 0]), None)]) is None
     found = tallied([(pose([0, 0, 0]), pose([0, 0, 0], child="camera"))])
     assert math.isnan(found["drift"])
-    assert place_lines(found) == ["pose         not scored in 1 frame: it is not base_link's, as the truth is"]
+    assert pose_lines(found) == ["pose         not scored in 1 frame: it is not of base_link, as the truth is"]

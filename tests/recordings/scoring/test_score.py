@@ -128,14 +128,14 @@ def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
     assert hazards["recall"] == 1
     assert hazards["false_safe"] == hazards["false_alarm"] == hazards["unknown"] == 0
     assert hazards["free_hazard"] == hazards["free_on_rock"] == 0
-    assert rocks["0.2 m"]["in_view"] > 5
+    assert rocks["0.2 m"]["visible"] > 5
     assert rocks["0.2 m"]["recall"] == rocks["0.3 m"]["recall"] == 1
     assert found.tilt["frames"] == 2
     assert found.tilt["max"] < 1e-6
     assert found.untilted == {}
 
 
-def test_disparity_errors_are_told_apart_from_missing_disparity(tmp_path, truth, frames):
+def test_missing_disparity_is_bad_but_has_no_error(tmp_path, truth, frames):
     def change(pixels):
         pixels += np.float32(0.75)
         pixels[::2] = np.nan
@@ -160,7 +160,7 @@ def test_disparities_of_another_camera_are_not_compared(tmp_path, truth, frames,
     assert found.terrain is not None
 
 
-def test_maps_of_other_cells_are_not_compared_and_all_else_is(tmp_path, truth, frames):
+def test_maps_of_another_resolution_are_not_scored_but_all_else_is(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, resolution=0.1)
     assert found.terrain is None
     reasons = {"its cells are 0.1 m wide, the truth's 0.05 m; run with that resolution": 2}
@@ -172,7 +172,7 @@ def test_maps_of_other_cells_are_not_compared_and_all_else_is(tmp_path, truth, f
     assert main(["score", str(tmp_path / "out.mcap"), "--truth", str(truth)]) == 3
 
 
-def test_a_map_whose_companion_does_not_fit_is_left_out_for_that(tmp_path, truth, frames):
+def test_a_map_is_not_scored_if_the_other_map_does_not_fit(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, resolution=0.1, navigation=0.05)
     assert found.terrain is None
     assert found.unscored == {
@@ -183,7 +183,7 @@ def test_a_map_whose_companion_does_not_fit_is_left_out_for_that(tmp_path, truth
 
 def test_a_run_of_which_nothing_fits_is_no_score(tmp_path, truth, frames):
     only = ("/nav/elevation_map", "/nav/navigation_map")
-    with pytest.raises(LogError, match=r"nothing in it fits the truth in .*: of /nav/elevation_map, its cells"):
+    with pytest.raises(LogError, match=r"no result fits the truth in .*: /nav/elevation_map: its cells"):
         scored(tmp_path, truth, frames, only=only, resolution=0.1)
 
 
@@ -214,11 +214,11 @@ def test_a_tilted_map_is_worse_far_off_and_perfect_once_levelled(tmp_path, truth
     assert found["0-8 m"]["levelled"]["rmse"] < 1e-6
 
 
-def test_values_where_nobody_could_see_the_ground_are_made_up(tmp_path, truth, frames):
+def test_values_where_no_camera_sees_the_ground_are_hallucinated(tmp_path, truth, frames):
     x = (np.arange(320) + 0.5) * 0.05 - 8
     near = np.hypot(x[None, :], x[:, None]) < 8
     in_view = [ground_truth.truth_maps(SMALL, 0, frame)[0].layers["in_view"][near] > 0.5 for frame in frames]
-    found = scored(tmp_path, truth, frames).terrain["made_up"]
+    found = scored(tmp_path, truth, frames).terrain["hallucinated"]
     assert found["of_values"] == found["of_cells"] == pytest.approx(1 - np.mean(in_view))
 
 
@@ -231,9 +231,9 @@ def test_a_smaller_map_is_compared_by_place_and_loses_completeness(tmp_path, tru
     assert 0.05 < found["hazards"]["unknown"] < 0.9
 
 
-def test_a_map_that_calls_everything_free_finds_no_rock(tmp_path, truth, frames):
+def test_a_map_that_is_all_free_detects_no_rock(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, cells=np.zeros_like).terrain
-    assert found["hazards"]["recall"] == found["rocks"]["0.2 m"]["found"] == 0
+    assert found["hazards"]["recall"] == found["rocks"]["0.2 m"]["detected"] == 0
     assert found["hazards"]["false_safe"] == 1
     blind = scored(tmp_path, truth, frames, cells=lambda cells: np.full_like(cells, Cell.UNKNOWN)).terrain
     assert blind["hazards"]["unknown"] == 1
@@ -241,7 +241,7 @@ def test_a_map_that_calls_everything_free_finds_no_rock(tmp_path, truth, frames)
     assert blind["rocks"]["0.2 m"]["recall"] == 0
 
 
-def test_cells_called_free_on_rocks_or_out_of_view_are_a_share_of_all_free_cells(tmp_path, truth, frames):
+def test_free_cells_on_rocks_or_out_of_view_are_shares_of_free_cells(tmp_path, truth, frames):
     maps = [ground_truth.truth_maps(SMALL, 0, frame) for frame in frames]
     found = scored(tmp_path, truth, frames, cells=np.zeros_like).terrain["hazards"]
     assert found["free_hazard"] == np.mean([navigation.cells == Cell.HAZARD for _, navigation in maps])
@@ -249,7 +249,7 @@ def test_cells_called_free_on_rocks_or_out_of_view_are_a_share_of_all_free_cells
     assert found["free_unseen"] == np.mean([terrain.layers["in_view"] < 0.5 for terrain, _ in maps])
 
 
-def test_disparities_where_one_camera_sees_are_told(tmp_path, truth, frames):
+def test_disparities_of_occluded_pixels_are_counted(tmp_path, truth, frames):
     seen = np.stack([frame.seen for frame in frames])
 
     def guess(error):
@@ -267,7 +267,7 @@ def test_disparities_where_one_camera_sees_are_told(tmp_path, truth, frames):
     assert painted["given_without_truth"] == {"pixels": np.sum(seen == 0), "share": np.mean(seen == 0)}
 
 
-def test_leaving_out_a_bad_frame_scores_as_saying_unknown(tmp_path, truth, frames):
+def test_a_missing_frame_scores_as_one_of_unknown_cells(tmp_path, truth, frames):
     silent = scored(tmp_path, truth, frames, skipped=(1,))
     honest = scored(tmp_path, truth, frames, blind=(1,))
     assert silent.disparity == honest.disparity
@@ -278,7 +278,7 @@ def test_leaving_out_a_bad_frame_scores_as_saying_unknown(tmp_path, truth, frame
     heights, hazards, rocks = (silent.terrain[name] for name in ("heights", "hazards", "rocks"))
     assert 0.3 < heights["0-8 m"]["completeness"] < 0.7
     assert hazards["unknown"] == pytest.approx(1 - heights["0-8 m"]["completeness"])
-    assert 0 < rocks["0.2 m"]["found"] < rocks["0.2 m"]["in_view"]
+    assert 0 < rocks["0.2 m"]["detected"] < rocks["0.2 m"]["visible"]
     assert silent.missing == {topic: [SMALL.stamp(1)] for topic in scoring.RESULTS}
     assert honest.missing == {}
 
@@ -286,7 +286,7 @@ def test_leaving_out_a_bad_frame_scores_as_saying_unknown(tmp_path, truth, frame
 def test_a_tilt_that_cannot_be_scored_says_why(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, only=scoring.RESULTS)
     assert found.tilt is None
-    assert found.untilted == {"the result has no /tf from 'level' at their stamps": 2}
+    assert found.untilted == {"the result has no /tf from 'level' at that stamp": 2}
     assert "not scored in 2 frames: the result has no /tf from 'level'" in format_score(found)
     other = scored(tmp_path, truth, frames, camera="mast_camera")
     assert other.untilted == {"the truth has no mount of 'mast_camera' on 'base_link'": 2}
@@ -306,26 +306,26 @@ def test_a_frame_without_results_is_missing_by_its_stamp(tmp_path, truth, frames
     partial = scored(tmp_path, truth, frames, only=("/nav/disparity",))
     assert partial.missing.keys() == {"/nav/elevation_map", "/nav/navigation_map"}
     assert partial.terrain["heights"]["0-8 m"]["completeness"] == partial.terrain["hazards"]["recall"] == 0
-    assert partial.terrain["rocks"]["0.2 m"]["found"] == 0
+    assert partial.terrain["rocks"]["0.2 m"]["detected"] == 0
     assert partial.terrain["hazards"]["unknown"] == partial.disparity["density"] == 1
 
 
-def test_results_at_stamps_without_truth_are_reported_and_never_compared(tmp_path, truth, frames):
+def test_results_at_stamps_without_truth_are_reported_not_scored(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, shift={1: 1})
     assert (found.frames, found.compared) == (2, 1)
     assert found.unmatched == dict.fromkeys(scoring.RESULTS, 1)
     assert "/nav/disparity: 1 message at stamps without truth" in format_score(found)
-    with pytest.raises(LogError, match=r"no result of .* has the stamp of a true frame"):
+    with pytest.raises(LogError, match=r"no result in .* has a stamp of"):
         scored(tmp_path, truth, frames, shift={0: 1, 1: 1})
 
 
 @pytest.mark.parametrize("ahead", [-(10**18), 3_600_000_000_000])
-def test_a_truth_that_was_logged_by_another_clock_than_its_stamps_scores_the_same(tmp_path, truth, frames, ahead):
+def test_log_times_of_another_clock_do_not_change_the_score(tmp_path, truth, frames, ahead):
     other = rewritten(truth, tmp_path / "other.mcap", time=lambda topic, log_time: log_time + ahead)
     assert scored(tmp_path, other, frames).to_json() == scored(tmp_path, truth, frames).to_json()
 
 
-def test_one_stamp_that_is_far_ahead_does_not_part_the_logs(tmp_path, truth, frames):
+def test_one_stamp_far_ahead_does_not_separate_the_logs(tmp_path, truth, frames):
     def ahead(topic, log_time):
         first = topic == "/truth/pose" and log_time == SMALL.stamp(0)
         return log_time - 3_600_000_000_000 if first else log_time  # as if its stamp were an hour ahead of its logging
@@ -349,14 +349,14 @@ def without(truth: Path, path: Path, *topics: str) -> Path:
     return path
 
 
-def test_a_topic_of_the_truth_that_no_message_came_on_is_not_waited_for(tmp_path, truth, frames):
+def test_a_truth_topic_without_messages_is_ignored(tmp_path, truth, frames):
     found = scored(tmp_path, without(truth, tmp_path / "bare.mcap", "/truth/occlusion", "/truth/rocks"), frames)
     assert found.disparity["whole_image"]["all"]["bad_0.5"] == 0
     assert found.terrain["heights"]["0-8 m"]["raw"]["rmse"] < 1e-6
     assert found.unscored == {}
 
 
-def test_a_truth_that_cannot_be_scored_with_says_what_it_lacks(tmp_path, truth, frames):
+def test_an_incomplete_truth_names_the_missing_topic(tmp_path, truth, frames):
     found = scored(tmp_path, without(truth, tmp_path / "bare.mcap", "/truth/navigation_map"), frames)
     assert found.terrain is None
     said = "not scored   /truth/elevation_map: 2 frames: the truth has no /truth/navigation_map there"
@@ -372,17 +372,17 @@ def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
     with Ros2Writer(tmp_path / "other.mcap") as writer:
         ones = {"elevation": np.ones((2, 2), np.float32)}
         writer.write("/nav/dense", ros2.grid_map(ElevationMap(1, ones, 0.05, (0, 0), "level")), 1)
-    with pytest.raises(LogError, match=r"none of /nav/disparity, .*, only /nav/dense: the run made none, or"):
+    with pytest.raises(LogError, match=r"none of /nav/disparity, .*, only /nav/dense: the run produced none, or"):
         scoring.score(tmp_path / "other.mcap", truth)
 
 
-def test_where_no_map_fits_frames_without_one_make_no_table(tmp_path, truth, frames):
+def test_no_terrain_table_if_no_map_fits(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, resolution=0.1, skipped=(1,))
     assert found.unscored["/nav/elevation_map"]
     assert found.terrain is None
 
 
-def test_a_damaged_truth_costs_what_it_held_and_nothing_is_scored_against_it(tmp_path, truth, frames):
+def test_frames_lost_in_a_damaged_truth_are_not_scored(tmp_path, truth, frames):
     run = Run().write(tmp_path / "run.mcap", frames)
     with truth.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -426,7 +426,7 @@ def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
     assert brief[:2] == table.splitlines()[:2]
     figures = {line.split()[0]: line for line in brief}
     assert {"disparity", "elevation", "hazards", "rocks", "tilt"} <= figures.keys()
-    assert "RMS error 2.0 cm to 4 m away, 2.0 cm to 8 m" in figures["elevation"]
+    assert "RMS error 2.0 cm up to 4 m away, 2.0 cm up to 8 m" in figures["elevation"]
     assert max(map(len, brief)) <= 100
     read = json.loads(found.to_json())
     assert read["terrain"]["heights"]["0-4 m"]["raw"]["bias"] == pytest.approx(0.02, abs=1e-6)

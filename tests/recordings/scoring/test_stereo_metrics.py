@@ -13,13 +13,13 @@ NAN, INF = float("nan"), float("inf")
 
 
 def measured(estimate, truth, occlusion, columns=0):
-    """The measures of one frame of float32 disparities."""
+    """The metrics of one frame of float32 disparities."""
     pixels = (np.array(values, np.float32) for values in (estimate, truth))
-    return StereoErrors.of(*pixels, None if occlusion is None else np.array(occlusion, np.uint8), columns).measures()
+    return StereoErrors.of(*pixels, None if occlusion is None else np.array(occlusion, np.uint8), columns).metrics()
 
 
 def defined(estimate, truth, counted):
-    """The measures of the pixels `counted`, as Middlebury's evaluation defines them."""
+    """The metrics of the pixels `counted`, as Middlebury's evaluation defines them."""
     estimate, truth = estimate.astype(np.float64)[counted], truth.astype(np.float64)[counted]
     unknown = ~np.isfinite(estimate)
     error = np.abs(estimate - truth)[~unknown]
@@ -81,7 +81,7 @@ def test_the_crop_is_the_range_rounded_up_to_sixteen(disparities, columns):
     assert cropped_columns(disparities) == columns
 
 
-def test_without_an_occlusion_mask_all_pixels_count_and_the_rest_is_not_told():
+def test_without_an_occlusion_mask_only_all_pixels_are_scored():
     found = measured([[10, 12, NAN]], [[10, 10, 10]], None)
     assert found["whole_image"]["all"]["bad_1"] == pytest.approx(2 / 3)
     assert found["whole_image"]["nonocc"]["pixels"] == found["whole_image"]["occluded"]["pixels"] == 0
@@ -132,6 +132,6 @@ def test_added_frames_count_as_one_large_frame(seed, cut, masked):
 def test_a_frame_of_twice_the_pixels_counts_twice():
     small = StereoErrors.of(np.full((1, 2), 13.0), np.full((1, 2), 10.0), None, 16)
     large = StereoErrors.of(np.full((1, 4), 10.0), np.full((1, 4), 10.0), None, 32)
-    found = (small + large).measures()
+    found = (small + large).metrics()
     assert found["whole_image"]["all"]["bad_2"] == pytest.approx(1 / 3)
     assert found["cropped_image"]["leftmost_columns_cropped"] == [16, 32]

@@ -42,10 +42,10 @@ def flat_truth(rocks: tuple[tuple[float, ...], ...] = ()) -> TrueGround:
 def scored(truth: TrueGround, layers: dict[str, Array], cells: Array | None = None) -> dict[str, Any]:
     tally = TerrainTally()
     tally.add(truth, layers, cells)
-    return tally.measures()
+    return tally.metrics()
 
 
-def test_heights_count_where_a_pixel_of_both_cameras_sees_and_a_plane_is_forgiven() -> None:
+def test_heights_count_in_visible_cells_and_levelling_removes_a_plane() -> None:
     truth = flat_truth()
     tilted = np.where(X > 0.05, 0.02 * X + 0.01, np.nan)
     tilted[(X > 0.05) & (Y > 0)] = np.nan
@@ -57,19 +57,19 @@ def test_heights_count_where_a_pixel_of_both_cameras_sees_and_a_plane_is_forgive
     assert found["0-2 m"]["seen"] + found["2-4 m"]["seen"] == found["0-4 m"]["seen"]
 
 
-def test_a_value_where_nothing_could_be_seen_is_made_up_and_one_between_the_pixels_is_not() -> None:
+def test_values_out_of_view_are_hallucinated_those_between_pixels_not() -> None:
     truth = flat_truth()
     elevation = np.full((N, N), np.nan)
     elevation[160, 161:261] = 0  # seen
     elevation[100:110, 160] = 0  # in view, no pixel
     elevation[100:140, 100] = 0  # hidden
-    found = scored(truth, {"elevation": elevation})["made_up"]
+    found = scored(truth, {"elevation": elevation})["hallucinated"]
     assert found["of_values"] == pytest.approx(40 / 150)
     assert found["of_cells"] == pytest.approx(40 / np.count_nonzero(RADIUS < 8))
     assert found["between_pixels"] == pytest.approx(10 / 150)
 
 
-def test_intervals_hold_for_errors_as_large_as_stated_and_tilt_counts_in_the_total_only() -> None:
+def test_stated_sigmas_cover_their_errors_and_tilt_only_the_total() -> None:
     truth, random = flat_truth(), np.random.default_rng(1)
     sigma, tilt = 0.01 + 0.002 * RADIUS, 0.02
     noise = random.normal(0, 1, (N, N)) * sigma
@@ -83,7 +83,7 @@ def test_intervals_hold_for_errors_as_large_as_stated_and_tilt_counts_in_the_tot
     assert silent["random"] == found["random"]
 
 
-def test_one_tilt_says_little_about_whether_intervals_hold_and_many_tell() -> None:
+def test_intervals_are_summed_over_the_given_tilt_errors() -> None:
     truth, random, tilt = flat_truth(), np.random.default_rng(3), 0.003
     own, others = np.array([0.2 * tilt, 0.1 * tilt]), random.normal(0, tilt, (400, 2))
     lean = own[0] * X + own[1] * Y
@@ -91,12 +91,12 @@ def test_one_tilt_says_little_about_whether_intervals_hold_and_many_tell() -> No
     assert scored(truth, layers)["intervals"]["total"]["1"] == 1.0
     tally = TerrainTally()
     tally.add(truth, layers, None, others - own)
-    total = tally.measures()["intervals"]["total"]
+    total = tally.metrics()["intervals"]["total"]
     assert total["1"] == pytest.approx(0.683, abs=0.03)
     assert total["2"] == pytest.approx(0.954, abs=0.02)
 
 
-def test_a_rock_counts_as_in_view_by_the_height_that_shows_and_as_found_by_a_hazard_on_it() -> None:
+def test_a_rock_is_visible_by_half_its_height_and_detected_by_a_hazard() -> None:
     rocks = (
         (4.0, 0.0, 0.5, 0.25, 400.0, 0.9),  # found
         (4.0, 2.0, 0.5, 0.35, 400.0, 0.9),  # missed: the hazard is two cells off
@@ -109,16 +109,20 @@ def test_a_rock_counts_as_in_view_by_the_height_that_shows_and_as_found_by_a_haz
     for x, y in ((4.2, 0.0), (4.0, 2.36), (6.0, 0.0)):
         cells[int((y + 8) / 0.05), int((x + 8) / 0.05)] = Cell.HAZARD
     found = scored(flat_truth(rocks), {}, cells)["rocks"]
-    assert found["0.2 m"] == {"in_view": 2, "found": 1, "glimpsed": 3, "glimpsed_found": 2, "recall": 0.5}
-    assert found["0.3 m"] == {"in_view": 1, "found": 0, "glimpsed": 2, "glimpsed_found": 1, "recall": 0.0}
+    assert found["0.2 m"] == {
+        "visible": 2, "detected": 1, "partly_visible": 3, "partly_visible_detected": 2, "recall": 0.5,
+    }  # fmt: skip
+    assert found["0.3 m"] == {
+        "visible": 1, "detected": 0, "partly_visible": 2, "partly_visible_detected": 1, "recall": 0.0,
+    }  # fmt: skip
 
 
-def test_unknown_is_no_alarm_and_no_find_and_what_is_free_on_a_rock_counts_anywhere() -> None:
+def test_unknown_is_neither_a_false_alarm_nor_a_detection() -> None:
     truth = flat_truth(((4.0, 0.0, 0.5, 0.25, 400.0, 0.9), (-3.0, 0.0, 0.5, 0.25, 0.0, 0.0)))
     nothing = scored(truth, {}, None)
     assert nothing["hazards"]["unknown"] == 1
     assert nothing["hazards"]["false_alarm"] == nothing["hazards"]["recall"] == 0
-    assert nothing["rocks"]["0.2 m"]["found"] == 0
+    assert nothing["rocks"]["0.2 m"]["detected"] == 0
     free = scored(truth, {}, np.zeros((N, N), np.int8))["hazards"]
     assert free["free_on_rock"] == pytest.approx(np.count_nonzero(truth.rock) / N**2)
     assert free["rock_false_safe"] == 1
@@ -134,11 +138,11 @@ def test_frames_add_up_and_the_table_prints() -> None:
     for height in (0.0, 0.1):
         layers = {"elevation": np.full((N, N), height), "variance": np.full((N, N), 1e-4)}
         tally.add(truth, layers, np.full((N, N), np.int8(Cell.HAZARD)))
-    found = tally.measures()
+    found = tally.metrics()
     assert found["heights"]["0-8 m"]["raw"]["bias"] == pytest.approx(0.05)
     assert found["intervals"]["total"] == {"1": 0.5, "2": 0.5}
     text = "\n".join(terrain_lines(found))
-    assert text.count("2 of 2; 0 of 0") == 2  # rocks of 0.2 m, in view and glimpsed; none of 0.3 m
+    assert text.count("2 of 2; 0 of 0") == 2  # rocks of 0.2 m, visible and partly visible; none of 0.3 m
     assert all(len(line) <= 100 for line in text.splitlines())
 
 
@@ -153,7 +157,7 @@ def simulated() -> tuple[Any, ElevationMap]:
     return truth, ground_truth.truth_maps(SMALL, SMALL.stamp(0), truth)[0]
 
 
-def test_every_cell_that_a_pixel_hits_is_in_view_and_the_others_in_view_lie_between(simulated: Any) -> None:
+def test_visible_cells_are_in_view_and_the_others_in_view_adjoin_them(simulated: Any) -> None:
     layers = simulated[1].layers
     visible, in_view = layers["visible"] > 0.5, layers["in_view"] > 0.5
     assert in_view[visible].all()

@@ -60,7 +60,7 @@ def solid(rocks: terrain.Rocks, facets: np.ndarray, index: int, points: np.ndarr
     return np.maximum(np.linalg.norm(unit, axis=1) - 1, (unit @ planes[:, :3].T - planes[:, 3]).max(axis=1))
 
 
-def test_true_disparity_reprojects_onto_the_true_surface_within_a_millimetre(seen):
+def test_true_disparity_reprojects_to_a_mm_of_the_true_surface(seen):
     points, v, u = world_points(seen)
     ground = seen.surface[v, u] == raycast.GROUND
     height = SMALL.terrain.elevation(points[ground, 0], points[ground, 1])
@@ -106,7 +106,7 @@ def test_the_images_agree_at_the_true_disparity_and_nowhere_else(seen, rings):
     assert at < 0.5 * min(before, after)
 
 
-def test_on_bare_ground_the_images_agree_best_within_a_hundredth_of_a_pixel_of_the_truth():
+def test_images_of_bare_ground_match_the_truth_to_a_hundredth_of_a_px():
     # Without rocks, that is without edges, over which the lens's blur mixes two surfaces.
     bare = replace(SMALL, abundance=0.0, width=1000, height=750)
     truth = bare.frame(0)
@@ -116,7 +116,7 @@ def test_on_bare_ground_the_images_agree_best_within_a_hundredth_of_a_pixel_of_t
         assert at < 8.0
 
 
-def test_a_pixel_is_occluded_exactly_where_the_right_camera_sees_something_nearer(seen):
+def test_occluded_pixels_are_those_hidden_from_the_right_camera(seen):
     pose = seen.base.after(SMALL.mounts[1])
     right = np.full(seen.depth.shape, np.nan)
     surface, facet = np.empty(right.shape, np.int32), np.empty(right.shape, np.int8)
@@ -218,7 +218,7 @@ def test_what_is_surely_lit_has_nothing_before_the_sun(elevation, azimuth):
     assert sure.sum() > 0.25 * np.sum(lit)
 
 
-def test_nothing_is_met_before_the_depth_up_to_which_a_stretch_of_a_row_is_clear():
+def test_no_ray_hits_before_the_clear_depth_of_its_span():
     scene, camera = SMALL.terrain.scene, SMALL.camera
     pose = SMALL.base_at(SMALL.begin).after(SMALL.mounts[0])
     rng, closest = np.random.default_rng(4), []
@@ -351,7 +351,7 @@ def test_odometry_without_errors_is_exact():
         np.testing.assert_allclose(pose.position, expected.translation, atol=1e-9)
 
 
-def test_odometry_overstates_the_way_and_loses_the_heading_by_as_much_as_told():
+def test_odometry_has_the_scale_error_and_heading_drift_of_its_settings():
     """Over many drives; the heading's error, and that of the place across the way, grow with the way as they should."""
     long, scale, turn = 16.0, 0.02, np.radians(0.5)
     ways = np.linspace(0, long, 161)
@@ -377,7 +377,7 @@ def test_odometry_does_not_drift_while_the_rover_stands():
     assert all(np.array_equal(pose.quaternion, poses[0].quaternion) for pose in poses)
 
 
-def test_equal_simulations_write_equal_bytes_whatever_the_threads(tmp_path: Path):
+def test_the_number_of_threads_does_not_change_the_log(tmp_path: Path):
     written = []
     for name, threads, seed in (("a", 1, 1), ("b", 3, 1), ("c", 1, 2)):
         small = Simulation(frames=1, width=96, height=72, relief_cells=256, threads=threads, seed=seed)

@@ -27,7 +27,7 @@ from tests.recordings.sinks.recorded_scene import (
 )
 
 
-def test_disparities_survive_to_an_eighth_of_a_pixel_and_unknown_is_zero(rrd: Path) -> None:
+def test_disparities_are_stored_to_an_eighth_of_a_px_unknown_as_0(rrd: Path) -> None:
     blob = rows(rrd, "/disparity/pixels", "EncodedDepthImage:blob")[0][2][0]
     stored = decoded(blob, cv2.IMREAD_UNCHANGED) / 8.0
     truth = scene()["disparity"].pixels
@@ -63,7 +63,7 @@ def test_clouds_are_thinned_by_a_fixed_stride(tmp_path: Path) -> None:
     np.testing.assert_array_equal(positions, scene()["points"].points[::4])
 
 
-def test_a_cloud_in_the_cameras_frame_is_not_put_into_level_space(rrd: Path) -> None:
+def test_a_cloud_in_the_camera_frame_is_not_drawn(rrd: Path) -> None:
     assert not any(path.startswith("/cloud") for path in entities(rrd))
 
 
@@ -92,7 +92,7 @@ def test_hazards_stand_on_the_ground_where_they_are(rrd: Path) -> None:
     np.testing.assert_allclose(position, [[0.35, -1.25, ground + 0.03]], atol=1e-6)
 
 
-def test_a_regional_map_is_drawn_beside_the_frame_s_own(tmp_path: Path) -> None:
+def test_a_regional_map_is_drawn_in_its_own_frame_of_reference(tmp_path: Path) -> None:
     items = scene()
     near, cells = items["elevation_map"], items["navigation_map"]
     level = Transform("odom", LEVEL_FRAME, np.eye(3), [6.0, 0.0, 2.0])
@@ -116,7 +116,7 @@ def test_a_regional_map_is_drawn_beside_the_frame_s_own(tmp_path: Path) -> None:
     assert spots[names.index("rover")] == [15.0, 30.0]
 
 
-def test_the_camera_stands_where_the_cloud_was_seen_from(rrd: Path) -> None:
+def test_the_camera_is_drawn_at_the_sensor_of_the_cloud(rrd: Path) -> None:
     assert rows(rrd, "/rectified/camera", "Transform3D:translation")[0][2] == [pytest.approx([0.0, 0.0, 0.9])]
 
 
@@ -140,7 +140,7 @@ def test_curves_of_one_plot_differ_in_colour(rrd: Path) -> None:
     assert len({found[0][2][0] for found in colours}) == 4
 
 
-def test_the_tilt_check_is_a_plot_and_says_once_what_is_wrong(rrd: Path, tmp_path: Path) -> None:
+def test_the_tilt_check_is_plotted_and_its_fault_logged_once(rrd: Path, tmp_path: Path) -> None:
     (_, _, turn), *_ = rows(rrd, "/health/" + rr.escape_entity_path_part("tilt off turn"), "Scalars:scalars")
     assert turn[0] == pytest.approx(np.degrees(0.01))
     assert rows(rrd, "/motion/features", "Scalars:scalars")[0][2] == [321.0]

@@ -123,7 +123,7 @@ def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path: Path) -> N
     assert stamp_of(moved.header) == START
 
 
-def test_losses_are_in_the_diagnostics_of_their_frame_and_the_late_ones_at_the_end(tmp_path: Path) -> None:
+def test_losses_are_in_the_diagnostics_of_their_frame_or_at_the_end(tmp_path: Path) -> None:
     path = write(tmp_path / "out.mcap")
     whole, lost, late = [message.status for topic, _, message in iter_decoded(path) if topic == "/nav/diagnostics"]
     assert [(s.level, s.message) for s in whole] == [(0, "nothing lost")]
@@ -132,7 +132,7 @@ def test_losses_are_in_the_diagnostics_of_their_frame_and_the_late_ones_at_the_e
     assert late[0].message == "the log is cut"
 
 
-def test_the_stamps_in_a_regional_map_s_cells_can_be_told_from_the_diagnostics_beside_it(tmp_path: Path) -> None:
+def test_the_diagnostics_contain_the_epoch_of_a_regional_map(tmp_path: Path) -> None:
     fuse, sink = Running(Fuse()), McapSink()
     sink.open(tmp_path / "out.mcap", {"regional_map": ElevationMap}, ABOUT)
     for frame in range(3):
@@ -151,7 +151,7 @@ def test_the_stamps_in_a_regional_map_s_cells_can_be_told_from_the_diagnostics_b
             assert told[stamp] + np.nanmax(read_grid_map(message).layers["last"]) * SECOND == stamp
 
 
-def test_the_log_says_what_it_was_made_from_and_how_the_run_ended(tmp_path: Path) -> None:
+def test_the_metadata_contain_the_inputs_and_the_verdict_of_the_run(tmp_path: Path) -> None:
     with write(tmp_path / "out.mcap").open("rb") as file:
         records = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
     assert records["roverflow"] == ABOUT
@@ -160,13 +160,13 @@ def test_the_log_says_what_it_was_made_from_and_how_the_run_ended(tmp_path: Path
     }  # fmt: skip
 
 
-def test_runs_that_differ_in_their_timing_only_give_the_same_bytes(tmp_path: Path) -> None:
+def test_timing_does_not_change_the_log(tmp_path: Path) -> None:
     one, other = write(tmp_path / "a.mcap", 0.1), write(tmp_path / "b.mcap", 2.7)
     assert hashlib.sha256(one.read_bytes()).digest() == hashlib.sha256(other.read_bytes()).digest()
 
 
 @pytest.mark.parametrize("compression", ["lz4", "zstd", "none"])
-def test_the_log_is_compressed_as_asked_for_and_holds_the_same(tmp_path: Path, compression: str) -> None:
+def test_the_log_has_the_given_compression_and_the_same_messages(tmp_path: Path, compression: str) -> None:
     log = write(tmp_path / "out.mcap", compression=compression)
     with log.open("rb") as file:
         used = {index.compression for index in make_reader(file).get_summary().chunk_indexes}
@@ -187,7 +187,7 @@ def test_a_run_without_frames_leaves_a_readable_log(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["out.mcap"]
 
 
-def test_only_what_was_asked_for_is_wanted() -> None:
+def test_only_the_named_streams_are_wanted() -> None:
     sink = McapSink(results=("disparity",))
     assert sink.wants("disparity", Disparity)
     assert not sink.wants("points", PointCloud)
@@ -213,7 +213,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         McapSink().open(tmp_path / "gone" / "out.mcap", {}, {})
 
 
-def test_a_regional_map_s_frame_is_joined_to_the_frame_level(tmp_path: Path) -> None:
+def test_tf_joins_the_frame_of_a_regional_map_to_frame_level(tmp_path: Path) -> None:
     level = Transform("odom", "level", np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), np.array([3.0, 4.0, 0.5]))
     region = ElevationMap(START, {"elevation": np.ones((3, 4), np.float32)}, 0.05, (-1.0, 2.0), "odom", level=level)
     sink = McapSink()
@@ -227,7 +227,7 @@ def test_a_regional_map_s_frame_is_joined_to_the_frame_level(tmp_path: Path) -> 
     assert (frames["odom", "level"].translation.x, frames["odom", "level"].translation.y) == (3.0, 4.0)
 
 
-def test_the_tilts_health_and_what_the_run_found_are_in_the_diagnostics(tmp_path: Path) -> None:
+def test_tilt_health_and_findings_are_in_the_diagnostics(tmp_path: Path) -> None:
     sink, path = McapSink(), tmp_path / "out.mcap"
     assert sink.wants("health", TiltHealth)
     sink.open(path, STREAMS, ABOUT)

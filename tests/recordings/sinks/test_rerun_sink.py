@@ -29,7 +29,7 @@ def test_every_intermediate_is_there(rrd: Path) -> None:
     }  # fmt: skip
 
 
-def test_pictures_stand_at_the_nanosecond_of_their_frame(rrd: Path) -> None:
+def test_entities_have_the_stamp_of_their_frame_in_nanoseconds(rrd: Path) -> None:
     times = [(clock, frame) for clock, frame, _ in rows(rrd, "/disparity/pixels", "EncodedDepthImage:blob")]
     assert times == [(START + n * STEP, n) for n in range(3)]
 
@@ -43,13 +43,13 @@ def test_only_the_logs_clock_and_the_frame_count_are_timelines(rrd: Path) -> Non
     assert not names & {"log_time", "log_tick"}
 
 
-def test_what_frames_have_in_common_is_stored_once(rrd: Path) -> None:
+def test_legends_that_do_not_change_are_stored_once(rrd: Path) -> None:
     for legend in ("/disparity/source/legend", "/disparity/pixels/scale/text", "/elevation_map/relief/lines/distances"):
         assert [frame for _, frame, _ in rows(rrd, legend, "Points2D:positions")] == [0], legend
     assert len(rows(rrd, "/disparity/source", "AnnotationContext:context")) == 1
 
 
-def test_what_a_frame_lacks_is_cleared_at_that_frame(tmp_path: Path) -> None:
+def test_entities_that_a_frame_lacks_are_cleared_at_that_frame(tmp_path: Path) -> None:
     """Else the viewer would show the picture before it as this frame's."""
     lost = ("stereo", "rectified", "disparity", "points", "elevation_map")
     second = {name: item for name, item in scene(START + STEP).items() if name not in lost}
@@ -72,7 +72,7 @@ def test_what_a_frame_lacks_is_cleared_at_that_frame(tmp_path: Path) -> None:
         assert [bool(blob) for blob in blobs] == [True, False, True], entity
 
 
-def test_the_times_of_every_frame_are_there_once_and_have_a_gap_where_a_frame_lacks_a_stage(tmp_path: Path) -> None:
+def test_stage_times_are_stored_once_with_gaps_for_missing_stages(tmp_path: Path) -> None:
     """However many frames are sent at once."""
     count, without = 2 * PLOT_BATCH + 1, (5, PLOT_BATCH)
     records = [
@@ -88,7 +88,7 @@ def test_the_times_of_every_frame_are_there_once_and_have_a_gap_where_a_frame_la
     assert [value for _, n, value in times if n not in without] == [row[2] for row in expected if row[1] not in without]
 
 
-def test_a_sink_that_is_opened_again_knows_nothing_of_the_recording_before(tmp_path: Path) -> None:
+def test_a_sink_that_is_opened_again_starts_a_new_recording(tmp_path: Path) -> None:
     sink = RerunSink()
     for name, end in (("given up", sink.discard), ("second", lambda: sink.close({"verdict": "COMPLETE"}))):
         sink.open(tmp_path / f"{name}.rrd", STREAMS, {})
@@ -99,7 +99,7 @@ def test_a_sink_that_is_opened_again_knows_nothing_of_the_recording_before(tmp_p
     assert drawn == {"/seconds/second"}
 
 
-def test_losses_are_told_at_their_own_stamps(tmp_path: Path) -> None:
+def test_losses_are_logged_at_their_own_stamps(tmp_path: Path) -> None:
     lost = Loss("tilt", START - 7, "tilt", "unaligned", "no message within 200 ms")
     late = Loss("right", START + 9, "left", "unmatched", "no partner within 5 ms")
     summary = {"verdict": "INCOMPLETE", "drops": {"unaligned": 1, "unmatched": 1}, "entries": (late,)}
@@ -136,7 +136,7 @@ def test_a_recording_passes_reruns_own_check(rrd: Path) -> None:
     assert check.returncode == 0, check.stderr
 
 
-def test_a_recording_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
+def test_a_recording_has_its_name_only_when_it_is_complete(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     sink = RerunSink()
     sink.open(path, STREAMS, {})
@@ -147,12 +147,12 @@ def test_a_recording_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["run.rrd"]
 
 
-def test_a_run_without_frames_leaves_a_recording_that_says_so(tmp_path: Path) -> None:
+def test_a_run_without_frames_leaves_a_recording_with_its_verdict(tmp_path: Path) -> None:
     path = record_of(tmp_path / "empty.rrd", [], {"verdict": "INCOMPLETE", "drops": {"unreadable": 2}})
     assert rows(path, "/ledger", "TextLog:text")[-1][2] == ["INCOMPLETE: 0 frames, 2 unreadable"]
 
 
-def test_a_picture_that_fails_is_an_error_and_not_a_warning(tmp_path: Path) -> None:
+def test_a_rerun_error_is_raised_and_not_only_a_warning(tmp_path: Path) -> None:
     sink = RerunSink()
     sink.open(tmp_path / "run.rrd", STREAMS, {})
     with pytest.raises((ValueError, TypeError)):
@@ -160,7 +160,7 @@ def test_a_picture_that_fails_is_an_error_and_not_a_warning(tmp_path: Path) -> N
     sink.close({})
 
 
-def test_an_end_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+def test_an_unwritable_end_leaves_no_file(tmp_path: Path) -> None:
     sink = RerunSink()
     sink.open(tmp_path / "run.rrd", STREAMS, {})
     sink.write(Record(START, scene(START)))
@@ -175,7 +175,7 @@ def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it was not foreseen, rerun tells it only to its log: the sink has to find out."""
     monkeypatch.setattr("recordings.sinks.rerun_sink._room", lambda file: RESERVED_BYTES)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -193,7 +193,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_full_disk_is_foreseen_and_the_recording_ends_in_what_room_is_left(tmp_path: Path) -> None:
+def test_a_recording_ends_before_the_disk_is_full(tmp_path: Path) -> None:
     """rerun's writer does not return from a disk that is full, or a file that may grow no more."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = RerunSink()
@@ -208,13 +208,13 @@ def test_a_full_disk_is_foreseen_and_the_recording_ends_in_what_room_is_left(tmp
     assert [file.name for file in tmp_path.iterdir()] == ["run.rrd"]
 
 
-def test_it_wants_what_it_has_a_picture_for() -> None:
+def test_every_type_with_a_logger_is_wanted() -> None:
     wanted = {kind for kind in (*STREAMS.values(), Mount) if RerunSink().wants("any", kind)}
     assert wanted == set(STREAMS.values())
 
 
 @pytest.mark.parametrize("settings", [{"max_points": 0}, {"jpeg_quality": 0}, {"jpeg_quality": 101}])
-def test_senseless_settings_are_refused(settings: dict[str, int]) -> None:
+def test_settings_out_of_range_are_refused(settings: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=next(iter(settings))):
         RerunSink(**settings)  # type: ignore[arg-type]
 

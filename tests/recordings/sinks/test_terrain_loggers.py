@@ -13,7 +13,7 @@ from stages.data import LEVEL_FRAME, CellReason, VoxelMap
 from tests.recordings.sinks.recorded_scene import START, Record, entities, rows, scene
 
 
-def test_a_map_that_a_later_one_contains_is_drawn_as_that_one_only(tmp_path: Path) -> None:
+def test_a_map_that_a_later_map_contains_is_not_drawn_twice(tmp_path: Path) -> None:
     items = scene()
     assessed = items.pop("elevation_map")
     cells = replace(assessed, layers={"elevation": assessed.layers["elevation"]})
@@ -27,7 +27,7 @@ def test_a_map_that_a_later_one_contains_is_drawn_as_that_one_only(tmp_path: Pat
     assert not any(entity.startswith("/cells") for entity in drawn)
 
 
-def test_voxels_are_boxes_about_the_middle_of_their_cubes(tmp_path: Path) -> None:
+def test_voxels_are_boxes_at_the_centres_of_their_cubes(tmp_path: Path) -> None:
     voxels = VoxelMap(
         START, np.array([[0, 0, 0], [20, -3, 2]], np.int32), np.array([[1, 2, 3], [4, 5, 6]], np.uint8),
         np.array([5, 9], np.int32), 0.1, LEVEL_FRAME,
