@@ -10,7 +10,7 @@ ROOMS = {"flow", "stages", "recordings"}
 SHARED = {
     "flow": (),
     "stages": ("flow.contracts", "flow.parameters"),
-    "recordings": ("flow.contracts", "flow.parameters", "stages.data"),
+    "recordings": ("flow.contracts", "flow.parameters", "stages.compiled.jit", "stages.data"),
 }
 COMPOSITION_ROOT = ROOT / "flow" / "cli"
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from recordings.simulator import raycast
-from recordings.simulator.compiled import allocating
 from recordings.simulator.simulation import FrameTruth, Simulation
+from stages.compiled.jit import typed_kernel
 from stages.data import LEVEL_FRAME, Array, Cell, CellReason, Disparity, ElevationMap, NavigationMap, PixelOrigin
 
 FINE = 3  # points along each side of a cell
@@ -183,7 +183,7 @@ def _within_image(simulation: Simulation, points: Array, margin: float = 0.0) ->
     return np.asarray((u >= -reach) & (u < camera.width - 1 + reach) & (v >= -reach) & (v < camera.height - 1 + reach))
 
 
-@allocating
+@typed_kernel
 def _clear_lines(scn: Any, eye: Any, points: Any, clear: Any) -> None:
     """Which points (N, 3) nothing hides from `eye`, into clear (N,) bool."""
     for k in range(points.shape[0]):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recordings.simulator.compiled import allocating, borrowing
+from stages.compiled.jit import borrowing_kernel, typed_kernel
 from stages.data import Array
 
 # One bucket of rocks spans 2**BUCKET_LEVEL ground cells.
@@ -70,7 +70,7 @@ def scene(
     )  # fmt: skip
 
 
-@borrowing
+@borrowing_kernel
 def height_at(ground: Any, resolution: float, x: float, y: float) -> float:
     """Bilinear ground elevation at one point."""
     mask = ground.shape[0] - 1
@@ -82,7 +82,7 @@ def height_at(ground: Any, resolution: float, x: float, y: float) -> float:
     return float(low * (1 - v) + (ground[i1, j] * (1 - u) + ground[i1, j1] * u) * v)
 
 
-@allocating
+@typed_kernel
 def heights_at(ground: Any, resolution: float, x: Any, y: Any) -> Any:
     """Bilinear ground elevation (N,) float64 at points x, y (N,)."""
     out = np.empty(x.shape[0])
@@ -91,7 +91,7 @@ def heights_at(ground: Any, resolution: float, x: Any, y: Any) -> Any:
     return out
 
 
-@borrowing
+@borrowing_kernel
 def _patch_hit(
     scn: Any, ix: int, iy: int, u: float, v: float, z: float, gx: float, gy: float, dz: float, length: float
 ) -> float:
@@ -121,7 +121,7 @@ def _patch_hit(
     return root if 0 <= root <= length else inf
 
 
-@borrowing
+@borrowing_kernel
 def _rock_hit(
     scn: Any, rock: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, int]:
@@ -158,7 +158,7 @@ def _rock_hit(
     return (enter, facet) if enter > 0 else (inf, ROUNDED)
 
 
-@borrowing
+@borrowing_kernel
 def _bucket_hit(
     scn: Any, bucket: int, x: float, y: float, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
     start: float, far: float,
@@ -178,7 +178,7 @@ def _bucket_hit(
     return best, best_rock, best_facet
 
 
-@borrowing
+@borrowing_kernel
 def first_hit(
     scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, start: float, far: float
 ) -> tuple[float, int, int]:
@@ -237,7 +237,7 @@ def first_hit(
     return (best if surface != SKY else inf), surface, facet
 
 
-@borrowing
+@borrowing_kernel
 def clear_until(
     scn: Any, origin: Any, rotation: Any, a: float, b: float, reach: float, far: float
 ) -> float:  # fmt: skip
@@ -279,7 +279,7 @@ def clear_until(
     return far
 
 
-@allocating
+@typed_kernel
 def tops_at(scn: Any, x: Any, y: Any, ceiling: float) -> Any:
     """What one meets from above at points x, y (N,): elevation (N,) float64, m, and surface (N,) int32.
 
@@ -292,7 +292,7 @@ def tops_at(scn: Any, x: Any, y: Any, ceiling: float) -> Any:
     return z, surface
 
 
-@borrowing
+@borrowing_kernel
 def cast_rows(
     scn: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float, far: float, first: int,
     depth: Any, surface: Any, facet: Any,
@@ -317,7 +317,7 @@ def cast_rows(
             depth[row, column], surface[row, column], facet[row, column] = t, what, side
 
 
-@borrowing
+@borrowing_kernel
 def seen_rows(
     scn: Any, left: Any, right: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float, first: int,
     depth: Any, seen: Any,

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from recordings.simulator.compiled import borrowing
 from recordings.simulator.raycast import GROUND, ROUNDED, SKY, first_hit, pyramid_of
+from stages.compiled.jit import borrowing_kernel
 from stages.data import Array
 
 TILE = 1024
@@ -63,7 +63,7 @@ def _band(rng: np.random.Generator, fall: float, shortest: float, longest: float
     return np.asarray(picture / picture.std())
 
 
-@borrowing
+@borrowing_kernel
 def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
     """Periodic bilinear sample at (x, y) px of the square tile of `size` that begins at `start`."""
     ix, iy = floor(x), floor(y)
@@ -74,7 +74,7 @@ def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
     return float(low * (1 - v) + (tiles[i1 + j] * (1 - u) + tiles[i1 + j1] * u) * v)
 
 
-@borrowing
+@borrowing_kernel
 def _sample(
     tiles: Any, levels: Any, period: float, x: float, y: float, width: float, taps: int, ux: float, uy: float
 ) -> float:
@@ -99,7 +99,7 @@ def _sample(
     return total / taps
 
 
-@borrowing
+@borrowing_kernel
 def _ground_albedo(
     texture: Any, x: float, y: float, width: float, length: float, ux: float, uy: float
 ) -> tuple[float, float]:
@@ -115,7 +115,7 @@ def _ground_albedo(
     return 1 + contrast * (grit - 1), (1 + 0.07 * cloud - 0.04 * broad) * (0.92 + 0.16 * sand)
 
 
-@borrowing
+@borrowing_kernel
 def _rock_albedo(
     texture: Any, rock: int, x: float, y: float, z: float, nx: float, ny: float, nz: float, width: float
 ) -> float:
@@ -131,7 +131,7 @@ def _rock_albedo(
     return max(0.3, (1 + 0.16 * grain + 0.45 * (pits - 1)) * (0.72 + 0.5 * ((rock * 61) % 89) / 89))
 
 
-@borrowing
+@borrowing_kernel
 def _upward(ground: Any, resolution: float, x: float, y: float) -> tuple[float, float, float]:
     """Normal, of no particular length, of the ground smoothed over neighbouring patches: differences over two cells."""
     mask = ground.shape[0] - 1
@@ -148,13 +148,13 @@ def _upward(ground: Any, resolution: float, x: float, y: float) -> tuple[float, 
     return -(west + east), -(south + north), 2 * resolution
 
 
-@borrowing
+@borrowing_kernel
 def _nearest_repetition(value: float, near: float, extent: float) -> float:
     """The one of value + k * extent that lies nearest to `near`."""
     return value + extent * floor((near - value) / extent + 0.5)
 
 
-@borrowing
+@borrowing_kernel
 def _normal_at(scn: Any, surface: int, facet: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Unit normal, towards the outside, of the surface at a point that a ray has hit.
 
@@ -179,7 +179,7 @@ def _normal_at(scn: Any, surface: int, facet: int, x: float, y: float, z: float)
     return nx / length, ny / length, nz / length
 
 
-@borrowing
+@borrowing_kernel
 def shade_rows(
     scn: Any, texture: Any, clear: Any, sun: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float,
     cy: float, first: int, depth: Any, surface: Any, facet: Any, radiance: Any,

@@ -1,9 +1,9 @@
-"""How kernels are compiled: `kernel` for what Python calls, `part` for what only kernels call.
+"""How kernels are compiled: `kernel` for functions that Python calls, `part` for functions that only kernels call.
 
-They are kept between runs. numba keeps the machine code of a kernel as long as the file that defines it is unchanged.
-But a kernel contains the code of those it calls, which may be in other files, so a change there would leave old code
-in use. Here every kernel is as old as the youngest of them: the mark by which numba tells whether its copy is current
-is a digest of all sources of this folder and of the versions of numba and LLVM. numba adds the processor itself.
+numba keeps the machine code of a kernel between runs as long as the file that defines it is unchanged. But a kernel
+contains the code of the functions it calls, which may be in other files, and a change there would leave old code in
+use. Therefore a kernel is compiled again when any source of its family changes. The families are the kernels of all
+stages, and the loops of each folder of `recordings`. numba itself compares the processor.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from __future__ import annotations
 import functools
 import hashlib
 import logging
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import llvmlite
 import numba
@@ -20,44 +21,45 @@ from numba import njit
 from numba.core import event
 from numba.core.caching import CacheImpl, _CacheLocator
 
-FOLDER = Path(__file__).resolve().parent.parent  # stages/
+STAGES = Path(__file__).resolve().parent.parent
+PACKAGES = ("stages", "recordings")
+KERNEL_FOLDERS = {"kernels", "compiled", "data"}  # of the stages; the codes of the data types are compiled in
+Function = TypeVar("Function", bound=Callable[..., Any])
 log = logging.getLogger(__name__)
 log.setLevel(logging.INFO)  # one line in the life of an installation: shown even where only errors are
 
 
-def _sources() -> list[Path]:
-    """The kernels of all steps, what they share, and the data types, whose codes are compiled in."""
-    rooms = {"kernels", "compiled", "data"}
-    return sorted(file for file in FOLDER.rglob("*.py") if file.parent.name in rooms)
-
-
 @functools.cache
-def digest() -> str:
-    """Hexadecimal digest of all that the compiled kernels depend on."""
+def digest(folder: Path) -> str:
+    """Hexadecimal digest of all sources that the machine code of the kernels in a folder may contain."""
+    if STAGES in folder.parents:
+        sources = [file for file in STAGES.rglob("*.py") if file.parent.name in KERNEL_FOLDERS]
+    else:
+        sources = list(folder.glob("*.py"))
     total = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
-    for file in sorted(_sources()):  # the codes of `Source` are compiled in
-        total.update(b"%s %d " % (str(file.relative_to(FOLDER)).encode(), file.stat().st_size) + file.read_bytes())
+    for file in sorted(sources):
+        total.update(f"{file.relative_to(STAGES.parent)} {file.stat().st_size} ".encode() + file.read_bytes())
     return total.hexdigest()
 
 
 class _KernelCacheLocator(_CacheLocator):
-    """Where numba would keep a kernel of this folder, but marked with `digest`."""
+    """numba's usual place for a kernel of this product, with the digest of its family as the mark of its age."""
 
     usual: tuple[Any, ...] = tuple(CacheImpl._locator_classes)
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
-        if FOLDER not in Path(py_file).resolve().parents:
+        if py_func.__module__.partition(".")[0] not in PACKAGES:
             return None
         candidates = (locator.from_function(py_func, py_file) for locator in cls.usual)
         locator = next((candidate for candidate in candidates if candidate is not None), None)
         if locator is not None:
-            locator.get_source_stamp = digest
+            locator.get_source_stamp = functools.partial(digest, Path(py_file).resolve().parent)
         return locator
 
 
 class _Announcement(event.Listener):
-    """Says, once, that the first call takes longer."""
+    """Reports once that the first call of a stage's kernel takes longer."""
 
     def __init__(self) -> None:
         self.made = False
@@ -72,7 +74,7 @@ class _Announcement(event.Listener):
 
 
 def install() -> None:
-    """Make numba keep this folder's kernels so, and announce when it compiles one."""
+    """Register the cache locator and the announcement with numba."""
     caches: Any = CacheImpl
     if _KernelCacheLocator not in caches._locator_classes:
         caches._locator_classes = [_KernelCacheLocator, *caches._locator_classes]
@@ -81,14 +83,19 @@ def install() -> None:
 
 install()
 _njit: Any = njit  # whose published type lacks the options on wrappers
-# No Python lock while they run, no exceptions for a division by 0; without the entry points that nobody calls, a third
-# of the time to compile is saved.
+# These release Python's lock and give inf or NaN for a division by 0. Without the entry points that nobody calls,
+# compiling takes a third less time.
 kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
 part: Any = _njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)
-# The same for arithmetic in which no NaN or infinity occurs and sums may be taken in any order; as deterministic.
+# The same for arithmetic without NaN and infinity, whose sums may be taken in any order; as deterministic.
 fast_kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True, fastmath=True)
-# Inlined into its callers: of several compiled copies the one that came first stands in for the others, and each may
+# Inlined into its callers: of several compiled copies numba would use the first for all of them, and each copy may
 # take its sums in an order of its own.
 fast_part: Any = _njit(
     nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True, fastmath=True, forceinline=True
 )
+# `kernel` for functions with type annotations.
+typed_kernel: Callable[[Function], Function] = kernel
+# The same for functions that make no arrays: counting references to the caller's arrays, as numba does by default,
+# would cost a third of the time.
+borrowing_kernel: Callable[[Function], Function] = _njit(nogil=True, cache=True, error_model="numpy", _nrt=False)

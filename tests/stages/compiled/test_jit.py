@@ -1,4 +1,4 @@
-"""Compiled kernels: kept between runs, announced when made, and never used after any kernel's source has changed."""
+"""Compiled kernels are kept between runs, announced when compiled, and compiled again after any source has changed."""
 
 import os
 import re
@@ -31,9 +31,17 @@ print(found.coefficients.tobytes().hex())
 """
 
 
+DIGESTS = """
+from pathlib import Path
+from stages.compiled.jit import digest
+for folder in ("stages/matching/kernels", "stages/terrain/kernels", "recordings/simulator"):
+    print(digest(Path(folder).resolve()))
+"""
+
+
 @pytest.fixture
 def run(tmp_path):
-    for room in ("flow", "stages"):  # flow.contracts is imported by the stages
+    for room in ("flow", "stages", "recordings"):
         shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__"))
 
     def call(script=SCRIPT):
@@ -68,3 +76,13 @@ def test_what_was_compiled_just_now_gives_the_same_bits_as_what_is_loaded(run):
     first, said = run(PLANES)
     assert "compiling kernels" in said
     assert run(PLANES) == (first, "")
+
+
+def test_a_change_in_the_simulator_keeps_the_kernels_of_the_stages(run, tmp_path):
+    matching, terrain, simulator = run(DIGESTS)[0].split()
+    assert matching == terrain != simulator
+    loops = tmp_path / "recordings" / "simulator" / "raycast.py"
+    loops.write_text(f"{loops.read_text()}\n# changed\n")
+    again = run(DIGESTS)[0].split()
+    assert again[:2] == [matching, terrain]
+    assert again[2] != simulator
