@@ -1,6 +1,6 @@
-"""Files that are whole or not there: one grows under a temporary name and takes its own when it is finished.
+"""Writes files that are complete or absent: a file is written under a temporary name and renamed when it is finished.
 
-A temporary name belongs to one writer, so two that write to one path at the same time do not mix; the later one wins.
+Each writer has a temporary name of its own, so two writers of one path do not mix; the later one wins.
 """
 
 from __future__ import annotations
@@ -17,37 +17,37 @@ _numbers = count()
 
 
 def temporary_name(path: Path) -> Path:
-    """A name beside `path` that no other writer has. Raises UnwritableError where no file can take the name `path`."""
+    """A unique temporary name beside `path`. Raises UnwritableError if no file can have the name `path`."""
     if path.is_dir():
-        raise UnwritableError(f"cannot write {path}: it is a folder; give the name of a file in it")
+        raise UnwritableError(f"cannot write {path}: it is a folder; give a file name")
     if path.exists() and not path.is_file():
-        raise UnwritableError(f"cannot write {path}: it is a device or the like; give the name of a file")
+        raise UnwritableError(f"cannot write {path}: it is not a regular file; give a file name")
     return path.with_name(f"{path.name}.{os.getpid()}-{next(_numbers)}.partial")
 
 
 def give_name(temporary: Path, path: Path) -> None:
-    """Give a finished file its name once the disk has its content. Raises OSError."""
-    _settle(temporary)
+    """Rename a finished file once its content is on the disk. Raises OSError."""
+    _flush_to_disk(temporary)
     temporary.replace(path)
-    _settle(path.parent)
+    _flush_to_disk(path.parent)
 
 
 @contextmanager
 def written(path: Path) -> Iterator[Path]:
-    """A temporary name to write to; it becomes `path` at the end, or goes. Raises UnwritableError where it cannot."""
+    """Yield a temporary name; rename it to `path` at the end, or delete it. Raises UnwritableError."""
     temporary = temporary_name(path)
     try:
         with writing(path):
             yield temporary
             give_name(temporary, path)
     finally:
-        with suppress(OSError):  # where nothing can be written, there is nothing to clear away
+        with suppress(OSError):  # nothing was written
             temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """What writes the file or the folder `path`. Raises UnwritableError where it cannot."""
+    """Turn an OSError while writing `path` into an UnwritableError."""
     try:
         yield
     except OSError as error:
@@ -55,12 +55,12 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def unwritable(path: Path, reason: str, kept: str = "") -> UnwritableError:
-    """The error of a file that cannot be written. kept: what there is of it all the same."""
+    """The error for a file that cannot be written. kept: a note about what was kept."""
     remedy = "choose another place for the output or make room there"
     return UnwritableError(f"cannot write {path}: {reason}{kept}; {remedy}")
 
 
-def _settle(path: Path) -> None:
+def _flush_to_disk(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk."""
     number = os.open(path, os.O_RDONLY)
     try:

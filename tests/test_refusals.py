@@ -35,7 +35,7 @@ def drop(*parts: str):
         (drop("/right"), "only one image topic"),
         (drop("/tf_static"), "tf_static"),
         (drop("/"), "no messages"),
-        (lambda topic, index, data: data.replace(b"\0rgb8\0", b"\0uyvy\0"), "encoding 'uyvy' is not one of those that"),
+        (lambda topic, index, data: data.replace(b"\0rgb8\0", b"\0uyvy\0"), "encoding 'uyvy' is not supported"),
     ],
     ids=["no tilt", "no calibration", "one camera", "no mounting", "nothing", "an encoding nobody reads"],
 )
@@ -379,7 +379,7 @@ def test_a_topic_that_is_named_but_not_there_is_refused_and_nothing_stands_in(
     ("field", "words"),
     [
         ("orientation.xx", "no 'xx' in its geometry_msgs/msg/Quaternion (it has x, y, z, w)"),
-        ("orientation", "field 'orientation' holds a geometry_msgs/msg/Quaternion, which is not an angle"),
+        ("orientation", "field 'orientation' contains a geometry_msgs/msg/Quaternion, which is not an angle"),
         ("header.frame_id", "which is not an angle"),
     ],
 )

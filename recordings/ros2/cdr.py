@@ -1,8 +1,8 @@
 """ROS 2 message types and their CDR codec, without a ROS installation.
 
-`TYPES` holds the message classes we write; `decoder_for` builds a decoder from the schema that a log carries, so that a
-vendor's own message or an older version of a known one reads as it was written. The codec is rosbags': arrays come and
-go as numpy arrays, and a decoded image is a view of the message's bytes, not a copy.
+`TYPES` contains the message classes we write. `decoder_for` builds a decoder from the schema in a log, so messages of
+a vendor or of an older version are read as they were written. The codec is rosbags'; a decoded image is a view of the
+message's bytes, not a copy.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ float64 length_y
 geometry_msgs/Pose pose
 """
 
-LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are 32 bits, with a sign
+LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are a signed 32 bit number
 
-_PACKED = b"\x28\xb5\x2f\xfd"  # begins a frame of zstd; no CDR message begins so
-_SAID = 100  # characters of what the parser says, which may hold the whole schema
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message begins so
+_MAX_REASON = 100  # characters of a parser's message, which may contain the whole schema
 _registering = RLock()  # rosbags builds classes and codecs in module-wide state
 
 
 class SharedTypestore(Typestore):
-    """A type store that several threads may use: codecs are built on first use, one at a time."""
+    """A type store for several threads: codecs are built on first use, one at a time."""
 
     def get_msgdef(self, typename: str) -> Any:
         if typename not in self.cache:
@@ -73,46 +73,42 @@ TYPES = _known_types()
 
 
 def make(name: str, /, **fields: Any) -> Any:
-    """A message of the type `name`, such as "std_msgs/msg/Header", with all of its fields given."""
+    """Make a message of the type `name`, such as "std_msgs/msg/Header", from all of its fields."""
     cls: Any = TYPES.types[name]
     return cls(**fields)
 
 
 def full_name(schema_name: str) -> str:
-    """The name with its interface kind: "sensor_msgs/Image" is "sensor_msgs/msg/Image"."""
+    """The full name: "sensor_msgs/msg/Image" for "sensor_msgs/Image"."""
     package, _, rest = schema_name.partition("/")
     return schema_name if "/" in rest or not rest else f"{package}/msg/{rest}"
 
 
 @lru_cache(maxsize=256)
 def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable[[bytes | memoryview], Any]:
-    """A function from CDR bytes to a message object, built from a log's schema ("ros2msg" or "ros2idl").
+    """Build a function from CDR bytes to a message by the schema of a log ("ros2msg" or "ros2idl").
 
-    An empty schema is that of the standard type of its name, else of a type without fields.
-    Raises LogError where the schema cannot be understood; the returned function raises whatever the codec does for
-    bytes that do not fit it.
+    An empty schema means the standard type of that name, or a type without fields. Raises LogError for a schema that
+    cannot be parsed. The returned function raises the codec's exceptions for bytes that do not fit.
     """
     name = full_name(schema_name)
     if schema_encoding not in ("ros2msg", "ros2idl"):
-        raise LogError(
-            f"schema '{schema_name}' is in '{schema_encoding}', which is not a ROS 2 schema (ros2msg, ros2idl)"
-        )
+        raise LogError(f"schema '{schema_name}' is in '{schema_encoding}', not a ROS 2 format (ros2msg, ros2idl)")
     if not text.strip() and name in TYPES.types:
         return lambda data: TYPES.deserialize_cdr(plain(data), name)
     try:
-        # Definitions hold what editors leave: a byte order mark, Windows line ends, comments that are not UTF-8.
+        # Definitions may contain a byte order mark, Windows line ends, and comments that are not UTF-8.
         store = _store_of(name, schema_encoding, text.decode("utf-8-sig", "replace").replace("\r\n", "\n"))
         store.get_msgdef(name)
-    except Exception as error:  # a parser of foreign text may fail in any way; all mean the same here
-        why = shorten(f"{type(error).__name__}: {error}", _SAID, placeholder=" ...")
+    except Exception as error:  # a parser of foreign text may fail in any way
+        why = shorten(f"{type(error).__name__}: {error}", _MAX_REASON, placeholder=" ...")
         raise LogError(f"schema '{schema_name}' cannot be parsed ({why})") from error
     return lambda data: store.deserialize_cdr(plain(data), name)
 
 
 def plain(data: bytes | memoryview, size: int = MAX_CHUNK_BYTES) -> bytes | memoryview:
-    """The first `size` bytes, at least, of a message, or all of them. rosbag2 may have compressed each by itself, which
-    nothing but the message tells."""
-    if data[: len(_PACKED)] != _PACKED:
+    """At least the first `size` bytes of a message, decompressed if rosbag2 compressed it by itself (zstd)."""
+    if data[: len(_ZSTD_MAGIC)] != _ZSTD_MAGIC:
         return data
     whole = zstandard.frame_content_size(data)
     with zstandard.ZstdDecompressor().stream_reader(data) as stream:
@@ -120,11 +116,11 @@ def plain(data: bytes | memoryview, size: int = MAX_CHUNK_BYTES) -> bytes | memo
 
 
 def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
-    """A store of exactly the types the schema defines, completed by standard ones it refers to but leaves out."""
+    """A store of the types in the schema, completed by the standard types that it leaves out."""
     store = _typestore("empty")
     with _registering:
-        # MCAP separates a schema's definitions by lines of '='; an IDL one is headed by "IDL: package/msg/Name". The
-        # definitions that it includes are among the others, and the parser knows no #include.
+        # Lines of '=' separate a schema's definitions; an IDL one begins with "IDL: package/msg/Name". Its includes are
+        # among the definitions, and the parser does not know #include.
         if encoding == "ros2idl":
             for part in re.split(r"^={20,}\s*$", text, flags=re.MULTILINE):
                 body = re.sub(r"^\s*(IDL:|#).*$", "", part, flags=re.MULTILINE)
@@ -137,9 +133,9 @@ def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
 
 
 def _complete(store: SharedTypestore, name: str, above: list[str], done: set[str]) -> None:
-    """Add the standard types that type `name` refers to, and those refer to. above: the types it is a part of."""
+    """Add the standard types in the fields of type `name`, recursively. above: the types that contain it."""
     if name in above:
-        raise ValueError(f"{name} is a part of itself")
+        raise ValueError(f"{name} contains itself")
     if name in done:
         return
     if name not in store.fielddefs:
@@ -151,7 +147,7 @@ def _complete(store: SharedTypestore, name: str, above: list[str], done: set[str
 
 
 def _references(fields: Any) -> set[str]:
-    """The names of the message types that a list of field definitions refers to."""
+    """The names of the message types in a list of field definitions."""
     found: set[str] = set()
     for _, (kind, detail) in fields:
         node, inner = (kind, detail) if kind in (Nodetype.BASE, Nodetype.NAME) else detail[0]

@@ -1,6 +1,6 @@
-"""Our data from ROS 2 messages: calibrations, transforms and poses, and what `to_msg` wrote.
+"""Data from ROS 2 messages: calibrations, transforms and poses, and readers of what `to_msg` writes.
 
-Every function raises LogError, with what is wrong, for a message that does not hold what it should.
+The functions raise LogError for a message with invalid content.
 """
 
 from __future__ import annotations
@@ -16,75 +16,72 @@ from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.to_msg import FLOAT32
 from stages.data import Array, CameraModel, Cell, CellReason, ElevationMap, NavigationMap, Pose, Transform
 
-REASON_NOT_RECORDED = 255  # of a hazard in a map read back: an OccupancyGrid alone cannot say why
-FARTHEST = 1e9  # m, of a place in any frame
+REASON_NOT_RECORDED = 255  # of a hazard in an OccupancyGrid without its `reason_map`
+MAX_DISTANCE_M = 1e9
 
 
 def stamp_of(message_header: Any) -> int:
-    """The stamp of a std_msgs/Header in ns."""
+    """The stamp of a std_msgs/Header, ns."""
     return int(message_header.stamp.sec) * 1_000_000_000 + int(message_header.stamp.nanosec)
 
 
 def stamp_or(header: Any, log_time: int) -> int:
-    """The header's stamp, ns; where the sender left it zero, the time the message was logged."""
+    """The header's stamp, ns; if it is zero, the log time."""
     stamp = stamp_of(header)
     if stamp < 0:
         raise LogError(f"its stamp is negative ({stamp} ns)")
     if header.stamp.nanosec >= 1_000_000_000:
         raise LogError(f"its stamp is damaged ({header.stamp.nanosec} ns beyond the second)")
     if not stamp and log_time >= LAST_STAMP:
-        raise LogError(
-            f"it has no stamp, and was logged at {log_time} ns, which no ROS 2 stamp can be: they end in 2038"
-        )
+        raise LogError(f"it has no stamp, and its log time {log_time} ns is beyond ROS 2 stamps, which end in 2038")
     return stamp or log_time
 
 
 def frame_of(message: Any) -> str:
-    """The frame_id of a message's header, empty where it has none."""
+    """The frame_id of a message's header, or an empty string."""
     header = getattr(message, "header", None)
     return frame_name(header.frame_id) if header is not None else ""
 
 
 def frame_name(text: str) -> str:
-    """The name of a frame without the slash in front that ROS 1 gave it."""
+    """The name of a frame without the leading slash of ROS 1."""
     return text.lstrip("/")
 
 
 def camera_model(info: Any) -> CameraModel:
-    """The calibration of a sensor_msgs/CameraInfo, for the part of the sensor and the binning that it tells, in which a
-    pixel at u lies at u / binning (as image_geometry has it)."""
+    """The calibration of a sensor_msgs/CameraInfo, after its region of interest and binning (as in image_geometry)."""
     roi, across, down = info.roi, max(int(info.binning_x), 1), max(int(info.binning_y), 1)
     x, y = float(roi.x_offset), float(roi.y_offset)
-    taken = np.array([[1 / across, 0, -x / across], [0, 1 / down, -y / down], [0, 0, 1]])
+    scaled = np.array([[1 / across, 0, -x / across], [0, 1 / down, -y / down], [0, 0, 1]])
     k, p = info.k.reshape(3, 3), info.p.reshape(3, 4)
     return CameraModel(
         width=int(roi.width or info.width) // across, height=int(roi.height or info.height) // down,
-        k=taken @ k if k.any() else k, d=info.d, r=info.r.reshape(3, 3), p=taken @ p if p.any() else p,
+        k=scaled @ k if k.any() else k, d=info.d, r=info.r.reshape(3, 3), p=scaled @ p if p.any() else p,
         model=info.distortion_model or "plumb_bob",
     )  # fmt: skip
 
 
 def transform_of(message: Any) -> Transform:
     """The transform of a geometry_msgs/TransformStamped."""
-    moved, turned = message.transform.translation, message.transform.rotation
+    transform = message.transform
     parent, child = frame_of(message), frame_name(message.child_frame_id)
     name = f"the transform '{parent}' <- '{child}'"
     if not parent or not child:
         raise LogError(f"{name} lacks the name of a frame")
-    translation = _place(moved, f"the translation of {name}")
-    return Transform(parent, child, rotation_of(turned, name).as_matrix(), translation)
+    translation = _finite(transform.translation, f"the translation of {name}")
+    return Transform(parent, child, rotation_of(transform.rotation, name).as_matrix(), translation)
 
 
-def _place(vector: Any, what: str) -> Array:
-    """A geometry_msgs/Vector3 or Point (3,), m, where it is one of this world."""
-    place = np.array([vector.x, vector.y, vector.z])
-    if not (np.abs(place) < FARTHEST).all():  # or NaN
-        raise LogError(f"{what} is {place.tolist()}, which is no place")
-    return place
+def _finite(vector: Any, what: str) -> Array:
+    """A geometry_msgs/Vector3 or Point (3,), m, below `MAX_DISTANCE_M`."""
+    values = np.array([vector.x, vector.y, vector.z])
+    if not (np.abs(values) < MAX_DISTANCE_M).all():  # or NaN
+        raise LogError(f"{what} is {values.tolist()}, which is no place")
+    return values
 
 
 def rotation_of(quaternion: Any, what: str) -> Rotation:
-    """The rotation of a geometry_msgs/Quaternion that is a unit quaternion, or nearly."""
+    """The rotation of a geometry_msgs/Quaternion of length 1, within 1 %."""
     values = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
     length = float(np.linalg.norm(values))
     if not abs(length - 1) < 1e-2:
@@ -95,24 +92,23 @@ def rotation_of(quaternion: Any, what: str) -> Rotation:
 
 
 def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
-    """The pose of nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped, or that of `base_frame` in
-    a tf2_msgs/TFMessage, None where it holds others only.
+    """The pose of an Odometry, PoseStamped or PoseWithCovarianceStamped, or of `base_frame` in a TFMessage.
 
-    base_frame: whose pose it is where the message does not say.
+    base_frame: whose pose it is if the message does not name a child frame. None if a TFMessage does not contain it.
     """
     if hasattr(message, "transforms"):
-        moved = next((t for t in message.transforms if frame_name(t.child_frame_id) == base_frame), None)
-        if moved is None:
+        transform = next((t for t in message.transforms if frame_name(t.child_frame_id) == base_frame), None)
+        if transform is None:
             return None
-        at = transform_of(moved)
-        quaternion = rotation_of(moved.transform.rotation, "the pose").as_quat()
-        return Pose(stamp_or(moved.header, log_time), at.translation, quaternion, at.parent, base_frame)
-    placed = message.pose if hasattr(message.pose, "covariance") else None
-    pose = message.pose.pose if placed is not None else message.pose
-    covariance = placed.covariance.reshape(6, 6) if placed is not None else None
+        at = transform_of(transform)
+        quaternion = rotation_of(transform.transform.rotation, "the pose").as_quat()
+        return Pose(stamp_or(transform.header, log_time), at.translation, quaternion, at.parent, base_frame)
+    stated = message.pose if hasattr(message.pose, "covariance") else None
+    pose = message.pose.pose if stated is not None else message.pose
+    covariance = stated.covariance.reshape(6, 6) if stated is not None else None
     if covariance is not None and (not covariance.any() or covariance[0, 0] < 0):
-        covariance = None  # all zero or -1: not known
-    position = _place(pose.position, "the position of the pose")
+        covariance = None  # zeros or -1: unknown
+    position = _finite(pose.position, "the position of the pose")
     child = frame_name(getattr(message, "child_frame_id", "")) or base_frame
     return Pose(
         stamp_or(message.header, log_time), position, rotation_of(pose.orientation, "the pose").as_quat(),
@@ -121,7 +117,26 @@ def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
 
 
 def read_disparity(message: Any) -> NDArray[np.float32]:
-    """The (H, W) float32 pixels of a stereo_msgs/DisparityImage, NaN = unknown, as `disparity_image` wrote them."""
+    """Read a stereo_msgs/DisparityImage.
+
+    Returns
+    -------
+    ndarray
+        (H, W) float32, px, NaN = unknown.
+
+    Raises
+    ------
+    ValueError
+        If the image is not 32FC1.
+
+    Examples
+    --------
+    >>> from recordings.ros2.to_msg import disparity_image
+    >>> from stages.data import Disparity
+    >>> pixels = np.full((1, 2), 7.5, np.float32)
+    >>> read_disparity(disparity_image(Disparity(0, pixels, np.ones((1, 2), np.uint8), np.ones_like(pixels))))
+    array([[7.5, 7.5]], dtype=float32)
+    """
     picture = message.image
     if picture.encoding != "32FC1":
         raise ValueError(f"a disparity image must be 32FC1, not {picture.encoding}")
@@ -131,9 +146,20 @@ def read_disparity(message: Any) -> NDArray[np.float32]:
 
 
 def read_point_cloud(message: Any) -> dict[str, Array]:
-    """The fields of a sensor_msgs/PointCloud2 of float32 fields, name -> (N,); "rgb" comes as (N, 3) uint8 "colors"."""
+    """Read a sensor_msgs/PointCloud2 of float32 fields.
+
+    Returns
+    -------
+    dict
+        Field name -> (N,) float32; the field "rgb" becomes "colors", (N, 3) uint8.
+
+    Raises
+    ------
+    ValueError
+        If a field is not a single float32.
+    """
     if any(known.datatype != FLOAT32 or known.count != 1 for known in message.fields):
-        raise ValueError("a point cloud with other fields than single float32 is not read")
+        raise ValueError("a point cloud must have fields of one float32 each")
     order, names = ">" if message.is_bigendian else "<", [known.name for known in message.fields]
     layout = {
         "names": names, "formats": [f"{order}f4"] * len(names), "offsets": [known.offset for known in message.fields],
@@ -149,9 +175,19 @@ def read_point_cloud(message: Any) -> dict[str, Array]:
 
 
 def read_grid_map(message: Any) -> ElevationMap:
-    """The ElevationMap that `grid_map` wrote, or any axis-aligned GridMap with a layer "elevation".
+    """Read an axis-aligned grid_map_msgs/GridMap with a layer "elevation".
 
-    A map that was moved in its circular buffer (start indices) is unrolled.
+    A map with start indices in its circular buffer is unrolled.
+
+    Returns
+    -------
+    ElevationMap
+        With all layers of the message.
+
+    Raises
+    ------
+    ValueError
+        If a layer is not column-major.
     """
     info, centre = message.info, message.info.pose.position
     return ElevationMap(
@@ -166,7 +202,7 @@ def _layers(message: Any) -> dict[str, Array]:
     for name, array in zip(message.layers, message.data, strict=True):
         outer, inner = array.layout.dim
         if outer.label != "column_index":
-            raise ValueError(f"grid map layer '{name}' is stored by {outer.label}; only column-major maps are read")
+            raise ValueError(f"grid map layer '{name}' is stored by {outer.label}, not column-major")
         stored = np.asarray(array.data, np.float32)[array.layout.data_offset :].reshape(outer.size, inner.size)
         # outer_start_index counts along the matrix' first index (-x), inner_start_index along its second (-y).
         unrolled = np.roll(stored, (-message.inner_start_index, -message.outer_start_index), axis=(0, 1))
@@ -175,8 +211,19 @@ def _layers(message: Any) -> dict[str, Array]:
 
 
 def read_occupancy_grid(message: Any, reasons: Any = None) -> NavigationMap:
-    """The NavigationMap of an OccupancyGrid and, where given, of its `reason_map`; an OccupancyGrid alone cannot say
-    why a cell is a hazard: `REASON_NOT_RECORDED`."""
+    """Read a nav_msgs/OccupancyGrid.
+
+    Parameters
+    ----------
+    message : nav_msgs/OccupancyGrid
+    reasons : grid_map_msgs/GridMap, optional
+        Its `reason_map`. Without it the reason of a hazard is `REASON_NOT_RECORDED`.
+
+    Returns
+    -------
+    NavigationMap
+        Cells and reasons.
+    """
     info = message.info
     cells = np.asarray(message.data, np.int8).reshape(info.height, info.width)
     reason = np.full(cells.shape, REASON_NOT_RECORDED, np.uint8)

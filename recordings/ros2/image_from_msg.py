@@ -1,4 +1,4 @@
-"""The pixels of ROS 2 images, whatever encoding they came in: gray or RGB, 8 or 16 bit."""
+"""The pixels of ROS 2 images in any common encoding, as gray or RGB, 8 or 16 bit."""
 
 from __future__ import annotations
 
@@ -19,45 +19,59 @@ _PLAIN: dict[str, tuple[str, int, int | None]] = {
     "16UC1": ("u2", 1, None),
     "rgb8": ("u1", 3, None),
     "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
-    "8UC3": ("u1", 3, cv2.COLOR_BGR2RGB),  # OpenCV's own name for its own order
+    "8UC3": ("u1", 3, cv2.COLOR_BGR2RGB),  # OpenCV's channel order
     "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
     "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB),
     "8UC4": ("u1", 4, cv2.COLOR_BGRA2RGB),
     "rgb16": ("u2", 3, None),
     "bgr16": ("u2", 3, cv2.COLOR_BGR2RGB),
 }
-# OpenCV's short names say what is at (1, 1), ROS names say what is at (0, 0): the long names of OpenCV agree with ROS.
+# OpenCV's short names begin at pixel (1, 1), ROS names at (0, 0), as do OpenCV's long names.
 _BAYER = {
     "bayer_rggb": cv2.COLOR_BayerRGGB2RGB,
     "bayer_bggr": cv2.COLOR_BayerBGGR2RGB,
     "bayer_gbrg": cv2.COLOR_BayerGBRG2RGB,
     "bayer_grbg": cv2.COLOR_BayerGRBG2RGB,
 }
-_PADDING = 1024  # bytes that may follow the end of a compressed image
+_MAX_PADDING_BYTES = 1024  # after the end of a compressed image
 _ENCODINGS = _PLAIN | {f"{name}{bits}": (f"u{bits // 8}", 1, code) for name, code in _BAYER.items() for bits in (8, 16)}
 
 
 def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
-    """Gray (H, W) or RGB (H, W, 3) pixels, uint8 or uint16, of a sensor_msgs Image or CompressedImage.
+    """Decode a sensor_msgs Image or CompressedImage.
 
-    size: (width, height) of the calibration; an image of another one is refused before it is unpacked.
+    Parameters
+    ----------
+    message : sensor_msgs/Image or sensor_msgs/CompressedImage
+    size : tuple of int, optional
+        Width and height of the calibration; an image of another size is refused before it is decoded.
+
+    Returns
+    -------
+    ndarray
+        Gray (H, W) or RGB (H, W, 3), uint8 or uint16.
+
+    Raises
+    ------
+    LogError
+        If the image is damaged, cut, or in an unsupported encoding.
     """
     return _raw_pixels(message, size) if hasattr(message, "encoding") else _compressed_pixels(message, size)
 
 
 def unread_encoding(message: Any) -> str:
-    """What to say of an Image in an encoding that `pixels_of` does not read; empty for any other message."""
+    """A sentence about an unsupported image encoding; empty for other messages."""
     encoding = getattr(message, "encoding", None)
     if encoding is None or encoding in _ENCODINGS:
         return ""
-    return f"image encoding '{encoding}' is not one of those that can be read ({', '.join(_ENCODINGS)})"
+    return f"the image encoding '{encoding}' is not supported, only {', '.join(_ENCODINGS)}"
 
 
 def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
     if width == 0 or height == 0:
         raise LogError(f"the image is empty ({width}x{height})")
     if size is not None and size != (width, height):
-        raise LogError(f"the image is {width}x{height}, its calibration is for {size[0]}x{size[1]}")
+        raise LogError(f"the image is {width}x{height}, but its calibration is for {size[0]}x{size[1]}")
 
 
 def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
@@ -70,9 +84,9 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     _check_size(width, height, size)
     if step < row:
         raise LogError(f"the image's step of {step} bytes is shorter than a row of {width} {message.encoding} pixels")
-    needed = (height - 1) * step + row  # the last row need not be padded
+    needed = (height - 1) * step + row  # the last row may lack its padding
     if data.size < needed:
-        raise LogError(f"the image is cut: {data.size} of {needed} bytes are there")
+        raise LogError(f"the image is cut: it has {data.size} of {needed} bytes")
     rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
     order = ">" if message.is_bigendian else "<"
     pixels = np.ascontiguousarray(rows).view(f"{order}{kind}").astype(kind, copy=False)
@@ -83,10 +97,10 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
 def _compressed_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     data = np.ascontiguousarray(message.data, np.uint8)
     content = data.tobytes()
-    # Of a JPEG that lacks a little of its end, OpenCV may say nothing and make a picture that is wrong there, if zeros
-    # follow: the rest of a camera's buffer. Behind a whole picture these, or other padding, do no harm.
+    # OpenCV may silently make a wrong picture of a JPEG whose end is replaced by zeros, the rest of a camera's buffer.
+    # Padding after a complete picture is harmless.
     end = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(content[:2], b"")
-    if end not in content.rstrip(b"\0")[-_PADDING:]:
+    if end not in content.rstrip(b"\0")[-_MAX_PADDING_BYTES:]:
         raise LogError(f"the compressed image is cut after {data.size} bytes")
     stated = _stated_size(content)
     if stated is not None:
@@ -99,8 +113,10 @@ def _compressed_pixels(message: Any, size: tuple[int, int] | None) -> Array:
 
 
 def unpacked_pixels(data: Array, mosaic: int | None = None) -> Array | None:
-    """Gray (H, W) or RGB (H, W, 3) pixels, uint8 or uint16, of an image file's bytes (n,); None where OpenCV makes none
-    such of them. mosaic: its conversion of a Bayer pattern, where a single channel is one."""
+    """Gray (H, W) or RGB (H, W, 3) pixels, uint8 or uint16, of an image file's bytes; None if they cannot be decoded.
+
+    mosaic: OpenCV's conversion of a Bayer pattern in a single channel.
+    """
     pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         return None
@@ -110,16 +126,16 @@ def unpacked_pixels(data: Array, mosaic: int | None = None) -> Array | None:
 
 
 def _stated_size(content: bytes) -> tuple[int, int] | None:
-    """(width, height) as the head of a PNG or JPEG file states it, None where it is neither."""
+    """(width, height) in the head of a PNG or JPEG file, else None."""
     if content.startswith(b"\x89PNG") and len(content) >= 24:
         width, height = struct.unpack_from(">II", content, 16)
         return width, height
     position = 2
     while content.startswith(b"\xff\xd8") and position + 9 <= len(content) and content[position] == 0xFF:
         kind, length = content[position + 1], struct.unpack_from(">H", content, position + 2)[0]
-        if kind == 0xFF:  # filling before a marker
+        if kind == 0xFF:  # padding before a marker
             position += 1
-        elif 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):  # a start of frame; those are tables
+        elif 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):  # a start of frame; the excluded codes are tables
             height, width = struct.unpack_from(">HH", content, position + 5)
             return width, height
         else:

@@ -1,7 +1,7 @@
 """Tilts from ROS 2 messages.
 
-A tilt is a direction, never angles: a quaternion turns the world's z axis into the sensor's frame; bare pitch and roll
-become a direction by the model that the pipeline file names.
+A tilt is a direction, never angles. A quaternion turns the world's z axis into the sensor's frame; plain pitch and roll
+become a direction by the model in the pipeline file.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from stages.data import Array, Tilt
 def tilt_of(message: Any, log_time: int) -> Tilt:
     """The tilt of a sensor_msgs/Imu, geometry_msgs/QuaternionStamped or Quaternion.
 
-    The quaternion turns the sensor's frame into a world whose z is up (REP 145), so up in the sensor's frame is the
-    third row of its matrix.
+    The quaternion turns the sensor's frame into a world with z up (REP 145), so up in the sensor's frame is the third
+    row of its matrix.
     """
     if hasattr(message, "orientation_covariance") and message.orientation_covariance[0] == -1:
-        raise LogError("the Imu says that it has no orientation (orientation_covariance[0] is -1)")
+        raise LogError("the Imu marks its orientation as absent (orientation_covariance[0] is -1)")
     quaternion = next((q for name in ("orientation", "quaternion") if (q := getattr(message, name, None))), message)
     up = rotation_of(quaternion, "the inclinometer").as_matrix()[2]
     return _tilt(message, log_time, up)
@@ -48,14 +48,14 @@ class AngleField:
         check_parameters(self)
 
     def __call__(self, message: Any) -> float:
-        """The angle in radians, in our sense of sign."""
+        """The angle in radians, with our sign."""
         value = self.number(message)
         if not np.isfinite(value):
-            raise LogError(f"field '{self.field}' holds {value}, which is not an angle")
+            raise LogError(f"field '{self.field}' contains {value}, which is not an angle")
         return self.sign * float(np.deg2rad(value) if self.unit == "deg" else value)
 
     def number(self, message: Any) -> float:
-        """What the field holds, a number, NaN perhaps. Raises LogError where the message's type has no such field."""
+        """The number in the field, maybe NaN. Raises LogError if the message has no such field."""
         value: Any = message
         for name in self.field.split("."):
             names = list(getattr(value, "__dataclass_fields__", ()))
@@ -65,22 +65,21 @@ class AngleField:
                 raise LogError(f"the message has no field '{self.field}': no '{name}' in its {where}")
             value = getattr(value, name)
         if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-            raise LogError(f"field '{self.field}' holds a {_kind(value)}, which is not an angle")
+            raise LogError(f"field '{self.field}' contains a {_kind(value)}, which is not an angle")
         return float(value)
 
 
 def _kind(value: Any) -> str:
-    """The type of what a message holds: a message's own, or that of a number or a text."""
+    """The name of a value's type."""
     return str(getattr(value, "__msgtype__", type(value).__name__))
 
 
 @dataclass(frozen=True)
 class PlainAngles:
-    """How bare pitch and roll make a direction, in a sensor frame x forward, y left, z up.
+    """Converts plain pitch and roll to a direction in a sensor frame x forward, y left, z up.
 
-    A positive pitch has the nose up, a positive roll the left side up (both after `sign`). model "axis": the angles of
-    the x and the y axis to the horizon, what an inclinometer measures. model "euler": pitch is that of the x axis, roll
-    turns about the pitched x axis.
+    A positive pitch is nose up, a positive roll left side up (both after `sign`). model "axis": angles of the x and y
+    axis to the horizon, as an inclinometer measures. model "euler": pitch of the x axis, roll about the pitched x axis.
     """
 
     pitch: AngleField
@@ -88,20 +87,22 @@ class PlainAngles:
     model: Literal["axis", "euler"]
 
     def check(self, message: Any) -> None:
-        """Raise LogError where the message has no numbers in the two fields."""
+        """Raise LogError if a field is not a number."""
         self.pitch.number(message)
         self.roll.number(message)
 
     def __call__(self, message: Any, log_time: int) -> Tilt:
-        """The tilt that a message's two angles tell."""
+        """The tilt by the two angles of a message."""
         return _tilt(message, log_time, up_of(self.pitch(message), self.roll(message), self.model))
 
 
 def up_of(pitch: float, roll: float, model: Literal["axis", "euler"]) -> Array:
-    """The unit vector up, in x forward, y left, z up, of a pitch (nose up) and a roll (left side up), rad."""
+    """The unit vector up in x forward, y left, z up, from pitch (nose up) and roll (left side up), rad."""
     for name, angle in (("pitch", pitch), ("roll", roll)):
         if not abs(angle) <= np.pi / 2:
-            raise LogError(f"a {name} of {np.rad2deg(angle):.1f} degrees is no tilt; check the field and its unit")
+            raise LogError(
+                f"a {name} of {np.rad2deg(angle):.1f} degrees is outside -90 to 90; check the field and its unit"
+            )
     if model == "euler":
         return np.array([np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
     forward, left = np.sin(pitch), np.sin(roll)
@@ -109,6 +110,6 @@ def up_of(pitch: float, roll: float, model: Literal["axis", "euler"]) -> Array:
     if rest < 0:
         angles = f"pitch {np.rad2deg(pitch):.1f} and roll {np.rad2deg(roll):.1f} degrees"
         raise LogError(
-            f"{angles} cannot both be angles of perpendicular axes to the horizon; check unit and tilt_model"
+            f"{angles} contradict each other as angles of perpendicular axes to the horizon; check unit and tilt_model"
         )
     return np.array([forward, left, np.sqrt(rest)])

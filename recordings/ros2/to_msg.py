@@ -1,9 +1,7 @@
-"""Our data as ROS 2 messages.
+"""Builds ROS 2 messages from our data; `from_msg` reads them.
 
-Each builder takes a type of `stages.data` (or plain numbers) and returns a message object of the rosbags type store;
-`from_msg` reads them back. The grids are where bugs live: ours grow with y (rows) and x (columns) from the
-lower-left corner; `nav_msgs/OccupancyGrid` has the same order, `grid_map_msgs/GridMap` starts at the corner of largest
-x and y, runs its first index along -x, and stores column-major.
+Our grids grow with y (rows) and x (columns) from the lower-left corner, as `nav_msgs/OccupancyGrid` does.
+`grid_map_msgs/GridMap` starts at the corner of largest x and y, runs its first index along -x, and is column-major.
 """
 
 from __future__ import annotations
@@ -76,9 +74,8 @@ def camera_info(stamp: int, frame_id: str, model: CameraModel) -> Any:
 def disparity_image(disparity: Disparity) -> Any:
     """stereo_msgs/DisparityImage, 32FC1, NaN = unknown.
 
-    As in stereo_image_proc, the principal points' difference is taken out, so Z = f * t / d holds for any consumer:
-    pixels are d + cx_right - cx. f and t are NaN where the camera is not known; delta_d is 0, disparities being
-    continuous; min_disparity and max_disparity are the image's own range (NaN where it has no value).
+    As in stereo_image_proc the pixels are d + cx_right - cx, so Z = f * t / d holds. f and t are NaN for an unknown
+    camera; min_disparity and max_disparity are the image's own range, NaN if empty.
     """
     camera = disparity.camera
     pixels, frame_id = disparity.pixels, _frame_of(disparity)
@@ -107,11 +104,13 @@ def _frame_of(disparity: Disparity) -> str:
 
 
 def point_cloud(cloud: PointCloud) -> Any:
-    """sensor_msgs/PointCloud2: x, y, z, rgb (PCL's packing, 0x00RRGGBB in the bits of a float32), sigma, and source
-    (the codes of `PixelOrigin`, as float32) where not all points are measured."""
+    """sensor_msgs/PointCloud2 with the fields x, y, z, rgb (0x00RRGGBB in the bits of a float32, as in PCL) and sigma.
+
+    With points that are not measured also source (the codes of `PixelOrigin`).
+    """
     names = ("x", "y", "z", "rgb", "sigma") + (() if cloud.source is None else ("source",))
     packed = np.zeros((len(cloud.points), len(names)), np.dtype("<f4"))
-    for axis in range(3):  # numpy copies column by column faster
+    for axis in range(3):  # numpy is faster by columns
         packed[:, axis] = cloud.points[:, axis]
         packed.view(np.uint8)[:, 4 * 3 + 2 - axis] = cloud.colors[:, axis]  # blue in the lowest byte
     packed[:, 4] = cloud.sigma
@@ -139,12 +138,12 @@ def grid_map(terrain: ElevationMap) -> Any:
 
 
 def reason_map(navigation: NavigationMap) -> Any:
-    """grid_map_msgs/GridMap with one layer, "reason": why each cell has the state that its OccupancyGrid tells."""
+    """grid_map_msgs/GridMap with one layer, "reason": the reason for each cell of the OccupancyGrid."""
     return _grid_map(navigation, {"reason": navigation.reason.astype(np.float32)}, [])
 
 
 def _grid_map(grid: ElevationMap | NavigationMap, layers: Mapping[str, Array], basic: list[str]) -> Any:
-    """The GridMap of some layers (rows, cols) on the cells of `grid`."""
+    """A GridMap of layers (rows, cols) on the cells of `grid`."""
     rows, cols = next(iter(layers.values())).shape
     length_x, length_y = cols * grid.resolution, rows * grid.resolution
     dimension = "std_msgs/msg/MultiArrayDimension"
@@ -191,10 +190,10 @@ def transform_message(transforms: Iterable[tuple[Transform, int]]) -> Any:
 
 
 def imu(stamp: int, frame_id: str, attitude: Array, covariance: Array | None = None) -> Any:
-    """sensor_msgs/Imu that knows its orientation only: `attitude`, xyzw, turns its frame into a world with z up.
+    """sensor_msgs/Imu with an orientation only: `attitude`, xyzw, turns its frame into a world with z up.
 
-    covariance: (3, 3) of the orientation, rad^2, or None where it is not known (all zeros, as REP 145 has it). Rates
-    and accelerations are marked absent by a first covariance element of -1.
+    covariance: (3, 3) of the orientation, rad^2; None (unknown) is written as zeros (REP 145). Rates and accelerations
+    are marked absent by a first covariance element of -1.
     """
     absent = np.array([-1.0, *[0.0] * 8])
     return make(

@@ -82,10 +82,13 @@ def format_description(description: dict[str, Any]) -> str:
         lines.append(_frame_line(d["frames"]))
     if d["mount"]:
         base, position = d["mount"]["base"], d["mount"]["position"]
-        lines.append("mount: camera position unknown" if base is None else f"mount: camera in '{base}' at {position} m")
+        lines.append("mount: camera position unknown" if base is None else f"mount: camera at {position} m in '{base}'")
     lines += [f"transform: {transform}" for transform in d["transforms"]]
-    for why in dict.fromkeys(d["missing"].values()):
-        lines.append(f"missing: {', '.join(stream for stream in d['missing'] if d['missing'][stream] == why)}: {why}")
+    reasons = dict.fromkeys(d["missing"].values())
+    for why in reasons:
+        streams = ", ".join(stream for stream in d["missing"] if d["missing"][stream] == why)
+        known = next((other for other in reasons if why.endswith(f": {other}")), "")  # it has a line of its own
+        lines.append(f"missing: {streams}: {why.removesuffix(f': {known}')}")
     lines += [f"note: {stream}: {note}" for stream, note in d["notes"].items()]
     lines += [d["undecodable"]] if d["undecodable"] else []
     lines += [f"damaged: {damage}" for damage in _grouped(d["damage"])]
@@ -110,13 +113,13 @@ def _table(topics: list[dict[str, Any]], streams: dict[str, str]) -> list[str]:
 
 def _frame_line(frames: dict[str, Any]) -> str:
     line = (
-        f"frames: {counted(frames['pairs'], 'stereo pair')} with stamps within {frames['slop_s'] * 1e3:g} ms, from "
+        f"frames: {counted(frames['pairs'], 'stereo pair')} (stamps within {frames['slop_s'] * 1e3:g} ms) from "
         f"{counted(frames['left'], 'left image')} and {counted(frames['right'], 'right image')}"
     )
     if frames["with_tilt"] is None:
         return line
     gap = f"{frames['tilt_gap_s'] * 1e3:g} ms"
-    return f"{line}; {counted(frames['with_tilt'], 'left image')} between tilts at most {gap} apart"
+    return f"{line}; {counted(frames['with_tilt'], 'left image')} with a tilt (readings at most {gap} apart)"
 
 
 def _topics(log: McapLog) -> list[dict[str, Any]]:

@@ -98,7 +98,7 @@ def test_pairs_are_found_by_name_in_order(tmp_path: Path, names: list[str], left
     [
         (["a-left.png", "a-right.png", "b-right.png", "c.png"], r"b-right\.png, c\.png has no partner"),
         (["a_l.png", "a_r.png", "b_l.png"], r"b_l\.png has no partner"),
-        (["0.png", "1.png", "2.png", "3.png"], r"holds no image pairs; .* \(4 images\)"),
+        (["0.png", "1.png", "2.png", "3.png"], r"contains no image pairs, only 4 images"),
         (["im0.png", "im1.png", "view5.png"], r"view5\.png has no partner"),
         (["left/1.png", "right/1.png", "left_raw/1.png", "right_raw/1.png"], r"several cameras \(left, left_raw\)"),
     ],
@@ -116,7 +116,7 @@ def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"b-left\.png has no partner"):
         pair_images(tmp_path)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(LogError, match="holds no image pairs"):
+    with pytest.raises(LogError, match="contains no image pairs"):
         pair_images(tmp_path / "empty")
 
 
@@ -128,8 +128,8 @@ def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
         ({"fx": "wide"}, r"'fx' must be a number up to 1e\+09, not 'wide'"),
         ({"fx": 10**30}, r"'fx' must be a number up to 1e\+09, not 1000"),
         ({"baseline": -0.2}, "'baseline' must be positive"),
-        ({"cx": 24.5}, "is 24x16, the calibration's centre .cx 24.5, cy 7.5. lies outside"),
-        ({"width": 640}, "is 24x16, the calibration or the first pair is 640x16"),
+        ({"cx": 24.5}, "the calibration's centre .cx 24.5, cy 7.5. is outside"),
+        ({"width": 640}, "is 24x16, but the calibration or the first pair is 640x16"),
     ],
 )
 def test_a_calibration_that_does_not_fit_is_refused_and_leaves_no_file(
@@ -145,7 +145,7 @@ def test_a_calibration_that_does_not_fit_is_refused_and_leaves_no_file(
 @pytest.mark.parametrize(("pitch_down", "roll"), [(91, 0), (float("nan"), 0), (0, 181)])
 def test_an_attitude_that_no_camera_has_is_refused(tmp_path: Path, pitch_down: float, roll: float) -> None:
     left, right = make_pairs(tmp_path, 1)
-    with pytest.raises(LogError, match="no camera looks"):
+    with pytest.raises(LogError, match="are impossible"):
         import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=pitch_down, roll=roll, height=1)
 
 
@@ -172,7 +172,7 @@ def test_the_calibration_may_be_a_file(tmp_path: Path) -> None:
     camera = images["left"].pair_with(images["right"]).camera
     assert (camera.fy, camera.cx, camera.cx_right) == (21.5, 11.0, 13.0)
     file.write_text("fx: [")
-    with pytest.raises(LogError, match="cannot read the calibration"):
+    with pytest.raises(LogError, match="is not plain YAML"):
         import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
 
 
@@ -182,7 +182,7 @@ def test_pictures_of_two_sizes_and_files_that_are_no_pictures_are_refused(tmp_pa
     with pytest.raises(LogError, match="differ in size or kind"):
         import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1)
     right[0].write_bytes(b"no picture")
-    with pytest.raises(LogError, match=r"0-right\.png is not an image"):
+    with pytest.raises(LogError, match=r"0-right\.png is not a readable image"):
         import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1)
 
 

@@ -152,7 +152,7 @@ def test_full_and_half_size_names_and_the_other_name_of_the_truth(tmp_path: Path
     [
         (("disp0GT.pfm",), set(), "without truth (no disp0GT.pfm or disp0.pfm)"),
         (("disp0GT.pfm", "mask0nocc.png"), set(), "without truth"),
-        (("mask0nocc.png",), {"/truth/disparity"}, "not which are occluded (no mask0nocc.png)"),
+        (("mask0nocc.png",), {"/truth/disparity"}, "without occlusions (no mask0nocc.png)"),
     ],
 )
 def test_a_scene_without_truth_says_so(tmp_path: Path, without: tuple[str, ...], topics: set[str], said: str) -> None:
@@ -183,33 +183,33 @@ def calibrate(**changes: object):
     [
         (lambda folder: (folder / "im1.png").unlink(), r"cannot read .*im1\.png: No such file"),
         (lambda folder: (folder / "calib.txt").unlink(), r"cannot read .*calib\.txt: No such file"),
-        (spoil("im0.png", b"no picture"), r"im0\.png is not an image"),
+        (spoil("im0.png", b"no picture"), r"im0\.png is not a readable image"),
         (spoil("calib.txt", b"\xff\xfe\x00"), r"calib\.txt is not a text file"),
         (calibrate(doffs=None), r"calib\.txt lacks 'doffs'"),
-        (calibrate(ndisp="many"), r"calib\.txt has a line that is no number or matrix .*many"),
-        (calibrate(cam0="[1 2]"), r"calib\.txt has a line that is no number or matrix"),
+        (calibrate(ndisp="many"), r"calib\.txt has an entry that is not a number or matrix .*many"),
+        (calibrate(cam0="[1 2]"), r"calib\.txt has an entry that is not a number or matrix"),
         (calibrate(cam0="[-9 0 1; 0 9 1; 0 0 1]"), r"calib\.txt: fx is -9"),
         (calibrate(baseline=0), r"calib\.txt: baseline is 0"),
         (calibrate(ndisp="nan"), r"calib\.txt: ndisp is nan"),
-        (calibrate(doffs=0), r"calib\.txt: doffs is 0, by cam0 and cam1 it is 12\.5"),
+        (calibrate(doffs=0), r"calib\.txt: doffs is 0, but 12\.5"),
         (
             spoil("disp0GT.pfm", b"Pf\n96 64\n-1\n" + 96 * 64 * b"\0\0\x80\x7f"),
-            r"disp0GT\.pfm has no pixel that is known",
+            r"disp0GT\.pfm has no known pixel",
         ),
-        (calibrate(width=48), r"im0\.png is 96x64, the calibration or the first pair is 48x64"),
+        (calibrate(width=48), r"im0\.png is 96x64, but the calibration or the first pair is 48x64"),
         (spoil("disp0GT.pfm", b"P6\n3 2\n255\n" + bytes(18)), r"disp0GT\.pfm is not a PFM file of one channel"),
         (spoil("disp0GT.pfm", b""), r"disp0GT\.pfm is not a PFM file"),
-        (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(23)), r"has 23 bytes of pixels where 3x2 take 24"),
+        (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(23)), r"has 23 bytes of pixels, but 3x2 pixels need 24"),
         (spoil("disp0GT.pfm", b"Pf\n3 2\n1e\n" + bytes(24)), r"its scale 1e is not a number"),
-        (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(24)), r"disp0GT\.pfm is 3x2, the images are 96x64"),
-        (spoil("mask0nocc.png", b""), r"mask0nocc\.png is not an image"),
+        (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(24)), r"disp0GT\.pfm is 3x2, but the images are 96x64"),
+        (spoil("mask0nocc.png", b""), r"mask0nocc\.png is not a readable image"),
         (
             lambda folder: cv2.imwrite(str(folder / "mask0nocc.png"), np.full((64, 96), 77, np.uint8)),
-            r"mask0nocc\.png has a pixel of 77; an occlusion mask has 255, 128 and 0 only",
+            r"mask0nocc\.png has a pixel of 77; an occlusion mask has only 255, 128 and 0",
         ),
         (
             lambda folder: cv2.imwrite(str(folder / "mask0nocc.png"), np.zeros((32, 48), np.uint8)),
-            r"mask0nocc\.png is 48x32, the images are 96x64",
+            r"mask0nocc\.png is 48x32, but the images are 96x64",
         ),
     ],
 )
@@ -227,7 +227,7 @@ def test_what_holds_no_scene_and_what_cannot_hold_the_logs_is_refused(tmp_path: 
     for out in (tmp_path / "out.mcap", tmp_path / "training" / "Box" / "im0.png"):
         with pytest.raises(LogError, match="give a folder for the logs instead of"):
             logs_of(tmp_path / "training", out)
-    with pytest.raises(LogError, match="holds no scene"):
+    with pytest.raises(LogError, match="contains a scene"):
         logs_of(tmp_path, tmp_path / "logs")
     with pytest.raises(LogError, match="is not a folder"):
         logs_of(tmp_path / "nowhere", tmp_path / "logs")

@@ -125,9 +125,9 @@ def test_an_image_of_another_size_than_its_calibration_is_refused_before_it_is_u
     data = cv2.imencode(suffix, picture(1), flags)[1].tobytes()
     assert pixels_of(compressed(data, suffix), (WIDTH, HEIGHT)).shape == (HEIGHT, WIDTH, 3)
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
-    with pytest.raises(LogError, match=f"the image is {WIDTH}x{HEIGHT}, its calibration is for 10x{HEIGHT}"):
+    with pytest.raises(LogError, match=f"the image is {WIDTH}x{HEIGHT}, but its calibration is for 10x{HEIGHT}"):
         pixels_of(compressed(data, suffix), (10, HEIGHT))
-    with pytest.raises(LogError, match=f"the image is {WIDTH}x{HEIGHT}, its calibration is for 10x{HEIGHT}"):
+    with pytest.raises(LogError, match=f"the image is {WIDTH}x{HEIGHT}, but its calibration is for 10x{HEIGHT}"):
         pixels_of(raw_image("mono8", picture(1)[:, :, 0], WIDTH), (10, HEIGHT))
 
 

@@ -61,8 +61,8 @@ def test_the_text_names_every_topic_its_stream_and_what_is_missing(tmp_path: Pat
     line = next(line for line in text.splitlines() if line.startswith(LEFT))
     assert line.split() == [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100", "s", "left"]
     assert "missing: odometry: the log has no nav_msgs/Odometry" in text
-    frames = "frames: 5 stereo pairs with stamps within 5 ms, from 5 left images and 5 right images"
-    assert f"{frames}; 5 left images between tilts at most 200 ms apart" in text
+    frames = "frames: 5 stereo pairs (stamps within 5 ms) from 5 left images and 5 right images"
+    assert f"{frames}; 5 left images with a tilt (readings at most 200 ms apart)" in text
 
 
 def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: Path) -> None:
@@ -80,10 +80,8 @@ def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: P
     wider = inventory_of(path, slop=6_000_000, max_gap=400_000_000)
     assert (wider["frames"]["pairs"], wider["frames"]["with_tilt"]) == (FRAMES, FRAMES)
     text = format_description(wider)
-    assert (
-        "5 stereo pairs with stamps within 6 ms, from 5 left images and 5 right images; 5 left images between" in text
-    )
-    assert "tilts at most 400 ms apart" in text
+    assert "5 stereo pairs (stamps within 6 ms) from 5 left images and 5 right images; 5 left images with" in text
+    assert "readings at most 400 ms apart" in text
 
 
 def test_repeated_stamps_count_once_and_are_told(tmp_path: Path) -> None:
@@ -198,7 +196,7 @@ def test_a_missing_right_calibration_is_said_in_whole_sentences(tmp_path: Path) 
     why = f"no CameraInfo belongs to {RIGHT} ({listed}); set 'right_info'"
     assert [line.partition(" of the source")[0] for line in text.splitlines() if line.startswith("missing")] == [
         f"missing: right: {why}",
-        f"missing: mount: the mount needs a calibrated pair of cameras: {why}",
+        "missing: mount: the mount needs a calibrated pair of cameras",
     ]
 
 
@@ -214,7 +212,7 @@ def test_topics_that_cannot_be_decoded_are_listed_once(tmp_path: Path) -> None:
 def test_one_is_not_many(tmp_path: Path) -> None:
     edit = lambda topic, number, message: None if number else message  # noqa: E731
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
-    assert "1 stereo pair with stamps within 5 ms, from 1 left image and 1 right image; 1 left image between" in text
+    assert "1 stereo pair (stamps within 5 ms) from 1 left image and 1 right image; 1 left image with" in text
 
 
 def test_damage_is_told(tmp_path: Path) -> None:

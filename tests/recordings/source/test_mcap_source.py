@@ -255,7 +255,7 @@ def test_one_bad_message_is_lost_alone(tmp_path: Path) -> None:
 
     events = items_of(write_sample(tmp_path / "log.mcap", edit))
     told = {stream: str(item) for _, stream, item in events if isinstance(item, Exception)}
-    assert f"the image is cut: {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in told["left"]
+    assert f"the image is cut: it has {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in told["left"]
     assert "image encoding 'yuv422' is not one of those that can be read" in told["right"]
     assert "the quaternion of the inclinometer is not a rotation" in told["inclinometer"]
     assert "its stamp is damaged (4294967295 ns beyond the second)" in told["odometry"]
@@ -271,8 +271,8 @@ def test_a_camera_whose_images_nobody_can_read_is_missing_before_the_run(tmp_pat
     path = write_sample(tmp_path / "log.mcap", edit)
     with McapSource().open(path) as log:
         assert list(log.missing) == ["right"]
-        assert log.missing["right"].startswith(f"{RIGHT}: image encoding 'yuv422_yuy2' is not one of those that can be")
-        assert "(mono8, 8UC1, " in log.missing["right"]
+        assert log.missing["right"].startswith(f"{RIGHT}: the image encoding 'yuv422_yuy2' is not supported")
+        assert "only mono8, 8UC1, " in log.missing["right"]
     described = inventory_of(path)
     assert (described["frames"]["pairs"], described["missing"]) == (0, log.missing)
 
