@@ -430,8 +430,8 @@ def test_maps_that_no_memory_holds_are_refused_before_the_run(settings, said, ca
 
 
 @pytest.mark.parametrize(("sinks", "said"), [
-    (["tests.flow.toys.Keep"], "tests.flow.toys.Keep writes .txt files, and a run has outputs for .mcap and .rrd only"),
-    (["recordings.McapSink", "another.Another"], "several sinks write .mcap files, and a run has one output for them"),
+    (["tests.flow.toys.Keep"], "tests.flow.toys.Keep writes .txt files, but a run writes only .mcap and .rrd files"),
+    (["recordings.McapSink", "another.Another"], "several sinks write .mcap files, but a run writes only one"),
 ])  # fmt: skip
 def test_a_sink_that_a_run_has_no_output_for_is_refused(traverse, tmp_path, capsys, sinks, said):
     (tmp_path / "another.py").write_text("from recordings import McapSink\nclass Another(McapSink):\n    pass\n")
