@@ -7,21 +7,12 @@ and a test fails when a page is not current.
 from __future__ import annotations
 
 import argparse
-import inspect
-import math
-import re
 from collections.abc import Iterator
-from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
-from typing import Any
 
-import flow.align
-import recordings
 import stages
 from flow.cli.main import parser
-from flow.runtime.graph import ports_of
-from flow.units import as_written
-from stages.stage import Stage
+from flow.config.reference import NodeReference, stage_reference
 
 DOCS = Path(__file__).parent.parent.parent / "docs"
 STEPS = {
@@ -32,6 +23,15 @@ STEPS = {
     "terrain": "Terrain",
     "localisation": "Localisation",
 }
+OTHERS = (
+    ("Alignment", "Aligners join streams of different clocks before any stage runs.", "flow.align."),
+    (
+        "Source and sinks",
+        "[logs.md](logs.md#settings-of-the-source) describes the settings of the source.",
+        "recordings.",
+    ),
+)
+UNITS = {"ns": "s, ms", "rad": "rad, deg"}
 STAGES_INTRO = """# Stages and their parameters
 
 This page is generated from the code by `make docs`.
@@ -60,108 +60,48 @@ def pages() -> dict[str, str]:
 
 
 def _stages() -> str:
+    nodes = stage_reference()
     parts = [STAGES_INTRO]
-    kinds = [getattr(stages, name) for name in stages.__all__]
-    found = [kind for kind in kinds if inspect.isclass(kind) and issubclass(kind, Stage)]
     for folder, title in STEPS.items():
         parts.append(f"## {title}\n")
-        for kind in sorted(found, key=lambda kind: kind.__name__):
-            if kind.__module__.split(".")[1] == folder:
-                parts += _section(kind, f"stages.{kind.__name__}")
-    parts += ["## The vehicle\n", *_section(stages.Rover, "stages.Rover")]
-    parts.append("## Alignment\n\nAligners join streams of different clocks before any stage runs.\n")
-    for name in ("pair", "interpolate", "nearest", "latest"):
-        parts += _section(getattr(flow.align, name), f"flow.align.{name}")
-    parts.append(
-        "## Source and sinks\n\n[logs.md](logs.md#settings-of-the-source) describes the settings of the source.\n"
-    )
-    for name in recordings.__all__:
-        parts += _section(getattr(recordings, name), f"recordings.{name}")
+        for node in sorted(nodes, key=lambda node: node.use):
+            if node.use.startswith("stages.") and _folder(node) == folder:
+                parts += _section(node)
+    for title, about, module in OTHERS:
+        parts.append(f"## {title}\n\n{about}\n")
+        for node in nodes:
+            if node.use.startswith(module):
+                parts += _section(node)
     return "\n".join(parts)
 
 
-def _section(kind: type, use: str) -> Iterator[str]:
-    """A class with its first sentence, its ports and its parameters."""
-    yield f"### {kind.__name__}\n"
-    yield f"`{use}`: {_first_sentence(kind)}\n"
-    if issubclass(kind, Stage):
-        ports, optional = ports_of(kind)
-        inputs = [f"`{name}` {_type(hint)}{' (optional)' if name in optional else ''}" for name, hint in ports.items()]
-        returned = inspect.signature(kind.__call__).return_annotation
-        yield f"Inputs: {', '.join(inputs)}. Output: {returned}.\n"
-    documented = _numpydoc(kind)
-    rows = (
-        [_row(item, documented.get(item.name, "")) for item in fields(kind) if item.init] if is_dataclass(kind) else []
-    )
-    if rows:
+def _folder(node: NodeReference) -> str:
+    """The step that a stage belongs to."""
+    return str(getattr(stages, node.use.rpartition(".")[2]).__module__.split(".")[1])
+
+
+def _section(node: NodeReference) -> Iterator[str]:
+    """A class with its summary, its ports and its parameters."""
+    yield f"### {node.use.rpartition('.')[2]}\n"
+    yield f"`{node.use}`: {_escaped(node.summary)}\n"
+    if node.role == "stage":
+        inputs = [f"`{name}` {kind.removesuffix(' | None')}" for name, kind in node.inputs.items()]
+        shown = [f"{text} (optional)" if text[1:].startswith(node.optional_inputs) else text for text in inputs]
+        yield f"Inputs: {', '.join(shown)}. Output: {node.output}.\n"
+    if node.parameters:
         yield "| parameter | meaning | unit | range | default |\n|---|---|---|---|---|"
-        yield "\n".join(rows) + "\n"
+        rows = [
+            (f"`{it.name}`", it.meaning, UNITS.get(it.unit, it.unit), it.range, it.default) for it in node.parameters
+        ]
+        yield "\n".join(_row(*row) for row in rows) + "\n"
 
 
-def _first_sentence(kind: type) -> str:
-    text = " ".join((inspect.getdoc(kind) or "").split("\n\n")[0].split())
-    end = text.find(". ")
-    return (text if end < 0 else text[: end + 1]).replace("<", "&lt;")
+def _row(*cells: str) -> str:
+    return "| " + " | ".join(_escaped(cell).replace("|", "\\|") for cell in cells) + " |"
 
 
-def _type(hint: Any) -> str:
-    if isinstance(hint, type):
-        return hint.__name__
-    return " or ".join(_type(part) for part in hint.__args__ if part is not type(None))
-
-
-def _numpydoc(kind: type) -> dict[str, str]:
-    """Parameter -> its text in the sections "Parameters" of a class and its bases."""
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
-        section = re.search(
-            r"^Parameters\n-+\n(.*?)(?:\n\n\w+\n-+\n|\Z)", inspect.cleandoc(base.__doc__ or ""), re.S | re.M
-        )
-        for names, text in re.findall(r"^(\S.*)\n((?:[ ]+.*\n?)+)", section[1] if section else "", re.M):
-            found |= dict.fromkeys(re.split(r",\s*", names.partition(" : ")[0]), " ".join(text.split()))
-    return found
-
-
-def _row(item: Field[Any], about: str) -> str:
-    meta = item.metadata
-    unit = meta.get("unit", "")
-    shown = {"ns": "s, ms", "rad": "rad, deg"}.get(unit, unit)
-    return _table_row(f"`{item.name}`", meta.get("help") or about, shown, _range(item), _value(_default(item), unit))
-
-
-def _table_row(*cells: str) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|").replace("<", "&lt;") for cell in cells) + " |"
-
-
-def _default(item: Field[Any]) -> Any:
-    return item.default_factory() if item.default_factory is not MISSING else item.default
-
-
-def _range(item: Field[Any]) -> str:
-    meta = item.metadata
-    if meta.get("choices"):
-        return ", ".join(_value(choice, "") for choice in meta["choices"])
-    low, high = (None if meta.get(key) is None else _value(meta[key], meta.get("unit", "")) for key in ("low", "high"))
-    if low is None:
-        return "" if high is None else f"at most {high}"
-    return f"at least {low}" if high is None else f"{low} to {high}"
-
-
-def _value(value: Any, unit: str) -> str:
-    """A value as a pipeline file writes it."""
-    if value is MISSING:
-        return "required"
-    if value is None or value == "":
-        return "none"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if is_dataclass(value):
-        return f"{type(value).__name__}()"
-    if isinstance(value, tuple):
-        return ", ".join(_value(part, unit) for part in value) or "none"
-    if isinstance(value, int | float):
-        return f"{math.degrees(value):.3g} deg" if unit == "rad" and value else as_written(value, unit)
-    return str(value)
+def _escaped(text: str) -> str:
+    return text.replace("<", "&lt;")
 
 
 def _commands() -> str:
@@ -191,7 +131,7 @@ def _option(action: argparse.Action) -> str:
     choices = ", ".join(map(str, action.choices)) if action.choices else ""
     value = action.metavar if isinstance(action.metavar, str) else action.dest.upper()
     shown = f"`{value}`" if not names else names if action.nargs == 0 else f"{names} `{value}`"
-    return _table_row(shown, "; ".join(text for text in (action.help, choices) if text))
+    return _row(shown, "; ".join(text for text in (action.help, choices) if text))
 
 
 if __name__ == "__main__":

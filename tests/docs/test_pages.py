@@ -1,6 +1,9 @@
 """README and docs: links resolve, commands parse, pipelines load, generated pages are current."""
 
 import argparse
+import contextlib
+import functools
+import importlib
 import re
 import shlex
 from pathlib import Path
@@ -97,3 +100,34 @@ def test_readme_fits_a_page_and_shows_the_two_commands_first():
     assert "docs/desk.jpg" in first_screen
     assert re.search(r"^make demo\b", first_screen, re.MULTILINE)
     assert re.search(r"^make test\b", first_screen, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", pages.NAMES)
+def test_paths_of_the_project_exist(name):
+    rooms = ("flow/", "stages/", "recordings/", "tests/", "docs/")
+    found = [code for code in pages.inline_codes(pages.ROOT / name) if code.startswith(rooms) and " " not in code]
+    assert [path for path in found if not (pages.ROOT / path).exists()] == []
+
+
+def dotted(name):
+    """Whether a dotted name is a module, or is found in one."""
+    parts = name.split(".")
+    for cut in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:cut]))
+        except ImportError:
+            continue
+        with contextlib.suppress(AttributeError):
+            functools.reduce(getattr, parts[cut:], found)
+            return True
+        return False
+    return False
+
+
+@pytest.mark.parametrize("name", pages.NAMES)
+def test_dotted_names_of_the_product_resolve(name):
+    text = "" if name == "CHANGELOG.md" else (pages.ROOT / name).read_text()
+    found = set(
+        re.findall(r"(?:^::: |[`\s{])((?:flow|stages|recordings)(?:\.[A-Za-z]\w*)+)\b(?!/)", text, re.MULTILINE)
+    )
+    assert sorted(item for item in found if not dotted(item)) == []
