@@ -13,6 +13,7 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,11 +93,11 @@ def test_a_log_without_a_pose_gets_one_that_says_it_is_visual(traverse, tmp_path
     log = rewrite(traverse, tmp_path / "log.mcap", lambda topic, _, data: None if topic in poses else data)
     out, summary = tmp_path / "out.mcap", tmp_path / "out.json"
     assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd", "--summary", summary) == 0
-    poses = [message for topic, _, message in iter_decoded(out) if topic == "/nav/pose"]
-    assert [(pose.header.frame_id, pose.child_frame_id) for pose in poses] == [("visual_odom", "base_link")] * FRAMES
+    written = [message for topic, _, message in iter_decoded(out) if topic == "/nav/pose"]
+    assert [(pose.header.frame_id, pose.child_frame_id) for pose in written] == [("visual_odom", "base_link")] * FRAMES
     simulation = Simulation(frames=FRAMES, width=320, height=240)
     start = level_pose(simulation.base_at(simulation.stamp(0))).inverse()
-    for index, pose in enumerate(poses):
+    for index, pose in enumerate(written):
         true = start.after(simulation.base_at(simulation.stamp(index))).translation
         place = pose.pose.pose.position
         assert np.linalg.norm([place.x - true[0], place.y - true[1], place.z - true[2]]) < 0.03
@@ -152,7 +153,7 @@ def test_the_result_reads_back_with_mcap_ros2_support(result):
 
 def test_the_result_reads_back_with_rosbags(result):
     with AnyReader([result]) as reader:
-        topics = [
+        topics: list[tuple[str, Any]] = [
             (connection.topic, reader.deserialize(data, connection.msgtype))
             for connection, _, data in reader.messages()
         ]

@@ -10,7 +10,7 @@ import re
 import struct
 from typing import BinaryIO
 
-import lz4.frame  # type: ignore[import-untyped]
+import lz4.frame
 import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,7 +40,7 @@ def frame_of(log: Path) -> StereoFrame:
     return images["left"].pair_with(images["right"])
 
 
-def truth_of(log: Path) -> dict[str, object]:
+def truth_of(log: Path) -> dict[str, Any]:
     return {topic: message for topic, _, message in iter_decoded(log) if topic.startswith("/truth")}
 
 

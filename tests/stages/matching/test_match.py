@@ -250,7 +250,7 @@ def test_a_wrong_prior_does_not_overrule_the_images(slope):
 
 def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
     simulation = Simulation(frames=3, width=480, height=360)
-    confidence, right = [], []
+    parts = []
     for index in range(simulation.frames):
         made = simulation.frame(index)
         stamp = simulation.stamp(index)
@@ -259,9 +259,8 @@ def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
         for cost in COSTS:
             result = Match(disparities=96, cost=cost)(frame)
             known = np.isfinite(result.pixels) & np.isfinite(truth)
-            confidence.append(result.confidence[known])
-            right.append(np.abs(result.pixels - truth)[known] <= 1)
-    confidence, right = np.concatenate(confidence), np.concatenate(right)
+            parts.append((result.confidence[known], np.abs(result.pixels - truth)[known] <= 1))
+    confidence, right = map(np.concatenate, zip(*parts, strict=True))
     assert len(right) > 200_000
     assert right.mean() == pytest.approx(confidence.mean(), abs=0.05)
     doubtful = confidence < 0.8

@@ -369,7 +369,7 @@ def polar_camera(folder, size):
 
 def row_offset(frame):
     """Median of v_left - v_right over mutual feature matches, px."""
-    features = cv2.ORB_create(4000, nlevels=4)
+    features = cv2.ORB.create(4000, nlevels=4)
     (points1, codes1), (points2, codes2) = (
         features.detectAndCompute(np.ascontiguousarray(image), None) for image in (frame.left, frame.right)
     )
