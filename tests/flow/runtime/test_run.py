@@ -354,7 +354,7 @@ def test_patience_runs_on_the_clock_of_the_whole_log(tmp_path):
     events += [(at, "level", Number(at, 0.0)) for at in range(0, 3000 * MS, 50 * MS)]
     _, summary = replayed(graph(tmp_path), events)
     (entry,) = summary["ledger"]
-    assert entry["detail"] == "no partner within 1000.0 ms of log time (both.patience)"
+    assert entry["detail"] == "no partner within 1 s of log time (both.patience)"
 
 
 def test_a_log_that_lacks_what_a_stage_needs_is_refused_with_the_logs_own_words(tmp_path):
