@@ -78,11 +78,11 @@ def refined(stream: str, **parameters: Any) -> Chain:
     return lambda streams, case: refine(case.frame, streams[stream])
 
 
-def remade(**streams: Callable[[dict[str, Any], Case], Disparity]) -> Chain:
+def remade(streams: dict[str, Callable[[dict[str, Any], Case], Disparity]]) -> Chain:
     """`rover` with these streams made otherwise, and with what follows from them."""
     return lambda found, case: stereo_part(
         "rover", case.frame, case.disparities, entry="rectified",
-        **{"backward": found["backward"], **{name: make(found, case) for name, make in streams.items()}},
+        **{"disparity/right": found["disparity/right"], **{name: make(found, case) for name, make in streams.items()}},
     )["disparity"]  # fmt: skip
 
 
@@ -101,7 +101,7 @@ def blind(streams: dict[str, Any], case: Case) -> Disparity:
 
 def at_once(streams: dict[str, Any], case: Case) -> Disparity:
     """The view from the right, of the whole range at full size."""
-    return Match(disparities=case.disparities, paths=4)(streams["swapped"])
+    return Match(disparities=case.disparities, paths=4)(streams["disparity/right/swapped"])
 
 
 def unguided(streams: dict[str, Any], case: Case) -> Disparity:
@@ -111,24 +111,24 @@ def unguided(streams: dict[str, Any], case: Case) -> Disparity:
 
 def eight(streams: dict[str, Any], case: Case) -> Disparity:
     """The match at full size with 8 paths."""
-    match: Match = replace(stage("rover", "matched"), paths=8, disparities=case.disparities)
-    return match(case.frame, streams["prior"])
+    match: Match = replace(stage("rover", "disparity/full"), paths=8, disparities=case.disparities)
+    return match(case.frame, streams["disparity/prior"])
 
 
 def unbanded(streams: dict[str, Any], case: Case) -> Disparity:
     """The match at full size of all rows for the whole range."""
-    match: Match = replace(stage("rover", "matched"), band_height=0, disparities=case.disparities)
-    return match(case.frame, streams["prior"])
+    match: Match = replace(stage("rover", "disparity/full"), band_height=0, disparities=case.disparities)
+    return match(case.frame, streams["disparity/prior"])
 
 
 def everywhere(streams: dict[str, Any], case: Case) -> Disparity:
     """The second match at full size with the whole range searched."""
-    return Match(disparities=case.disparities, paths=4)(case.frame, streams["outlined"])
+    return Match(disparities=case.disparities, paths=4)(case.frame, streams["disparity/full_filled"])
 
 
 def thrice(streams: dict[str, Any], case: Case) -> Disparity:
     """The second match guided by what comes of itself."""
-    again: Match = stage("rover", "matched_again")
+    again: Match = stage("rover", "disparity/second")
     return again(case.frame, streams["disparity"])
 
 
@@ -139,7 +139,7 @@ def part_of_range(part: int) -> Chain:
 
 def by_rows(streams: dict[str, Any], case: Case) -> Disparity:
     """`rover` with holes filled along their rows, from the farther end, without asking the image."""
-    found = refined("checked_again", fill=False)(streams, case)
+    found = refined("disparity/second_checked", fill=False)(streams, case)
     return replace(found, pixels=rows_filled(found.pixels))
 
 
@@ -150,41 +150,45 @@ def whole(pipeline: str) -> Chain:
 
 STEPS: dict[str, Chain] = {
     "matching alone, filled": alone,
-    "coarse to fine, filled": refined("matched", **PLAIN),
-    "+ view from the right": refined("checked", **PLAIN),
-    "+ matched again about that": refined("checked_again", **PLAIN),
-    "+ doubtful matches dropped": refined("checked_again", **{**PLAIN, "min_confidence": 0.5}),
-    "+ fractions from brightness": refined("checked_again", **{**PLAIN, "min_confidence": 0.5, "subpixel_radius": 2}),
-    "+ median": refined("checked_again", **{**PLAIN, "min_confidence": 0.5, "subpixel_radius": 2, "median_size": 3}),
-    "+ planes of superpixels": refined(
-        "checked_again", surface_size=0, plane_fill=False, bilateral_radius=0, edge_radius=0
+    "coarse to fine, filled": refined("disparity/full", **PLAIN),
+    "+ view from the right": refined("disparity/full_checked", **PLAIN),
+    "+ matched again about that": refined("disparity/second_checked", **PLAIN),
+    "+ doubtful matches dropped": refined("disparity/second_checked", **{**PLAIN, "min_confidence": 0.5}),
+    "+ fractions from brightness": refined(
+        "disparity/second_checked", **{**PLAIN, "min_confidence": 0.5, "subpixel_radius": 2}
     ),
-    "+ they fill holes": refined("checked_again", surface_size=0, bilateral_radius=0, edge_radius=0),
-    "+ planes of surfaces": refined("checked_again", bilateral_radius=0, edge_radius=0),
-    "+ bilateral filter": refined("checked_again", edge_radius=0),
+    "+ median": refined(
+        "disparity/second_checked", **{**PLAIN, "min_confidence": 0.5, "subpixel_radius": 2, "median_size": 3}
+    ),
+    "+ planes of superpixels": refined(
+        "disparity/second_checked", surface_size=0, plane_fill=False, bilateral_radius=0, edge_radius=0
+    ),
+    "+ they fill holes": refined("disparity/second_checked", surface_size=0, bilateral_radius=0, edge_radius=0),
+    "+ planes of surfaces": refined("disparity/second_checked", bilateral_radius=0, edge_radius=0),
+    "+ bilateral filter": refined("disparity/second_checked", edge_radius=0),
     "+ edges as in the image: rover": lambda streams, _: streams["disparity"],
 }
 VARIANTS: dict[str, Chain] = {
-    "rover without the coarse match": remade(matched=unguided),
-    "rover, coarse match not refined": remade(outline=lambda streams, _: streams["coarse"]),
-    "rover without the right view": remade(backward=blind),
-    "rover, right view of whole range": remade(backward=at_once),
-    "rover, not matched again": refined("checked"),
-    "rover, all rows the whole range": remade(matched=unbanded),
-    "rover, again the whole range": remade(matched_again=everywhere),
-    "rover, matched a third time": remade(matched_again=thrice),
+    "rover without the coarse match": remade({"disparity/full": unguided}),
+    "rover, coarse match not refined": remade({"disparity/half_refined": lambda streams, _: streams["disparity/half"]}),
+    "rover without the right view": remade({"disparity/right": blind}),
+    "rover, right view of whole range": remade({"disparity/right": at_once}),
+    "rover, not matched again": refined("disparity/full_checked"),
+    "rover, all rows the whole range": remade({"disparity/full": unbanded}),
+    "rover, again the whole range": remade({"disparity/second": everywhere}),
+    "rover, matched a third time": remade({"disparity/second": thrice}),
     "rover with half the range": part_of_range(2),
     "rover with a third of the range": part_of_range(3),
-    "rover, fractions from matching": refined("checked_again", subpixel_radius=0),
-    "rover without planes": refined("checked_again", plane_weight=0, plane_fill=False, surface_size=0),
-    "rover without surfaces": refined("checked_again", surface_size=0),
-    "rover, planes draw more: 0.7": refined("checked_again", plane_weight=0.7),
-    "rover, planes draw less: 0.3": refined("checked_again", plane_weight=0.3),
+    "rover, fractions from matching": refined("disparity/second_checked", subpixel_radius=0),
+    "rover without planes": refined("disparity/second_checked", plane_weight=0, plane_fill=False, surface_size=0),
+    "rover without surfaces": refined("disparity/second_checked", surface_size=0),
+    "rover, planes draw more: 0.7": refined("disparity/second_checked", plane_weight=0.7),
+    "rover, planes draw less: 0.3": refined("disparity/second_checked", plane_weight=0.3),
     "rover, holes filled along rows": by_rows,
-    "rover, bilateral radius 6": refined("checked_again", bilateral_radius=6),
-    "rover, edges of radius 5": refined("checked_again", edge_radius=5),
-    "rover, 64 planes tried": refined("checked_again", hypotheses=64),
-    "rover with 8 paths": remade(matched=eight),
+    "rover, bilateral radius 6": refined("disparity/second_checked", bilateral_radius=6),
+    "rover, edges of radius 5": refined("disparity/second_checked", edge_radius=5),
+    "rover, 64 planes tried": refined("disparity/second_checked", hypotheses=64),
+    "rover with 8 paths": remade({"disparity/full": eight}),
     "fast": whole("fast"),
     "paper": whole("paper"),
 }
@@ -237,8 +241,8 @@ def print_skies(cases: list[Case]) -> None:
     for case in cases:
         streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
         for name, chain in (
-            ("asked", refined("checked_again")),
-            ("not", refined("checked_again", min_correlation=0.0)),
+            ("asked", refined("disparity/second_checked")),
+            ("not", refined("disparity/second_checked", min_correlation=0.0)),
         ):
             measured = chain(streams, case).source == PixelOrigin.MEASURED
             known = np.isfinite(case.truth) & (case.mask == 255)

@@ -84,7 +84,7 @@ def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
     assert (summary["verdict"], summary["frames_in"], summary["frames_out"]) == ("COMPLETE", FRAMES, FRAMES)
     assert summary["drops"] == {}
     assert summary["surveys"]["rectified"]["sentence"].endswith("too little to correct")
-    assert summary["seconds"]["matched"] > 0
+    assert summary["seconds"]["disparity/full"] > 0
     assert set(summary["seconds"]) >= {"rectified", "disparity", "points", "elevation_map", "navigation_map"}
 
 
@@ -179,7 +179,15 @@ def test_the_recording_verifies_and_holds_every_intermediate(result):
     import rerun as rr
 
     paths = {str(path) for path in rr.chunk.RrdReader(str(rrd)).store().schema().entity_paths()}
-    streams = ("rectified/left", "rectified/right", "matched", "disparity", "points", "elevation_map", "navigation_map")
+    streams = (
+        "rectified/left",
+        "rectified/right",
+        "disparity/full",
+        "disparity",
+        "points",
+        "elevation_map",
+        "navigation_map",
+    )
     for stream in streams:
         assert any(f"/{stream}" in path for path in paths), (stream, sorted(paths))
 
@@ -409,7 +417,7 @@ def test_help_imports_nothing_heavy():
 def test_graph_draws_every_stream(form, capsys):
     assert roverflow("graph", "--format", form) == 0
     drawn = capsys.readouterr().out
-    for stream in ("stereo", "tilt", "matched", "disparity", "points", "elevation_map", "navigation_map"):
+    for stream in ("stereo", "tilt", "disparity", "points", "elevation_map", "navigation_map"):
         assert stream in drawn
     assert drawn.count("every stream of the frame") == (0 if form == "text" else 2)  # to the two sinks
 
@@ -422,11 +430,11 @@ def test_a_stream_may_have_the_name_of_a_keyword_of_mermaid(tmp_path, capsys):
 
 
 def test_graph_shows_what_is_set(capsys):
-    assert roverflow("graph", "--set", "disparities=128") == 0
+    assert roverflow("graph", "--set", "disparities=128", "--set", "rover.max_slope=25deg") == 0
     drawn = capsys.readouterr().out
     assert "disparities=128" in drawn
     assert "smooth=100 ms)" in drawn
-    assert "max_slope=20 deg)" in drawn
+    assert "rover.max_slope=25 deg)" in drawn
 
 
 def test_stages_lists_every_stage_and_the_parameters_of_one(capsys):

@@ -62,8 +62,10 @@ def test_a_file_that_is_no_log_is_refused_in_one_sentence(tmp_path, capsys, cont
 
 
 def test_what_a_stage_cannot_do_without_is_asked_for_before_anything_runs(traverse, tmp_path, capsys):
-    assert roverflow("run", traverse, "--set", "rough.search_radius=4", "-o", tmp_path / "out.mcap") == 2
-    assert "stream 'rough': Match.search_radius = 4 px needs a `prior`" in capsys.readouterr().err
+    assert (
+        roverflow("run", traverse, "--set", "disparity/half/quarter.search_radius=4", "-o", tmp_path / "out.mcap") == 2
+    )
+    assert "stream 'disparity/half/quarter': Match.search_radius = 4 px needs a `prior`" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

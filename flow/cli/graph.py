@@ -15,6 +15,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_pipeline_options(sub)
     sub.add_argument("--format", choices=("text", "mermaid", "svg"), default="text")
+    sub.add_argument("--expand", action="store_true", help="draw the streams inside templates one by one")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -22,5 +23,5 @@ def run(options: argparse.Namespace) -> int:
     from flow.config.draw import draw
     from flow.config.loader import load
 
-    say(draw(load(options.pipeline, options.set), options.format))
+    say(draw(load(options.pipeline, options.set), options.format, options.expand))
     return COMPLETE

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from html import escape
 from typing import Any
 
@@ -16,36 +16,80 @@ _BOX_WIDTH, _BOX_HEIGHT, _GAP_X, _GAP_Y, _MARGIN = 168, 44, 76, 22, 16
 _TO_SINKS = "every stream of the frame"
 
 
-def draw(graph: Graph, form: str) -> str:
-    """The graph in the given form: "text", "mermaid" or "svg"."""
-    return {"text": _text, "mermaid": _mermaid, "svg": _svg}[form](graph)
+@dataclass(frozen=True)
+class _Box:
+    """A stage, an aligner or a template. made: its streams, the output last; remark: on its line of text."""
+
+    name: str
+    use: str
+    made: tuple[str, ...]
+    inputs: tuple[str, ...]
+    settings: tuple[str, ...] = ()
+    remark: str = ""
 
 
-def _edges(graph: Graph) -> list[tuple[str, str, str, str]]:
+def draw(graph: Graph, form: str, expand: bool = False) -> str:
+    """The drawing of a graph.
+
+    Parameters
+    ----------
+    graph
+        A loaded pipeline.
+    form
+        "text", "mermaid" or "svg".
+    expand
+        Draw the streams inside templates one by one, not each template as one box.
+    """
+    return {"text": _text, "mermaid": _mermaid, "svg": _svg}[form](graph, _boxes(graph, expand))
+
+
+def _boxes(graph: Graph, expand: bool) -> list[_Box]:
+    """What is drawn between the source and the sinks, in the order of work."""
+    boxes, folded = [], defaultdict(list)
+    for node in graph.nodes:
+        root = node.name.partition("/")[0]
+        if root in graph.templates and not expand:
+            folded[root].append(node)
+        if root in graph.templates and not expand and root == node.name:
+            made = tuple(inner.name for inner in folded[root])
+            used = dict.fromkeys(stream for inner in folded[root] for stream in inner.inputs.values())
+            inputs = tuple(stream for stream in used if stream not in made)
+            use = graph.templates[root]
+            settings = tuple(f"{key}={value}" for key, value in use.parameters.items())
+            boxes.append(_Box(root, use.template, made, inputs, settings, f", {len(made)} streams: --expand"))
+        elif root not in graph.templates or expand:
+            inputs, remark = tuple(dict.fromkeys(node.inputs.values())), " (optional)" if node.optional else ""
+            boxes.append(_Box(node.name, node.use, (node.name,), inputs, tuple(_settings(node.actor)), remark))
+    return boxes
+
+
+def _edges(graph: Graph, boxes: list[_Box]) -> list[tuple[str, str, str, str]]:
     """(from box, to box, stream, type) for every connection; the source is one box."""
-    made = {node.name for node in graph.nodes}
-    edges = []
-    for node in graph.nodes:
-        for stream in node.inputs.values():
-            start = stream if stream in made else "source"
-            edges.append((start, node.name, stream, graph.kinds[stream].__name__))
-    return edges
+    maker = {stream: box.name for box in boxes for stream in box.made}
+    return [
+        (maker.get(stream, "source"), box.name, stream, graph.kinds[stream].__name__)
+        for box in boxes
+        for stream in box.inputs
+    ]
 
 
-def _text(graph: Graph) -> str:
-    width = max(len(node.name) for node in graph.nodes)
+def _text(graph: Graph, boxes: list[_Box]) -> str:
+    width = max(len(box.name) for box in boxes)
     lines = [f"pipeline {graph.name}", f"  source  {graph.source_use}"]
-    for node in graph.nodes:
-        mark = " (optional)" if node.optional else ""
-        given = ", ".join([*dict.fromkeys(node.inputs.values()), *_settings(node.actor)])
-        lines.append(f"  {node.name:{width}}  {node.output.__name__:13} = {node.use}({given}){mark}")
+    for box in boxes:
+        kind, given = graph.kinds[box.name].__name__, ", ".join([*box.inputs, *box.settings])
+        lines.append(f"  {box.name:{width}}  {kind:13} = {box.use}({given}){box.remark}")
     return "\n".join([*lines, *(f"  sink    {use}" for use, _ in graph.sinks)])
 
 
-def _settings(actor: Any) -> list[str]:
-    """The parameters of a stage or aligner that are not as by default."""
-    given = [(item, getattr(actor, item.name)) for item in fields(actor) if item.init]
-    return [f"{item.name}={_shown(value, item.metadata)}" for item, value in given if value != item.default]
+def _settings(item: Any, prefix: str = "") -> Iterator[str]:
+    """The parameters of an object that differ from their defaults."""
+    for known in (known for known in fields(item) if known.init):
+        value = getattr(item, known.name)
+        if value != known.default and is_dataclass(value):
+            yield from _settings(value, f"{prefix}{known.name}.")
+        elif value != known.default:
+            yield f"{prefix}{known.name}={_shown(value, known.metadata)}"
 
 
 def _shown(value: Any, metadata: Mapping[str, Any]) -> str:
@@ -53,22 +97,23 @@ def _shown(value: Any, metadata: Mapping[str, Any]) -> str:
     return as_written(value, metadata.get("unit", "")) if is_number else str(value)
 
 
-def _mermaid(graph: Graph) -> str:
-    boxes = {"source": "source"} | {node.name: f"s{i}" for i, node in enumerate(graph.nodes)}  # `end` is a keyword
+def _mermaid(graph: Graph, boxes: list[_Box]) -> str:
+    names = {"source": "source"} | {box.name: f"s{i}" for i, box in enumerate(boxes)}  # `end` is a keyword
     lines = ["flowchart LR", f"  source[({graph.source_use})]"]
-    lines += [f"  {boxes[node.name]}[{node.name}<br/>{node.use}]" for node in graph.nodes]
-    lines += [f"  {boxes[start]} -- {stream}: {kind} --> {boxes[end]}" for start, end, stream, kind in _edges(graph)]
-    last = boxes[graph.nodes[-1].name]
+    lines += [f"  {names[box.name]}[{box.name}<br/>{box.use}]" for box in boxes]
+    for start, end, stream, kind in _edges(graph, boxes):
+        lines.append(f"  {names[start]} -- {stream}: {kind} --> {names[end]}")
+    last = names[boxes[-1].name]
     lines += [f"  {last} -- {_TO_SINKS} --> frames{i}[/{use}/]" for i, (use, _) in enumerate(graph.sinks)]
     return "\n".join(lines)
 
 
-def _svg(graph: Graph) -> str:
+def _svg(graph: Graph, drawn: list[_Box]) -> str:
     """Boxes in columns by their distance from the source; arrows carry stream and type as tooltips."""
-    column = {"source": 0}
-    for node in graph.nodes:
-        column[node.name] = 1 + max(column.get(stream, 0) for stream in node.inputs.values())
-    boxes = {"source": ("source", graph.source_use), **{node.name: (node.name, node.use) for node in graph.nodes}}
+    column, edges = {"source": 0}, _edges(graph, drawn)
+    for box in drawn:
+        column[box.name] = 1 + max(column.get(start, 0) for start, end, *_ in edges if end == box.name)
+    boxes = {"source": ("source", graph.source_use), **{box.name: (box.name, box.use) for box in drawn}}
     last = max(column.values()) + 1
     for use, _ in graph.sinks:
         column[use], boxes[use] = last, ("sink", use)
@@ -82,8 +127,8 @@ def _svg(graph: Graph) -> str:
         rows[column[name]] += 1
     width = 2 * _MARGIN + last * (_BOX_WIDTH + _GAP_X) + _BOX_WIDTH
     height = 2 * _MARGIN + max(rows.values()) * (_BOX_HEIGHT + _GAP_Y)
-    arrows = [_arrow(place[start], place[end], f"{stream}: {kind}") for start, end, stream, kind in _edges(graph)]
-    arrows += [_arrow(place[graph.nodes[-1].name], place[use], _TO_SINKS) for use, _ in graph.sinks]
+    arrows = [_arrow(place[start], place[end], f"{stream}: {kind}") for start, end, stream, kind in edges]
+    arrows += [_arrow(place[drawn[-1].name], place[use], _TO_SINKS) for use, _ in graph.sinks]
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif">'
     paper = f'<rect width="{width}" height="{height}" fill="white"/>'
     return "\n".join([head, paper, *arrows, *(_box(place[name], *boxes[name]) for name in boxes), "</svg>"])

@@ -7,12 +7,14 @@ file, the line, and the nearest name that would have been valid.
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from flow.config.node_spec import NodeSpec, mapping, place_at_fault, type_name
-from flow.config.yaml_tree import Value, nearest, read, settled
+from flow.config.overrides import Change, with_settings
+from flow.config.templates import Expansion, Library, Scope, expand, resolved
+from flow.config.yaml_tree import Value, nearest, read
 from flow.errors import UsageError
 from flow.runtime.graph import (
     Graph,
@@ -28,28 +30,48 @@ from flow.runtime.graph import (
 )
 
 SHIPPED = Path(__file__).parent.parent / "pipelines"
+_KEYS = ("settings", "source", "templates", "streams", "sinks")
 _BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"
 
 
 def load(name: str, overrides: Iterable[str] = ()) -> Graph:
-    """The pipeline `name`: one that ships with the product, or the path of a YAML file.
+    """The checked graph of a pipeline.
 
-    overrides: settings of the command line (see `flow.config.yaml_tree.settled`), applied before anything is checked.
+    Parameters
+    ----------
+    name
+        A pipeline that ships with the product, or the path of a YAML file.
+    overrides
+        Changes as of `--set`: "setting=value", "stream.parameter=value", "source.parameter=value" or
+        "McapSink.parameter=value". The parameter may be a path of keys, as in "source.pitch.sign=-1".
+
+    Raises
+    ------
+    PipelineError
+        If the file does not describe a graph that can run; the sentence contains file and line.
+    UsageError
+        If there is no such file.
     """
     path = pipeline_file(name)
+    text = _text(path)
+    if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
+        sys.path.append(str(path.parent.resolve()))  # so that stages can be beside the file that uses them
+    tree = _checked_keys(read(text, lambda line: YamlLocation(path.name, line)))
+    tree, changes = with_settings(tree, map(Change.read, overrides))
+    _check_parts(tree)
+    own = mapping(tree.value["templates"], "'templates'") if "templates" in tree.value else {}
+    streams = mapping(tree.value["streams"], "'streams'")
+    expansion = expand(streams, Library(path, SHIPPED, own), changes)
+    return _graph(path.stem, text, tree.value, expansion)
+
+
+def _text(path: Path) -> str:
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise UsageError(f"the pipeline {path} is no text; give {', '.join(shipped())} or a YAML file") from error
     except OSError as error:
         raise UsageError(f"cannot read the pipeline {path}: {error}") from error
-    if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
-        sys.path.append(str(path.parent.resolve()))  # stages may stand beside the file that uses them
-    tree = read(text, lambda line: YamlLocation(path.name, line))
-    if tree.value is None:
-        raise tree.place.error(f"the file is empty; {_BEGIN}")
-    _check_keys(tree)
-    return _graph(path, text, settled(tree, overrides))
 
 
 def pipeline_file(name: str) -> Path:
@@ -67,60 +89,80 @@ def shipped() -> list[str]:
     return sorted(file.stem for file in SHIPPED.glob("*.yaml"))
 
 
-def _check_keys(tree: Value) -> None:
-    """Refuse what has no such parts, and an unknown one: what it should have been would else be missed elsewhere."""
-    valid = ("settings", "source", "streams", "sinks")
+def _checked_keys(tree: Value) -> Value:
+    """The file, refused where it has unknown parts, which hide the ones that they should be."""
+    if tree.value is None:
+        raise tree.place.error(f"the file is empty; {_BEGIN}")
     for key, value in mapping(tree, "the pipeline").items():
-        if key not in valid:
-            raise value.place.error(f"a pipeline has no '{key}'{nearest(key, valid)}")
+        if key not in _KEYS:
+            raise value.place.error(f"a pipeline has no '{key}'{nearest(key, _KEYS)}")
+    return tree
 
 
-def _graph(path: Path, text: str, tree: Value) -> Graph:
-    """The checked graph of a file's settled tree."""
-    top = mapping(tree, "the pipeline")
+def _check_parts(tree: Value) -> None:
+    """Refuse a file without a source, streams or sinks."""
     for key in ("source", "streams", "sinks"):
-        if key not in top:
+        if key not in tree.value:
             raise tree.place.error(f"the pipeline has no '{key}'; {_BEGIN}")
-    from_source = NodeSpec.read(top["source"], "the source", "source")
+    sinks = tree.value["sinks"]
+    if not isinstance(sinks.value, list) or not sinks.value:
+        raise sinks.place.error("'sinks' must be a list of at least one sink")
+
+
+def _graph(name: str, text: str, parts: Mapping[str, Value], expansion: Expansion) -> Graph:
+    """The checked graph of the expanded streams."""
+    from_source = NodeSpec.read(parts["source"], "the source", "source")
     source = from_source.made()
-    streams = mapping(top["streams"], "'streams'")
-    if not isinstance(top["sinks"].value, list) or not top["sinks"].value:
-        raise top["sinks"].place.error("'sinks' must be a list of at least one sink")
-    to_sinks = [NodeSpec.read(item, "a sink", "sink") for item in top["sinks"].value]
+    to_sinks = [NodeSpec.read(item, "a sink", "sink") for item in parts["sinks"].value]
     sinks = tuple((entry.use, entry.made()) for entry in to_sinks)
     for entry in to_sinks:
         if [use for use, _ in sinks].count(entry.use) > 1:
-            raise entry.place.error(f"{entry.use} stands twice among the sinks")
-    kinds: dict[str, type] = dict(source.streams)
-    clocks = {name: name for name in kinds}
-    for name, item in streams.items():
-        _check_name(name, item.place, kinds)
-    entries = {name: NodeSpec.read(item, f"stream '{name}'", "stage") for name, item in streams.items()}
-    wiring = {name: _inputs(name, entry, [*kinds, *streams]) for name, entry in entries.items()}
-    places = {name: item.place for name, item in streams.items()}
-    nodes = []
-    for name in in_order({n: ports.values() for n, ports in wiring.items()}, places):
-        node = _node(name, entries[name], wiring[name], kinds, clocks)
-        kinds[name], clocks[name] = node.output, node.clock
-        nodes.append(node)
-    _check_clock(nodes, top["streams"].place)
-    graph = Graph(path.stem, text, source, from_source.use, tuple(nodes), sinks, kinds)
+            raise entry.place.error(f"{entry.use} is twice among the sinks")
+    nodes, kinds = _nodes(expansion, dict(source.streams))
+    _check_clock(nodes, parts["streams"].place)
+    graph = Graph(name, text, source, from_source.use, tuple(nodes), sinks, kinds, templates=expansion.templates)
     for (_, sink), entry in zip(sinks, to_sinks, strict=True):
         _check_streams(sink, entry, graph)
     return graph
 
 
-def _check_name(name: str, place: YamlLocation, of_source: Collection[str]) -> None:
-    """Whether a stream may be called so."""
-    if not (name.isascii() and name.isidentifier()):
-        raise place.error(f"'{name}' is no name of a stream; letters, digits and underscores make one, no digit first")
-    if name == "source":
-        raise place.error("'source' is no name of a stream: settings of the source go by it")
-    if name in of_source:
-        raise place.error(f"'{name}' is already a stream of the source; choose another name")
+def _nodes(expansion: Expansion, kinds: dict[str, type]) -> tuple[list[Node], dict[str, type]]:
+    """The nodes in the order of their work, and the types of all streams; kinds: of the streams of the source."""
+    clocks, streams = {name: name for name in kinds}, expansion.streams
+    for name, spec in streams.items():
+        if name in kinds:
+            raise spec.item.place.error(f"'{name}' is already a stream of the source; choose another name")
+    known = [*kinds, *streams]
+    for given in expansion.inputs:
+        _check_known(given.stream, known, given.place)
+    entries = {name: NodeSpec.read(spec.item, f"stream '{name}'", "stage") for name, spec in streams.items()}
+    wiring = {name: _inputs(name, entry, known, streams[name].scope) for name, entry in entries.items()}
+    places = {name: spec.item.place for name, spec in streams.items()}
+    nodes = []
+    for name in in_order({name: ports.values() for name, ports in wiring.items()}, places):
+        _check_declared(streams[name].scope, kinds)
+        node = _node(name, entries[name], wiring[name], kinds, clocks)
+        kinds[name], clocks[name] = node.output, node.clock
+        nodes.append(node)
+    return nodes, kinds
 
 
-def _inputs(name: str, entry: NodeSpec, streams: list[str]) -> dict[str, str]:
+def _check_known(stream: str, known: Collection[str], place: YamlLocation) -> None:
+    if stream not in known:
+        raise place.error(f"there is no stream '{stream}'{nearest(stream, known)}")
+
+
+def _check_declared(scope: Scope | None, kinds: Mapping[str, type]) -> None:
+    """Whether the streams given to a template, as far as their types are known, are of the declared types."""
+    for name, given in (scope.inputs if scope else {}).items():
+        kind = kinds.get(given.stream)
+        if kind is not None and given.kind not in [base.__name__ for base in getattr(kind, "__mro__", (kind,))]:
+            raise given.place.error(
+                f"template '{given.template}' takes {given.kind} as '{name}', but '{given.stream}' is {type_name(kind)}"
+            )
+
+
+def _inputs(name: str, entry: NodeSpec, known: list[str], scope: Scope | None) -> dict[str, str]:
     """Port -> stream, as the entry of stream `name` wires them."""
     try:
         ports, unneeded = ports_of(entry.kind)
@@ -129,15 +171,12 @@ def _inputs(name: str, entry: NodeSpec, streams: list[str]) -> dict[str, str]:
     parameters, inputs = entry.parameters(), {}
     for key, value in entry.given(but=("optional",)).items():
         if key in ports:
-            if not isinstance(value.value, str):
-                raise value.place.error(f"'{key}' must be the name of a stream, not {value.plain()!r}")
-            if value.value not in streams:
-                raise value.place.error(f"there is no stream '{value.value}'{nearest(value.value, streams)}")
-            inputs[key] = value.value
+            inputs[key] = resolved(key, value, scope)
+            _check_known(inputs[key], known, value.place)
         elif key not in parameters:
             valid = [*ports, *parameters, "use", "optional"]
             meant = nearest(key, valid) or f"; it has {', '.join(valid)}"
-            raise value.place.error(f"{entry.use} has no input or parameter '{key}'{meant}")
+            raise value.key_place.error(f"{entry.use} has no input or parameter '{key}'{meant}")
     for port in ports:
         if port not in inputs and port not in unneeded:
             raise entry.place.error(f"'{name}' lacks its input '{port}' ({entry.use} needs it)")

@@ -73,7 +73,7 @@ def _constructed(kind: type, name: str, given: Mapping[str, Value], place: YamlL
     parameters = {item.name: item for item in fields(kind) if item.init}
     for key, value in given.items():
         if key not in parameters:
-            raise value.place.error(f"{name} has no parameter '{key}'{nearest(key, parameters)}")
+            raise value.key_place.error(f"{name} has no parameter '{key}'{nearest(key, parameters)}")
         inner = dataclass_of(hints[key])
         if inner is not None and isinstance(value.value, dict):
             values[key] = _constructed(inner, f"{name}.{key}", value.value, value.place)

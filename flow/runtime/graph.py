@@ -21,15 +21,27 @@ from flow.runtime.ledger import failure
 
 @dataclass(frozen=True)
 class YamlLocation:
-    """Where something stands: a line of a pipeline file, or a setting on the command line (`line` is then None)."""
+    """A line of a pipeline file, or a setting of the command line (`line` is then None).
+
+    used_at: for a line of a template, the place that uses the template.
+    """
 
     file: str
     line: int | None
+    used_at: YamlLocation | None = None
 
     def error(self, sentence: str) -> PipelineError:
         """The error to raise about it."""
-        where = self.file if self.line is None else f"{self.file}:{self.line}"
-        return PipelineError(f"{where}: {sentence}")
+        return PipelineError(f"{self._shown}: {sentence}{self._uses}")
+
+    @property
+    def _shown(self) -> str:
+        return self.file if self.line is None else f"{self.file}:{self.line}"
+
+    @property
+    def _uses(self) -> str:
+        """The places that use the template, from the inside out."""
+        return "" if self.used_at is None else f" (template used at {self.used_at._shown}){self.used_at._uses}"
 
 
 @dataclass(frozen=True)
@@ -57,9 +69,18 @@ class Node:
 
 
 @dataclass(frozen=True)
+class TemplateUse:
+    """The template that a stream uses, and the parameters that differ from the template's own."""
+
+    template: str
+    parameters: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
 class Graph:
     """A checked pipeline. nodes: in an order in which every stream comes before its use; left_out: the optional streams
-    that a log cannot have, and why."""
+    that a log cannot have, and why; templates: stream -> the template whose output it is. The other streams of that
+    template are called `stream/...`."""
 
     name: str
     text: str
@@ -69,6 +90,7 @@ class Graph:
     sinks: tuple[tuple[str, Sink], ...]
     kinds: Mapping[str, type] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
+    templates: Mapping[str, TemplateUse] = field(default_factory=dict)
 
     @property
     def clock(self) -> str:

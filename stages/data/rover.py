@@ -24,7 +24,7 @@ class Rover:
     max_step: float = parameter(0.2, "highest step that is not a hazard", unit="m", low=0.01)
     ground_clearance: float = parameter(0.25, "height of the belly above the ground", unit="m", low=0.01)
     max_slope: float = parameter(
-        0.349, "steepest ground that is not a hazard (20 degrees)", unit="rad", low=0.0, high=math.radians(89)
+        math.radians(20), "steepest ground that is not a hazard", unit="rad", low=0.0, high=math.radians(89)
     )
 
     def __post_init__(self) -> None:

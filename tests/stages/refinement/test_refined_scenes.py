@@ -66,7 +66,7 @@ def test_ground_nearly_four_times_as_near_as_the_range_is_known(pipeline):
     assert near.mean() > 0.3
     assert (truth[near] > 3 * 13).mean() > 0.1
     if pipeline == "rover":  # the right view reaches as near
-        assert np.isfinite(streams["backward"].pixels).mean() > 0.75
+        assert np.isfinite(streams["disparity/right"].pixels).mean() > 0.75
     measured = near & (refined.source == PixelOrigin.MEASURED)
     assert measured.sum() > 0.95 * near.sum()
     error = np.abs(refined.pixels - truth)[measured]

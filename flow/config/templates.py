@@ -1,0 +1,287 @@
+"""Templates: named groups of streams with inputs, parameters and one output, expanded when a pipeline is loaded.
+
+A use of a template makes the stream of its own name, which is the template's output. The other streams of the template
+are called `use/stream`. A template is found in the pipeline file, in a YAML file beside it, or in the shipped parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from flow.config.node_spec import NodeSpec, mapping
+from flow.config.overrides import Change, filled_in
+from flow.config.yaml_tree import Value, nearest, read
+from flow.runtime.graph import TemplateUse, YamlLocation, ports_of
+
+_KEYS = ("inputs", "parameters", "output", "streams")
+
+
+@dataclass(frozen=True)
+class Template:
+    """A checked template. inputs: name -> type; parameters: name -> default."""
+
+    name: str
+    place: YamlLocation
+    inputs: Mapping[str, str]
+    parameters: Mapping[str, Value]
+    output: str
+    streams: Mapping[str, Value]
+
+    @classmethod
+    def read(cls, name: str, item: Value) -> Template:
+        """The template that a mapping of inputs, parameters, output and streams describes."""
+        given = mapping(item, f"template '{name}'")
+        for key, value in given.items():
+            if key not in _KEYS:
+                raise value.place.error(f"template '{name}' has no '{key}'{nearest(key, _KEYS)}")
+        for key in ("output", "streams"):
+            if key not in given:
+                raise item.place.error(f"template '{name}' lacks '{key}'")
+        parts = {key: mapping(given[key], f"'{key}'") for key in ("inputs", "parameters", "streams") if key in given}
+        template = cls(
+            name,
+            item.place,
+            {key: str(kind.plain()) for key, kind in parts.get("inputs", {}).items()},
+            parts.get("parameters", {}),
+            str(given["output"].plain()),
+            parts["streams"],
+        )
+        if template.output not in template.streams:
+            meant = nearest(template.output, template.streams)
+            raise given["output"].place.error(f"the output '{template.output}' is no stream of '{name}'{meant}")
+        template._check_names()
+        return template
+
+    def _check_names(self) -> None:
+        """Refuse a name that is used twice, and a parameter that is not used."""
+        for key, item in self.streams.items():
+            check_name(key, item.place)
+            if key in self.inputs:
+                raise item.place.error(f"'{key}' is already an input of template '{self.name}'; choose another name")
+        used = set(_texts(self.streams.values()))
+        for key, item in self.parameters.items():
+            if key in (*self.inputs, "use", "template", "optional"):
+                raise item.place.error(f"'{key}' is no name of a parameter of '{self.name}'; choose another name")
+            if f"${key}" not in used:
+                raise item.place.error(f"the parameter '{key}' of '{self.name}' is used nowhere; write ${key} for it")
+
+
+@dataclass(frozen=True)
+class TemplateInput:
+    """What a use of a template gives to one of its inputs. kind: the name of the declared type."""
+
+    stream: str
+    kind: str
+    template: str
+    place: YamlLocation
+
+
+@dataclass(frozen=True)
+class Scope:
+    """The names of streams inside one use of a template."""
+
+    streams: Mapping[str, str] = field(default_factory=dict)
+    inputs: Mapping[str, TemplateInput] = field(default_factory=dict)
+
+    def stream(self, name: str) -> str | None:
+        """The stream that a name inside the template means."""
+        first, slash, rest = name.partition("/")
+        if first in self.inputs and not slash:
+            return self.inputs[first].stream
+        return f"{self.streams[first]}{slash}{rest}" if first in self.streams else None
+
+
+@dataclass(frozen=True)
+class StreamSpec:
+    """A stream of the pipeline after expansion; scope: None for one that is in no template."""
+
+    item: Value
+    scope: Scope | None = None
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """The streams of a pipeline. templates: use -> template, for the uses in the pipeline file itself."""
+
+    streams: Mapping[str, StreamSpec]
+    templates: Mapping[str, TemplateUse]
+    inputs: Sequence[TemplateInput]
+
+
+def expand(streams: Mapping[str, Value], library: Library, changes: Iterable[Change]) -> Expansion:
+    """The streams of a pipeline with every template expanded and the changes of streams applied."""
+    work = _Expander(library, list(changes))
+    for name, item in streams.items():
+        check_name(name, item.place)
+        work.add(name, name, item)
+    for change in work.changes:
+        meant = nearest(change.target, work.paths)
+        raise change.value.place.error(f"there is no stream '{change.target}'{meant}")
+    top = {name: work.used[name] for name in streams if name in work.used}
+    return Expansion(work.streams, top, work.inputs)
+
+
+def check_name(name: str, place: YamlLocation) -> None:
+    """Refuse a name that no stream can have."""
+    if not (name.isascii() and name.isidentifier()):
+        raise place.error(f"'{name}' is no name of a stream; letters, digits and underscores make one, no digit first")
+    if name == "source":
+        raise place.error("'source' is no name of a stream: settings of the source go by it")
+
+
+class Library:
+    """Finds templates by name: in the pipeline file, in files beside it, and in the shipped parts."""
+
+    def __init__(self, file: Path, shipped: Path, own: Mapping[str, Value]) -> None:
+        self._file, self._shipped = file, shipped
+        self._known = {name: Template.read(name, item) for name, item in own.items()}
+
+    def find(self, name: Value) -> Template:
+        """The template that `template: name` means: a name, or the path of a YAML file from the pipeline's folder."""
+        if not isinstance(name.value, str) or not name.value:
+            raise name.place.error(f"'template: {name.plain()}' must be the name of a template")
+        if name.value not in self._known:
+            self._known[name.value] = self._read(name)
+        return self._known[name.value]
+
+    def _read(self, name: Value) -> Template:
+        folder, parts = self._file.parent, f"parts/{name.value}.yaml"
+        is_path = name.value.endswith((".yaml", ".yml"))
+        places = [folder / name.value] if is_path else [folder / parts, self._shipped / parts]
+        found = next((place for place in places if place.is_file()), None)
+        if found is None:
+            files = [*(folder / "parts").glob("*.yaml"), *(self._shipped / "parts").glob("*.yaml")]
+            meant = nearest(name.value, [*self._known, *(file.stem for file in files)])
+            raise name.place.error(
+                f"there is no template '{name.value}'{meant or f' under templates or in {places[0]}'}"
+            )
+        try:
+            text = found.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise name.place.error(f"cannot read the template {found}: {error}") from error
+        shown = name.value if is_path else parts
+        return Template.read(found.stem, read(text, lambda line: YamlLocation(shown, line)))
+
+
+class _Expander:
+    """The expansion as far as it has come. changes: those not applied yet; paths: what changes can name."""
+
+    def __init__(self, library: Library, changes: list[Change]) -> None:
+        self.library, self.changes = library, changes
+        self.streams: dict[str, StreamSpec] = {}
+        self.used: dict[str, TemplateUse] = {}
+        self.inputs: list[TemplateInput] = []
+        self.paths: list[str] = []
+
+    def add(self, name: str, path: str, item: Value, scope: Scope | None = None, within: tuple[str, ...] = ()) -> None:
+        """Add the stream `name`, or the streams of the template that it uses; within: the templates around it."""
+        self.paths.append(path)
+        is_use = _is_use(item)
+        for change in self._taken(path, lambda change: not is_use or change.keys[0] == "template"):
+            item = change.applied(item)
+        if not _is_use(item):
+            self.streams[name] = StreamSpec(item, scope)
+            return
+        template = self.library.find(item.value["template"])
+        if template.name in within:
+            circle = " -> ".join([*within[within.index(template.name) :], template.name])
+            raise item.value["template"].place.error(f"template '{template.name}' uses itself: {circle}")
+        own = (*template.inputs, *template.parameters, "optional")
+        for change in self._taken(path, lambda change: change.keys[0] in own):
+            item = change.applied(item)
+        for change in self._taken(path, lambda change: True):  # of the output stream
+            _check_key(change, template)
+            self.changes.append(replace(change, target=f"{path}/{template.output}"))
+        self._expand(name, path, item, template, scope, (*within, template.name))
+
+    def _taken(self, path: str, wanted: Callable[[Change], bool]) -> list[Change]:
+        """Take the changes of one entry from those that are left."""
+        taken = [change for change in self.changes if change.target == path and wanted(change)]
+        self.changes = [change for change in self.changes if change not in taken]
+        return taken
+
+    def _expand(
+        self, name: str, path: str, use: Value, template: Template, scope: Scope | None, within: tuple[str, ...]
+    ) -> None:
+        """Add the streams of a template for one use of it."""
+        given = {key: value for key, value in use.value.items() if key not in ("template", "optional")}
+        for key, value in given.items():
+            if key not in template.inputs and key not in template.parameters:
+                valid = [*template.inputs, *template.parameters, "optional"]
+                meant = nearest(key, valid) or f"; it has {', '.join(valid)}"
+                raise value.key_place.error(f"template '{template.name}' has no input or parameter '{key}'{meant}")
+        own = {key: item.plain() for key, item in template.parameters.items()}
+        changed = {key: given[key].plain() for key in own if key in given and given[key].plain() != own[key]}
+        self.used[name] = TemplateUse(template.name, changed)
+        inputs = {}
+        for key, kind in template.inputs.items():
+            if key not in given:
+                raise use.place.error(f"'{name}' lacks its input '{key}' (template '{template.name}' needs it)")
+            stream = resolved(key, given[key], scope)
+            inputs[key] = TemplateInput(stream, kind, template.name, given[key].place)
+        self.inputs += inputs.values()
+        values = {key: given.get(key, _moved(item, use.place)) for key, item in template.parameters.items()}
+        names = {key: name if key == template.output else f"{path}/{key}" for key in template.streams}
+        inner = Scope(names, inputs)
+        for key, item in template.streams.items():
+            moved = filled_in(_moved(item, use.place), values, f"template '{template.name}' has no parameter '{{}}'")
+            if "optional" in use.value and isinstance(moved.value, dict):
+                moved = Value({**moved.value, "optional": use.value["optional"]}, moved.place)
+            self.add(names[key], f"{path}/{key}", moved, inner, within)
+
+
+def resolved(port: str, given: Value, scope: Scope | None) -> str:
+    """The stream that an entry gives to a port."""
+    if not isinstance(given.value, str):
+        raise given.place.error(f"'{port}' must be the name of a stream, not {given.plain()!r}")
+    if scope is None or (given.place.line is None and scope.stream(given.value) is None):
+        return given.value
+    stream = scope.stream(given.value)
+    if stream is None:
+        meant = nearest(given.value, [*scope.inputs, *scope.streams])
+        raise given.place.error(f"the template has no stream or input '{given.value}'{meant}")
+    return stream
+
+
+def _is_use(item: Value) -> bool:
+    """Whether an entry uses a template; raises PipelineError where it uses a class at the same time."""
+    if not isinstance(item.value, dict) or "template" not in item.value:
+        return False
+    if "use" in item.value:
+        raise item.place.error("an entry has 'use' or 'template', not both")
+    return True
+
+
+def _check_key(change: Change, template: Template) -> None:
+    """Refuse a change of a parameter that neither a template nor the class of its output stream has."""
+    output = template.streams[template.output]
+    if _is_use(output):
+        return
+    spec = NodeSpec.read(output, f"stream '{template.output}'", "stage")
+    valid = [*ports_of(spec.kind)[0], *spec.parameters(), "use", "optional"]
+    if change.keys[0] not in valid:
+        meant = nearest(change.keys[0], [*template.inputs, *template.parameters, *valid])
+        raise change.value.place.error(
+            f"neither template '{template.name}' nor its output, {spec.use}, has '{change.keys[0]}'{meant}"
+        )
+
+
+def _moved(item: Value, use: YamlLocation) -> Value:
+    """A value of a template, its place with that of the template's use."""
+    place = replace(item.place, used_at=use)
+    if isinstance(item.value, dict):
+        return Value({key: _moved(value, use) for key, value in item.value.items()}, place)
+    if isinstance(item.value, list):
+        return Value([_moved(value, use) for value in item.value], place)
+    return Value(item.value, place)
+
+
+def _texts(items: Iterable[Value]) -> Iterable[object]:
+    """All values in the items that contain no others."""
+    for item in items:
+        if isinstance(item.value, dict | list):
+            yield from _texts(item.value.values() if isinstance(item.value, dict) else item.value)
+        else:
+            yield item.value
