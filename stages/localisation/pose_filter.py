@@ -1,9 +1,8 @@
-"""PoseFilter: the rover's pose as its log tells it, or else by visual odometry with gravity as a constraint.
+"""PoseFilter: the rover's pose from its log, or else from visual odometry with gravity as a constraint.
 
-The images turn and move the camera from frame to frame, the tilt says where up is. A tilt of some tenths of a degree is
-noisier than a step of the images, but it does not drift: so the pose is carried along by the images and drawn towards
-the tilt by as much as their variances say (a Kalman filter of the six errors of a pose). Heading and position have
-nothing but the images to go by, and their covariance grows.
+Visual odometry is precise from frame to frame but drifts. The tilt is noisier but does not drift. A Kalman filter of
+the six errors of a pose predicts with the images and corrects with the tilt. Heading and position have only the images,
+so their covariance grows.
 """
 
 from __future__ import annotations
@@ -20,153 +19,154 @@ from stages.data.covariance import translated_covariance
 from stages.localisation.pose_check import PoseCheck
 from stages.stage import Stage, parameter
 
-VISUAL_FRAME = "visual_odom"  # the label of poses made here; "visual_odom/2" after tracking was lost once
+VISUAL_FRAME = "visual_odom"  # "visual_odom/2" after tracking was lost once
+SCALE_ERROR = 0.005  # relative error common to all steps' lengths; half of it sideways
+TURN_ERROR = float(np.deg2rad(0.015))  # rad per metre, common to all steps
 
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
-    """What is known of the camera after a frame.
-
-    segment, camera, told: as the motion tells, the camera in its segment's first and the covariance (6, 6) of that;
-    world: the camera in its segment's world (z up); covariance: (6, 6) of that, of position (m) and turn (rad) about
-    the world's axes; way: m driven in the segment.
-    """
+    """The camera after a frame."""
 
     segment: int
-    camera: Transform
-    told: Array
-    world: Transform
-    covariance: Array
-    way: float
+    camera: Transform  # in the first camera of its segment, by the motion
+    motion_covariance: Array  # (6, 6), of that
+    world: Transform  # the camera in its segment's world, z up
+    covariance: Array  # (6, 6), of position (m) and rotation (rad) about the world's axes
+    distance: float  # m, driven in the segment
 
 
 @dataclass
 class PoseMemory:
-    """The estimate after the last frame, how many poses were made, the last segment of the motion, and the check of the
-    logged poses."""
+    """The state of `PoseFilter`."""
 
     estimate: _Estimate | None = None
-    visual: int = 0
-    segment: int = 0
+    poses: int = 0  # made here
+    segment: int = 0  # of the last motion
     check: PoseCheck = field(default_factory=PoseCheck)
 
 
 @dataclass(frozen=True)
 class PoseFilter(Stage):
-    """Where the rover is; it remembers, so it takes frames in order."""
+    """Passes the logged pose through, or estimates it from visual odometry and the tilt.
+
+    Examples
+    --------
+    >>> motion = CameraMotion(0, 1, Transform("start", "camera", np.eye(3), np.zeros(3)), np.zeros((6, 6)))
+    >>> pose_filter = PoseFilter()
+    >>> pose = pose_filter(motion, Tilt(0, [0.0, -1.0, 0.0]), Mount(0, np.eye(3)), state=pose_filter.start())
+    >>> pose.frame_id, pose.child_frame_id, pose.position.tolist()
+    ('visual_odom', 'camera', [0.0, 0.0, 0.0])
+    """
 
     tilt_noise: float = parameter(
         np.deg2rad(0.3), "standard deviation of a tilt", unit="rad", low=1e-5, high=float(np.deg2rad(10))
     )
     tilt_bias: float = parameter(
-        np.deg2rad(0.1), "error of all tilts alike, which no filter lowers", unit="rad", low=0.0, high=0.2
-    )
-    scale_error: float = parameter(0.005, "error of all steps' length alike, as a share; half of it sideways", low=0.0)
-    turn_error: float = parameter(
-        np.deg2rad(0.015), "error of all steps' turn alike, per metre of way", unit="rad", low=0.0, high=0.1
+        np.deg2rad(0.1), "standard deviation of the error common to all tilts", unit="rad", low=0.0, high=0.2
     )
 
     def start(self) -> PoseMemory:
-        """The memory of one run, empty."""
+        """The state of one run."""
         return PoseMemory()
 
     def __call__(
         self, motion: CameraMotion, tilt: Tilt, mount: Mount, logged: Pose | None = None, *, state: PoseMemory
     ) -> Pose:
-        """`logged` where it is connected; else the pose of base_link, or of the camera where base_link is unknown.
+        """`logged` if it is connected; else the pose of base_link, or of the camera if base_link is unknown.
 
-        Its frame is `visual_odom`: z up, origin and heading those of the first frame, and "visual_odom/2" and so on for
-        what came after tracking was lost. Raises ValueError where the images do not tell the motion.
+        Its frame is `visual_odom`: z up, with the origin and heading of the first frame. After tracking is lost a new
+        frame begins, "visual_odom/2" and so on. Raises StageError if the images do not determine the motion.
         """
         state.segment = motion.segment
         if logged is not None:
             state.check.add(motion, logged, mount)
             return logged
         if motion.camera is None:
-            raise StageError(f"PoseFilter: no pose can be told from the images: {motion.lost}")
+            raise StageError(f"PoseFilter: no pose from the images: {motion.lost}")
         before = state.estimate
         if before is None or before.segment != motion.segment:
-            estimate = self._begun(motion, motion.camera, tilt, mount)
+            estimate = self._first(motion, motion.camera, tilt, mount)
         else:
-            estimate = self._drawn(_carried(before, motion, motion.camera), tilt, mount)
+            estimate = self._corrected(_predicted(before, motion, motion.camera), tilt, mount)
         state.estimate = estimate
-        state.visual += 1
+        state.poses += 1
         return self._pose(motion.stamp, estimate, mount)
 
     def finding(self, state: PoseMemory) -> Finding | None:
-        """Where poses come from, if not from the log, and how often tracking was lost: a warning where that parts them,
-        and where those of the log do not fit the images; None where they are given and do."""
-        if doubt := state.check.doubt():
-            return Finding(doubt, Severity.WARNING)
-        lost = "tracking was lost " + ("once" if state.segment == 2 else f"{state.segment - 1} times")
+        """The source of the poses if it is not the log; a warning if tracking was lost or the log's poses are wrong."""
+        if problem := state.check.problem():
+            return Finding(problem, Severity.WARNING)
+        losses = counted(state.segment - 1, "time")
         if state.estimate is None:
-            return Finding(f"{lost} by visual odometry; the poses are the log's own") if state.segment > 1 else None
-        said = f"no pose is given: visual odometry supplies it ({counted(state.visual, 'pose')})"
+            if state.segment < 2:
+                return None
+            return Finding(f"Visual odometry lost track {losses}. The poses are those of the log.")
+        source = f"The log contains no pose. Visual odometry supplies it ({counted(state.poses, 'pose')}"
         if state.segment < 2:
-            return Finding(f"{said}, in frame {VISUAL_FRAME}")
+            return Finding(f"{source}, frame {VISUAL_FRAME}).")
         frames = f"{VISUAL_FRAME} {'and' if state.segment == 2 else 'to'} {_frame_of(state.segment)}"
-        parted = f"{said}; {lost}, so they are in {state.segment} frames, {frames}, that nothing joins"
-        return Finding(parted, Severity.WARNING)
+        unaligned = f"{source}). It lost track {losses}: the poses are in {state.segment} unaligned frames, {frames}."
+        return Finding(unaligned, Severity.WARNING)
 
-    def _begun(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> _Estimate:
+    def _first(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> _Estimate:
         """The first frame of a segment: at its origin, upright by the tilt."""
         world = level_transform(tilt, mount, camera.child, camera_height=0.0)
-        # About the origin, which is base_link where that is known, the tilt's error moves the camera as well.
-        covariance = translated_covariance(
-            np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0]), world.translation
-        )
+        # The origin is base_link if it is known; then the tilt's error moves the camera.
+        tilt_covariance = np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0])
+        covariance = translated_covariance(tilt_covariance, world.translation)
         return _Estimate(motion.segment, camera, motion.covariance, world, covariance, 0.0)
 
-    def _drawn(self, estimate: _Estimate, tilt: Tilt, mount: Mount) -> _Estimate:
-        """The estimate corrected by the tilt, which measures the turns about the two level axes."""
+    def _corrected(self, estimate: _Estimate, tilt: Tilt, mount: Mount) -> _Estimate:
+        """The estimate corrected by the tilt, which measures the rotation about the two level axes."""
         world, covariance = estimate.world, estimate.covariance
         up = world.rotation @ mount.camera_from_inclinometer @ tilt.up
         gain = covariance[:, 3:5] @ np.linalg.inv(covariance[3:5, 3:5] + self.tilt_noise**2 * np.eye(2))
-        change = gain @ np.array([up[1], -up[0]])  # the turn that brings up to z
+        change = gain @ np.array([up[1], -up[0]])  # the rotation that brings up to z
         turn = np.asarray(Rotation.from_rotvec(change[3:]).as_matrix())
-        drawn = Transform(world.parent, world.child, turn @ world.rotation, world.translation + change[:3])
-        return replace(estimate, world=drawn, covariance=covariance - gain @ covariance[3:5])
+        corrected = Transform(world.parent, world.child, turn @ world.rotation, world.translation + change[:3])
+        return replace(estimate, world=corrected, covariance=covariance - gain @ covariance[3:5])
 
     def _pose(self, stamp: int, estimate: _Estimate, mount: Mount) -> Pose:
         base = mount.base_from_camera
-        placed = estimate.world if base is None else estimate.world.after(base.inverse())
-        alike = self._alike(placed.translation, estimate.way)
-        covariance = (
-            translated_covariance(estimate.covariance, placed.translation - estimate.world.translation)
-            + alike.T @ alike
-        )
-        np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # the origin's is zero but for rounding
-        return Pose(
-            stamp, placed.translation, Rotation.from_matrix(placed.rotation).as_quat(canonical=True),
-            _frame_of(estimate.segment), placed.child, covariance,
-        )  # fmt: skip
+        rover = estimate.world if base is None else estimate.world.after(base.inverse())
+        common = self._common_errors(rover.translation, estimate.distance)
+        covariance = translated_covariance(estimate.covariance, rover.translation - estimate.world.translation)
+        covariance = covariance + common.T @ common
+        np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # at the origin zero but for rounding
+        quaternion = Rotation.from_matrix(rover.rotation).as_quat(canonical=True)
+        return Pose(stamp, rover.translation, quaternion, _frame_of(estimate.segment), rover.child, covariance)
 
-    def _alike(self, place: Array, way: float) -> Array:
-        """The errors (5, 6) of position and turn, one standard deviation each, that are the same in all steps: of their
-        length, of their direction, of their turn (which bends the way by half of it), and of up about two axes."""
-        x, y, z = place
-        turned, bias = self.turn_error * way, self.tilt_bias
+    def _common_errors(self, position: Array, distance: float) -> Array:
+        """One standard deviation (5, 6) of position and rotation for each error common to all steps.
+
+        Length, direction and rotation of the steps (a rotation bends the track by half of it), and up about two axes.
+        """
+        x, y, z = position
+        turned, bias = TURN_ERROR * distance, self.tilt_bias
         return np.array([
-            [self.scale_error * x, self.scale_error * y, self.scale_error * z, 0, 0, 0],
-            [-self.scale_error / 2 * y, self.scale_error / 2 * x, 0, 0, 0, 0],
+            [SCALE_ERROR * x, SCALE_ERROR * y, SCALE_ERROR * z, 0, 0, 0],
+            [-SCALE_ERROR / 2 * y, SCALE_ERROR / 2 * x, 0, 0, 0, 0],
             [-turned / 2 * y, turned / 2 * x, 0, 0, 0, turned],
             [0, -bias * z, bias * y, bias, 0, 0],
             [bias * z, 0, -bias * x, 0, bias, 0],
         ])  # fmt: skip
 
 
-def _carried(before: _Estimate, motion: CameraMotion, camera: Transform) -> _Estimate:
-    """The estimate carried along by the images: the way levers the turns' errors, and the step adds its own."""
+def _predicted(before: _Estimate, motion: CameraMotion, camera: Transform) -> _Estimate:
+    """The estimate moved along by the images, with the covariance of the step added."""
     world = before.world.after(before.camera.inverse().after(camera))
     way = world.translation - before.world.translation
-    # What the motion's covariance, in the axes of its segment's first camera, has gained since the frame before.
-    step = motion.covariance - translated_covariance(before.told, camera.translation - before.camera.translation)
-    values, axes = np.linalg.eigh(step)
-    added = (axes * np.clip(values, 0, None)) @ axes.T  # two frames tracked from one keyframe may err the same way
+    # The motion's covariance gained since the frame before, in the axes of its segment's first camera.
+    gained = motion.covariance - translated_covariance(
+        before.motion_covariance, camera.translation - before.camera.translation
+    )  # fmt: skip
+    values, axes = np.linalg.eigh(gained)
+    added = (axes * np.clip(values, 0, None)) @ axes.T  # two frames tracked from one keyframe may have common errors
     turned = np.kron(np.eye(2), world.rotation @ camera.rotation.T)
     covariance = translated_covariance(before.covariance, way) + turned @ added @ turned.T
-    driven = before.way + float(np.linalg.norm(way))
-    return _Estimate(motion.segment, camera, motion.covariance, world, covariance, driven)
+    distance = before.distance + float(np.linalg.norm(way))
+    return _Estimate(motion.segment, camera, motion.covariance, world, covariance, distance)
 
 
 def _frame_of(segment: int) -> str:

@@ -1,8 +1,8 @@
-"""How the camera moved between two stereo frames: ORB features, PnP with RANSAC, then tracked patches.
+"""The camera's motion between two stereo frames: ORB features, PnP with RANSAC, then tracked patches.
 
-The trick is the order. Descriptors find their partners over any motion, but place them to a pixel or two only; the pose
-they give says where every patch of the earlier image must be in the later one, so that Lucas-Kanade needs no search
-and places it to a tenth of a pixel. The pose is then fitted once more, robustly, to those places.
+Descriptors match over any motion, but only to a pixel or two. Their pose predicts every patch of the earlier image in
+the later one, so Lucas-Kanade needs no search and is accurate to a tenth of a pixel. The pose is then fitted once more,
+robustly, to the tracked patches.
 """
 
 from __future__ import annotations
@@ -17,165 +17,163 @@ from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.robust_weights import tukey_weights
 
-DETECTION_WIDTH = 640  # px; features are looked for in an image of at most about this width
-FEATURES = 1500
-ALIKE = 64  # largest Hamming distance of a pair, of 256 bits
-DISTINCT = 0.85  # largest ratio of the distance to that of the next best (Lowe, 2004)
-COARSE = 3.0  # px of the detection image, reprojection error of an inlier of RANSAC
-TRIALS = 300
+DETECTION_WIDTH = 640  # px, approximate largest width of the image in which features are detected
+MAX_FEATURES = 1500
+MAX_HAMMING_BITS = 64  # between the descriptors of a pair, of 256
+MAX_DISTANCE_RATIO = 0.85  # to the next best partner (Lowe, 2004)
+RANSAC_TOLERANCE = 3.0  # px of the detection image, reprojection error of an inlier
+RANSAC_TRIALS = 300
 PATCH = 21  # px, side of the tracked patch
-STRAY = 6.0  # px, by how much a patch may lie beside the place that RANSAC's pose gives it
-SHARPEST = 0.05  # px, least standard deviation that tracked patches are taken to have
-ROUNDS = 8
-DEPENDENT = 4.0  # how much larger errors are, held against exact truth, than if patches erred independently
-DEEPEST = 30.0  # m
+MAX_PATCH_SHIFT = 6.0  # px, from the patch's position predicted by RANSAC's pose
+MIN_PATCH_SIGMA = 0.05  # px
+FIT_ROUNDS = 8
+ERROR_INFLATION = 4.0  # measured errors over those of independent patches
+MAX_DEPTH = 30.0  # m
+MAX_CONDITION = 1e12  # of the normal equations
 
 
 @dataclass(frozen=True, eq=False)
 class VoFrame:
-    """What is kept of a stereo frame to track from and to.
+    """The features of a stereo frame."""
 
-    gray: (H, W) uint8; places: (N, 2) float32 px of its features, codes: (N, 32) uint8 their descriptors; points:
-    (N, 3) float64 m in the camera, NaN where the disparity is not known.
-    """
-
-    gray: Array
-    places: Array
-    codes: Array
-    points: Array
+    gray: Array  # (H, W) uint8
+    pixels: Array  # (N, 2) float32, px
+    descriptors: Array  # (N, 32) uint8
+    points: Array  # (N, 3) float64, m in the camera; NaN without a disparity
     camera: StereoCamera
 
     @property
     def known(self) -> int:
-        """How many features have a place in space."""
+        """Number of features with a point."""
         return int(np.count_nonzero(np.isfinite(self.points[:, 2])))
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """How the camera moved: a point p of the earlier camera is at `rotation @ p + translation` in the later one's.
-
-    inliers: patches that agree; error: their root mean square reprojection error, px; flow: their median way, px;
-    covariance: (6, 6) of a small turn (rad) and shift (m) in the later camera's frame.
-    """
+    """The camera's motion: a point p of the earlier camera is `rotation @ p + translation` in the later one."""
 
     rotation: Array
     translation: Array
-    inliers: int
-    error: float
-    flow: float
-    covariance: Array
+    inliers: int  # patches that agree
+    rms: float  # px, their reprojection error
+    flow: float  # px, median of all patches
+    covariance: Array  # (6, 6) of a small rotation (rad) and translation (m) in the later camera
 
 
-def view(frame: StereoFrame, disparity: Disparity) -> VoFrame:
-    """The features of the left image, and where in space those are whose disparity is measured."""
+def vo_frame(frame: StereoFrame, disparity: Disparity) -> VoFrame:
+    """The features of the left image, with the points of those that have a disparity."""
     image = gray(eight_bit(frame.left)[0])
     shrink = max(1, round(image.shape[1] / DETECTION_WIDTH))
     small = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA) if shrink > 1 else image
-    nothing = VoFrame(image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty((0, 3)), frame.camera)
-    if min(small.shape) < PATCH:  # OpenCV fails on the smallest
-        return nothing
-    found, codes = cv2.ORB.create(FEATURES, scaleFactor=1.3, nlevels=5, fastThreshold=5).detectAndCompute(small, None)
+    empty = VoFrame(image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty((0, 3)), frame.camera)
+    if min(small.shape) < PATCH:  # OpenCV's detector fails on smaller images
+        return empty
+    found, descriptors = cv2.ORB.create(MAX_FEATURES, scaleFactor=1.3, nlevels=5, fastThreshold=5).detectAndCompute(
+        small, None
+    )
     if not found:
-        return nothing
-    places = (np.array([point.pt for point in found], np.float32) + 0.5) * shrink - 0.5
-    return VoFrame(image, places, codes, _in_space(places, disparity, frame.camera), frame.camera)
+        return empty
+    pixels = (np.array([point.pt for point in found], np.float32) + 0.5) * shrink - 0.5
+    return VoFrame(image, pixels, descriptors, _triangulated(pixels, disparity, frame.camera), frame.camera)
 
 
-def _in_space(places: Array, disparity: Disparity, camera: StereoCamera) -> Array:
-    """Places (N, 2) of the left image as points (N, 3); NaN where a disparity about them is unknown or filled."""
+def _triangulated(pixels: Array, disparity: Disparity, camera: StereoCamera) -> Array:
+    """Points (N, 3) of pixels (N, 2) of the left image; NaN where a neighbouring disparity is unknown or filled."""
     seen = np.isin(disparity.source, (PixelOrigin.MEASURED, PixelOrigin.PLANE))
-    pixels = np.where(seen, disparity.pixels, np.float32(np.nan))
-    at = cv2.remap(pixels, places[:, 0].copy(), places[:, 1].copy(), cv2.INTER_LINEAR, borderValue=float("nan"))
+    known = np.where(seen, disparity.pixels, np.float32(np.nan))
+    at = cv2.remap(known, pixels[:, 0].copy(), pixels[:, 1].copy(), cv2.INTER_LINEAR, borderValue=float("nan"))
     shift = at.ravel().astype(np.float64) + (camera.cx_right - camera.cx)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = camera.fx * camera.baseline / np.where(shift > 0, shift, np.nan)
-    depth[~(depth <= DEEPEST)] = np.nan
-    x = (places[:, 0] - camera.cx) / camera.fx
-    y = (places[:, 1] - camera.cy) / camera.fy
+    depth[~(depth <= MAX_DEPTH)] = np.nan
+    x = (pixels[:, 0] - camera.cx) / camera.fx
+    y = (pixels[:, 1] - camera.cy) / camera.fy
     return np.stack([x * depth, y * depth, depth], axis=1)
 
 
-def step_between(earlier: VoFrame, later: VoFrame, least: int) -> Step | None:
-    """How the camera moved from one view to another; None where fewer than `least` features agree on it, or where the
-    images are not of one size: a patch looks different then."""
+def step_between(earlier: VoFrame, later: VoFrame, min_features: int) -> Step | None:
+    """The camera's motion between two frames; None if too few features agree or the image sizes differ."""
     if earlier.gray.shape != later.gray.shape:
         return None
     matrix = np.array([[later.camera.fx, 0, later.camera.cx], [0, later.camera.fy, later.camera.cy], [0, 0, 1.0]])
     here, there = _pairs(earlier, later)
-    if len(here) < least:
+    if len(here) < min_features:
         return None
-    tolerance = COARSE * max(1.0, later.gray.shape[1] / DETECTION_WIDTH)
+    tolerance = RANSAC_TOLERANCE * max(1.0, later.gray.shape[1] / DETECTION_WIDTH)
     found, turn, shift, agreeing = cv2.solvePnPRansac(
-        earlier.points[here], later.places[there].astype(np.float64), matrix, None, iterationsCount=TRIALS,
+        earlier.points[here], later.pixels[there].astype(np.float64), matrix, None, iterationsCount=RANSAC_TRIALS,
         reprojectionError=tolerance, confidence=0.9999, flags=cv2.SOLVEPNP_P3P,
     )  # fmt: skip
-    if not found or agreeing is None or len(agreeing) < least:
+    if not found or agreeing is None or len(agreeing) < min_features:
         return None
-    return _tracked_step(earlier, later, matrix, turn, shift, least)
+    return _tracked_step(earlier, later, matrix, turn, shift, min_features)
 
 
 def _pairs(earlier: VoFrame, later: VoFrame) -> tuple[Array, Array]:
-    """Indices of features, those of the earlier view known in space, that have a clearly best partner."""
+    """Indices of matching features, of which the earlier ones have a point."""
     known = np.flatnonzero(np.isfinite(earlier.points[:, 2]))
-    here, there = clear_partners(earlier.codes[known], later.codes, ALIKE, DISTINCT)
+    here, there = clear_partners(
+        earlier.descriptors[known], later.descriptors, MAX_HAMMING_BITS, MAX_DISTANCE_RATIO
+    )  # fmt: skip
     return known[here], there
 
 
 def _tracked_step(
-    earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array, least: int
+    earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array, min_features: int
 ) -> Step | None:
-    """The pose fitted to patches of the earlier image, tracked from where the given pose puts them."""
-    points, start, guess = _ahead(earlier, later, matrix, turn, shift)
-    if len(points) < least:
+    """The pose fitted to patches of the earlier image, tracked from their positions predicted by the given pose."""
+    points, start, guess = _predicted(earlier, later, matrix, turn, shift)
+    if len(points) < min_features:
         return None
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         earlier.gray, later.gray, start, guess.copy(), winSize=(PATCH, PATCH), maxLevel=1, criteria=stop,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
-    good = (status[:, 0] == 1) & (np.linalg.norm(found - guess, axis=1) < STRAY)
-    if np.count_nonzero(good) < least:
+    good = (status[:, 0] == 1) & (np.linalg.norm(found - guess, axis=1) < MAX_PATCH_SHIFT)
+    if np.count_nonzero(good) < min_features:
         return None
-    return _fitted(points[good], start[good], found[good].astype(np.float64), matrix, turn, shift, least)
+    return _fitted(points[good], start[good], found[good].astype(np.float64), matrix, turn, shift, min_features)
 
 
-def _ahead(earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array) -> tuple[Array, Array, Array]:
-    """The earlier view's points that the later image shows, and where the earlier and the later image show them."""
+def _predicted(
+    earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array
+) -> tuple[Array, Array, Array]:
+    """Points of the earlier frame in view of the later one, with their pixels in both."""
     known = np.isfinite(earlier.points[:, 2])
-    points, places = earlier.points[known], earlier.places[known]
+    points, pixels = earlier.points[known], earlier.pixels[known]
     depth = (points @ cv2.Rodrigues(turn)[0].T + shift.ravel())[:, 2]
-    points, places = points[depth > 0.1], places[depth > 0.1]
+    points, pixels = points[depth > 0.1], pixels[depth > 0.1]
     if not len(points):
-        return points, places, places
+        return points, pixels, pixels
     at = cv2.projectPoints(points, turn, shift, matrix, None)[0].reshape(-1, 2)
     height, width = later.gray.shape
     inside = np.all((at > PATCH / 2) & (at < np.array([width, height]) - PATCH / 2), axis=1)
-    return points[inside], places[inside], at[inside].astype(np.float32)
+    return points[inside], pixels[inside], at[inside].astype(np.float32)
 
 
 def _fitted(
-    points: Array, start: Array, found: Array, matrix: Array, turn: Array, shift: Array, least: int
+    points: Array, start: Array, found: Array, matrix: Array, turn: Array, shift: Array, min_features: int
 ) -> Step | None:
-    """The pose that fits points (N, 3) to their places (N, 2), by Gauss-Newton with Tukey's weights."""
+    """The pose that fits points (N, 3) to their pixels (N, 2), by Gauss-Newton with Tukey's weights."""
     pose = np.concatenate([turn.ravel(), shift.ravel()])
-    for _ in range(ROUNDS):
-        at, slopes = cv2.projectPoints(points, pose[:3], pose[3:], matrix, None)
+    for _ in range(FIT_ROUNDS):
+        at, jacobian = cv2.projectPoints(points, pose[:3], pose[3:], matrix, None)
         errors = (found - at.reshape(-1, 2)).ravel()
-        slopes = slopes[:, :6]
+        jacobian = jacobian[:, :6]
         sizes = np.linalg.norm(errors.reshape(-1, 2), axis=1)
-        scale = max(float(np.median(sizes)) / 1.1774, SHARPEST)  # the median of a Rayleigh distribution
+        scale = max(float(np.median(sizes)) / 1.1774, MIN_PATCH_SIGMA)  # median of a Rayleigh distribution
         weights = tukey_weights(sizes, scale)
         both = np.repeat(weights, 2)
-        normal = slopes.T @ (slopes * both[:, None])
-        if not np.all(np.isfinite(normal)) or np.linalg.cond(normal) > 1e12:
+        normal = jacobian.T @ (jacobian * both[:, None])
+        if not np.all(np.isfinite(normal)) or np.linalg.cond(normal) > MAX_CONDITION:
             return None
-        pose = pose + np.linalg.solve(normal, slopes.T @ (errors * both))
+        pose = pose + np.linalg.solve(normal, jacobian.T @ (errors * both))
     inside = weights > 0
-    if np.count_nonzero(inside) < least:
+    if np.count_nonzero(inside) < min_features:
         return None
-    # The slopes are those of the rotation vector; near enough those of a small turn for turns of some degrees.
-    covariance = np.linalg.inv(normal) * (DEPENDENT * scale) ** 2
+    # The Jacobian is with respect to the rotation vector, close enough to a small rotation for a few degrees.
+    covariance = np.linalg.inv(normal) * (ERROR_INFLATION * scale) ** 2
     return Step(
         cv2.Rodrigues(pose[:3])[0], pose[3:], int(np.count_nonzero(inside)),
         float(np.sqrt(np.mean(np.square(sizes[inside])))),

@@ -1,4 +1,4 @@
-"""The regional map: what is remembered of a cell, how what a frame shows of it enters there, and what it then tells."""
+"""The fused regional map: what it keeps of each cell, and how a frame is merged into it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import numpy as np
 
 from stages.data import Array
 from stages.data.tiles import Tiles
-from stages.terrain.height_alignment import rise
+from stages.terrain.height_alignment import plane_height
 
-# What is remembered of a cell, 29 bytes. weight: sum of 1 / variance over its frames; best: the smallest standard
-# deviation among them; below, above: from the height to the cell's extremes; first, last: ms since the first frame;
-# numbers stop at the largest of their type; doubt: by how much the newest frame contradicts it, where that is not
-# settled. Where no frame saw it, but one looked, weight is HIDDEN and height what it must lie below.
+SHARED_SHARE = 0.5  # share of the smallest variance of a cell's frames that they have in common
+MAX_CONTRADICTION = 3.0  # standard deviations between two heights of a cell
+# 29 bytes a cell. weight: sum of 1 / variance over its frames; best: their smallest standard deviation; below, above:
+# from the height to the extremes; first, last: ms since the epoch; doubt: height difference to the newest frame while
+# it contradicts the cell. Integers saturate. Cells seen by no frame but hidden from one have weight HIDDEN, and their
+# height is the ceiling.
 CELL = np.dtype(
     [
         ("height", "f4"), ("weight", "f4"), ("best", "f2"), ("below", "f2"), ("above", "f2"), ("count", "u2"),
@@ -27,45 +29,42 @@ _MS = 1_000_000
 
 @dataclass(eq=False)
 class FusedMap:
-    """The map so far: its frame, the stamps of its first and last frame, ns, whether those tell what was hidden from
-    them, its cells, the plane that joined the last frame, the sum of up as the tilts tell it in the map's frame, how
-    many frames in succession did not join, and how often the map began anew for that."""
+    """The regional map so far, the state of `Fuse`."""
 
-    frame_id: str | None = None  # a pose may be in a frame without a name
-    epoch: int = 0
-    last: int = -1
-    hides: bool = False
+    frame_id: str | None = None  # "" is a valid name
+    epoch: int = 0  # ns, stamp of the first frame
+    last: int = -1  # ns, stamp of the last frame
+    has_ceiling: bool = False  # whether the frames contain occluded cells
     cells: Tiles = field(default_factory=lambda: Tiles(CELL))
-    plane: Array = field(default_factory=lambda: np.zeros(3))
-    ups: Array = field(default_factory=lambda: np.zeros(3))
-    refused: int = 0
-    anew: int = 0
+    plane: Array = field(default_factory=lambda: np.zeros(3))  # that aligned the last frame
+    up_sum: Array = field(default_factory=lambda: np.zeros(3))  # of the tilts, in the map's frame
+    rejected: int = 0  # frames in succession that did not align
+    resets: int = 0  # because of them
 
-    def begin(self, frame_id: str, stamp: int) -> None:
-        """Start anew: nothing joins the two."""
+    def reset(self, frame_id: str, stamp: int) -> None:
+        """Start an empty map."""
         self.frame_id, self.epoch, self.cells = frame_id, stamp, Tiles(CELL)
-        self.plane, self.ups = np.zeros(3), np.zeros(3)
+        self.plane, self.up_sum = np.zeros(3), np.zeros(3)
 
     def age(self, stamp: int) -> int:
-        """The time since the first frame, ms."""
+        """Time since the epoch, ms."""
         return (stamp - self.epoch) // _MS
 
 
 class Observation(NamedTuple):
-    """What a frame shows of n cells, (n,) float64 each: how far from the rover they lie, m, their heights, m, the
-    variance of `elevation`, m^2, and how many points they hold."""
+    """What a frame shows of n cells, (n,) float64 each."""
 
-    x: Array
+    x: Array  # m from the rover
     y: Array
-    elevation: Array
+    elevation: Array  # m
     minimum: Array
     maximum: Array
-    variance: Array
+    variance: Array  # m^2, of elevation
     points: Array
 
-    def raised(self, plane: Array) -> Observation:
-        """The same, with a plane (3,) added to the heights."""
-        up = rise(plane, self.x, self.y)
+    def with_plane(self, plane: Array) -> Observation:
+        """The same with a plane (3,) added to the heights."""
+        up = plane_height(plane, self.x, self.y)
         return self._replace(elevation=self.elevation + up, minimum=self.minimum + up, maximum=self.maximum + up)
 
     def only(self, which: Array) -> Observation:
@@ -73,96 +72,92 @@ class Observation(NamedTuple):
         return Observation(*(values[which] for values in self))
 
 
-def variance_of(cells: Array, shared: float) -> Array:
-    """Variance of the heights of known cells, m^2; shared: of its frames' least, the share that all have in common."""
-    return np.asarray(1 / cells["weight"].astype(np.float64) + shared * cells["best"].astype(np.float64) ** 2)
+def variance_of(cells: Array) -> Array:
+    """Variance of the heights of known cells, m^2."""
+    return np.asarray(1 / cells["weight"].astype(np.float64) + SHARED_SHARE * cells["best"].astype(np.float64) ** 2)
 
 
-def merged(cells: Array, seen: Observation, now: int, contradiction: float, shared: float) -> Array:
-    """The cells (n,) with what a frame saw in them at `now`, ms since the first.
-
-    contradiction: standard deviations, beyond which it contradicts a cell; shared: of `variance_of`.
-    """
+def merged(cells: Array, frame: Observation, now: int) -> Array:
+    """The cells (n,) with a frame's observation at `now`, ms since the epoch."""
     cells, known = cells.copy(), cells["frames"] > 0
-    off = np.abs(seen.elevation - cells["height"])
-    have = np.full(len(cells), np.inf)
-    have[known] = variance_of(cells[known], shared)
-    contradicted = known & (off > contradiction * np.sqrt(have + seen.variance))
-    replaced = contradicted & (seen.variance <= 2 * have)  # the cell has lost half its weight
-    unsettled = contradicted & ~replaced  # until it is settled which is right, nobody may rely on the cell
+    off = np.abs(frame.elevation - cells["height"])
+    variance = np.full(len(cells), np.inf)
+    variance[known] = variance_of(cells[known])
+    contradicted = known & (off > MAX_CONTRADICTION * np.sqrt(variance + frame.variance))
+    replaced = contradicted & (frame.variance <= 2 * variance)  # the cell has lost half its weight
+    unsettled = contradicted & ~replaced
     cells["weight"][contradicted] /= 2
     cells["best"][contradicted] *= np.float16(np.sqrt(2))
-    cells["contradictions"][contradicted] = _sum(cells["contradictions"][contradicted], 1)
+    cells["contradictions"][contradicted] = _saturated_sum(cells["contradictions"][contradicted], 1)
     cells["doubt"][unsettled] = off[unsettled]
     now = min(now, np.iinfo(CELL["first"]).max)
     new = ~known | replaced
     cells[new] = _fresh(cells[new], now)
     added = ~unsettled
-    cells[added] = _averaged(cells[added], seen.only(added), now, shared)
+    cells[added] = _averaged(cells[added], frame.only(added), now)
     return cells
 
 
 def _fresh(cells: Array, now: int) -> Array:
-    """Cells (n,) that forget all but how often they were contradicted."""
+    """Empty cells (n,) that keep their number of contradictions."""
     fresh = np.zeros(len(cells), CELL)
     fresh["first"], fresh["contradictions"] = now, cells["contradictions"]
     return fresh
 
 
-def _averaged(cells: Array, seen: Observation, now: int, shared: float) -> Array:
-    """The cells (n,) with what a frame saw in them as one more of their frames, weighted by inverse variance."""
-    after, spread = cells.copy(), np.sqrt(seen.variance)
-    weight = 1 / ((1 - shared) * seen.variance + 1e-12)
+def _averaged(cells: Array, frame: Observation, now: int) -> Array:
+    """The cells (n,) with one more frame, weighted by inverse variance."""
+    after, sigma = cells.copy(), np.sqrt(frame.variance)
+    weight = 1 / ((1 - SHARED_SHARE) * frame.variance + 1e-12)
     after["weight"] = total = cells["weight"] + weight
     share = weight / total
-    for name, value in (
-        ("height", seen.elevation), ("below", seen.elevation - seen.minimum), ("above", seen.maximum - seen.elevation),
-    ):  # fmt: skip
+    below, above = frame.elevation - frame.minimum, frame.maximum - frame.elevation
+    for name, value in (("height", frame.elevation), ("below", below), ("above", above)):
         after[name] = cells[name] + share * (value - cells[name])
-    after["best"] = np.where(cells["frames"] > 0, np.minimum(cells["best"], spread), spread)
-    after["count"], after["frames"] = _sum(cells["count"], seen.points), _sum(cells["frames"], 1)
+    after["best"] = np.where(cells["frames"] > 0, np.minimum(cells["best"], sigma), sigma)
+    after["count"], after["frames"] = _saturated_sum(cells["count"], frame.points), _saturated_sum(cells["frames"], 1)
     after["last"], after["doubt"] = now, 0
     return after
 
 
-def _sum(numbers: Array, more: Array | int) -> Array:
-    """Unsigned numbers with `more` added, or the largest of their type."""
-    most = np.iinfo(numbers.dtype).max
-    return np.asarray(np.minimum(numbers + np.asarray(more, np.float64), most).astype(numbers.dtype))
+def _saturated_sum(numbers: Array, more: Array | int) -> Array:
+    """Unsigned numbers plus `more`, at most the largest of their type."""
+    largest = np.iinfo(numbers.dtype).max
+    return np.asarray(np.minimum(numbers + np.asarray(more, np.float64), largest).astype(numbers.dtype))
 
 
-def hidden_below(cells: Array, ceiling: Array) -> Array:
-    """Cells (n,) that no frame saw, and that lie below the heights `ceiling` (n,), m, too."""
+def with_ceiling(cells: Array, ceiling: Array) -> Array:
+    """Cells (n,) seen by no frame, with the lower of their ceiling and a frame's, (n,) m."""
     cells = cells.copy()
     cells["height"] = np.where(cells["weight"] == HIDDEN, np.minimum(cells["height"], ceiling), ceiling)
     cells["weight"] = HIDDEN
     return cells
 
 
-def layers_of(cells: Array, shared: float, hides: bool) -> dict[str, Array]:
-    """What the cells (rows, cols) tell, as layers of an elevation map, float32; hides: of `FusedMap`."""
+def layers_of(cells: Array, has_ceiling: bool) -> dict[str, Array]:
+    """The layers of an elevation map, float32, from cells (rows, cols)."""
     known = cells["frames"] > 0
     seen = cells[known]
     doubt = seen["doubt"].astype(np.float64)
     layers = {
-        "elevation": _laid_out(known, seen["height"]),
-        "minimum": _laid_out(known, seen["height"] - seen["below"]),
-        "maximum": _laid_out(known, seen["height"] + seen["above"]),
+        "elevation": _scattered(known, seen["height"]),
+        "minimum": _scattered(known, seen["height"] - seen["below"]),
+        "maximum": _scattered(known, seen["height"] + seen["above"]),
         "count": cells["count"].astype(np.float32),
-        "variance": _laid_out(known, variance_of(seen, shared) + np.square(doubt)),
-        "first": _laid_out(known, seen["first"] / 1e3),
-        "last": _laid_out(known, seen["last"] / 1e3),
+        "variance": _scattered(known, variance_of(seen) + np.square(doubt)),
+        "first": _scattered(known, seen["first"] / 1e3),
+        "last": _scattered(known, seen["last"] / 1e3),
         "frames": cells["frames"].astype(np.float32),
         "contradictions": cells["contradictions"].astype(np.float32),
     }
-    if hides:
+    if has_ceiling:
         hidden = cells["weight"] == HIDDEN
         layers["occluded"] = np.where(known, 0, np.where(hidden, 1, np.nan)).astype(np.float32)
-        layers["ceiling"] = _laid_out(hidden, cells["height"][hidden])
+        layers["ceiling"] = _scattered(hidden, cells["height"][hidden])
     return layers
 
 
-def _laid_out(where: Array, values: Array) -> Array:
+def _scattered(where: Array, values: Array) -> Array:
     """Values (n,) in the cells of the mask `where` (rows, cols), NaN in the others; float32."""
     layer = np.full(where.shape, np.nan, np.float32)
     layer[where] = values

@@ -1,8 +1,8 @@
-"""What a frame has to rise and tilt to lie on a map that it overlaps: a robust plane through the height differences.
+"""The plane that aligns a frame to the map it overlaps: a robust fit through the height differences.
 
-Errors of neighbouring cells are alike, so a patch of them counts as one; and cells that changed, or that stand at the
-edge of a rock, lie far off and must not pull. The fit is by reweighting: Huber's weights first, which lead to the one
-solution there is, then Cauchy's, with which what is far off pulls the less the farther it is.
+Errors of neighbouring cells are alike, so a patch of them counts as one. Cells that changed, or lie at the edge of a
+rock, are outliers. The fit is iteratively reweighted: Huber's weights first, which have a single solution, then
+Cauchy's, whose influence falls with the distance.
 """
 
 from __future__ import annotations
@@ -11,27 +11,25 @@ import numpy as np
 
 from stages.data import Array
 
-PATCH = 0.3  # m, within which errors of stereo heights are alike
-# Standard deviations; 95 % as efficient as least squares where all errors are normal
-_HUBER, _CAUCHY = 1.345, 2.385
+CORRELATION_LENGTH = 0.3  # m, of stereo height errors
+_HUBER, _CAUCHY = 1.345, 2.385  # standard deviations; 95 % as efficient as least squares for normal errors
 _ROUNDS = 8  # of each
 
 
 def fit_plane(x: Array, y: Array, off: Array, variance: Array, expected: Array, resolution: float) -> Array:
-    """The most likely plane (3,): height at (0, 0), m, and slopes along x and y.
+    """The most likely plane (3,): height at (0, 0), m, and slopes along x and y; zero without cells.
 
-    x, y: (n,) where, m; off: (n,) height differences, m; variance: (n,) of each, m^2; expected: (3,) standard
-    deviations that the plane's numbers are known to have before anything is seen; resolution: cell size, m. Without
-    cells the plane is zero.
+    x, y: (n,) positions, m; off: (n,) height differences, m; variance: (n,) of each, m^2; expected: (3,) prior standard
+    deviations of the plane's numbers; resolution: cell size, m.
     """
     known = np.flatnonzero(expected > 0)
     plane = np.zeros(3)
     design = np.stack([np.ones_like(x), x, y])[known]
-    trust = 1 / (variance * max(1.0, (PATCH / resolution) ** 2))
+    trust = 1 / (variance * max(1.0, (CORRELATION_LENGTH / resolution) ** 2))
     prior = np.diag(1 / expected[known] ** 2)
-    spread = np.sqrt(variance)
+    sigma = np.sqrt(variance)
     for number in range(2 * _ROUNDS if len(x) else 0):
-        residual = np.abs(off - plane[known] @ design) / spread
+        residual = np.abs(off - plane[known] @ design) / sigma
         if number < _ROUNDS:
             weight = np.minimum(1.0, _HUBER / np.maximum(residual, 1e-12))
         else:
@@ -41,6 +39,6 @@ def fit_plane(x: Array, y: Array, off: Array, variance: Array, expected: Array, 
     return plane
 
 
-def rise(plane: Array, x: Array, y: Array) -> Array:
-    """The height, m, of a plane of `fit_plane` at the places (x, y), (n,) m each: (n,)."""
+def plane_height(plane: Array, x: Array, y: Array) -> Array:
+    """The height, m, of a plane of `fit_plane` at (x, y), (n,) m each: (n,)."""
     return np.asarray(plane @ [np.ones_like(x), x, y])

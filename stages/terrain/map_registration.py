@@ -1,6 +1,6 @@
-"""Where a levelled cloud lies in the frame of the rover's pose, and in which cells of the regional map.
+"""Registration of a levelled cloud in the frame of the rover's pose, and in the cells of the regional map.
 
-Only heading and place are the pose's: the cloud knows by itself, from the inclinometer, which way is up.
+Only heading and position come from the pose. Up comes from the inclinometer, because the cloud is levelled already.
 """
 
 from __future__ import annotations
@@ -16,97 +16,95 @@ from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
 from stages.terrain.dem import Voxelise
 
-# Beyond this the pose's frame does not have z up. An odometry that knows no tilt may differ by the slope of the ground.
-_LARGEST_LEAN = np.radians(30.0)
+# Between z of the pose's frame and up. Odometry without an inclinometer may differ by the slope of the ground.
+_MAX_LEAN = np.radians(30.0)
 
 
 @dataclass(frozen=True, eq=False)
 class FrameGrid:
-    """What one frame shows of the region.
+    """The cells of the regional map that one frame shows.
 
-    placed: frame `level` in the region's; terrain: the elevation map of the frame, whose cells are the region's and
-    whose heights are in its frame; row, col: of its first cell in the region.
+    level: frame `level` in the map's frame; terrain: the frame's elevation map, on the map's cells and in its frame;
+    row, col: of the first cell in the map.
     """
 
-    placed: Transform
+    level: Transform
     terrain: ElevationMap
     row: int
     col: int
 
     @cached_property
     def known(self) -> Array:
-        """Cells that have a height, and whose error is known, (rows, cols) bool."""
+        """Cells with a height and a variance, (rows, cols) bool."""
         return np.isfinite(self.terrain.layers["elevation"]) & np.isfinite(self.terrain.layers["variance"])
 
     @cached_property
     def ceiling(self) -> Array:
-        """What hidden cells lie below, (rows, cols) m, NaN where none is told to be hidden."""
+        """Height, m, below which occluded cells lie, (rows, cols), NaN elsewhere."""
         return self.terrain.layers.get("ceiling", np.full(self.terrain.shape, np.nan))
 
     def offsets(self, which: Array) -> tuple[Array, Array]:
-        """x and y of the centres of the cells of a mask, (rows, cols) bool, from the rover, m."""
+        """x and y, m from the rover, of the centres of the cells of a mask, (rows, cols) bool."""
         rows, cols = np.nonzero(which)
-        x, y = (
-            (first + cells + 0.5) * self.terrain.resolution for first, cells in ((self.col, cols), (self.row, rows))
-        )
-        return x - self.placed.translation[0], y - self.placed.translation[1]
+        firsts = ((self.col, cols), (self.row, rows))
+        x, y = ((first + cells + 0.5) * self.terrain.resolution for first, cells in firsts)
+        return x - self.level.translation[0], y - self.level.translation[1]
 
 
-def placement(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tuple[Transform, Array]:
-    """Frame `level` of a levelled cloud in the pose's frame: upright, turned by the pose's heading; and up (3,), as the
-    tilt tells, in the frame as it is.
+def register(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tuple[Transform, Array]:
+    """Frame `level` of a levelled cloud in the pose's frame, upright with the pose's heading; and up (3,) by the tilt.
 
-    Pitch and roll of the pose are not used: which way is up, the inclinometer knows. Raises ValueError where nothing
-    tells how the frame whose pose it is sits to the camera, or where the pose's frame does not have z up.
+    Roll and pitch of the pose are not used. Raises StageError if the transform from the pose's child frame to the
+    camera is unknown, or if z of the pose's frame is not up.
     """
     assert cloud.sensor is not None
     child = _child_from_camera(pose, cloud.sensor, mount)
     camera = pose.transform.rotation @ child.rotation
     turned = camera @ cloud.sensor.rotation.T
     lean = float(np.arccos(np.clip(turned[2, 2], -1.0, 1.0)))
-    if lean > _LARGEST_LEAN:
+    if lean > _MAX_LEAN:
         raise StageError(
             f"Fuse: z of the pose's frame '{pose.frame_id}' is {np.degrees(lean):.0f} degrees off the vertical of the "
             "tilt; give a pose in a frame whose z points up"
         )
     yaw = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
     rotation = Rotation.from_euler("z", yaw).as_matrix()
-    origin = cloud.sensor(child.inverse().translation)  # of the frame whose pose it is, in level
+    origin = cloud.sensor(child.inverse().translation)  # of the pose's child frame, in level
     return Transform(pose.frame_id, LEVEL_FRAME, rotation, pose.position - rotation @ origin), turned[:, 2]
 
 
 def _child_from_camera(pose: Pose, sensor: Transform, mount: Mount | None) -> Transform:
-    """The camera in the frame whose pose is given."""
-    mount = mount or Mount(0, np.eye(3))
-    seat = mount.camera_in(pose.child_frame_id, sensor.child)
-    if seat is None:
+    """The camera in the pose's child frame."""
+    camera = (mount or Mount(0, np.eye(3))).camera_in(pose.child_frame_id, sensor.child)
+    if camera is None:
         raise StageError(
-            f"Fuse: the pose is that of '{pose.child_frame_id}', and nothing tells how the camera '{sensor.child}' "
-            "sits on it; record its static transform, or set base_frame of the source"
+            f"Fuse: the pose is of '{pose.child_frame_id}', and no transform links it to the camera '{sensor.child}'; "
+            "record its static transform, or set base_frame of the source"
         )
-    return seat
+    return camera
 
 
-def sight_of(cloud: PointCloud, placed: Transform, resolution: float, region: float) -> FrameGrid:
-    """What the measured points of a cloud show of the region's cells.
+def frame_grid(cloud: PointCloud, level: Transform, resolution: float, max_range: float) -> FrameGrid:
+    """The measured points of a cloud in frame `level`, on the cells of the regional map.
 
-    cloud: in frame `level`, which is `placed` upright in the region's frame; resolution, region: of `Voxelise`, m.
+    The cloud is shifted by less than a cell before it is binned, so that nothing is resampled.
     """
     cloud = cloud.only(cloud.measured)
-    cell = np.floor(placed.translation[:2] / resolution).astype(int)
-    rest = replace(placed, translation=np.append(placed.translation[:2] - cell * resolution, 0.0))
+    cell = np.floor(level.translation[:2] / resolution).astype(int)
+    rest = replace(level, translation=np.append(level.translation[:2] - cell * resolution, 0.0))
     points = transform_points(cloud.points, rest.rotation, rest.translation)
     sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
-    terrain = Voxelise(resolution=resolution, max_range=region)(replace(cloud, points=points, sensor=sensor))
+    terrain = Voxelise(resolution=resolution, max_range=max_range)(replace(cloud, points=points, sensor=sensor))
     col, row = (int(number) - extent // 2 for number, extent in zip(cell, terrain.shape[::-1], strict=True))
     heights = [name for name in ("elevation", "minimum", "maximum", "ceiling") if name in terrain.layers]
-    lifted = {name: terrain.layers[name] + np.float32(placed.translation[2]) for name in heights}
+    lifted = {name: terrain.layers[name] + np.float32(level.translation[2]) for name in heights}
     origin = (col * resolution, row * resolution)
-    terrain = replace(terrain, layers={**terrain.layers, **lifted}, origin=origin, frame_id=placed.parent)
-    return FrameGrid(placed, terrain, row, col)
+    terrain = replace(terrain, layers={**terrain.layers, **lifted}, origin=origin, frame_id=level.parent)
+    return FrameGrid(level, terrain, row, col)
 
 
-def raised(placed: Transform, plane: Array) -> Transform:
-    """A placement with a plane (height, slopes) added: a rise, and the small rotation that makes the slopes."""
-    turn = Rotation.from_rotvec([plane[2], -plane[1], 0.0]).as_matrix()
-    return replace(placed, rotation=turn @ placed.rotation, translation=placed.translation + np.array([0, 0, plane[0]]))
+def with_plane(level: Transform, plane: Array) -> Transform:
+    """The transform of frame `level` with a plane (height, slopes) added: a rise and a small rotation."""
+    rotation = Rotation.from_rotvec([plane[2], -plane[1], 0.0]).as_matrix()
+    translation = level.translation + np.array([0, 0, plane[0]])
+    return replace(level, rotation=rotation @ level.rotation, translation=translation)

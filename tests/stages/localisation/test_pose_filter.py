@@ -1,4 +1,4 @@
-"""PoseFilter makes poses that stand upright by the tilt and go by the images, and labels them as visual."""
+"""PoseFilter makes visual poses, upright by the tilt, and reports their source."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ def errors(drive: Drive, poses: list[Pose]) -> tuple[Array, Array]:
     return np.array(places), np.degrees(turns)
 
 
-def test_poses_of_base_link_follow_the_drive_and_say_that_they_are_visual():
+def test_visual_poses_of_base_link_follow_the_drive():
     stage = Running(PoseFilter())
     poses = located(DRIVE, stage)
     places, turns = errors(DRIVE, poses)
     assert {(pose.frame_id, pose.child_frame_id) for pose in poses} == {("visual_odom", "base_link")}
     np.testing.assert_allclose(poses[0].position, 0, atol=1e-12)
-    assert np.linalg.norm(places[-1]) < 0.05  # of 12 m; the first tilt's noise is all that errs here
+    assert np.linalg.norm(places[-1]) < 0.05  # of 12 m, from the noise of the first tilt
     assert np.abs(turns[:, 2]).max() < 0.1
-    said = f"no pose is given: visual odometry supplies it ({FRAMES} poses), in frame visual_odom"
-    assert stage.finding() == Finding(said)
+    sentence = f"The log contains no pose. Visual odometry supplies it ({FRAMES} poses, frame visual_odom)."
+    assert stage.finding() == Finding(sentence)
 
 
 def test_the_tilt_is_smoothed_along_the_images():
-    """Roll and pitch get better than any single tilt, and the tilt keeps them from drifting."""
+    """Roll and pitch are better than any single tilt, and do not drift."""
     _, turns = errors(DRIVE, located(DRIVE, Running(PoseFilter(tilt_noise=float(np.radians(0.15))))))
     assert np.sqrt(np.mean(np.square(turns[20:, :2]))) < 0.4 * 0.3 * 0.45
     tilted = Drive(2, 6.0, noise=0.0)
@@ -64,14 +64,14 @@ def test_the_tilt_is_smoothed_along_the_images():
         assert motion.camera is not None
         lean = Rotation.from_rotvec([0, 0, leaning * count]).as_matrix()
         wrong = Transform(motion.camera.parent, motion.camera.child, lean @ motion.camera.rotation, np.zeros(3))
-        told = replace(motion, camera=wrong, covariance=np.eye(6) * leaning**2 * count)
-        pose = stage(told, Tilt(motion.stamp, up), mount)
+        drifting = replace(motion, camera=wrong, covariance=np.eye(6) * leaning**2 * count)
+        pose = stage(drifting, Tilt(motion.stamp, up), mount)
         z = Rotation.from_quat(pose.quaternion).as_matrix()[2]
         leans.append(np.degrees(np.arccos(np.clip(z @ tilted.truth.base_at(motion.stamp).rotation[2], -1, 1))))
     assert max(leans) < 1.0  # 5 degrees without the tilt
 
 
-def test_the_stated_covariance_covers_the_errors_and_grows():
+def test_the_covariance_covers_the_errors_and_grows():
     for seed in (2, 3, 4):
         drive = Drive(seed, 6.0)
         poses = located(drive, Running(PoseFilter(tilt_noise=float(np.radians(0.15)))))
@@ -83,8 +83,8 @@ def test_the_stated_covariance_covers_the_errors_and_grows():
         assert spread[-1, 5] > spread[5, 5]
 
 
-def test_a_rover_that_stands_stays_where_it_is_however_its_tilts_err():
-    """The camera is 1 m from base_link: with each tilt it is placed anew, and base_link stays."""
+def test_a_rover_that_stands_does_not_move_with_the_noise_of_its_tilt():
+    """Each tilt moves the camera, 1 m from base_link, but not base_link."""
     noise, rng, places, stated = np.radians(0.5), np.random.default_rng(0), [], []
     camera = DRIVE.truth.base_at(DRIVE.stamps(1)[0]).after(DRIVE.truth.mounts[0])
     for _ in range(20):
@@ -99,7 +99,7 @@ def test_a_rover_that_stands_stays_where_it_is_however_its_tilts_err():
     assert np.max(stated) < 5e-4
 
 
-def test_the_logs_own_pose_goes_through_untouched():
+def test_a_logged_pose_passes_through_unchanged():
     pose = Pose(7, [1, 2, 3], [0, 0, 0, 1], "odom", "base_link")
     motion = motions(DRIVE.cameras(1), DRIVE.stamps(1))[0]
     stage = Running(PoseFilter())
@@ -109,26 +109,26 @@ def test_the_logs_own_pose_goes_through_untouched():
     assert stage.finding() is None
 
 
-def test_after_a_lost_track_the_poses_are_in_a_frame_of_their_own():
+def test_poses_after_lost_tracking_are_in_a_frame_of_their_own():
     cameras, stamps, ups = DRIVE.cameras(6), DRIVE.stamps(6), DRIVE.ups(6)
     given = [*motions(cameras[:3], stamps[:3]), *motions(cameras[3:], stamps[3:], segment=2)]
     stage = Running(PoseFilter())
     poses = [stage(motion, Tilt(motion.stamp, up), mount_of(DRIVE)) for motion, up in zip(given, ups, strict=True)]
     assert [pose.frame_id for pose in poses] == ["visual_odom"] * 3 + ["visual_odom/2"] * 3
     np.testing.assert_allclose(poses[3].position, 0, atol=1e-12)
-    said = (
-        "no pose is given: visual odometry supplies it (6 poses); tracking was lost once, so they are in 2 frames, "
-        "visual_odom and visual_odom/2, that nothing joins"
+    sentence = (
+        "The log contains no pose. Visual odometry supplies it (6 poses). It lost track 1 time: the poses are in 2 "
+        "unaligned frames, visual_odom and visual_odom/2."
     )
-    assert stage.finding() == Finding(said, Severity.WARNING)
+    assert stage.finding() == Finding(sentence, Severity.WARNING)
 
 
-def test_a_lost_track_is_a_mere_note_where_the_log_has_the_poses():
+def test_lost_tracking_is_a_note_if_the_log_contains_poses():
     pose, stage = Pose(7, [1, 2, 3], [0, 0, 0, 1], "odom", "base_link"), Running(PoseFilter())
     for segment in (1, 2, 3):
         motion = motions(DRIVE.cameras(1), DRIVE.stamps(1), segment=segment)[0]
         stage(motion, Tilt(7, DRIVE.ups(1)[0]), mount_of(DRIVE), pose)
-    assert stage.finding() == Finding("tracking was lost 2 times by visual odometry; the poses are the log's own")
+    assert stage.finding() == Finding("Visual odometry lost track 2 times. The poses are those of the log.")
 
 
 def frozen(poses: list[Pose]) -> list[Pose]:
@@ -149,27 +149,27 @@ def slipping(poses: list[Pose]) -> list[Pose]:
 
 
 @pytest.mark.parametrize("based", [True, False])
-@pytest.mark.parametrize(("change", "said"), [
+@pytest.mark.parametrize(("change", "sentence"), [
     (lambda poses: poses, None),
     (slipping, None),
-    (frozen, r"does not move as the images tell: steps of 0\.0\d m for theirs of 0\.\d\d m"),
-    (askew, "does not move as the images tell"),
-    (leaping, r"jumps once against the images, by up to 8\.\d m"),
+    (frozen, r"disagrees with visual odometry: median step 0\.0\d m vs 0\.\d\d m"),
+    (askew, "disagrees with visual odometry"),
+    (leaping, r"jumps 1 time relative to visual odometry, by up to 8\.\d m"),
 ])  # fmt: skip
-def test_a_logged_pose_that_does_not_fit_the_images_is_a_warning(change, said, based):
+def test_a_logged_pose_that_disagrees_with_the_images_is_a_warning(change, sentence, based):
     stage, mount = Running(PoseFilter()), mount_of(DRIVE, based)
     poses = change(located(DRIVE, Running(PoseFilter()), based))
     given = motions(DRIVE.cameras(), DRIVE.stamps())
     for motion, up, pose in zip(given, DRIVE.ups(), poses, strict=True):
         assert stage(motion, Tilt(motion.stamp, up), mount, pose) is pose
     found = stage.finding()
-    assert (found is None) == (said is None)
-    if found is not None and said is not None:
-        assert re.search(said, found.sentence)
+    assert (found is None) == (sentence is None)
+    if found is not None and sentence is not None:
+        assert re.search(sentence, found.sentence)
         assert found.severity == Severity.WARNING
 
 
-def test_without_base_link_it_is_the_cameras_pose():
+def test_without_base_link_the_pose_is_that_of_the_camera():
     poses = located(DRIVE, Running(PoseFilter()), based=False)
     assert poses[0].child_frame_id == DRIVE.truth.mounts[0].child
     first, last = (DRIVE.cameras()[frame].translation for frame in (0, -1))
@@ -178,7 +178,9 @@ def test_without_base_link_it_is_the_cameras_pose():
     assert abs(axis[1]) < 1e-9  # the optical axis is the heading
 
 
-def test_no_pose_is_made_up_where_the_images_show_none():
-    motion = replace(motions(DRIVE.cameras(1), DRIVE.stamps(1))[0], camera=None, lost="only 3 features are in view")
-    with pytest.raises(ValueError, match="no pose can be told from the images: only 3 features are in view"):
+def test_a_frame_without_motion_is_refused():
+    motion = replace(
+        motions(DRIVE.cameras(1), DRIVE.stamps(1))[0], camera=None, lost="only 3 features have a disparity"
+    )
+    with pytest.raises(ValueError, match="no pose from the images: only 3 features have a disparity"):
         Running(PoseFilter())(motion, Tilt(0, DRIVE.ups(1)[0]), mount_of(DRIVE))

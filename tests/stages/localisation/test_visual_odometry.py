@@ -1,4 +1,4 @@
-"""Visual odometry follows the camera as the truth has it, says where it lost it, and never makes a motion up."""
+"""VisualOdometry follows the true camera and reports lost tracking; it never invents a motion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages import CameraMotion, Disparity, StereoCamera, StereoFrame, Transform, VisualOdometry
-from stages.localisation.vo_tracking import view
+from stages.localisation.visual_odometry import MIN_FEATURES
+from stages.localisation.vo_tracking import vo_frame
 from tests.stages.running import Running
 
 FRAMES = 5
@@ -42,7 +43,7 @@ def blank(given: Input) -> Input:
     return replace(frame, left=np.zeros_like(frame.left), right=np.zeros_like(frame.right)), disparity
 
 
-def test_the_camera_is_followed_to_a_fraction_of_a_degree_and_a_hundredth_of_the_way(drive):
+def test_the_drift_is_below_a_hundredth_of_the_distance(drive):
     inputs, cameras = drive
     odometry = Running(VisualOdometry())
     motions = [odometry(*given) for given in inputs]
@@ -57,7 +58,7 @@ def test_the_camera_is_followed_to_a_fraction_of_a_degree_and_a_hundredth_of_the
     assert odometry.finding() is None
 
 
-def test_what_it_says_of_its_error_grows_and_holds(drive):
+def test_the_covariance_grows_and_covers_the_error(drive):
     inputs, cameras = drive
     odometry = Running(VisualOdometry())
     spreads = []
@@ -82,7 +83,7 @@ def test_a_rover_that_stands_still_does_not_drift(drive):
     assert np.degrees(Rotation.from_matrix(camera_of(motion).rotation).magnitude()) < 0.05
 
 
-def test_tracking_that_is_lost_begins_a_segment_and_says_so(drive):
+def test_lost_tracking_begins_a_segment(drive):
     inputs, _ = drive
     odometry = Running(VisualOdometry())
     odometry(*inputs[0])
@@ -96,8 +97,7 @@ def test_tracking_that_is_lost_begins_a_segment_and_says_so(drive):
     assert odometry.finding() is None  # PoseFilter reports it, once
 
 
-def test_images_of_another_size_begin_a_segment_and_say_so(drive):
-    """As where a camera is switched to another mode: what was tracked at one size is not found at another."""
+def test_images_of_another_size_begin_a_segment(drive):
     inputs, _ = drive
     frame, disparity = inputs[1]
     camera, layers = frame.camera, (disparity.pixels / 2, disparity.source, disparity.confidence)
@@ -109,22 +109,22 @@ def test_images_of_another_size_begin_a_segment_and_say_so(drive):
     motion = odometry(smaller, Disparity(frame.stamp, *(layer[::2, ::2].copy() for layer in layers), camera=half))
     size = f"{camera.width}x{camera.height}"
     assert motion.segment == 2
-    assert motion.lost == f"the images, {size} before, are {half.width}x{half.height} now; segment 2 begins"
+    assert motion.lost == f"the image size changed from {size} to {half.width}x{half.height}; segment 2 begins"
     np.testing.assert_array_equal(camera_of(motion).rotation, np.eye(3))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 700), (20, 20)])
-def test_an_image_smaller_than_a_patch_shows_too_little(shape):
+def test_an_image_smaller_than_a_patch_has_no_features(shape):
     height, width = shape
     image = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
     camera = StereoCamera(50.0, 50.0, width / 2, height / 2, 0.2, width, height)
     known = [np.ones(shape, kind) for kind in (np.float32, np.uint8, np.float32)]
     motion = Running(VisualOdometry())(StereoFrame(0, image, image, camera), Disparity(0, *known))
-    assert motion.lost == "only 0 features with a disparity are in view, less than 40"
+    assert motion.lost == "only 0 features have a disparity (minimum 40)"
 
 
-def test_features_that_agree_only_roughly_are_no_track(drive):
-    """An image turned by half a turn looks as if the camera had rolled, but for its principal point."""
+def test_features_that_agree_only_roughly_are_not_tracked(drive):
+    """An image rotated by 180 degrees looks like a roll of the camera, except for its principal point."""
     inputs, _ = drive
     odometry = Running(VisualOdometry())
     odometry(*inputs[0])
@@ -133,21 +133,21 @@ def test_features_that_agree_only_roughly_are_no_track(drive):
     assert "segment 2 begins" in odometry(turned, disparity).lost
 
 
-def test_a_blind_frame_has_no_motion_and_the_next_goes_on_from_the_last_that_saw(drive):
+def test_tracking_continues_after_a_dark_frame(drive):
     inputs, cameras = drive
     odometry = Running(VisualOdometry())
     odometry(*inputs[0])
     blind = odometry(*blank(inputs[1]))
     assert blind.camera is None
-    assert "features with a disparity are in view" in blind.lost
+    assert "features have a disparity" in blind.lost
     after = odometry(*inputs[2])
     assert after.segment == 1
     true = cameras[0].inverse().after(cameras[2])
     assert np.linalg.norm(camera_of(after).translation - true.translation) < 0.02
-    assert odometry.finding().sentence == "1 frame shows too little to track"
+    assert odometry.finding().sentence == "Too few features to track in 1 frame."
 
 
-def test_everything_is_counted_from_the_first_frame_that_shows_something(drive):
+def test_the_first_segment_begins_at_the_first_usable_frame(drive):
     inputs, cameras = drive
     odometry = Running(VisualOdometry())
     assert odometry(*blank(inputs[0])).camera is None
@@ -158,22 +158,22 @@ def test_everything_is_counted_from_the_first_frame_that_shows_something(drive):
     assert np.linalg.norm(camera_of(second).translation - true.translation) < 0.02
 
 
-def test_what_everything_is_counted_from_needs_few_features(drive):
+def test_the_first_frame_needs_only_few_features(drive):
     frame, disparity = drive[0][0]
     patch = np.zeros_like(disparity.source)
     patch[180:210, 150:190] = disparity.source[180:210, 150:190]
     few = replace(disparity, source=patch)
-    assert 0 < view(frame, few).known < VisualOdometry().min_features
+    assert 0 < vo_frame(frame, few).known < MIN_FEATURES
     np.testing.assert_array_equal(camera_of(Running(VisualOdometry())(frame, few)).rotation, np.eye(3))
 
 
-def test_a_filled_disparity_is_no_place_in_space(drive):
+def test_features_with_a_filled_disparity_do_not_count(drive):
     frame, disparity = drive[0][0]
     filled = replace(disparity, source=np.full_like(disparity.source, 3))
-    assert Running(VisualOdometry())(frame, filled).lost == "only 0 features with a disparity are in view, less than 40"
+    assert Running(VisualOdometry())(frame, filled).lost == "only 0 features have a disparity (minimum 40)"
 
 
-def test_disparities_of_another_size_are_refused(drive):
+def test_a_disparity_of_another_size_is_refused(drive):
     frame, disparity = drive[0][0]
     layers = disparity.pixels, disparity.source, disparity.confidence
     half = Disparity(0, *(layer[::2, ::2].copy() for layer in layers))

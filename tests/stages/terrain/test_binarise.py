@@ -1,4 +1,4 @@
-"""Binarise finds what stops a rover, on any slope it can climb, and calls nothing free that nobody saw."""
+"""Binarise finds hazards on any slope the rover can climb, and calls no unseen cell free."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def with_plane(elevation: ElevationMap, gx: float, gy: float, offset: float = 0.
 
 
 def shares(terrain: Terrain, result: NavigationMap) -> tuple[float, float, float, float]:
-    """Recall of cells 0.2 m above the ground, share of them called free, false alarms three cells and more from any
+    """Recall of cells 0.2 m above the ground, share of them called free, false alarms at least three cells from any
     rock, share of rocks found."""
     hazard = result.cells == Cell.HAZARD
     high, clear = terrain.above_mean >= 0.2, ~binary_dilation(terrain.rock > 0, np.ones((7, 7)))
@@ -61,7 +61,7 @@ def shares(terrain: Terrain, result: NavigationMap) -> tuple[float, float, float
     ],
     ids=["flat", "10 degrees", "17 degrees", "rolling", "rolling slope", "noisy"],
 )
-def test_every_rock_on_every_ground_is_found_with_few_false_alarms(ground: dict[str, float]) -> None:
+def test_every_rock_on_any_ground_is_found_with_few_false_alarms(ground: dict[str, float]) -> None:
     results = []
     for seed in range(3):
         terrain = rolling_terrain(seed, **ground)
@@ -75,7 +75,7 @@ def test_every_rock_on_every_ground_is_found_with_few_false_alarms(ground: dict[
 
 @settings(max_examples=25, deadline=None)
 @given(degrees=st.floats(0, 19.9), heading=st.floats(0, 2 * np.pi), offset=st.floats(-50, 50))
-def test_a_tilted_plane_within_the_slope_limit_is_free_wherever_it_was_seen(
+def test_a_plane_within_the_slope_limit_is_free_where_it_was_seen(
     degrees: float, heading: float, offset: float
 ) -> None:
     x, y = grid()
@@ -123,7 +123,7 @@ def test_a_plane_beyond_the_slope_limit_is_a_hazard_for_its_slope() -> None:
     assert (result.cells == Cell.HAZARD).all()
 
 
-def test_a_ridge_that_may_be_too_steep_under_a_wheel_is_unknown_and_a_gentle_one_is_free() -> None:
+def test_a_ridge_near_the_slope_limit_is_unknown_and_a_gentle_one_free() -> None:
     x, _ = grid()
     ridge = np.exp(-(((x - 2) / 0.24) ** 2))
     steep, doubtful, gentle = (map_of(height * ridge) for height in (0.14, 0.12, 0.1))
@@ -136,9 +136,7 @@ def test_a_ridge_that_may_be_too_steep_under_a_wheel_is_unknown_and_a_gentle_one
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 1000), gx=st.floats(-0.2, 0.2), gy=st.floats(-0.2, 0.2), offset=st.floats(-5, 5))
-def test_tilting_and_raising_the_scene_changes_no_step_and_no_roughness(
-    seed: int, gx: float, gy: float, offset: float
-) -> None:
+def test_tilting_and_raising_the_scene_changes_no_hazard(seed: int, gx: float, gy: float, offset: float) -> None:
     terrain = rolling_terrain(seed, rocks=5, cells=80)
     plain, moved = (
         Binarise(rover=Rover(max_slope=1.3))(TerrainFeatures(rover=Rover(max_slope=1.0))(elevation))
@@ -157,7 +155,7 @@ def test_a_mirrored_map_gives_the_mirrored_result(seed: int) -> None:
     assert (other.cells[::-1] != plain.cells).mean() <= 0.0005
 
 
-def test_a_rock_on_a_slope_is_a_hazard_and_the_slope_beside_it_is_free() -> None:
+def test_a_rock_on_a_slope_is_a_hazard_and_the_slope_is_free() -> None:
     x, y = grid()
     distance = np.hypot(x - 2, y - 2)
     z = np.tan(TEN_DEGREES) * x + np.where(distance < 0.3, np.sqrt(np.maximum(0.09 - distance**2, 0)), 0)
@@ -170,10 +168,8 @@ def test_a_rock_on_a_slope_is_a_hazard_and_the_slope_beside_it_is_free() -> None
 @pytest.mark.parametrize("step", [0.12, 0.16, 0.18, 0.25])
 @pytest.mark.parametrize("limit", [0.14, 0.17, 0.22])
 @pytest.mark.parametrize("degrees", [0.0, 12.0])
-def test_an_edge_is_a_step_if_and_only_if_it_is_higher_than_the_limit(
-    step: float, limit: float, degrees: float
-) -> None:
-    """A terrace across a slope, seen from below or above: its edge is a step, the rest of it is not."""
+def test_an_edge_is_a_step_only_if_it_exceeds_the_limit(step: float, limit: float, degrees: float) -> None:
+    """A terrace across a slope: only its edge is a step."""
     x, y = grid()
     scene = map_of(np.tan(np.deg2rad(degrees)) * x + np.where(y > 2, step, 0.0))
     features = TerrainFeatures(rover=Rover(max_step=limit))(scene)
@@ -182,8 +178,8 @@ def test_an_edge_is_a_step_if_and_only_if_it_is_higher_than_the_limit(
     assert not (result.reason[np.abs(y - 2) > 0.6] == CellReason.STEP).any()
 
 
-def test_a_rock_in_a_hollow_behind_a_rise_is_found_by_the_face_that_shows() -> None:
-    """The ground rises to a crest, what lies behind is hidden, and out of it comes the upper half of a rock."""
+def test_a_half_hidden_rock_behind_a_rise_is_found() -> None:
+    """Behind a crest the ground is hidden, and only the upper half of a rock is visible."""
     x, y = grid(120)
     ground = 0.25 * np.exp(-(((x - 2) / 0.7) ** 2)) - 0.12 * np.exp(-(((x - 3.5) / 0.6) ** 2))
     distance = np.hypot(x - 3.5, y - 3)
@@ -203,7 +199,7 @@ def test_a_ditch_is_a_hazard_and_so_are_its_edges() -> None:
     assert (result.cells[np.abs(x - 2) > 0.7] == Cell.FREE).all()
 
 
-def test_what_would_touch_the_belly_is_a_hazard_below_the_limit_of_a_step() -> None:
+def test_a_bump_higher_than_the_ground_clearance_is_a_hazard() -> None:
     x, y = grid()
     bump = 0.15 * np.exp(-((x - 2) ** 2 + (y - 2) ** 2) / 0.3**2)
     low, high = (decided(map_of(bump), rover=Rover(ground_clearance=clearance)) for clearance in (0.1, 0.25))
@@ -212,7 +208,7 @@ def test_what_would_touch_the_belly_is_a_hazard_below_the_limit_of_a_step() -> N
     assert (high.cells == Cell.FREE).mean() > 0.9
 
 
-def test_the_cells_beside_an_obstacle_are_hazards_as_far_as_told() -> None:
+def test_cells_within_the_hazard_margin_of_an_obstacle_are_hazards() -> None:
     x, y = grid()
     rock = (np.abs(x - 2) < 0.2) & (np.abs(y - 2) < 0.2)
     for beside in (0.0, 0.05, 0.1):
@@ -223,7 +219,7 @@ def test_the_cells_beside_an_obstacle_are_hazards_as_far_as_told() -> None:
         np.testing.assert_array_equal(result.reason == CellReason.BESIDE, around)
 
 
-def test_an_empty_cell_says_whether_it_was_hidden_and_a_lonely_one_is_unsure() -> None:
+def test_empty_cells_are_occluded_or_unobserved_and_lone_ones_unsure() -> None:
     flat, occluded = np.zeros((80, 80)), np.zeros((80, 80))
     flat[20:40, 20:40] = np.nan
     occluded[20:40, 20:30], occluded[20:40, 30:40] = 1, np.nan
@@ -236,12 +232,12 @@ def test_an_empty_cell_says_whether_it_was_hidden_and_a_lonely_one_is_unsure() -
     assert (result.cells[20:40, 20:40] == Cell.UNKNOWN).all()
 
 
-def test_a_map_that_was_not_assessed_is_refused() -> None:
+def test_a_map_without_terrain_features_is_refused() -> None:
     with pytest.raises(ValueError, match="no layer 'ground'; put stages"):
         Binarise()(map_of(np.zeros((40, 40))))
 
 
-def test_a_pit_is_a_hazard_too() -> None:
+def test_a_pit_is_a_hazard() -> None:
     x, y = grid()
     pit = np.hypot(x - 2, y - 2) < 0.25
     result = decided(map_of(np.where(pit, -0.4, 0.0)))
@@ -254,7 +250,7 @@ def test_noise_of_two_centimetres_is_no_hazard() -> None:
         assert (decided(map_of(noise, maximum=noise + 0.02, minimum=noise - 0.02)).cells == Cell.FREE).all()
 
 
-def test_the_low_back_of_a_rock_belongs_to_it_and_bumps_apart_from_it_do_not() -> None:
+def test_the_low_back_of_a_rock_is_part_of_the_obstacle() -> None:
     """A wide rock, 0.22 m high in front, whose back runs down to the ground over 0.8 m."""
     x, y = grid()
     rock = (x > 1.5) & (x < 2.3) & (np.abs(y - 2) < 0.5)
@@ -264,17 +260,15 @@ def test_the_low_back_of_a_rock_belongs_to_it_and_bumps_apart_from_it_do_not() -
     scene = map_of(height + 0.08 * far + 0.04 * touching)
     back = rock & (height > 0.1) & (height < 0.15)
     whole = Binarise(hazard_margin=0.0)(TerrainFeatures()(scene))
-    peaks_only = Binarise(hazard_margin=0.0, rover=Rover(max_slope=1.0))(TerrainFeatures(skirt=1.0)(scene))
+    peaks_only = Binarise(hazard_margin=0.0, rover=Rover(max_slope=1.0))(TerrainFeatures(min_skirt_height=1.0)(scene))
     assert (whole.reason[back] == CellReason.STEP).all()
     assert (whole.cells[rock & (height < 0.03)] == Cell.FREE).mean() > 0.9
-    assert not (
-        whole.reason[~rock] == CellReason.STEP
-    ).any()  # the high bump far off, the low one that touches the rock
+    assert not (whole.reason[~rock] == CellReason.STEP).any()
     assert (peaks_only.reason[back] != CellReason.STEP).mean() > 0.4
     assert (peaks_only.reason[rock & (height > 0.2)] == CellReason.STEP).all()
 
 
-def test_a_cell_whose_height_is_not_known_to_a_step_is_not_free_and_a_hazard_stays_one() -> None:
+def test_a_cell_with_a_large_sigma_may_be_a_hazard_but_not_free() -> None:
     flat = np.zeros((80, 80))
     flat[60:64, 60:64] = 0.4
     sigma = np.full(flat.shape, 0.02)
@@ -292,7 +286,7 @@ def test_a_cell_whose_height_is_not_known_to_a_step_is_not_free_and_a_hazard_sta
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("method", ["rover", "absolute"])
-def test_heights_that_are_not_finite_are_unknown_and_extremes_that_are_not_count_for_nothing(method: str) -> None:
+def test_heights_that_are_not_finite_are_unknown(method: str) -> None:
     flat = np.zeros((40, 40))
     infinite, top, bottom = flat.copy(), flat.copy(), flat.copy()
     infinite[5, 5], infinite[6, 6] = np.inf, -np.inf
@@ -302,7 +296,7 @@ def test_heights_that_are_not_finite_are_unknown_and_extremes_that_are_not_count
     assert result.cells[5, 5] == result.cells[6, 6] == Cell.UNKNOWN
 
 
-def test_one_stray_point_in_a_cell_is_no_hazard_but_a_point_on_a_rock_is() -> None:
+def test_one_stray_point_is_no_hazard_but_a_rock_is() -> None:
     flat = np.zeros((80, 80))
     top = flat.copy()
     top[40, 40] = 0.5
@@ -317,7 +311,7 @@ def test_rubble_too_low_to_be_a_step_is_too_rough() -> None:
     assert (result.reason == CellReason.ROUGHNESS).mean() > 0.95
 
 
-def test_what_was_not_seen_is_unknown_never_free() -> None:
+def test_unseen_cells_are_unknown() -> None:
     terrain = rolling_terrain(2)
     seen = np.random.default_rng(0).random((160, 160)) > 0.3
     complete = terrain.elevation.layers
@@ -332,7 +326,7 @@ def test_what_was_not_seen_is_unknown_never_free() -> None:
         np.testing.assert_array_equal(result.cells == Cell.UNKNOWN, unknown)
 
 
-def test_ground_that_nothing_surrounds_is_unknown_and_a_high_face_alone_is_a_hazard() -> None:
+def test_lone_ground_is_unknown_and_a_lone_high_face_is_a_hazard() -> None:
     lone = np.full((80, 80), np.nan)
     lone[40, 40:42] = 0.0
     lone[10, :] = 0.0
@@ -342,7 +336,7 @@ def test_ground_that_nothing_surrounds_is_unknown_and_a_high_face_alone_is_a_haz
     assert face.reason[40, 40] == CellReason.STEP
 
 
-def test_cells_of_fewer_points_than_wanted_and_empty_maps_are_unknown() -> None:
+def test_cells_with_few_points_and_empty_maps_are_unknown() -> None:
     flat = np.zeros((40, 40))
     count = np.full((40, 40), 5.0)
     count[7, 9] = 2
@@ -352,7 +346,7 @@ def test_cells_of_fewer_points_than_wanted_and_empty_maps_are_unknown() -> None:
     assert (decided(map_of(np.full((40, 40), np.nan))).cells == Cell.UNKNOWN).all()
 
 
-def test_the_papers_rule_calls_a_gentle_slope_a_hazard_and_the_default_does_not() -> None:
+def test_only_the_absolute_rule_makes_a_gentle_slope_a_hazard() -> None:
     x, _ = grid(160)
     gentle = map_of(np.tan(np.deg2rad(3)) * x)
     absolute = Binarise(method="absolute")(gentle)
@@ -368,7 +362,7 @@ def test_the_grid_of_the_map_is_kept() -> None:
     assert result.cells.shape == elevation.shape
 
 
-def test_a_height_on_too_few_points_is_never_free_but_may_be_a_hazard() -> None:
+def test_a_splatted_cell_may_be_a_hazard_but_not_free() -> None:
     height, count = np.zeros((80, 80)), np.full((80, 80), 5.0)
     height[20:23, 20:23] = 0.4
     count[20:23, 20:23] = count[40, 40] = 0.5
@@ -378,7 +372,7 @@ def test_a_height_on_too_few_points_is_never_free_but_may_be_a_hazard() -> None:
     assert (navigation.cells[19, 19:24] == Cell.HAZARD).all()
 
 
-def test_about_an_obstacle_lie_hazards_then_cells_that_are_not_free() -> None:
+def test_an_obstacle_is_surrounded_by_hazard_and_unsure_cells() -> None:
     height = np.zeros((80, 80))
     height[40, 40] = 0.4
     navigation = decided(map_of(height))
@@ -388,8 +382,8 @@ def test_about_an_obstacle_lie_hazards_then_cells_that_are_not_free() -> None:
     assert navigation.cells[40, 39:44].tolist() == [Cell.HAZARD] * 3 + [Cell.UNKNOWN, Cell.FREE]
 
 
-def test_a_cell_of_which_no_steepness_is_known_is_not_free() -> None:
-    """An obstacle lower than a rover's step: its top takes no part in planes."""
+def test_a_cell_without_a_steepness_is_not_free() -> None:
+    """The top of an obstacle lower than a step is in no plane."""
     height = np.zeros((80, 80))
     height[40:43, 40:43] = 0.25
     navigation = decided(map_of(height), rover=Rover(max_step=0.4, ground_clearance=0.5))

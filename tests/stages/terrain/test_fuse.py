@@ -1,4 +1,4 @@
-"""The regional map: many frames on one grid, joined, weighted, and corrected by what came later."""
+"""Fuse merges many frames into one grid: aligned, weighted, and corrected by later frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import pytest
 
 from stages import Binarise, Cell, Fuse, PixelOrigin, TerrainFeatures
 from stages.data.tiles import Tiles
-from stages.terrain.map_registration import placement, sight_of
+from stages.terrain.fused_map import SHARED_SHARE
+from stages.terrain.map_registration import frame_grid, register
 from tests.stages.running import Running
 from tests.stages.terrain.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
 
@@ -44,16 +45,16 @@ def test_a_rock_seen_from_two_headings_stands_where_it_is():
     assert (x[rock].mean(), y[rock].mean()) == (pytest.approx(1.0, abs=0.01), pytest.approx(2.0, abs=0.01))
 
 
-def test_cells_hidden_from_all_frames_are_told_apart_from_those_never_looked_at(monkeypatch):
+def test_cells_hidden_from_all_frames_differ_from_cells_out_of_view(monkeypatch):
     def hiding(*arguments):
-        sight = sight_of(*arguments)
-        x, y = centres(sight.terrain)
+        frame = frame_grid(*arguments)
+        x, y = centres(frame.terrain)
         looked = np.hypot(x, y) < 3
-        ceiling = np.where(~sight.known & looked, next(heights), np.nan).astype(np.float32)
-        return replace(sight, terrain=replace(sight.terrain, layers={**sight.terrain.layers, "ceiling": ceiling}))
+        ceiling = np.where(~frame.known & looked, next(heights), np.nan).astype(np.float32)
+        return replace(frame, terrain=replace(frame.terrain, layers={**frame.terrain.layers, "ceiling": ceiling}))
 
     heights = iter((-0.2, -0.1))
-    monkeypatch.setattr("stages.terrain.fuse.sight_of", hiding)
+    monkeypatch.setattr("stages.terrain.fuse.frame_grid", hiding)
     fuse = Running(Fuse())
     fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
     terrain = fuse(*drive(1, flat, at=(0.0, 0.0, 1.2)), MOUNT)
@@ -72,7 +73,7 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance():
     ]
     clouds[1] = (clouds[1][0], replace(clouds[1][1], position=[0, 0, 0]))
     clouds[1] = (replace(clouds[1][0], points=clouds[1][0].points + np.float32([0, 0, 0.01])), clouds[1][1])
-    local = [sight_of(cloud, placement(cloud, pose, MOUNT)[0], 0.05, 8.0).terrain.layers for cloud, pose in clouds]
+    local = [frame_grid(cloud, register(cloud, pose, MOUNT)[0], 0.05, 8.0).terrain.layers for cloud, pose in clouds]
     for cloud, pose in clouds:
         terrain = fuse(cloud, pose, MOUNT)
     one, other = (layers["variance"].astype(float) + fuse.alignment_sigma**2 for layers in local)
@@ -81,21 +82,21 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance():
     both = np.isfinite(one) & np.isfinite(other)
     assert both.sum() > 10_000
     np.testing.assert_allclose(elevation[both], (0.01 * share)[both], atol=1e-6)
-    variance = (1 - fuse.shared_share) / (1 / one + 1 / other) + fuse.shared_share * np.minimum(one, other)
+    variance = (1 - SHARED_SHARE) / (1 / one + 1 / other) + SHARED_SHARE * np.minimum(one, other)
     np.testing.assert_allclose(terrain.layers["variance"][40:360, 40:360][both], variance[both], rtol=2e-3)
 
 
-def test_a_frame_is_surer_of_level_cells_than_of_steep_ones_for_its_place_is_not_sure():
-    spread, steep = {}, 0.2
+def test_position_errors_add_to_the_variance_of_steep_cells():
+    variance, steep = {}, 0.2
     for position in (0.0, 0.05):
         terrain = Running(Fuse(position_sigma=position))(*drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0)), MOUNT)
-        spread[position] = terrain.layers["variance"]
-    known = np.isfinite(spread[0.0])
-    added = float(np.mean((spread[0.05] - spread[0.0])[known]))
+        variance[position] = terrain.layers["variance"]
+    known = np.isfinite(variance[0.0])
+    added = float(np.mean((variance[0.05] - variance[0.0])[known]))
     assert added == pytest.approx((0.05 * steep) ** 2, rel=0.3)
 
 
-def test_many_frames_of_one_place_do_not_make_it_known_beyond_what_they_share():
+def test_many_frames_do_not_reduce_the_variance_they_share():
     fuse = Running(Fuse(alignment_sigma=0.01, position_sigma=0.0))
     for frame in range(40):
         cloud, pose = drive(frame, at=(0.0, 0.0, 0.3))
@@ -103,11 +104,11 @@ def test_many_frames_of_one_place_do_not_make_it_known_beyond_what_they_share():
         if frame == 0:
             single = terrain.layers["variance"]
     known = (terrain.layers["frames"] > 35) & np.isfinite(single)
-    assert np.all(terrain.layers["variance"][known] >= 0.99 * fuse.shared_share * np.nanmin(single))
+    assert np.all(terrain.layers["variance"][known] >= 0.99 * SHARED_SHARE * np.nanmin(single))
     assert np.all(terrain.layers["variance"][known] <= single[known])
 
 
-def test_cells_know_when_and_by_how_many_frames_they_were_seen():
+def test_cells_count_their_frames_and_keep_their_first_and_last_time():
     fuse = Running(Fuse())
     for frame in range(6):
         cloud, pose = drive(frame, at=(1.0 * frame, 0.0, 0.0))
@@ -119,7 +120,7 @@ def test_cells_know_when_and_by_how_many_frames_they_were_seen():
 
 
 @pytest.mark.parametrize("gap", [0.0, 5.0, 12.0])
-def test_a_height_that_drifts_by_and_by_joins_after_a_gap_and_makes_no_step(gap):
+def test_a_drifting_height_aligns_after_a_gap_and_makes_no_step(gap):
     fuse = Running(Fuse())
     for frame in range(90):
         along = 0.25 * frame + (gap if frame >= 60 else 0.0)
@@ -131,7 +132,7 @@ def test_a_height_that_drifts_by_and_by_joins_after_a_gap_and_makes_no_step(gap)
     assert not (Binarise()(TerrainFeatures()(terrain)).cells[known] == Cell.HAZARD).any()
 
 
-def test_a_clock_that_jumps_by_years_leaves_the_map_as_it_is():
+def test_a_clock_that_jumps_by_years_keeps_the_map():
     fuse = Running(Fuse())
     for frame in range(2):
         fuse(*drive(frame, flat, at=(0.0, 0.0, 0.0)), MOUNT)
@@ -141,7 +142,7 @@ def test_a_clock_that_jumps_by_years_leaves_the_map_as_it_is():
     assert np.nanmax(terrain.layers["frames"]) == 3
 
 
-def test_a_pose_whose_frame_has_no_name_makes_the_map_that_a_named_one_does():
+def test_a_pose_in_a_frame_without_a_name_makes_the_same_map():
     maps = {}
     for name in ("odom", ""):
         fuse = Running(Fuse())
@@ -157,7 +158,7 @@ def with_box(x, y):
     return np.where((np.abs(x - 4) < 0.4) & (np.abs(y) < 0.4), 0.5, 0.0)
 
 
-def test_newer_evidence_clears_what_is_gone_and_says_since_when():
+def test_newer_frames_clear_an_obstacle_that_is_gone():
     fuse = Running(Fuse())
     for frame in range(10):
         cloud, pose = drive(frame, with_box if frame < 5 else flat, at=(0.05 * frame, 0.0, 0.0))
@@ -171,7 +172,7 @@ def test_newer_evidence_clears_what_is_gone_and_says_since_when():
     assert cell(terrain, 3.02, 0.02, "first") == 0.0
 
 
-def test_one_uncertain_frame_does_not_overturn_what_many_saw():
+def test_one_uncertain_frame_does_not_overturn_many():
     fuse = Running(Fuse())
     for frame in range(6):
         cloud, pose = drive(frame, with_box, at=(0.05 * frame, 0.0, 0.0))
@@ -209,7 +210,7 @@ def test_equal_frames_give_equal_bits():
     assert maps[0] == maps[1]
 
 
-def test_an_obstacle_that_appears_is_never_stated_to_be_flat_ground():
+def test_an_obstacle_that_appears_is_never_mapped_as_sure_flat_ground():
     fuse = Running(Fuse())
     for frame in range(16):
         ground, sigma = (with_box, 0.05) if frame >= 10 else (flat, 0.01)
@@ -229,7 +230,7 @@ def test_an_empty_cloud_changes_nothing():
     assert np.isfinite(fuse(*drive(1), MOUNT).layers["elevation"]).any()
 
 
-def test_points_whose_error_is_not_known_do_not_enter_the_map():
+def test_points_without_a_sigma_do_not_enter_the_map():
     fuse, (cloud, pose) = Running(Fuse()), drive(0)
     unsure = cloud.sigma.copy()
     left = cloud.points[:, 1] > 0
@@ -241,17 +242,17 @@ def test_points_whose_error_is_not_known_do_not_enter_the_map():
     assert np.abs(terrain.layers["elevation"] - rolling(*centres(terrain)))[known].max() < 0.03
 
 
-def test_what_refinement_made_up_is_no_evidence_for_the_map():
+def test_filled_points_do_not_enter_the_map():
     cloud, pose = drive(0)
-    guessed = cloud.points[:, 1] > 0
-    made_up = replace(cloud, source=np.where(guessed, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8))
-    terrain, expected = Running(Fuse())(made_up, pose, MOUNT), Running(Fuse())(part(cloud, ~guessed), pose, MOUNT)
+    filled = cloud.points[:, 1] > 0
+    partly_filled = replace(cloud, source=np.where(filled, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8))
+    terrain, expected = Running(Fuse())(partly_filled, pose, MOUNT), Running(Fuse())(part(cloud, ~filled), pose, MOUNT)
     assert np.isfinite(terrain.layers["elevation"]).any()
     for name, layer in expected.layers.items():
         np.testing.assert_array_equal(terrain.layers[name], layer)
 
 
-def test_a_window_that_cannot_hold_what_a_frame_changes_is_refused():
+def test_a_window_smaller_than_a_frame_is_refused():
     with pytest.raises(ValueError, match=r"Fuse\.window must be at least 19 m, not 15 m"):
         Fuse(max_range=8.0, window=15.0)
 
@@ -280,9 +281,9 @@ print(cells, sum(tile.nbytes for tile in tiles) / 1e6, peak() - before)
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux, to tell the memory of a process")
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the memory of a process as Linux does")
 @pytest.mark.parametrize("metres", [160, pytest.param(1000, marks=pytest.mark.slow)])
-def test_a_kilometre_of_20_metres_width_fits_into_500_megabytes(metres):
+def test_a_kilometre_20_metres_wide_fits_into_500_megabytes(metres):
     done = subprocess.run([sys.executable, "-c", TRACK, str(metres)], capture_output=True, text=True, check=True)
     cells, map_size, grown = (float(value) for value in done.stdout.split())
     assert cells == pytest.approx(metres * 20 / 0.05**2, rel=0.01)

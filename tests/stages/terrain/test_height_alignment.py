@@ -1,4 +1,4 @@
-"""The plane that joins a frame to the map: found in spite of what changed, and never larger than can be believed."""
+"""The plane that aligns a frame to the map: robust to changes, and bounded by its prior."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def differences(plane, count=4000, seed=1, noise=0.01):
     return x, y, plane[0] + plane[1] * x + plane[2] * y + noise * rng.normal(size=count)
 
 
-def test_a_plane_is_found_though_a_fifth_of_the_ground_has_changed():
+def test_a_plane_is_found_although_a_fifth_of_the_ground_has_changed():
     plane = np.array([0.02, 0.006, -0.004])
     x, y, off = differences(plane)
     off[x > 6.5] -= 0.3
@@ -34,7 +34,7 @@ def test_a_few_cells_do_not_tilt_a_frame():
 
 
 @pytest.mark.parametrize("fixed", [0, 1, 2])
-def test_what_is_known_exactly_stays(fixed):
+def test_a_number_with_a_zero_sigma_stays_zero(fixed):
     expected = EXPECTED.copy()
     expected[fixed] = 0
     x, y, off = differences(np.array([0.02, 0.006, -0.004]))

@@ -1,4 +1,4 @@
-"""Where a frame lies on the regional map: joined to what is there, refused where it fits nowhere, begun anew."""
+"""Frames are aligned to the regional map, refused where they do not fit, and reset it if that continues."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import Severity
 from stages import Fuse, Pose, Transform
-from stages.terrain.map_registration import placement
+from stages.terrain.map_registration import register
 from tests.stages.running import Running
 from tests.stages.terrain.region_scene import MOUNT, START, drive, flat, part
 
@@ -23,11 +23,11 @@ def heights(cloud, placed):
         return np.bincount(cells, points[:, 2], 160_000) / np.bincount(cells, minlength=160_000)
 
 
-def test_frames_with_errors_of_their_tilt_join_without_a_seam():
+def test_frames_with_tilt_errors_join_without_a_seam():
     rng, fuse, seams, before = np.random.default_rng(3), Running(Fuse()), [], None
     for frame in range(12):
         cloud, pose = drive(frame, tilt=tuple(rng.normal(0, np.radians(0.4), 2)), noise=0.01)
-        now = [heights(cloud, placed) for placed in (placement(cloud, pose, MOUNT)[0], fuse(cloud, pose, MOUNT).level)]
+        now = [heights(cloud, placed) for placed in (register(cloud, pose, MOUNT)[0], fuse(cloud, pose, MOUNT).level)]
         if before is not None:
             off = [one - other for one, other in zip(before, now, strict=True)]
             seams.append([1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) for values in off])
@@ -38,20 +38,20 @@ def test_frames_with_errors_of_their_tilt_join_without_a_seam():
     assert np.max(seams, axis=0)[1] < 0.008
 
 
-def test_the_tilt_error_of_the_first_frame_fades_and_does_not_swing_back():
+def test_the_tilt_error_of_the_first_frame_fades_without_overshoot():
     fuse, lean, found = Running(Fuse()), np.radians(0.6), []
     for frame in range(61):
         cloud, pose = drive(frame, flat, tilt=(lean if frame == 0 else 0.0, 0.0), at=(0.25 * frame, 0.0, 0.0))
         placed = fuse(part(cloud, np.s_[::10]), pose, MOUNT).level
         found.append(np.arcsin(placed.rotation[2, 0]) / lean)
-    assert 0.7 < found[1] < 1.0  # it joins the map much as that is
+    assert 0.7 < found[1] < 1.0  # aligned to the map
     assert abs(found[40]) < 0.15
     assert abs(found[60]) < 0.1
     assert min(found) > -0.1
     assert abs(placed.translation[2]) < 0.1
 
 
-def test_a_pose_of_the_camera_is_as_good_as_one_of_the_rover():
+def test_a_pose_of_the_camera_gives_the_map_of_a_pose_of_the_rover():
     cloud, pose = drive(3)
     base = Transform("odom", "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
     camera = base.after(MOUNT.base_from_camera)
@@ -69,7 +69,7 @@ def test_roll_and_pitch_of_the_pose_do_not_tilt_the_map():
     tilted = Rotation.from_quat(pose.quaternion) * Rotation.from_euler("yx", [8, -5], degrees=True)
     level = Transform("level", "base_link", Rotation.from_euler("yx", [8, -5], degrees=True).as_matrix(), np.zeros(3))
     cloud = replace(cloud, sensor=level.after(MOUNT.base_from_camera))
-    placed, _ = placement(cloud, replace(pose, quaternion=tilted.as_quat()), MOUNT)
+    placed, _ = register(cloud, replace(pose, quaternion=tilted.as_quat()), MOUNT)
     np.testing.assert_allclose(placed.rotation, Rotation.from_quat(pose.quaternion).as_matrix(), atol=1e-9)
     np.testing.assert_allclose(placed.translation, pose.position, atol=1e-9)
 
@@ -81,38 +81,38 @@ def upside_down(pose):
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("change", "message"),
     [
         (lambda cloud, pose: (replace(cloud, frame_id="camera", sensor=None), pose), "it needs Level"),
-        (lambda cloud, pose: (cloud, replace(pose, child_frame_id="mast")), "the pose is that of 'mast', and nothing"),
+        (lambda cloud, pose: (cloud, replace(pose, child_frame_id="mast")), "the pose is of 'mast', and no transform"),
         (lambda cloud, pose: (cloud, upside_down(pose)), "180 degrees off the vertical .* whose z points up"),
-        (lambda cloud, pose: (replace(cloud, stamp=START), pose), "comes after"),
+        (lambda cloud, pose: (replace(cloud, stamp=START), pose), "is not later than the last one"),
     ],
 )  # fmt: skip
-def test_a_frame_that_cannot_be_placed_is_refused_and_leaves_the_map_as_it_was(change, sentence):
+def test_a_frame_that_cannot_be_registered_does_not_change_the_map(change, message):
     fuse = Running(Fuse())
     fuse(*drive(0), MOUNT)
     before = fuse.state.cells.read(-300, -300, 600, 600)
-    with pytest.raises(ValueError, match=sentence):
+    with pytest.raises(ValueError, match=message):
         fuse(*change(*drive(1)), MOUNT)
     np.testing.assert_array_equal(fuse.state.cells.read(-300, -300, 600, 600), before)
 
 
-@pytest.mark.parametrize(("degrees", "told"), [(0, False), (3, False), (12, True)])
-def test_a_pose_in_a_frame_that_leans_is_told(degrees, told):
+@pytest.mark.parametrize(("degrees", "warned"), [(0, False), (3, False), (12, True)])
+def test_a_pose_in_a_frame_that_leans_is_a_warning(degrees, warned):
     fuse, lean = Running(Fuse()), Rotation.from_euler("x", degrees, degrees=True)
     for frame in range(4):
         cloud, pose = drive(frame)
         quaternion = (lean * Rotation.from_quat(pose.quaternion)).as_quat()
         fuse(cloud, replace(pose, position=lean.as_matrix() @ pose.position, quaternion=quaternion), MOUNT)
     found = fuse.finding()
-    assert (found is not None) == told
+    assert (found is not None) == warned
     if found:
         assert "'odom' is 12 degrees off the vertical" in found.sentence
         assert found.severity == "warning"
 
 
-def test_a_frame_that_is_refused_does_not_lean_the_map():
+def test_a_refused_frame_does_not_count_as_leaning():
     fuse, lean = Running(Fuse()), Rotation.from_euler("x", 29, degrees=True)
     for frame in range(3):
         fuse(*drive(frame), MOUNT)
@@ -125,7 +125,7 @@ def test_a_frame_that_is_refused_does_not_lean_the_map():
 
 
 @pytest.mark.parametrize("jump", [np.array([0, 0, up]) for up in (0.6, -0.4, 30.0, -1e3, 1e6)])
-def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jump):
+def test_a_pose_that_jumps_is_refused_and_the_third_time_resets_the_map(jump):
     fuse = Running(Fuse())
     for frame in range(5):
         terrain = fuse(*drive(frame), MOUNT)
@@ -133,20 +133,20 @@ def test_a_pose_that_jumps_is_refused_and_where_it_stays_the_map_begins_anew(jum
         cloud, pose = drive(frame)
         with pytest.raises(ValueError, match=r"m and 0\.0 degrees off the map, .* left out of the regional map"):
             fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
-    again = fuse(*drive(7), MOUNT)  # it was a slip: the map goes on
+    again = fuse(*drive(7), MOUNT)  # the map goes on
     assert fuse.finding() is None
     assert again.layers["frames"].max() > terrain.layers["frames"].max()
     for frame in (8, 9, 10):
         cloud, pose = drive(frame)
         try:
-            anew = fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
+            fresh = fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
         except ValueError:
             assert frame < 10
-    assert anew.layers["frames"].max() == 1
+    assert fresh.layers["frames"].max() == 1
     found = fuse.finding()
     assert found is not None
     assert found.severity is Severity.WARNING
-    assert "began anew in the same frame, odom, 1 time:" in found.sentence
+    assert "The regional map was reset 1 time (frame odom)" in found.sentence
 
 
 def leaning(frame, degrees, up=0.0):
@@ -158,7 +158,7 @@ def leaning(frame, degrees, up=0.0):
 @pytest.mark.parametrize(("sigmas", "degrees"), [
     ({"tilt_sigma": 0.05}, (0, 3, -4, 5, -3, 4)), ({"height_sigma": 0.002}, (0.0, 0.4, -0.3, 0.5, -0.4, 0.3)),
 ])  # fmt: skip
-def test_what_the_stated_errors_of_height_and_tilt_explain_together_is_no_jump(sigmas, degrees):
+def test_a_change_within_the_stated_height_and_tilt_errors_is_no_jump(sigmas, degrees):
     fuse = Running(Fuse(**sigmas))
     for frame, angle in enumerate(degrees):
         terrain = fuse(*leaning(frame, angle), MOUNT)
@@ -166,7 +166,7 @@ def test_what_the_stated_errors_of_height_and_tilt_explain_together_is_no_jump(s
     assert fuse.finding() is None
 
 
-def test_a_tilt_that_jumps_is_told_in_degrees():
+def test_a_tilt_that_jumps_is_refused_with_its_degrees():
     fuse = Running(Fuse())
     for frame in range(3):
         fuse(*drive(frame), MOUNT)
@@ -174,7 +174,7 @@ def test_a_tilt_that_jumps_is_told_in_degrees():
         fuse(*leaning(3, 6), MOUNT)
 
 
-def test_a_pose_in_another_frame_begins_the_map_anew():
+def test_a_pose_in_another_frame_resets_the_map():
     fuse, fresh = Running(Fuse()), Running(Fuse())
     fuse(*drive(0), MOUNT)
     cloud, pose = drive(1)
