@@ -102,7 +102,7 @@ def test_a_log_without_a_pose_gets_one_that_says_it_is_visual(traverse, tmp_path
         place = pose.pose.pose.position
         assert np.linalg.norm([place.x - true[0], place.y - true[1], place.z - true[2]]) < 0.03
     findings = json.loads(summary.read_text())["findings"]
-    said = f"no pose is given: visual odometry supplies it ({FRAMES} poses), in frame visual_odom"
+    said = f"The log contains no pose. Visual odometry supplies it ({FRAMES} poses, frame visual_odom)."
     assert findings["pose"]["sentence"] == said
     assert f"pose: {findings['pose']['sentence']}" in capsys.readouterr().out
 
@@ -111,7 +111,7 @@ def test_the_logs_own_pose_is_kept_and_the_tilt_judged_all_the_same(result):
     poses = [message for topic, _, message in iter_decoded(result) if topic == "/nav/pose"]
     assert {pose.header.frame_id for pose in poses} == {"odom"}
     findings = json.loads(result.with_suffix(".json").read_text())["findings"]
-    assert findings == {"health": {"severity": "note", "sentence": f"too few frames to judge the tilt ({FRAMES})"}}
+    assert findings == {"health": {"severity": "note", "sentence": f"Too few frames to judge the tilt ({FRAMES})."}}
 
 
 def test_a_pipeline_without_a_recording_writes_and_lists_none(traverse, tmp_path, capsys):

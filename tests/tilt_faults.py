@@ -1,4 +1,4 @@
-"""Faults that an inclinometer can have, planted into a log message by message, and a pipeline that looks for them."""
+"""Faults of an inclinometer, written into a log message by message, and a pipeline that looks for them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from recordings.ros2.cdr import TYPES
 from stages.data import Array
 from tests.conftest import rewrite
 
-# What of the default pipeline the check of the tilt and visual odometry need, and no more.
+# The part of the default pipeline that the tilt check and visual odometry need.
 PIPELINE = """
 source: {use: recordings.McapSource}
 streams:
   stereo:    {use: flow.align.pair, left: left, right: right, slop: 5 ms}
   tilt:      {use: flow.align.interpolate, stream: inclinometer, at: stereo, max_gap: 200 ms, smooth: 100 ms}
   mounting:  {use: flow.align.latest, stream: mount, at: stereo}
-  matched:   {use: stages.Match, frame: stereo, disparities: 64, speckle_size: 100}
+  matched:   {use: stages.Match, frame: stereo, disparities: 64, max_speckle_size: 100}
   cloud:     {use: stages.Reproject, frame: stereo, disparity: matched}
   motion:    {use: stages.VisualOdometry, frame: stereo, disparity: matched}
   pose:      {use: stages.PoseFilter, motion: motion, tilt: tilt, mount: mounting}
@@ -43,19 +43,19 @@ def exchanged(up: Array) -> Array:
 
 
 def degrees_as_radians(up: Array) -> Array:
-    """The driver takes its degrees for radians, and makes a quaternion of them."""
+    """The driver takes degrees for radians."""
     pitch, roll = np.rad2deg(np.arcsin(up[:2]))
     return np.array([np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
 
 
 def radians_as_degrees(up: Array) -> Array:
-    """And the other way round."""
+    """The driver takes radians for degrees."""
     pitch, roll = np.deg2rad(np.arcsin(up[:2]))
     return np.array([np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
 
 
 def changed_ups(log: Path, out: Path, change: Change) -> Path:
-    """The log with every tilt changed."""
+    """A copy of the log with every tilt changed."""
 
     def edit(topic: str, index: int, data: bytes) -> bytes:
         if topic != "/imu/inclinometer":
@@ -70,7 +70,7 @@ def changed_ups(log: Path, out: Path, change: Change) -> Path:
 
 
 def turned_mount(log: Path, out: Path, axis: str, degrees: float) -> Path:
-    """The log whose static transform has the inclinometer turned about one of its own axes."""
+    """A copy of the log with the inclinometer rotated about one of its own axes in the static transform."""
 
     def edit(topic: str, index: int, data: bytes) -> bytes:
         if topic != "/tf_static":
@@ -87,7 +87,7 @@ def turned_mount(log: Path, out: Path, axis: str, degrees: float) -> Path:
 
 
 def late_tilts(log: Path, out: Path, seconds: float) -> Path:
-    """The log whose tilts carry stamps that are late by so much."""
+    """A copy of the log with late stamps of the tilts."""
 
     def edit(topic: str, index: int, data: bytes) -> bytes:
         if topic != "/imu/inclinometer":

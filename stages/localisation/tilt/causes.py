@@ -1,6 +1,6 @@
-"""What may be wrong with a tilt: each fault that it can have, as large as suits the evidence best, and how well.
+"""Candidate faults of a tilt, each fitted to the evidence, and how well it explains it.
 
-The camera's turns carry every tilt back to the first frame, where all must point the same way once the fault is undone.
+The camera's rotations transform every tilt to the first frame. There all tilts must be equal once the fault is undone.
 """
 
 from __future__ import annotations
@@ -14,52 +14,48 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from stages.data import Array
 
-GROUND = float(np.deg2rad(8))  # standard deviation of the slope of all ground in view
-PARAMETER = 4.0  # by how much a fault must fit better for each number that is fitted to it
-LEAST_FRAMES = 8
-LONGEST = 0.6  # s, of time offsets that are tried
-SLOWEST = 1.5  # s between frames, beyond which no offset can be told
+GROUND_SIGMA = float(np.deg2rad(8))  # rad, of the mean slope of the ground in view
+PARAMETER_COST = 4.0  # added to the score for each fitted number
+MIN_FRAMES = 8
+MIN_ANGLE = float(np.deg2rad(2.0))  # rad, of a mount error that is a fault
+MIN_OFFSET = 0.08  # s, of a time offset that is a fault
+MAX_OFFSET = 0.6  # s, of the time offsets tried
+MAX_FRAME_GAP = 1.5  # s, for a time offset to be measurable
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What n frames show.
+    """The measurements of n frames."""
 
-    stamps: (n,) int64 ns; segments: (n,) int, within which `cameras`, (n, 3, 3), turn vectors of the camera into those
-    of the segment's first; drift: (n,) rad^2, variance of that turn; ups: (n, 3) in the inclinometer's frame; mount:
-    (3, 3), from there to the camera; ground: (n, 3) upward normal of the ground in view in the camera, NaN if unknown.
-    """
-
-    stamps: Array
-    segments: Array
-    cameras: Array
-    drift: Array
-    ups: Array
-    mount: Array
-    ground: Array
+    stamps: Array  # (n,) int64, ns
+    segments: Array  # (n,) int, of visual odometry
+    cameras: Array  # (n, 3, 3), rotation from the camera to the first camera of its segment
+    drift: Array  # (n,) rad^2, variance of that rotation
+    ups: Array  # (n, 3), in the inclinometer's frame
+    mount: Array  # (3, 3), rotation from the inclinometer to the camera
+    ground: Array  # (n, 3), upward normal of the ground in view, in the camera; NaN if unknown
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """One explanation of the evidence, and how badly it fits: `misfit` in units of a tilt's variance, `ground` of its
-    own."""
+    """One explanation of the evidence."""
 
     fault: str
     remedy: str
-    misfit: float
-    ground: float
-    parameters: int = 0
-    size: float = np.inf  # how large it is, over the least that counts
-    error: float = 0.0  # standard deviation of that, for tilts with that variance
-    undone: Array | None = None  # what then turns the inclinometer's vectors into the camera's
+    misfit: float  # squared residuals, over a tilt's variance
+    ground: float  # squared slope of the ground, over its variance
+    parameters: int = 0  # fitted numbers
+    size: float = np.inf  # over the smallest that is a fault
+    error: float = 0.0  # standard deviation of the size, for tilts with that variance
+    undone: Array | None = None  # the corrected rotation from the inclinometer to the camera
 
     def score(self, variance: float) -> float:
-        """How badly it explains tilts with that variance; each number that is fitted must pay."""
-        return self.misfit / variance + self.ground + PARAMETER * self.parameters
+        """Misfit in all, for tilts with that variance; the lowest score is the best explanation."""
+        return self.misfit / variance + self.ground + PARAMETER_COST * self.parameters
 
 
 class Fit:
-    """How well tilts, changed by some hypothesis, agree once the camera's turns carry them to one frame."""
+    """How well tilts agree under a hypothesis, once the camera's rotations transform them to one frame."""
 
     def __init__(self, evidence: Evidence, noise: float) -> None:
         self.evidence, self.noise = evidence, noise
@@ -69,33 +65,32 @@ class Fit:
         self.normal = evidence.ground[known].mean(axis=0) if known.any() else None
         self.known = known
 
-    def carried(self, ups: Array, cameras: Array | None = None) -> Array:
-        """Residuals (n, 3), whitened, of directions in the camera."""
+    def residuals(self, ups: Array, cameras: Array | None = None) -> Array:
+        """Whitened residuals (n, 3) of directions in the camera."""
         turned = np.einsum("kij,kj->ki", self.evidence.cameras if cameras is None else cameras, ups)
-        residuals: Array = self.operator @ turned
-        return residuals
+        return np.asarray(self.operator @ turned)
 
     def misfit(self, undo: Array) -> float:
-        """The squared residuals after `undo`, (3, 3), has changed the inclinometer's vectors."""
+        """Squared residuals after `undo`, (3, 3), is applied to the inclinometer's vectors."""
         return self.misfit_of(self.evidence.ups @ (self.evidence.mount @ undo).T)
 
     def misfit_of(self, ups: Array, cameras: Array | None = None) -> float:
         """The same for directions in the camera."""
-        return float(np.sum(np.square(self.carried(ups, cameras))))
+        return float(np.sum(np.square(self.residuals(ups, cameras))))
 
     def slope(self, undo: Array) -> float:
-        """The squared slope of the ground in view, on the average, in units of what is likely."""
+        """Squared mean slope of the ground in view, over its variance."""
         return self.slope_of(self.evidence.ups @ (self.evidence.mount @ undo).T)
 
     def slope_of(self, ups: Array) -> float:
         """The same for directions in the camera."""
         if self.normal is None:
             return 0.0
-        return float(np.sum(np.square(self.normal - ups[self.known].mean(axis=0)))) / GROUND**2
+        return float(np.sum(np.square(self.normal - ups[self.known].mean(axis=0)))) / GROUND_SIGMA**2
 
 
 def _operator(segments: Array, drift: Array, noise: float) -> Array:
-    """The matrix (n, n) that whitens the residuals of each segment and takes its mean away."""
+    """The matrix (n, n) that whitens the residuals of each segment and removes its mean."""
     n = len(segments)
     covariance = np.where(segments[:, None] == segments, np.minimum(drift[:, None], drift), 0.0)
     first = np.array([drift[segments == segment].min() for segment in segments])
@@ -108,7 +103,7 @@ def _operator(segments: Array, drift: Array, noise: float) -> Array:
 
 
 def exchanged_axes(fit: Fit) -> list[Cause]:
-    """Flipped signs and exchanged axes; a motion alone does not tell up from down."""
+    """Flipped signs and exchanged axes; motion alone does not determine the sign of up."""
     return [
         Cause(fault, remedy, fit.misfit(undo), fit.slope(undo), 1, undone=fit.evidence.mount @ undo)
         for fault, remedy, undo in _exchanges()
@@ -118,7 +113,7 @@ def exchanged_axes(fit: Fit) -> list[Cause]:
 
 @cache
 def _exchanges() -> tuple[tuple[str, str, Array], ...]:
-    """Flipped signs and exchanged axes: their names, what to do, and the matrix that undoes each."""
+    """Flipped signs and exchanged axes: name, remedy, and the matrix that undoes each."""
     found = []
     for swapped, x, y, z in product((False, True), (1, -1), (1, -1), (1, -1)):
         if (swapped, x, y, z) == (False, 1, 1, 1):
@@ -132,26 +127,26 @@ def _exchanges() -> tuple[tuple[str, str, Array], ...]:
             parts.append(f"{flipped} {'are' if len(names) > 1 else 'is'} flipped")
         settings = ["the fields of source.pitch and source.roll"] if swapped else []
         settings += [f"source.{name}.sign" for name in names if name != "up"]
-        settings += ["whether up or down is meant"] if z < 0 else []
-        remedy = f"check {' and '.join(settings)}, or the axes of the inclinometer's driver"
+        settings += ["the direction of up"] if z < 0 else []
+        remedy = f"Check {' and '.join(settings)}, or the axes of the inclinometer's driver."
         found.append((" and ".join(parts), remedy, undo))
     return tuple(found)
 
 
 def radians_as_degrees(fit: Fit) -> Cause | None:
-    """Radians taken for degrees: the tilt hardly leaves the vertical; None where it leaves that too far."""
+    """Radians taken for degrees, which makes the tilt nearly vertical; None if it is too large for that."""
     level = fit.evidence.ups[:, :2] * (180 / np.pi)
     rest = 1 - np.sum(np.square(level), axis=1)
     if np.any(rest < 0):
         return None
     ups = np.column_stack([level, np.sqrt(rest)]) @ fit.evidence.mount.T
-    remedy = "check the unit of source.pitch and source.roll (rad, not deg), or the inclinometer's driver"
+    remedy = "Check the unit of source.pitch and source.roll (rad, not deg), or the inclinometer's driver."
     return Cause("radians are taken for degrees", remedy, fit.misfit_of(ups), fit.slope_of(ups), 1)
 
 
 @cache
 def _right_angles() -> Array:
-    """The 24 rotations (24, 3, 3) that map axes to axes; the first is none."""
+    """The 24 rotations (24, 3, 3) that map axes to axes, the identity first."""
     found = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         matrix = np.diag(signs)[list(order)]
@@ -160,8 +155,8 @@ def _right_angles() -> Array:
     return np.array(sorted(found, key=lambda matrix: -np.trace(matrix)))
 
 
-def wrong_mount(fit: Fit, least: float) -> Cause:
-    """The rotation that the mount lacks, by Gauss-Newton from the most fitting of all right angles."""
+def wrong_mount(fit: Fit) -> Cause:
+    """The rotation missing from the mount, by Gauss-Newton from the best of the right angles."""
     mount = fit.evidence.mount
     starts = [mount @ turn @ mount.T for turn in _right_angles()]
     cost = [fit.misfit_of(fit.ups @ s.T) + fit.slope_of(fit.ups @ s.T) for s in starts]
@@ -171,34 +166,34 @@ def wrong_mount(fit: Fit, least: float) -> Cause:
         # d(exp(e) u) / de = -[u]x
         x, y, z = ups.T
         o = np.zeros_like(x)
-        slopes = np.array([[o, z, -y], [-z, o, x], [y, -x, o]]).transpose(2, 0, 1)
-        carried = np.einsum("kij,kjl->kil", fit.evidence.cameras, slopes)
-        columns = np.einsum("mk,kil->mil", fit.operator, carried).reshape(-1, 3)
-        normal = columns.T @ columns + np.eye(3)  # what the motion cannot tell stays where it is
-        change = -np.linalg.solve(normal, columns.T @ fit.carried(ups).ravel())
+        jacobian = np.array([[o, z, -y], [-z, o, x], [y, -x, o]]).transpose(2, 0, 1)
+        turned = np.einsum("kij,kjl->kil", fit.evidence.cameras, jacobian)
+        columns = np.einsum("mk,kil->mil", fit.operator, turned).reshape(-1, 3)
+        normal = columns.T @ columns + np.eye(3)  # a prior for directions that the motion does not determine
+        change = -np.linalg.solve(normal, columns.T @ fit.residuals(ups).ravel())
         turn = Rotation.from_rotvec(change).as_matrix() @ turn
     ups = fit.ups @ turn.T
     error = Rotation.from_matrix(turn).as_rotvec()
     angle = float(np.linalg.norm(error))
-    spread = float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(normal))[-1]))
+    sigma = float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(normal))[-1]))
     along = mount.T @ error / max(angle, 1e-12)
     x, y, z, w = Rotation.from_matrix(turn @ mount).as_quat(canonical=True)
     fault = f"the mount of the inclinometer is wrong by {degrees(angle)}"
     remedy = (
-        f"it is turned by that about ({along[0]:.2f}, {along[1]:.2f}, {along[2]:.2f}) of its own axes; check "
-        f"/tf_static, or set source.camera_from_inclinometer to [{x:.4f}, {y:.4f}, {z:.4f}, {w:.4f}]"
+        f"It is rotated by {degrees(angle)} about axis ({along[0]:.2f}, {along[1]:.2f}, {along[2]:.2f}). Check "
+        f"/tf_static, or set source.camera_from_inclinometer to [{x:.4f}, {y:.4f}, {z:.4f}, {w:.4f}]."
     )
     return Cause(
-        fault, remedy, fit.misfit_of(ups), fit.slope_of(ups), 3, angle / least, spread / least, turn @ mount
+        fault, remedy, fit.misfit_of(ups), fit.slope_of(ups), 3, angle / MIN_ANGLE, sigma / MIN_ANGLE, turn @ mount
     )  # fmt: skip
 
 
-def late_stamps(whole: Fit, sound: Cause, least: float) -> Cause | None:
-    """The time by which the tilt's stamps are late; None where frames are too far apart or too few to tell."""
+def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
+    """The delay of the tilt's stamps; None if frames are too far apart or too few to measure it."""
     evidence = whole.evidence
     within, splines = _splines(evidence)
     kept = within >= 0
-    if np.count_nonzero(kept) < LEAST_FRAMES:
+    if np.count_nonzero(kept) < MIN_FRAMES:
         return None
     part = Evidence(
         evidence.stamps[kept], evidence.segments[kept], evidence.cameras[kept], evidence.drift[kept],
@@ -216,29 +211,28 @@ def late_stamps(whole: Fit, sound: Cause, least: float) -> Cause | None:
         return fit.misfit_of(fit.ups, cameras)
 
     step = 0.05
-    times = np.arange(-LONGEST, LONGEST + step / 2, step)
+    times = np.arange(-MAX_OFFSET, MAX_OFFSET + step / 2, step)
     costs = np.array([misfit(float(late)) for late in times])
-    place = int(np.clip(np.argmin(costs), 1, len(times) - 2))
-    low, middle, high = costs[place - 1 : place + 2]
-    bend = max((low - 2 * middle + high) / step**2, 1e-9)
-    late = float(np.clip(times[place] - (high - low) / (2 * step) / bend, -LONGEST, LONGEST))
+    lowest = int(np.clip(np.argmin(costs), 1, len(times) - 2))
+    low, middle, high = costs[lowest - 1 : lowest + 2]
+    curvature = max((low - 2 * middle + high) / step**2, 1e-9)
+    late = float(np.clip(times[lowest] - (high - low) / (2 * step) / curvature, -MAX_OFFSET, MAX_OFFSET))
     misfit_best = misfit(late)
     gained = misfit(0.0) - misfit_best
-    way = "late" if late > 0 else "early"
-    fault = f"the tilt's stamps are {abs(late) * 1000:.0f} ms {way}"
-    remedy = "check the clocks of camera and inclinometer, and what delays the driver"
+    fault = f"the tilt's stamps are {abs(late) * 1000:.0f} ms {'late' if late > 0 else 'early'}"
+    remedy = "Check the clocks of camera and inclinometer, and delays in the driver."
     return Cause(
-        fault, remedy, max(sound.misfit - gained, misfit_best), sound.ground, 1, abs(late) / least,
-        float(np.sqrt(2 / bend)) / least,
+        fault, remedy, max(sound.misfit - gained, misfit_best), sound.ground, 1, abs(late) / MIN_OFFSET,
+        float(np.sqrt(2 / curvature)) / MIN_OFFSET,
     )  # fmt: skip
 
 
 def _splines(evidence: Evidence) -> tuple[Array, dict[int, RotationSpline]]:
-    """Per stretch of rising stamps without long gaps the camera's turn as a function of time, s; and for each frame its
-    stretch, -1 for one that does not lie `LONGEST` within its own."""
+    """The camera's rotation over time, s, for each stretch of rising stamps without long gaps; and the stretch of each
+    frame, -1 within `MAX_OFFSET` of its ends."""
     seconds = (evidence.stamps - evidence.stamps[0]) / 1e9
     steps = np.diff(seconds)
-    breaks = (steps <= 0) | (steps > SLOWEST) | (np.diff(evidence.segments) != 0)
+    breaks = (steps <= 0) | (steps > MAX_FRAME_GAP) | (np.diff(evidence.segments) != 0)
     stretches = np.concatenate([[0], np.cumsum(breaks)])
     within, splines = np.full(len(seconds), -1), dict[int, RotationSpline]()
     for stretch in np.unique(stretches):
@@ -247,11 +241,11 @@ def _splines(evidence: Evidence) -> tuple[Array, dict[int, RotationSpline]]:
         if len(times) < 4:
             continue
         splines[int(stretch)] = RotationSpline(times, Rotation.from_matrix(evidence.cameras[inside]))
-        within[inside & (seconds - LONGEST >= times[0]) & (seconds + LONGEST <= times[-1])] = stretch
+        within[inside & (seconds - MAX_OFFSET >= times[0]) & (seconds + MAX_OFFSET <= times[-1])] = stretch
     return within, splines
 
 
 def degrees(angle: float) -> str:
-    """An angle, rad, in words."""
+    """An angle, rad, as text in degrees."""
     size = float(np.rad2deg(angle))
     return f"{size:.2f} degrees" if size < 1 else f"{size:.1f} degrees"

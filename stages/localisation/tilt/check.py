@@ -1,7 +1,7 @@
-"""CheckTilt: can the tilt be believed? The camera and the ground it sees are asked, no truth is needed.
+"""CheckTilt: is the tilt consistent with the camera and the ground that it sees?
 
-Frames between which the rover has moved are kept, the last fifty of them, and `tilt_diagnosis` tries on them every
-fault that a tilt can have. A rover that stands still proves nothing and crowds nothing out.
+The last frames between which the rover has moved are kept, and `diagnosis` tries every fault of a tilt on them. Frames
+of a rover that stands still add no information and are not kept.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from stages.localisation.tilt.diagnosis import INCONSISTENT, Diagnosis, diagnose
 from stages.robust_weights import MAD_TO_SIGMA, tukey_weights
 from stages.stage import Stage, parameter
 
-MOVED = 0.05  # m, or
-TURNED = float(np.deg2rad(0.3))  # rad, by which a frame must differ from the one kept before
-GROUND_FROM, GROUND_TO = 0.5, 8.0  # m of depth, of the ground that a plane is laid through
-GROUND_POINTS = 4000
-GROUND_ROUNDS = 6
-GROUND_NOISE = 0.03  # m
-NOTHING_YET = Diagnosis("", "no frames to judge the tilt by", False)
+MIN_STEP = 0.05  # m, or
+MIN_TURN = float(np.deg2rad(0.3))  # rad, from the last frame kept
+JUDGEMENT_INTERVAL = 5  # frames kept
+MIN_GROUND_DEPTH, MAX_GROUND_DEPTH = 0.5, 8.0  # m
+MAX_GROUND_POINTS = 4000
+MIN_GROUND_SIGMA = 0.03  # m
+FIT_ROUNDS = 6
+NO_JUDGEMENT = Diagnosis("", "No frames to judge the tilt by.", False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,149 +42,155 @@ class _TiltSample:
 
 @dataclass(frozen=True)
 class _Verdict:
-    """What all judgements come to. last: of them; fault: the one to tell at the end, None where none was found; faults:
-    how many judgements found one; clear: how many found one or could rule out all."""
+    """All judgements so far."""
 
-    last: Diagnosis = NOTHING_YET
-    fault: Diagnosis | None = None
-    faults: int = 0
-    clear: int = 0
+    last: Diagnosis = NO_JUDGEMENT
+    fault: Diagnosis | None = None  # to report at the end
+    faults: int = 0  # judgements that found a fault
+    clear: int = 0  # judgements that found a fault or could rule out all
 
     def and_then(self, judged: Diagnosis) -> _Verdict:
         """The verdict after one more judgement."""
         if not judged.fault:
             return replace(self, last=judged, clear=self.clear + judged.clear)
-        vague = judged.fault == INCONSISTENT  # as where a fault begins or ends
-        told = self.fault if vague and self.fault is not None else judged
-        return _Verdict(judged, told, self.faults + 1, self.clear + 1)
+        vague = judged.fault == INCONSISTENT  # as when a fault begins or ends
+        reported = self.fault if vague and self.fault is not None else judged
+        return _Verdict(judged, reported, self.faults + 1, self.clear + 1)
 
 
 @dataclass
 class TiltMemory:
-    """The frames that count, the last frame of all, how many were kept since they were judged, the verdict, and the
-    least angle, rad, by which the ground was off level in any frame that shows it, with the number of these."""
+    """The state of `CheckTilt`."""
 
     kept: deque[_TiltSample] = field(default_factory=deque)
     last: _TiltSample | None = None
-    since: int = 0
+    since: int = 0  # frames kept since the last judgement
     verdict: _Verdict = field(default_factory=_Verdict)
-    least_slope: float = np.inf
-    slopes: int = 0
+    min_slope: float = np.inf  # rad, between up and the ground in any frame that shows it
+    slopes: int = 0  # number of those frames
 
 
 @dataclass(frozen=True)
 class CheckTilt(Stage):
-    """Judges the tilt; it remembers, so it takes frames in order."""
+    """Compares the tilt with the camera's rotation and the ground in view.
 
-    window: int = parameter(50, "frames that a judgement rests on at most", low=10)
-    interval: int = parameter(5, "frames after which the tilt is judged again", low=1)
-    min_angle: float = parameter(
-        np.deg2rad(2.0), "least error of the mount that is called a fault", unit="rad", low=1e-3, high=0.5
-    )
-    min_offset: float = parameter(0.08, "least error of the tilt's stamps that is", unit="s", low=0.01, high=1.0)
+    Examples
+    --------
+    >>> motion = CameraMotion(0, 1, Transform("start", "camera", np.eye(3), np.zeros(3)), np.zeros((6, 6)))
+    >>> check = CheckTilt()
+    >>> state = check.start()
+    >>> check(motion, Tilt(0, [0.0, -1.0, 0.0]), Mount(0, np.eye(3)), state=state).judgement
+    'No frames to judge the tilt by.'
+    >>> check.finding(state).sentence
+    'Too few frames to judge the tilt (1).'
+    """
+
+    window: int = parameter(50, "number of frames behind a judgement, at most", low=10)
 
     def start(self) -> TiltMemory:
-        """The memory of one run, empty."""
+        """The state of one run."""
         return TiltMemory()
 
     def __call__(
         self, motion: CameraMotion, tilt: Tilt, mount: Mount, cloud: PointCloud | None = None, *, state: TiltMemory
     ) -> TiltHealth:
-        """The tilt's health so far. `cloud`, of the same camera, shows the ground; without it only motion counts."""
+        """The tilt's health so far; `cloud`, of the same camera, shows the ground."""
         ground = _ground_normal(cloud) if cloud is not None else np.full(3, np.nan)
         up = mount.camera_from_inclinometer @ tilt.up
         turn = np.nan
         if motion.camera is not None:
             drift = max(float(np.trace(motion.covariance[3:, 3:])) / 3, 0.0)
-            sight = _TiltSample(
+            sample = _TiltSample(
                 motion.stamp, motion.segment, motion.camera, drift, tilt.up, mount.camera_from_inclinometer, ground
             )  # fmt: skip
-            turn = _residual(sight, state.last)
-            state.last = sight
-            self._keep(sight, state)
+            turn = _residual(sample, state.last)
+            state.last = sample
+            self._keep(sample, state)
         slope = np.nan
         if np.isfinite(ground).all():
             slope = _angle(up, ground)
-            state.least_slope, state.slopes = min(state.least_slope, slope), state.slopes + 1
-        judged = _told(state.verdict, state)
+            state.min_slope, state.slopes = min(state.min_slope, slope), state.slopes + 1
+        judged = _reported(state.verdict, state)
         return TiltHealth(motion.stamp, turn, slope, len(state.kept), judged.fault, judged.sentence)
 
     def finding(self, state: TiltMemory) -> Finding:
-        """What to say of the whole run, the frames after the last judgement included; a fault is a warning."""
+        """The verdict of the whole run, including the frames after the last judgement; a fault is a warning."""
         verdict = state.verdict
         if state.since:
-            verdict = verdict.and_then(self._diagnosis(state))
+            verdict = verdict.and_then(_diagnosis(state))
         if verdict.fault is None:
-            told = _told(verdict, state)
-            return Finding(told.sentence, Severity.WARNING if told.fault else Severity.NOTE)
+            judged = _reported(verdict, state)
+            return Finding(judged.sentence, Severity.WARNING if judged.fault else Severity.NOTE)
         where = "" if verdict.faults == verdict.clear else f" ({verdict.faults} of {verdict.clear} judgements)"
         return Finding(verdict.fault.sentence + where, Severity.WARNING)
 
-    def _keep(self, sight: _TiltSample, memory: TiltMemory) -> None:
-        before = memory.kept[-1] if memory.kept else None
-        if before is not None and before.segment == sight.segment:
-            step = before.camera.inverse().after(sight.camera)
-            if np.linalg.norm(step.translation) < MOVED and Rotation.from_matrix(step.rotation).magnitude() < TURNED:
+    def _keep(self, sample: _TiltSample, state: TiltMemory) -> None:
+        """Keep the frame if the rover has moved, and judge again at intervals."""
+        before = state.kept[-1] if state.kept else None
+        if before is not None and before.segment == sample.segment:
+            step = before.camera.inverse().after(sample.camera)
+            turn = Rotation.from_matrix(step.rotation).magnitude()
+            if np.linalg.norm(step.translation) < MIN_STEP and turn < MIN_TURN:
                 return
-        if before is not None and not np.array_equal(before.mount, sight.mount):
-            memory.kept.clear()  # what was seen speaks of another mount
-        memory.kept.append(sight)
-        if len(memory.kept) > self.window:
-            memory.kept.popleft()
-        memory.since += 1
-        if memory.since >= self.interval:
-            memory.verdict, memory.since = memory.verdict.and_then(self._diagnosis(memory)), 0
-
-    def _diagnosis(self, memory: TiltMemory) -> Diagnosis:
-        """What the frames that are kept now show."""
-        kept = memory.kept
-        evidence = Evidence(
-            np.array([sight.stamp for sight in kept]), np.array([sight.segment for sight in kept]),
-            np.array([sight.camera.rotation for sight in kept]), np.array([sight.drift for sight in kept]),
-            np.array([sight.up for sight in kept]), kept[-1].mount, np.array([sight.ground for sight in kept]),
-        )  # fmt: skip
-        return diagnose(evidence, self.min_angle, self.min_offset)
+        if before is not None and not np.array_equal(before.mount, sample.mount):
+            state.kept.clear()  # those frames are evidence about another mount
+        state.kept.append(sample)
+        if len(state.kept) > self.window:
+            state.kept.popleft()
+        state.since += 1
+        if state.since >= JUDGEMENT_INTERVAL:
+            state.verdict, state.since = state.verdict.and_then(_diagnosis(state)), 0
 
 
-def _told(verdict: _Verdict, memory: TiltMemory) -> Diagnosis:
-    """The last judgement; as long as none could tell anything, what the ground alone says of every frame so far."""
-    steep = off_level(memory.least_slope, memory.slopes) if verdict.clear == 0 and not verdict.last.fault else None
+def _diagnosis(state: TiltMemory) -> Diagnosis:
+    """The diagnosis of the frames kept."""
+    stamps, segments, cameras, drift, ups, ground = (
+        np.array(column)
+        for column in zip(*((s.stamp, s.segment, s.camera.rotation, s.drift, s.up, s.ground) for s in state.kept),
+                          strict=True)
+    )  # fmt: skip
+    return diagnose(Evidence(stamps, segments, cameras, drift, ups, state.kept[-1].mount, ground))
+
+
+def _reported(verdict: _Verdict, state: TiltMemory) -> Diagnosis:
+    """The last judgement; until one is clear, the judgement by the ground alone."""
+    steep = off_level(state.min_slope, state.slopes) if verdict.clear == 0 and not verdict.last.fault else None
     return steep or verdict.last
 
 
-def _residual(sight: _TiltSample, last: _TiltSample | None) -> float:
-    """By how much up differs from the last frame's, carried along by the camera; NaN in a new segment."""
-    if last is None or last.segment != sight.segment:
+def _residual(sample: _TiltSample, last: _TiltSample | None) -> float:
+    """Angle, rad, between up and the last frame's up rotated by the camera's motion; NaN in a new segment."""
+    if last is None or last.segment != sample.segment:
         return float("nan")
-    carried = sight.camera.rotation.T @ last.camera.rotation @ last.mount @ last.up
-    return _angle(sight.mount @ sight.up, carried)
+    predicted = sample.camera.rotation.T @ last.camera.rotation @ last.mount @ last.up
+    return _angle(sample.mount @ sample.up, predicted)
 
 
 def _ground_normal(cloud: PointCloud) -> Array:
-    """The upward normal (3,), in the camera, of the plane through most of the ground in view; NaN where there is none.
+    """Upward normal (3,), in the camera, of the ground in view; NaN if there is none.
 
-    Least squares of the measured points with Tukey's weights, so that rocks do not tilt it.
+    A plane fitted to the measured points with Tukey's weights, so that rocks do not tilt it.
     """
     cloud = cloud.only(cloud.measured)
-    some = cloud.points[:: -(-len(cloud.points) // GROUND_POINTS) or 1].astype(np.float64)
+    some = cloud.points[:: -(-len(cloud.points) // MAX_GROUND_POINTS) or 1].astype(np.float64)
     if cloud.sensor is not None:
         some = cloud.sensor.inverse()(some)
-    some = some[np.isfinite(some).all(axis=1) & (some[:, 2] > GROUND_FROM) & (some[:, 2] < GROUND_TO)]
-    if len(some) < GROUND_POINTS // 20:
+    some = some[np.isfinite(some).all(axis=1) & (some[:, 2] > MIN_GROUND_DEPTH) & (some[:, 2] < MAX_GROUND_DEPTH)]
+    if len(some) < MAX_GROUND_POINTS // 20:
         return np.full(3, np.nan)
     weights = np.ones(len(some))
-    for _ in range(GROUND_ROUNDS):
+    for _ in range(FIT_ROUNDS):
         centre = weights @ some / weights.sum()
-        spread = (some - centre) * np.sqrt(weights)[:, None]
-        values, axes = np.linalg.eigh(spread.T @ spread / weights.sum())
+        offsets = (some - centre) * np.sqrt(weights)[:, None]
+        values, axes = np.linalg.eigh(offsets.T @ offsets / weights.sum())
         normal = axes[:, 0]
         distance = (some - centre) @ normal
-        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(distance))), GROUND_NOISE)
+        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(distance))), MIN_GROUND_SIGMA)
         weights = tukey_weights(distance, scale) + 1e-9
-    if values[1] < 4 * values[0]:  # a heap of points rather than a plane
+    if values[1] < 4 * values[0]:  # not a plane
         return np.full(3, np.nan)
-    towards: Array = normal * (-np.sign(normal @ centre) or 1.0)
-    return towards
+    upward: Array = normal * (-np.sign(normal @ centre) or 1.0)
+    return upward
 
 
 def _angle(one: Array, other: Array) -> float:

@@ -1,4 +1,4 @@
-"""CheckTilt gathers evidence frame by frame, takes the ground's slope from the cloud, and keeps what counts."""
+"""CheckTilt judges the tilt by the frames in which the rover moved, and by the slope of the ground in view."""
 
 from __future__ import annotations
 
@@ -40,53 +40,53 @@ def ground(slope: float, rocks: int = 0) -> PointCloud:
     )  # fmt: skip
 
 
-def test_a_sound_tilt_comes_to_be_called_sound():
+def test_a_sound_tilt_is_reported_as_sound():
     stage = Running(CheckTilt())
     found = checked(DRIVE.ups(), stage)
-    assert found[0].judgement == "no frames to judge the tilt by"
+    assert found[0].judgement == "No frames to judge the tilt by."
     assert np.isnan(found[0].turn)
     assert 0.05 < np.degrees(np.sqrt(np.nanmean(np.square([health.turn for health in found])))) < 0.4
     assert found[-1].frames == FRAMES
     assert {health.fault for health in found} == {""}
-    assert stage.finding().sentence.startswith("tilt and camera agree to 0.")
+    assert stage.finding().sentence.startswith("Tilt and camera agree to 0.")
     assert stage.finding().severity is Severity.NOTE
 
 
-def test_a_flipped_sign_is_found_long_before_the_fiftieth_frame_and_told_at_the_end():
+def test_a_flipped_sign_is_found_within_30_frames_and_reported_at_the_end():
     stage = Running(CheckTilt())
     found = checked(np.array([flipped(0)(up) for up in DRIVE.ups()]), stage)
     first = next(count for count, health in enumerate(found) if health.fault)
     assert first < 30
-    assert "the sign of pitch is flipped" in stage.finding().sentence
+    assert "The sign of pitch is flipped" in stage.finding().sentence
     assert stage.finding().severity is Severity.WARNING
-    assert stage.finding() == stage.finding()  # to ask changes nothing
+    assert stage.finding() == stage.finding()  # asking changes nothing
 
 
-def test_frames_that_stand_still_crowd_nothing_out():
+def test_frames_of_a_standing_rover_are_not_kept():
     moving, halting = Running(CheckTilt()), Running(CheckTilt())
     checked(DRIVE.ups(), moving)
     assert checked(DRIVE.ups(), halting, repeats=4)[-1].frames == FRAMES
     assert halting.finding() == moving.finding()
 
 
-def test_stamps_that_repeat_or_go_back_hide_no_fault():
+def test_repeated_stamps_hide_no_fault():
     flip, stage = flipped(0), Running(CheckTilt())
     for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), DRIVE.ups(), strict=True):
-        stamp = motion.stamp // 10**9 * 10**9  # of a clock that counts whole seconds
+        stamp = motion.stamp // 10**9 * 10**9  # a clock of whole seconds
         stage(replace(motion, stamp=stamp), Tilt(stamp, flip(up)), Mount(0, DRIVE.mount))
-    assert "the sign of pitch is flipped" in stage.finding().sentence
+    assert "The sign of pitch is flipped" in stage.finding().sentence
 
 
-def test_what_the_log_mends_halfway_is_still_told_at_the_end():
+def test_a_fault_that_ends_halfway_is_reported_at_the_end():
     ups = DRIVE.ups()
     ups[:25] = [flipped(0)(up) for up in ups[:25]]
     stage = Running(CheckTilt(window=20))
     checked(ups, stage)
-    assert "the sign of pitch is flipped" in stage.finding().sentence
+    assert "The sign of pitch is flipped" in stage.finding().sentence
     assert "judgements)" in stage.finding().sentence
 
 
-def test_the_ground_in_view_is_measured_whatever_lies_on_it_and_whatever_frame_the_cloud_is_in():
+def test_the_slope_of_the_ground_ignores_rocks_and_the_frame_of_the_cloud():
     motion, tilt = motions(DRIVE.cameras(1), [0])[0], Tilt(0, np.array([0, -1.0, 0]), "camera")
     mount = Mount(0, np.eye(3))
     for slope in (0.0, 8.0, -15.0):
@@ -105,8 +105,8 @@ def test_the_ground_in_view_is_measured_whatever_lies_on_it_and_whatever_frame_t
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 12])
-def test_ground_far_off_level_in_every_frame_is_a_warning_however_few_they_are(frames):
-    """As where the pitch of a camera that looks down by 14.6 degrees has the wrong sign."""
+def test_ground_far_off_level_in_every_frame_is_a_warning(frames):
+    """For example: the sign of pitch is wrong and the camera looks down by 14.6 degrees."""
     stage, mount, tilt = Running(CheckTilt()), Mount(0, np.eye(3)), np.array([0, -1.0, 0])
     for motion in motions(DRIVE.cameras(1), [0]) * frames:
         health = stage(motion, Tilt(motion.stamp, tilt, "camera"), mount, ground(29.2))
@@ -114,10 +114,10 @@ def test_ground_far_off_level_in_every_frame_is_a_warning_however_few_they_are(f
     found = stage.finding()
     assert found.severity is Severity.WARNING
     assert re.search(r"off level by 29\.\d degrees or more in (the only|every)", found.sentence), found.sentence
-    assert "look at the unit and the sign of pitch, the inclinometer's axes and its mount" in found.sentence
+    assert "Check the unit and the sign of pitch, the inclinometer's axes and its mount" in found.sentence
 
 
-def test_steep_ground_is_no_fault_nor_is_a_bank_that_only_some_frames_show():
+def test_steep_ground_in_only_some_frames_is_no_fault():
     motion, tilt = motions(DRIVE.cameras(1), [0])[0], Tilt(0, np.array([0, -1.0, 0]), "camera")
     for slopes in ((15.0, 15.0), (-15.0,), (29.0, 18.0)):
         stage = Running(CheckTilt())
@@ -125,14 +125,14 @@ def test_steep_ground_is_no_fault_nor_is_a_bank_that_only_some_frames_show():
         assert (health.fault, stage.finding().severity) == ("", Severity.NOTE)
 
 
-def test_a_tilt_that_the_motion_proves_sound_stays_sound_on_a_hillside_of_25_degrees():
+def test_motion_proves_a_tilt_sound_on_a_hillside_of_25_degrees():
     stage, mount = Running(CheckTilt()), Mount(0, DRIVE.mount)
     for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), DRIVE.ups(), strict=True):
         level = Rotation.align_vectors([mount.camera_from_inclinometer @ up], [[0, -1.0, 0]])[0].as_matrix()
         hill = ground(25.0)
         stage(motion, Tilt(motion.stamp, up), mount, replace(hill, points=(hill.points @ level.T).astype(np.float32)))
     assert stage.finding().severity is Severity.NOTE
-    assert stage.finding().sentence.startswith("tilt and camera agree to 0.")
+    assert stage.finding().sentence.startswith("Tilt and camera agree to 0.")
 
 
 def test_an_empty_cloud_has_no_ground():

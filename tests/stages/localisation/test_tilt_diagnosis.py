@@ -1,4 +1,4 @@
-"""Each fault of a tilt is named, with little noise and much; a sound tilt is not accused, and little motion says so."""
+"""Each fault of a tilt is named at any noise; a sound tilt has no fault, and too little motion is reported."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ def test_wrong_signs_axes_and_units_are_named(drive, change, name):
     assert found.fault.startswith(name), found.sentence
 
 
-def test_a_wrong_unit_is_named_on_nearly_level_ground_though_the_rover_steers():
+def test_a_wrong_unit_is_named_on_nearly_level_ground():
     found = diagnose(Drive(7, slope=0.3, noise=0.1).evidence(change=degrees_as_radians))
     assert found.fault == "degrees are taken for radians", found.sentence
 
 
-def test_a_wrong_unit_is_named_though_the_ground_was_not_always_seen():
+def test_a_wrong_unit_is_named_if_the_ground_is_not_always_seen():
     evidence = Drive(7, slope=0.3, noise=0.1).evidence(change=degrees_as_radians)
     evidence.ground[::5] = np.nan
     assert diagnose(evidence).fault == "degrees are taken for radians"
 
 
 @pytest.mark.parametrize(("slope", "yaw"), [(8, 30), (12, 20), (15, 17), (19, 15), (0, 40)])
-def test_a_rover_that_turns_on_a_slope_has_no_wrong_unit(slope, yaw):
-    """Its up goes round the normal of the ground, as far as it leans."""
+def test_a_rover_that_turns_on_a_slope_has_no_fault(slope, yaw):
+    """Up rotates around the normal of the ground."""
     frames, lean = 20, Rotation.from_euler("x", slope, degrees=True)
     cameras = [lean * Rotation.from_euler("z", yaw * i, degrees=True) for i in range(frames)]  # z off the ground
     turns = np.array([(cameras[0].inv() * camera).as_matrix() for camera in cameras])
@@ -69,7 +69,7 @@ def test_a_rover_that_turns_on_a_slope_has_no_wrong_unit(slope, yaw):
 
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("turned", [about("x", 5), about("y", -5), about("z", 5), about("z", -5), about("x", 90)])
-def test_a_wrong_mount_is_named_and_the_sentence_has_the_right_one(drive, turned):
+def test_a_wrong_mount_is_named_with_its_correction(drive, turned):
     found = diagnose(drive.evidence(turned=turned))
     assert found.fault.startswith("the mount of the inclinometer is wrong by"), found.sentence
     numbers = re.search(r"camera_from_inclinometer to \[(.*)\]", found.sentence)
@@ -89,30 +89,30 @@ def test_a_time_offset_is_named_with_its_size(drive, late):
 
 
 @pytest.mark.parametrize("late", [0.2, 0.1, -0.2])
-def test_few_frames_that_tell_a_wrong_mount_do_not_hide_that_it_may_be_the_time(late):
+def test_few_frames_name_a_time_offset_beside_a_wrong_mount(late):
     found = diagnose(Drive(3, 5.0, 0.1).evidence(frames=8, late=late))
     assert re.match(r"the mount .* is wrong by .* degrees or its stamps are late or early$", found.fault)
-    assert "check the clocks first" in found.sentence
+    assert "Check the clocks first" in found.sentence
 
 
 @settings(max_examples=40, deadline=None)
-@example(seed=31, slope=2.0, noise=0.03, frames=22, odometry=0.05)  # the camera's drift is more than the tilt's noise
+@example(seed=31, slope=2.0, noise=0.03, frames=22, odometry=0.05)  # more drift than noise
 @given(
     seed=st.integers(10, 49), slope=st.sampled_from([2.0, 4.0, 8.0]), noise=st.sampled_from([0.03, 0.1, 0.3, 0.6]),
     frames=st.integers(3, 50), odometry=st.sampled_from([0.0, 0.01, 0.05]),
 )  # fmt: skip
-def test_a_sound_tilt_is_never_accused(seed, slope, noise, frames, odometry):
+def test_a_sound_tilt_has_no_fault(seed, slope, noise, frames, odometry):
     assert diagnose(Drive(seed, slope, noise, odometry).evidence(frames)).fault == ""
 
 
-def test_a_sound_tilt_on_rolling_ground_is_called_sound():
+def test_a_sound_tilt_on_rolling_ground_is_reported_as_sound():
     found = diagnose(Drive(2, 8.0).evidence())
     assert found.clear
-    assert found.sentence.startswith("tilt and camera agree to 0.")
+    assert found.sentence.startswith("Tilt and camera agree to 0.")
 
 
 def still(drive: Drive, frames: int) -> Evidence:
-    """The first frame over and over, but for the noise."""
+    """The first frame repeated, with noise."""
     moving = drive.evidence(frames)
     noise = np.random.default_rng(0).normal(0, 0.003, (frames, 3))
     ups = moving.ups[0] + noise
@@ -122,14 +122,14 @@ def still(drive: Drive, frames: int) -> Evidence:
     )  # fmt: skip
 
 
-def test_without_motion_nothing_is_guessed():
+def test_without_motion_the_diagnosis_is_not_clear():
     found = diagnose(still(Drive(1), 50))
     assert (found.fault, found.clear) == ("", False)
-    assert found.sentence.startswith("not enough motion in 50 frames to rule out exchanged or flipped axes")
+    assert found.sentence.startswith("Not enough motion in 50 frames to rule out exchanged or flipped axes")
     assert not diagnose(Drive(1).evidence(4)).clear
 
 
-def test_without_motion_the_ground_still_tells_up_from_down():
+def test_without_motion_the_ground_shows_the_sign_of_up():
     evidence = still(Drive(1), 20)
     upside_down = diagnose(replace(evidence, ups=-evidence.ups))
     assert "up" in upside_down.fault, upside_down
@@ -137,7 +137,7 @@ def test_without_motion_the_ground_still_tells_up_from_down():
     assert aside.fault == "up is off the ground" or "mount" in aside.fault, aside
 
 
-def test_a_lost_track_in_the_middle_does_not_matter():
+def test_a_fault_is_found_across_lost_tracking():
     drive = Drive(2, 8.0)
     for change, fault in ((None, ""), (flipped(0), "the sign of pitch is flipped")):
         whole = drive.evidence(change=change)
@@ -148,7 +148,7 @@ def test_a_lost_track_in_the_middle_does_not_matter():
         assert found.fault == fault, found.sentence
 
 
-def test_garbage_is_called_inconsistent_and_no_fault_is_made_up():
+def test_a_random_walk_of_the_tilt_is_inconsistent():
     drive = Drive(2, 4.0)
     walk = np.cumsum(np.random.default_rng(1).normal(0, 0.03, (50, 3)), axis=0)
     ups = drive.ups() + walk
