@@ -44,7 +44,7 @@ def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, capsys):
     assert refined["density"] > matched["density"]
 
 
-def test_a_folder_of_scenes_becomes_a_log_each(tmp_path, capsys):
+def test_each_scene_of_a_folder_becomes_a_log(tmp_path, capsys):
     for name in ("Two", "One"):
         write_scene(tmp_path / "trainingF" / name)
     assert roverflow("import", "middlebury", tmp_path / "trainingF", tmp_path / "logs") == 0
@@ -55,7 +55,7 @@ def test_a_folder_of_scenes_becomes_a_log_each(tmp_path, capsys):
     assert "give a folder for the logs" in capsys.readouterr().err
 
 
-def test_a_broken_scene_does_not_keep_the_others_from_being_imported(tmp_path, capsys):
+def test_a_broken_scene_does_not_stop_the_others(tmp_path, capsys):
     for name in ("One", "Two", "Three"):
         write_scene(tmp_path / "scenes" / name)
     (tmp_path / "scenes" / "One" / "disp0GT.pfm").write_bytes(b"spoilt")
@@ -75,7 +75,7 @@ def test_a_broken_scene_does_not_keep_the_others_from_being_imported(tmp_path, c
         (None, "Bex.png", "no input log of roverflow"),
     ],
 )
-def test_a_scene_that_cannot_be_imported_is_refused_in_one_sentence(tmp_path, capsys, spoilt, out, words):
+def test_an_invalid_scene_is_refused_in_one_sentence(tmp_path, capsys, spoilt, out, words):
     scene = write_scene(tmp_path / "Box")
     if out == "Bex.png":
         (tmp_path / out).write_bytes(b"a picture")
@@ -90,7 +90,7 @@ def test_a_scene_that_cannot_be_imported_is_refused_in_one_sentence(tmp_path, ca
     assert (scene / "im0.png").read_bytes() == before
 
 
-def test_the_help_of_the_import_says_what_it_takes_for_granted(capsys):
+def test_the_help_of_import_names_its_assumptions(capsys):
     with pytest.raises(SystemExit):
         roverflow("import", "middlebury", "--help")
     assert "assumes level, 1 m above ground" in " ".join(capsys.readouterr().out.split())

@@ -9,7 +9,7 @@ from tests.conftest import FRAMES, roverflow
 from tests.recordings.sample_log import RIGHT, TILT, write_sample
 
 
-def test_info_says_what_a_log_holds(traverse, capsys):
+def test_info_describes_a_log(traverse, capsys):
     assert roverflow("info", traverse) == 0
     said = capsys.readouterr().out
     assert "/stereo/left/image_rect_color" in said
@@ -17,7 +17,7 @@ def test_info_says_what_a_log_holds(traverse, capsys):
     assert said.splitlines()[-1] == "run -p rover: can run on this log"
 
 
-def test_info_says_why_a_run_would_be_refused(traverse, capsys):
+def test_info_reports_why_a_run_would_refuse_the_log(traverse, capsys):
     assert roverflow("info", traverse, "-p", "paper", "--set", "source.left=/nix") == 0
     said = capsys.readouterr().out.splitlines()[-1]
     assert said.startswith("run -p paper: would refuse this log: the source's 'left' is set to /nix")
@@ -25,14 +25,14 @@ def test_info_says_why_a_run_would_be_refused(traverse, capsys):
     assert said.partition("refused: ")[2] in capsys.readouterr().err
 
 
-def test_info_of_a_log_that_is_cut_short_says_so_and_ends_incomplete(traverse, tmp_path, capsys):
+def test_info_of_a_cut_log_ends_incomplete(traverse, tmp_path, capsys):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(traverse.read_bytes()[: traverse.stat().st_size * 2 // 3])
     assert roverflow("info", cut) == 3
     assert "damaged" in capsys.readouterr().out
 
 
-def test_info_looks_at_a_log_as_a_run_with_that_pipeline_would(traverse, tmp_path, capsys):
+def test_info_uses_the_settings_of_the_pipeline(traverse, tmp_path, capsys):
     def streams(*given):
         assert roverflow("info", traverse, "--json", *given) == 0
         return json.loads(capsys.readouterr().out)["streams"]
@@ -45,7 +45,7 @@ def test_info_looks_at_a_log_as_a_run_with_that_pipeline_would(traverse, tmp_pat
     assert "odometry" not in streams("-p", pipeline)
 
 
-def test_info_counts_pairs_and_tilts_by_the_tolerances_of_the_pipeline(tmp_path, capsys):
+def test_info_counts_pairs_and_tilts_by_the_pipeline(tmp_path, capsys):
     def edit(topic, number, message):
         if topic in (RIGHT, TILT):
             message.header.stamp.nanosec += 8_000_000
@@ -79,7 +79,7 @@ sinks: [{use: recordings.McapSink}]
     assert frames("-p", pipeline) == (5, 0.009, None, None)
 
 
-def test_info_says_that_it_cannot_look_through_a_source_of_another_kind(traverse, tmp_path, capsys):
+def test_info_refuses_a_source_of_another_kind(traverse, tmp_path, capsys):
     pipeline = tmp_path / "toys.yaml"
     text = """
 source: {use: tests.flow.toys.Source}

@@ -39,7 +39,7 @@ def drop(*parts: str):
     ],
     ids=["no tilt", "no calibration", "one camera", "no mounting", "nothing", "an encoding nobody reads"],
 )
-def test_a_log_that_lacks_something_is_refused_in_one_sentence(traverse, tmp_path, capsys, change, words):
+def test_an_incomplete_log_is_refused_in_one_sentence(traverse, tmp_path, capsys, change, words):
     log = rewrite(traverse, tmp_path / "lacking.mcap", change)
     assert roverflow("run", log, "-o", tmp_path / "out.mcap") == 2
     said = capsys.readouterr().err
@@ -49,7 +49,7 @@ def test_a_log_that_lacks_something_is_refused_in_one_sentence(traverse, tmp_pat
 
 
 @pytest.mark.parametrize("content", [b"", b"this is no log\n" * 100, b"\x89MCAP0\r\n"], ids=["empty", "text", "magic"])
-def test_a_file_that_is_no_log_is_refused_in_one_sentence(tmp_path, capsys, content):
+def test_a_file_of_another_format_is_refused_in_one_sentence(tmp_path, capsys, content):
     log = tmp_path / "odd.mcap"
     log.write_bytes(content)
     for command in (("run", log), ("info", log)):
@@ -61,7 +61,7 @@ def test_a_file_that_is_no_log_is_refused_in_one_sentence(tmp_path, capsys, cont
     assert roverflow("info", tmp_path / ("long" * 100)) == 2
 
 
-def test_what_a_stage_cannot_do_without_is_asked_for_before_anything_runs(traverse, tmp_path, capsys):
+def test_a_missing_stage_input_is_refused_before_the_run(traverse, tmp_path, capsys):
     assert (
         roverflow("run", traverse, "--set", "disparity/half/quarter.search_radius=4", "-o", tmp_path / "out.mcap") == 2
     )
@@ -76,7 +76,7 @@ def test_what_a_stage_cannot_do_without_is_asked_for_before_anything_runs(traver
         ("rover.max_slope=95deg", "must be at most 89 deg, not 95deg"),
     ],
 )
-def test_a_setting_that_cannot_be_is_told_as_it_was_written(traverse, tmp_path, capsys, change, words):
+def test_an_invalid_setting_is_quoted_as_written(traverse, tmp_path, capsys, change, words):
     for more in ((), ("--debug",)):  # which shows the way there, and changes no exit code
         assert roverflow("run", traverse, "--set", change, "-o", tmp_path / "out.mcap", *more) == 2
         said = capsys.readouterr().err
@@ -85,7 +85,7 @@ def test_a_setting_that_cannot_be_is_told_as_it_was_written(traverse, tmp_path, 
 
 
 @pytest.mark.parametrize("option", ["-o", "--rrd", "--summary"])
-def test_what_is_read_is_never_overwritten(traverse, tmp_path, capsys, option):
+def test_an_input_is_never_overwritten(traverse, tmp_path, capsys, option):
     before = traverse.stat()
     (tmp_path / "link").symlink_to(traverse)
     for name in (traverse, tmp_path / "link"):
@@ -94,7 +94,7 @@ def test_what_is_read_is_never_overwritten(traverse, tmp_path, capsys, option):
     assert traverse.stat() == before
 
 
-def test_a_log_that_others_recorded_is_never_replaced(traverse, tmp_path, capsys):
+def test_a_log_of_another_recorder_is_never_replaced(traverse, tmp_path, capsys):
     raw = rewrite(traverse, tmp_path / "raw.mcap", lambda topic, index, data: data)
     (tmp_path / "noise.mcap").write_bytes(b"noise")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
@@ -121,7 +121,7 @@ OF_OTHERS = {
 
 
 @pytest.mark.parametrize("name", OF_OTHERS)
-def test_no_output_takes_the_place_of_what_is_of_another_kind(traverse, result, tmp_path, capsys, name):
+def test_an_output_never_replaces_a_file_of_another_kind(traverse, result, tmp_path, capsys, name):
     mine, run = tmp_path / name, ["run", traverse, "-o", tmp_path / "o.mcap"]
     mine.write_text(OF_OTHERS[name])
     for kind, command in {
@@ -134,7 +134,7 @@ def test_no_output_takes_the_place_of_what_is_of_another_kind(traverse, result, 
     assert mine.read_text() == OF_OTHERS[name]
 
 
-def test_an_output_takes_the_place_of_an_earlier_one_of_its_kind_alone(traverse, result, tmp_path, capsys):
+def test_an_output_replaces_only_an_earlier_one_of_its_kind(traverse, result, tmp_path, capsys):
     score = tmp_path / "score.json"
     assert roverflow("score", result, "--truth", traverse, "--json", score) == 0
     files = {
@@ -147,7 +147,7 @@ def test_an_output_takes_the_place_of_an_earlier_one_of_its_kind_alone(traverse,
         assert is_ours(tmp_path / "empty", kind)
 
 
-def test_a_recording_of_another_application_is_ours_as_well(tmp_path):
+def test_a_recording_of_another_application_is_replaced(tmp_path):
     sink, recording = RerunSink(application_id="desk"), tmp_path / "out.rrd"
     sink.open(recording, {}, {"log": "traverse.mcap", "pipeline": "# a line of many\n" * 5000})
     sink.close({"verdict": "COMPLETE"})
@@ -158,7 +158,7 @@ def test_a_recording_of_another_application_is_ours_as_well(tmp_path):
     assert not is_ours(tmp_path / "theirs.rrd", "recording")
 
 
-def test_the_demo_takes_no_folder_that_holds_anything_else(traverse, tmp_path, capsys):
+def test_the_demo_refuses_a_folder_with_other_files(traverse, tmp_path, capsys):
     for name, content in (("notes.txt", b"mine"), ("traverse.mcap", b"theirs"), ("maps/mine.tif", b"mine")):
         folder = tmp_path / name.replace("/", "-")
         (folder / name).parent.mkdir(parents=True)
@@ -196,7 +196,7 @@ def test_a_device_is_never_replaced_by_a_file(traverse, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("option", ["--rrd", "--summary"])
-def test_nothing_but_a_log_takes_the_place_or_the_name_of_one(traverse, tmp_path, capsys, option):
+def test_only_a_log_replaces_a_log_or_has_its_name(traverse, tmp_path, capsys, option):
     log = tmp_path / "earlier.log"
     log.write_bytes(traverse.read_bytes())
     for name in (log, tmp_path / "new.mcap"):
@@ -208,9 +208,7 @@ def test_nothing_but_a_log_takes_the_place_or_the_name_of_one(traverse, tmp_path
     assert list(tmp_path.iterdir()) == [log]
 
 
-def test_an_output_that_cannot_be_begun_leaves_the_others_of_an_earlier_run(
-    traverse, result, tmp_path, capsys, monkeypatch
-):
+def test_an_output_that_cannot_be_opened_keeps_earlier_results(traverse, result, tmp_path, capsys, monkeypatch):
     out, rrd = tmp_path / "out.mcap", tmp_path / "out.rrd"
     out.write_bytes(result.read_bytes())
     monkeypatch.setattr("recordings.sinks.rerun_sink.RESERVED_BYTES", 1 << 62)
@@ -221,7 +219,7 @@ def test_an_output_that_cannot_be_begun_leaves_the_others_of_an_earlier_run(
 
 
 @pytest.mark.parametrize("bounds", [("--end", "0"), ("--start", "2.6"), ("--start", "0.1", "--end", "0.2")])
-def test_a_range_without_an_image_is_refused_and_replaces_nothing(traverse, result, tmp_path, capsys, bounds):
+def test_a_range_without_images_is_refused(traverse, result, tmp_path, capsys, bounds):
     out = tmp_path / "out.mcap"
     out.write_bytes(result.read_bytes())
     assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", *bounds) == 2
@@ -229,7 +227,7 @@ def test_a_range_without_an_image_is_refused_and_replaces_nothing(traverse, resu
     assert out.read_bytes() == result.read_bytes()
 
 
-def test_an_export_that_fails_leaves_nothing_in_the_way_of_another(result, tmp_path, capsys, monkeypatch):
+def test_a_failed_export_does_not_block_the_next(result, tmp_path, capsys, monkeypatch):
     folder = tmp_path / "maps"
 
     def full(*_: object) -> None:
@@ -260,12 +258,12 @@ def test_an_export_that_fails_leaves_nothing_in_the_way_of_another(result, tmp_p
         ("--odometry-scale", "nan", "--odometry-scale must be -50 to 100 %, not nan %"),
     ],
 )
-def test_a_simulation_beyond_its_limits_is_refused_in_the_words_of_the_options(tmp_path, capsys, option, value, said):
+def test_a_simulation_beyond_its_limits_is_refused_by_option(tmp_path, capsys, option, value, said):
     assert roverflow("simulate", tmp_path / "log.mcap", option, value) == 2
     assert said in capsys.readouterr().err
 
 
-def test_a_setting_named_by_its_section_is_told_how_it_is_set(traverse, tmp_path, capsys):
+def test_a_section_in_place_of_a_setting_is_explained(traverse, tmp_path, capsys):
     assert roverflow("run", traverse, "--set", "settings.disparities=64", "-o", tmp_path / "out.mcap") == 2
     assert "settings are set by their names alone, as in disparities=value" in capsys.readouterr().err
 
@@ -284,12 +282,12 @@ def test_an_output_that_is_a_folder_is_refused_before_anything_runs(traverse, tm
 
 
 @pytest.mark.parametrize("log", [".", "/", ""])
-def test_a_log_without_a_name_is_refused_in_one_sentence(log, capsys):
+def test_an_empty_log_path_is_refused_in_one_sentence(log, capsys):
     assert roverflow("run", log, "-o", "out.mcap", "--no-rrd") == roverflow("run", log) == 2
     assert capsys.readouterr().err.count("is a folder; give the .mcap file in it\n") == 2
 
 
-def test_a_link_that_leads_to_itself_is_replaced_by_the_output(tmp_path):
+def test_a_link_to_itself_is_replaced_by_the_output(tmp_path):
     (tmp_path / "a").symlink_to(tmp_path / "b")
     (tmp_path / "b").symlink_to(tmp_path / "a")
     assert roverflow("simulate", tmp_path / "a", "--frames", 1, "--size", "64x64") == 0
@@ -302,7 +300,7 @@ def test_a_link_that_leads_to_itself_is_replaced_by_the_output(tmp_path):
     ("--workers", "9" * 20, "must be at most 1024"),
     ("--start", "1e300", "at most 9e+09"),
 ])  # fmt: skip
-def test_a_number_beyond_all_measure_is_refused(traverse, tmp_path, option, value, said, capsys):
+def test_a_huge_number_is_refused(traverse, tmp_path, option, value, said, capsys):
     with pytest.raises(SystemExit) as caught:
         roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, value)
     assert caught.value.code == 2
@@ -319,14 +317,14 @@ def test_an_odd_start_is_refused(traverse, seconds, capsys):
 
 @pytest.mark.parametrize("option", ["--slope", "--tilt-noise", "--odometry-turn", "--rocks"])
 @pytest.mark.parametrize("value", ["-1", "nan"])
-def test_a_simulation_of_less_than_nothing_is_refused(tmp_path, option, value, capsys):
+def test_a_simulation_of_negative_size_is_refused(tmp_path, option, value, capsys):
     assert roverflow("simulate", tmp_path / "log.mcap", option, value) == 2
     assert re.search(rf"^roverflow: {option} must be 0 to [\d.]+ ?\w*, not {value}", capsys.readouterr().err)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder in which nobody can write")
-def test_a_place_that_cannot_be_written_is_the_same_fault_of_every_command(traverse, result, tmp_path, capsys):
+def test_every_command_reports_an_unwritable_path_alike(traverse, result, tmp_path, capsys):
     scene = write_scene(tmp_path / "scenes" / "Box")
     (tmp_path / "cam.yaml").write_text("{fx: 100, cx: 10, cy: 10, baseline: 0.1}")
     images = ("images", scene, "/proc/x.mcap", "--calibration", tmp_path / "cam.yaml", "--pitch-down", 20)
@@ -346,7 +344,7 @@ def test_a_place_that_cannot_be_written_is_the_same_fault_of_every_command(trave
         assert said.count("\n") == 1
 
 
-def test_a_full_output_is_said_in_a_sentence():
+def test_a_full_disk_is_reported_in_one_sentence():
     """A disk that is full where the drawing of a graph is sent to."""
     code = "import sys; from flow.cli.main import main; sys.exit(main(['graph']))"
     with Path("/dev/full").open("w") as full:
@@ -367,9 +365,7 @@ def test_a_full_output_is_said_in_a_sentence():
         ("inclinometer", "/odometry", "its tilt topics are /imu"),
     ],
 )
-def test_a_topic_that_is_named_but_not_there_is_refused_and_nothing_stands_in(
-    traverse, tmp_path, capsys, key, topic, there
-):
+def test_a_topic_that_is_set_but_absent_is_refused(traverse, tmp_path, capsys, key, topic, there):
     assert roverflow("run", traverse, "--set", f"source.{key}={topic}", "-o", tmp_path / "out.mcap") == 2
     said = capsys.readouterr().err
     assert f"the source's '{key}' is set to {topic}, which is not a suitable topic of the log ({there}" in said
@@ -385,9 +381,7 @@ def test_a_topic_that_is_named_but_not_there_is_refused_and_nothing_stands_in(
         ("header.frame_id", "which is not an angle"),
     ],
 )
-def test_angles_of_a_field_that_is_not_there_are_refused_before_the_first_frame(
-    traverse, tmp_path, capsys, field, words
-):
+def test_angles_of_an_absent_field_are_refused_before_the_run(traverse, tmp_path, capsys, field, words):
     with McapSource().open(traverse) as opened:
         imu = opened.topics["inclinometer"]
     angles = ["--set", f"source.pitch={{field: {field}, unit: deg, sign: 1}}", "--set", "source.tilt_model=axis"]
@@ -400,14 +394,14 @@ def test_angles_of_a_field_that_is_not_there_are_refused_before_the_first_frame(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_pipe_is_no_log(tmp_path, capsys):
+def test_a_pipe_is_refused(tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe")
     for command in (("run", tmp_path / "pipe", "-o", tmp_path / "out.mcap"), ("info", tmp_path / "pipe")):
         assert roverflow(*command) == 2
         assert "pipe is a pipe or a device; give a .mcap file" in capsys.readouterr().err
 
 
-def test_a_pipeline_whose_aliases_hold_each_other_is_refused_at_once(tmp_path, capsys):
+def test_a_pipeline_of_nested_aliases_is_refused_at_once(tmp_path, capsys):
     lines = [
         "a0: &a0 [x, x, x, x, x, x, x, x, x]",
         *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)),
@@ -426,7 +420,7 @@ def test_a_pipeline_whose_aliases_hold_each_other_is_refused_at_once(tmp_path, c
     (["cells.max_range=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
     (["regional_cells.window=400m"], "makes a map 8000 cells of 0.05 m wide, and 4000 is the most"),
 ])  # fmt: skip
-def test_maps_that_no_memory_holds_are_refused_before_the_run(settings, said, capsys):
+def test_maps_beyond_memory_are_refused_before_the_run(settings, said, capsys):
     assert roverflow("graph", *(text for setting in settings for text in ("--set", setting))) == 2
     assert said in capsys.readouterr().err
 
@@ -435,7 +429,7 @@ def test_maps_that_no_memory_holds_are_refused_before_the_run(settings, said, ca
     (["tests.flow.toys.Keep"], "tests.flow.toys.Keep writes .txt files, but a run writes only .mcap and .rrd files"),
     (["recordings.McapSink", "another.Another"], "several sinks write .mcap files, but a run writes only one"),
 ])  # fmt: skip
-def test_a_sink_that_a_run_has_no_output_for_is_refused(traverse, tmp_path, capsys, sinks, said):
+def test_a_sink_without_an_output_is_refused(traverse, tmp_path, capsys, sinks, said):
     (tmp_path / "another.py").write_text("from recordings import McapSink\nclass Another(McapSink):\n    pass\n")
     listed = ", ".join(f"{{use: {use}}}" for use in sinks)
     shipped = (ROOT / "flow" / "pipelines" / "paper.yaml").read_text()
@@ -445,7 +439,7 @@ def test_a_sink_that_a_run_has_no_output_for_is_refused(traverse, tmp_path, caps
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_a_log_whose_name_is_no_text_is_run(traverse, tmp_path):
+def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
     log = os.fsencode(tmp_path / "Fahrt-") + b"\xfcd.mcap"
     os.link(traverse, log)
     assert roverflow("run", os.fsdecode(log), *SMALL, "--end", 0.6, "-o", tmp_path / "out.mcap") == 0

@@ -35,7 +35,7 @@ def events(path: Path) -> list[tuple[int, str, Any]]:
         return list(log.events())
 
 
-def test_the_images_come_back_bit_for_bit_in_pairs_at_the_rate(tmp_path: Path) -> None:
+def test_images_are_logged_bit_for_bit_at_the_rate(tmp_path: Path) -> None:
     left, right = make_pairs(tmp_path)
     out = tmp_path / "out.mcap"
     assert import_images(left, right, CALIBRATION, out, pitch_down=15, height=0.9, rate=4) == 3
@@ -56,7 +56,7 @@ def test_the_images_come_back_bit_for_bit_in_pairs_at_the_rate(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("pitch_down", "roll"), [(0, 0), (14.5, 0), (20, 10), (5, -30)])
-def test_the_camera_looks_where_it_was_said_to(tmp_path: Path, pitch_down: float, roll: float) -> None:
+def test_the_camera_has_the_given_attitude(tmp_path: Path, pitch_down: float, roll: float) -> None:
     left, right = make_pairs(tmp_path, 1)
     out = tmp_path / "out.mcap"
     import_images(left, right, CALIBRATION, out, pitch_down=pitch_down, roll=roll, height=0.88)
@@ -103,7 +103,7 @@ def test_pairs_are_found_by_name_in_order(tmp_path: Path, names: list[str], left
         (["left/1.png", "right/1.png", "left_raw/1.png", "right_raw/1.png"], r"several cameras \(left, left_raw\)"),
     ],
 )
-def test_no_image_is_left_out_without_a_word(tmp_path: Path, names: list[str], said: str) -> None:
+def test_no_image_is_left_out_silently(tmp_path: Path, names: list[str], said: str) -> None:
     for name in names:
         save(tmp_path / name, picture(0))
     with pytest.raises(LogError, match=said):
@@ -132,9 +132,7 @@ def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
         ({"width": 640}, "is 24x16, but the calibration or the first pair is 640x16"),
     ],
 )
-def test_a_calibration_that_does_not_fit_is_refused_and_leaves_no_file(
-    tmp_path: Path, change: dict[str, Any], said: str
-) -> None:
+def test_a_wrong_calibration_is_refused_and_leaves_no_file(tmp_path: Path, change: dict[str, Any], said: str) -> None:
     left, right = make_pairs(tmp_path, 1)
     calibration = {k: v for k, v in {**CALIBRATION, "height": 16, **change}.items() if v is not None}
     with pytest.raises(LogError, match=said):
@@ -143,7 +141,7 @@ def test_a_calibration_that_does_not_fit_is_refused_and_leaves_no_file(
 
 
 @pytest.mark.parametrize(("pitch_down", "roll"), [(91, 0), (float("nan"), 0), (0, 181)])
-def test_an_attitude_that_no_camera_has_is_refused(tmp_path: Path, pitch_down: float, roll: float) -> None:
+def test_an_impossible_attitude_is_refused(tmp_path: Path, pitch_down: float, roll: float) -> None:
     left, right = make_pairs(tmp_path, 1)
     with pytest.raises(LogError, match="are impossible"):
         import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=pitch_down, roll=roll, height=1)
@@ -154,7 +152,7 @@ def test_an_attitude_that_no_camera_has_is_refused(tmp_path: Path, pitch_down: f
     [("height", value) for value in (0.0, np.inf, np.nan)]
     + [("rate", value) for value in (0.0, np.inf, np.nan, 1e-12, 1e10)],
 )
-def test_a_rate_or_height_that_nothing_has_is_refused(tmp_path: Path, option: str, value: float) -> None:
+def test_an_impossible_rate_or_height_is_refused(tmp_path: Path, option: str, value: float) -> None:
     left, right = make_pairs(tmp_path, 1)
     options = {"pitch_down": 0.0, "height": 1.0, option: value}
     with pytest.raises(LogError, match=f"{option} .*must be"):
@@ -176,7 +174,7 @@ def test_the_calibration_may_be_a_file(tmp_path: Path) -> None:
         import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
 
 
-def test_pictures_of_two_sizes_and_files_that_are_no_pictures_are_refused(tmp_path: Path) -> None:
+def test_images_of_two_sizes_and_other_files_are_refused(tmp_path: Path) -> None:
     left, right = make_pairs(tmp_path, 1)
     save(right[0], picture(0)[:8])
     with pytest.raises(LogError, match="differ in size or kind"):

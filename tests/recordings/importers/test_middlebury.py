@@ -55,7 +55,7 @@ def result(log: Path, frame: StereoFrame, pixels: np.ndarray) -> Path:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_a_pfm_is_read_in_either_byte_order_from_its_last_row_up(tmp_path: Path, order: str) -> None:
+def test_a_pfm_is_read_from_the_bottom_in_either_byte_order(tmp_path: Path, order: str) -> None:
     pixels = np.arange(6, dtype=np.float32).reshape(2, 3) + np.float32(0.25)
     pixels[0, 2], pixels[1, 0] = np.inf, -np.inf
     path = write_pfm(tmp_path / "d.pfm", pixels, order)
@@ -65,7 +65,7 @@ def test_a_pfm_is_read_in_either_byte_order_from_its_last_row_up(tmp_path: Path,
     np.testing.assert_array_equal(read_pfm(path), expected)
 
 
-def test_images_and_camera_of_a_scene_come_back_from_its_log(tmp_path: Path) -> None:
+def test_images_and_camera_of_a_scene_are_in_its_log(tmp_path: Path) -> None:
     log, said = imported(write_scene(tmp_path / "Box"))
     assert said.endswith("run it with --set disparities=32")
     frame = frame_of(log)
@@ -76,7 +76,7 @@ def test_images_and_camera_of_a_scene_come_back_from_its_log(tmp_path: Path) -> 
     assert (camera.baseline, camera.width, camera.height, camera.raw) == (0.25, 96, 64, None)
 
 
-def test_a_plane_comes_out_at_its_distance(tmp_path: Path) -> None:
+def test_a_plane_has_its_distance(tmp_path: Path) -> None:
     """Z = baseline * f / (d + doffs): 0.25 m * 100 px / (5 + 12.5) px, the box at 25 / 25.5."""
     log, _ = imported(write_scene(tmp_path / "Box"))
     message, camera = truth_of(log)["/truth/disparity"], frame_of(log).camera
@@ -87,7 +87,7 @@ def test_a_plane_comes_out_at_its_distance(tmp_path: Path) -> None:
     np.testing.assert_allclose(distance[np.isfinite(distance)], ours[np.isfinite(distance)], rtol=1e-6)
 
 
-def test_the_truth_is_the_scenes_own(tmp_path: Path) -> None:
+def test_the_truth_is_that_of_the_scene(tmp_path: Path) -> None:
     log, said = imported(write_scene(tmp_path / "Box"))
     assert "with true disparities and occlusions" in said
     truth = truth_of(log)
@@ -136,7 +136,7 @@ def test_the_score_counts_known_errors_exactly(tmp_path: Path) -> None:
     assert f"{bad:.2f}%" in next(line for line in table.splitlines() if "seen by both" in line)
 
 
-def test_full_and_half_size_names_and_the_other_name_of_the_truth(tmp_path: Path) -> None:
+def test_either_name_of_the_truth_is_read(tmp_path: Path) -> None:
     source = tmp_path / "trainingH"
     for name in ("Vintage", "Adirondack-perfect"):
         scene = write_scene(source / name)
@@ -156,7 +156,9 @@ def test_full_and_half_size_names_and_the_other_name_of_the_truth(tmp_path: Path
         (("mask0nocc.png",), {"/truth/disparity"}, "without occlusions (no mask0nocc.png)"),
     ],
 )
-def test_a_scene_without_truth_says_so(tmp_path: Path, without: tuple[str, ...], topics: set[str], said: str) -> None:
+def test_a_scene_without_truth_is_reported(
+    tmp_path: Path, without: tuple[str, ...], topics: set[str], said: str
+) -> None:
     log, sentence = imported(write_scene(tmp_path / "Box", without))
     assert set(truth_of(log)) == topics
     assert said in sentence
@@ -223,7 +225,7 @@ def test_a_damaged_scene_is_refused_and_leaves_no_log(tmp_path: Path, damage, sa
     assert [path.name for path in tmp_path.iterdir()] == ["Box"]
 
 
-def test_what_holds_no_scene_and_what_cannot_hold_the_logs_is_refused(tmp_path: Path) -> None:
+def test_folders_without_scenes_and_files_for_several_logs_are_refused(tmp_path: Path) -> None:
     write_scene(tmp_path / "training" / "Box")
     for out in (tmp_path / "out.mcap", tmp_path / "training" / "Box" / "im0.png"):
         with pytest.raises(LogError, match="give a folder for the logs instead of"):

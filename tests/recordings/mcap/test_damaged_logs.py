@@ -75,7 +75,7 @@ def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]]
 @pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no compression", "lz4", "no index"])
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(share=st.floats(0, 1, exclude_max=True))
-def test_a_log_cut_anywhere_loses_only_what_was_cut(
+def test_a_cut_log_loses_only_the_part_after_the_cut(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, share: float
 ) -> None:
     full = tmp_path / "full.mcap"
@@ -87,7 +87,7 @@ def test_a_log_cut_anywhere_loses_only_what_was_cut(
     check_nothing_is_lost_silently(cut, whole, times_of(full, int(share * len(content)), math.inf))
 
 
-def test_a_cut_chunk_still_gives_the_messages_before_the_cut(
+def test_messages_before_the_cut_in_a_chunk_are_rescued(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path
 ) -> None:
     full = rewritten(sample, tmp_path / "full.mcap", compression=CompressionType.NONE)  # one chunk
@@ -103,7 +103,7 @@ def test_a_cut_chunk_still_gives_the_messages_before_the_cut(
 @pytest.mark.parametrize("layout", ["small chunks", "no index", "no compression"])
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-def test_a_flipped_bit_anywhere_is_never_taken_for_data(
+def test_a_flipped_bit_never_becomes_data(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, share: float, bit: int
 ) -> None:
     full = tmp_path / "full.mcap"
@@ -117,7 +117,7 @@ def test_a_flipped_bit_anywhere_is_never_taken_for_data(
     check_nothing_is_lost_silently(damaged, whole, times_of(full, place, place + 1))
 
 
-def test_a_broken_chunk_costs_its_own_messages_each_with_its_time(
+def test_a_broken_chunk_loses_its_own_messages_with_their_times(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path
 ) -> None:
     full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500)
@@ -138,7 +138,7 @@ def test_a_broken_chunk_costs_its_own_messages_each_with_its_time(
     assert inventory_of(damaged)["damage"]
 
 
-def test_damage_that_took_all_images_is_told_as_that(sample: Path, tmp_path: Path) -> None:
+def test_a_log_that_lost_all_images_reports_the_damage(sample: Path, tmp_path: Path) -> None:
     full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500, use_statistics=False)
     with full.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -158,7 +158,7 @@ def test_damage_that_took_all_images_is_told_as_that(sample: Path, tmp_path: Pat
         assert log.resolution.unavailable["left"].endswith("give a log with images")
 
 
-def test_a_record_with_a_broken_length_costs_what_it_held(
+def test_a_broken_record_length_loses_that_record(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path
 ) -> None:
     full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500, index_types=IndexType.NONE, use_statistics=False)
@@ -177,7 +177,7 @@ def test_a_record_with_a_broken_length_costs_what_it_held(
     assert good == [essence(item) for _, _, item in whole]  # the chunk itself was whole
 
 
-def test_a_broken_length_in_a_large_file_does_not_fill_the_memory(tmp_path: Path) -> None:
+def test_a_broken_length_does_not_fill_the_memory(tmp_path: Path) -> None:
     resource = pytest.importorskip("resource")
     path = tmp_path / "sparse.mcap"
     with path.open("wb") as file:
@@ -190,7 +190,7 @@ def test_a_broken_length_in_a_large_file_does_not_fill_the_memory(tmp_path: Path
 
 
 @pytest.mark.parametrize("compression", [b"zstd", b"lz4"])
-def test_a_chunk_that_holds_more_than_it_states_is_broken_and_not_unpacked(tmp_path: Path, compression: bytes) -> None:
+def test_a_chunk_larger_than_stated_is_broken_and_not_unpacked(tmp_path: Path, compression: bytes) -> None:
     resource = pytest.importorskip("resource")
     pack = {b"zstd": zstandard.ZstdCompressor(level=1).compress, b"lz4": lz4.frame.compress}[compression]
     packed = pack(bytes(1 << 28))
@@ -203,7 +203,7 @@ def test_a_chunk_that_holds_more_than_it_states_is_broken_and_not_unpacked(tmp_p
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 
-def test_a_chunk_that_states_more_than_any_may_is_broken() -> None:
+def test_a_chunk_beyond_the_size_limit_is_broken() -> None:
     content = struct.pack("<QQQII", 0, 1, 1 << 50, 0, 4) + b"zstd" + struct.pack("<Q", 1) + b"x"
     with pytest.raises(ValueError, match="the limit is"):
         unpack_chunk(content)
@@ -211,7 +211,7 @@ def test_a_chunk_that_states_more_than_any_may_is_broken() -> None:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("layout", ["small chunks", "no message index", "no index", "no chunks"])
-def test_a_log_time_that_no_clock_can_show_costs_its_message(
+def test_an_impossible_log_time_loses_its_message(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str
 ) -> None:
     third = [time for time, stream, _ in whole if stream == "left"][2]
@@ -229,7 +229,7 @@ def test_a_log_time_that_no_clock_can_show_costs_its_message(
     assert inventory_of(path)["end"] == whole[-1][0]
 
 
-def test_many_losses_take_their_time_from_the_last_message_before_them() -> None:
+def test_losses_are_placed_after_the_last_message_before_them() -> None:
     index = Index()
     for time in (5, 9, 7):
         index.count_message(1, time)
@@ -238,7 +238,7 @@ def test_many_losses_take_their_time_from_the_last_message_before_them() -> None
     assert index.latest == 9
 
 
-def test_statistics_that_do_not_count_by_channel_are_no_sign_of_an_empty_log(
+def test_statistics_without_channel_counts_do_not_mean_an_empty_log(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written = Statistics.write
@@ -249,7 +249,7 @@ def test_statistics_that_do_not_count_by_channel_are_no_sign_of_an_empty_log(
 
 @pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no index", "no crcs"])
 @pytest.mark.parametrize("second", ["log", "zeros"])
-def test_what_is_behind_the_end_of_a_log_is_told(
+def test_bytes_after_the_end_of_a_log_are_reported(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, second: str
 ) -> None:
     first = rewritten(sample, tmp_path / "first.mcap", **LAYOUTS[layout]).read_bytes()
@@ -265,7 +265,7 @@ def test_what_is_behind_the_end_of_a_log_is_told(
     assert inventory_of(path)["damage"] == [said]
 
 
-def test_an_index_that_points_behind_the_end_loses_its_chunk_alone(sample: Path, tmp_path: Path) -> None:
+def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample: Path, tmp_path: Path) -> None:
     full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500)
     with McapFile(full) as log:
         good = len(list(log.messages(set(log.index.channels))))
@@ -286,14 +286,14 @@ def test_an_index_that_points_behind_the_end_loses_its_chunk_alone(sample: Path,
         (b"\x89MCAP0\r\n", "contains no messages that can be read: the log is cut"),
     ],
 )
-def test_what_is_no_log_is_refused_with_what_it_is(tmp_path: Path, content: bytes, said: str) -> None:
+def test_a_file_of_another_format_is_refused_by_its_name(tmp_path: Path, content: bytes, said: str) -> None:
     path = tmp_path / "log.mcap"
     path.write_bytes(content)
     with pytest.raises(LogError, match=rf"log\.mcap {said}"):
         McapSource().open(path)
 
 
-def test_no_file_a_folder_and_no_messages_are_refused(tmp_path: Path) -> None:
+def test_a_missing_file_a_folder_and_an_empty_log_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"cannot read .*none\.mcap: No such file"):
         McapSource().open(tmp_path / "none.mcap")
     with pytest.raises(LogError, match="is a folder; give the"):
@@ -307,7 +307,7 @@ def test_no_file_a_folder_and_no_messages_are_refused(tmp_path: Path) -> None:
         McapSource().open(tmp_path / "no.mcap")
 
 
-def test_every_file_of_the_conformance_suite_gives_all_its_messages() -> None:
+def test_all_messages_of_the_conformance_suite_are_read() -> None:
     folder, checked = data_folder("logs/conformance"), 0
     for path in sorted(folder.rglob("*.mcap")):
         records = json.loads(path.with_suffix(".json").read_text())["records"]
@@ -321,7 +321,7 @@ def test_every_file_of_the_conformance_suite_gives_all_its_messages() -> None:
     assert checked == 205
 
 
-def test_every_real_log_is_described_or_refused_in_a_sentence() -> None:
+def test_every_real_log_is_described_or_refused() -> None:
     refused = []
     paths = [path for path in sorted(data_folder("logs").rglob("*")) if path.suffix in (".mcap", ".bag")]
     for path in paths:
@@ -344,7 +344,7 @@ def test_the_field_log_has_its_tilt_at_ten_hertz() -> None:
     assert all(abs(np.linalg.norm(tilt.up) - 1) < 1e-9 for tilt in tilts)
 
 
-def test_messages_of_a_channel_that_is_nowhere_defined_are_told(tmp_path: Path) -> None:
+def test_messages_of_an_undefined_channel_are_reported(tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     with log.open("wb") as file:
         writer = Writer(file, use_chunking=False, use_statistics=False)

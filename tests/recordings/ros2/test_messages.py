@@ -140,7 +140,7 @@ def test_another_decoder_reads_the_same_numbers(written: Path) -> None:
     assert read["/diagnostics"].status[0].message == "no texture"
 
 
-def test_our_reader_returns_every_message_with_its_topic_and_time(written: Path) -> None:
+def test_iter_decoded_returns_each_message_with_topic_and_time(written: Path) -> None:
     read = {topic: (stamp, message) for topic, stamp, message in iter_decoded(written)}
     for topic, message in one_of_each().items():
         assert read[topic][0] == STAMP
@@ -167,7 +167,7 @@ def test_a_grid_map_starts_at_the_corner_of_largest_x_and_y() -> None:
 @given(
     st.integers(1, 7), st.integers(1, 7), st.floats(0.01, 2.0), st.floats(-50, 50), st.integers(0, 6), st.integers(0, 6)
 )
-def test_a_grid_map_comes_back_as_it_was(rows: int, cols: int, cell: float, x: float, outer: int, inner: int) -> None:
+def test_a_grid_map_is_read_back_unchanged(rows: int, cols: int, cell: float, x: float, outer: int, inner: int) -> None:
     layer = np.random.default_rng(rows * 10 + cols).normal(size=(rows, cols)).astype(np.float32)
     ours = ElevationMap(STAMP, {"elevation": layer}, cell, (x, -x / 3), "odom")
     message = grid_map(ours)
@@ -201,7 +201,7 @@ def test_disparity_obeys_depth_equals_f_times_t_over_d() -> None:
     np.testing.assert_array_equal(read_disparity(disparity_image(disparity())), disparity().pixels)
 
 
-def test_a_cloud_packs_colours_as_pcl_does() -> None:
+def test_a_cloud_packs_colours_as_in_pcl() -> None:
     message = point_cloud(cloud())
     assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
         ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("rgb", 12, 7), ("sigma", 16, 7),
@@ -223,12 +223,12 @@ def test_a_transform_message_turns_points_like_its_transform() -> None:
     np.testing.assert_allclose(turned + np.array([t.x, t.y, t.z]), transform(v), atol=1e-12)
 
 
-def test_equal_calls_make_equal_bytes(tmp_path: Path) -> None:
+def test_equal_calls_write_equal_bytes(tmp_path: Path) -> None:
     digests = [hashlib.sha256(write_sample(tmp_path / name).read_bytes()).hexdigest() for name in ("a", "b")]
     assert digests[0] == digests[1]
 
 
-def test_a_log_has_its_name_only_once_it_is_whole(tmp_path: Path) -> None:
+def test_a_log_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     path.write_bytes(b"the log before")
     with Ros2Writer(path) as writer:
@@ -238,7 +238,7 @@ def test_a_log_has_its_name_only_once_it_is_whole(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
+def test_an_unwritable_path_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"cannot write .*nowhere/out\.mcap: No such file"):
         Ros2Writer(tmp_path / "nowhere" / "out.mcap")
 
@@ -254,7 +254,7 @@ def test_an_output_that_is_a_folder_is_refused_at_once(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["late.mcap", "out.mcap"]
 
 
-def test_two_writers_to_one_path_each_write_a_whole_log(tmp_path: Path) -> None:
+def test_two_writers_of_one_path_each_write_a_complete_log(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     writers = [Ros2Writer(path), Ros2Writer(path)]
     for number in range(1, 50):
@@ -266,7 +266,7 @@ def test_two_writers_to_one_path_each_write_a_whole_log(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_log_takes_its_name_when_the_disk_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_is_renamed_after_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     order: list[str] = []
     settle, replace = os.fsync, Path.replace
     monkeypatch.setattr(os, "fsync", lambda number: (order.append("settled"), settle(number))[1])
@@ -276,14 +276,14 @@ def test_a_log_takes_its_name_when_the_disk_has_it(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize("stamp", [-1, 2**31 * 10**9])
-def test_a_stamp_that_ros_cannot_tell_is_refused(tmp_path: Path, stamp: int) -> None:
+def test_a_stamp_outside_ros_time_is_refused(tmp_path: Path, stamp: int) -> None:
     with Ros2Writer(tmp_path / "out.mcap") as writer:
         with pytest.raises(ValueError, match=f"the stamp {stamp} ns is outside ROS time"):
             writer.write("/image", image(1, "cam", np.zeros((2, 2), np.uint8)), stamp)
         writer.abort()
 
 
-def test_a_full_disk_is_told_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_leaves_no_file(tmp_path: Path) -> None:
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -320,7 +320,7 @@ def test_a_schema_may_leave_out_standard_types() -> None:
     assert (message.header.frame_id, message.pitch) == ("abc", 2.5)
 
 
-def test_schemas_in_idl_read_as_rosidl_writes_them(tmp_path: Path) -> None:
+def test_idl_schemas_of_rosidl_are_read(tmp_path: Path) -> None:
     seen = set()
     with write_sample(tmp_path / "log.mcap").open("rb") as log:
         for schema, _, message in make_reader(log).iter_messages():
@@ -338,19 +338,19 @@ RECURSIVE = {
 
 
 @pytest.mark.parametrize("text", RECURSIVE.values(), ids=RECURSIVE)
-def test_a_schema_that_is_a_part_of_itself_is_a_log_error(text: bytes) -> None:
+def test_a_schema_that_contains_itself_is_refused(text: bytes) -> None:
     with pytest.raises(LogError, match="vendor_msgs/msg/Odd contains itself"):
         decoder_for("vendor_msgs/msg/Odd", "ros2msg", text)
 
 
-def test_a_schema_reads_as_any_editor_saved_it() -> None:
+def test_a_schema_with_byte_order_mark_or_crlf_is_read() -> None:
     plain = "std_msgs/Header header\nfloat32 pitch # 0 to 90 °\n"
     for text in (plain.encode("latin-1"), plain.replace("\n", "\r\n").encode(), plain.encode("utf-8-sig")):
         decode = decoder_for("vendor_msgs/msg/Tilt", "ros2msg", text)
         assert decode(b"\0\1\0\0" + struct.pack("<iII4xf", 5, 6, 1, 0.25)).pitch == 0.25
 
 
-def test_an_empty_schema_is_that_of_a_type_without_fields() -> None:
+def test_an_empty_schema_means_a_type_without_fields() -> None:
     decoder = decoder_for("test_msgs/msg/Empty", "ros2msg", b"")
     assert type(decoder(b"\0\1\0\0\0")).__name__.endswith("Empty")
     with pytest.raises(Exception, match="size mismatch"):
@@ -359,12 +359,12 @@ def test_an_empty_schema_is_that_of_a_type_without_fields() -> None:
 
 @settings(max_examples=30)
 @given(st.binary(max_size=80))
-def test_a_schema_of_nonsense_is_a_log_error(text: bytes) -> None:
+def test_an_invalid_schema_is_a_log_error(text: bytes) -> None:
     with suppress(LogError):  # any other exception fails the test
         decoder_for("vendor_msgs/msg/Odd", "ros2msg", text)
 
 
-def test_messages_of_real_recorders_decode() -> None:
+def test_messages_of_real_recorders_are_decoded() -> None:
     folder = data_folder("logs/rosbag2")
     talker = folder / "rosbag2_py__test__resources__mcap__talker__talker.mcap"
     assert sum(1 for _ in iter_decoded(talker)) == 20
@@ -372,7 +372,7 @@ def test_messages_of_real_recorders_decode() -> None:
     assert sum(1 for _ in iter_decoded(cdr)) == 7
 
 
-def test_a_point_cloud_reads_back_as_it_was_whatever_its_padding_and_byte_order() -> None:
+def test_a_point_cloud_is_read_with_padding_and_either_byte_order() -> None:
     rng = np.random.default_rng(3)
     points, colors = rng.normal(size=(7, 3)).astype(np.float32), rng.integers(0, 256, (7, 3), dtype=np.uint8)
     points[2] = np.nan
@@ -390,7 +390,7 @@ def test_a_point_cloud_reads_back_as_it_was_whatever_its_padding_and_byte_order(
         read_point_cloud(replace(message, fields=[replace(message.fields[0], datatype=8), *message.fields[1:]]))
 
 
-def test_a_point_cloud_tells_which_points_are_filled() -> None:
+def test_a_point_cloud_contains_the_origin_of_its_points() -> None:
     points = np.arange(9, dtype=np.float32).reshape(3, 3)
     source = np.array([PixelOrigin.MEASURED, PixelOrigin.FILLED, PixelOrigin.PLANE], np.uint8)
     black, index = np.zeros((3, 3), np.uint8), np.arange(3, dtype=np.int32)
@@ -399,7 +399,7 @@ def test_a_point_cloud_tells_which_points_are_filled() -> None:
     assert "source" not in read_point_cloud(point_cloud(replace(cloud, source=None)))
 
 
-def test_a_schema_that_cannot_be_parsed_is_not_told_whole() -> None:
+def test_the_error_of_an_unparsable_schema_is_short() -> None:
     text = b"MSG: what is this\n" + b"int64 number\n" * 200
     with pytest.raises(LogError, match="schema 'vendor_msgs/msg/Long' cannot be parsed") as caught:
         decoder_for("vendor_msgs/msg/Long", "ros2msg", text)

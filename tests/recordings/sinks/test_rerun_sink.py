@@ -169,7 +169,7 @@ def test_an_unwritable_end_leaves_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
+def test_an_unwritable_path_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="nowhere"):
         RerunSink().open(tmp_path / "nowhere" / "run.rrd", STREAMS, {})
 

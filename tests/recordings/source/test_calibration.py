@@ -42,7 +42,7 @@ def turned(axis: str, degrees: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
-def test_parallel_cameras_beside_each_other_are_rectified_as_they_are(tmp_path: Path, names: tuple[str, str]) -> None:
+def test_parallel_cameras_need_no_rectification(tmp_path: Path, names: tuple[str, str]) -> None:
     beside = Transform("left_optical", "right_optical", np.eye(3), [0.25, 0.001, 0])
     with McapSource().open(single_calibrations(tmp_path / "log.mcap", names, beside)) as log:
         assert log.resolution.cameras is not None
@@ -60,7 +60,7 @@ def test_parallel_cameras_beside_each_other_are_rectified_as_they_are(tmp_path: 
         (np.eye(3), [0.25, 0, 0], 22.0),
     ],
 )
-def test_cameras_that_are_not_parallel_are_rectified_or_refused_where_called_rectified(
+def test_cameras_that_are_not_parallel_need_rectification(
     tmp_path: Path, rotation: np.ndarray, place: list[float], fx: float
 ) -> None:
     beside = Transform("left_optical", "right_optical", rotation, place)
@@ -81,7 +81,7 @@ def test_cameras_that_are_not_parallel_are_rectified_or_refused_where_called_rec
 
 @pytest.mark.parametrize("place", [[0, -0.25, 0], [0, 0.25, 0], [0.15, 0, 0.2], [0, 0, -0.25]])
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
-def test_a_right_camera_that_is_not_beside_the_left_is_refused(
+def test_a_right_camera_not_beside_the_left_is_refused(
     tmp_path: Path, names: tuple[str, str], place: list[float]
 ) -> None:
     beside = Transform("left_optical", "right_optical", np.eye(3), place)
@@ -90,7 +90,7 @@ def test_a_right_camera_that_is_not_beside_the_left_is_refused(
 
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
-def test_exchanged_cameras_are_named_so(tmp_path: Path, names: tuple[str, str]) -> None:
+def test_exchanged_cameras_are_reported(tmp_path: Path, names: tuple[str, str]) -> None:
     beside = Transform("left_optical", "right_optical", np.eye(3), [-0.25, 0, 0])
     with McapSource().open(single_calibrations(tmp_path / "log.mcap", names, beside)) as log:
         assert f"so {names[0]} is the right camera" in log.missing["left"]
@@ -110,7 +110,7 @@ def test_exchanged_cameras_are_named_so(tmp_path: Path, names: tuple[str, str]) 
         ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "are impossible for a camera"),
     ],
 )
-def test_a_calibration_that_cannot_be_is_told_as_such(tmp_path: Path, values: dict[str, Any], said: str) -> None:
+def test_an_impossible_calibration_is_refused(tmp_path: Path, values: dict[str, Any], said: str) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == "/stereo/left/camera_info":
             for name, value in values.items():
@@ -129,7 +129,7 @@ def test_a_calibration_that_cannot_be_is_told_as_such(tmp_path: Path, values: di
         ("plumb_bob", 8, ""),  # as many drivers call a rational polynomial
     ],
 )
-def test_a_lens_that_cannot_be_undone_is_told_before_the_run(tmp_path: Path, model: str, count: int, said: str) -> None:
+def test_an_unknown_distortion_is_reported_before_the_run(tmp_path: Path, model: str, count: int, said: str) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic.endswith("camera_info"):
             message.distortion_model, message.d = model, np.full(count, 1e-3)
@@ -140,7 +140,7 @@ def test_a_lens_that_cannot_be_undone_is_told_before_the_run(tmp_path: Path, mod
 
 
 @pytest.mark.parametrize("distorted", [False, True])
-def test_a_calibration_of_the_projection_alone_is_that_of_rectified_images(tmp_path: Path, distorted: bool) -> None:
+def test_a_calibration_with_only_p_means_rectified_images(tmp_path: Path, distorted: bool) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic.endswith("camera_info"):
             message.k, message.d = np.zeros(9), np.full(5, 0.1 * distorted)
@@ -156,7 +156,7 @@ def test_a_calibration_of_the_projection_alone_is_that_of_rectified_images(tmp_p
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
 @pytest.mark.parametrize(("place", "value", "said"), [((0, 0), 18.6, "fx is 20 and 18.6"), ((1, 2), 8.5, "cy is 7.5")])
-def test_a_stereo_calibration_whose_projections_differ_is_refused(
+def test_projections_of_no_rectified_pair_are_refused(
     tmp_path: Path, names: tuple[str, str], place: tuple[int, int], value: float, said: str
 ) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
@@ -170,7 +170,7 @@ def test_a_stereo_calibration_whose_projections_differ_is_refused(
         assert f"does not belong to a rectified pair: {said}" in log.missing["left"]
 
 
-def test_lenses_that_leave_no_image_are_refused() -> None:
+def test_lenses_without_a_rectified_image_are_refused() -> None:
     k = np.array([[300.0, 0, 320], [0, 300, 240], [0, 0, 1]])
     folding = np.array([0.0005, -0.0118, -0.0077, -0.0217])  # has no inverse at the corners
     lens = CameraModel(640, 480, k, folding, np.eye(3), np.hstack([k, np.zeros((3, 1))]), "equidistant")
@@ -181,7 +181,7 @@ def test_lenses_that_leave_no_image_are_refused() -> None:
         calibrated_pair((lens, lens), ("l", "r"), RAW, frames)
 
 
-def test_a_rectified_image_has_a_frame_of_its_own_where_r_turns_the_camera(tmp_path: Path) -> None:
+def test_a_rectified_image_has_its_own_frame_if_r_rotates_it(tmp_path: Path) -> None:
     """Everything that speaks of the camera's own frame, transforms and poses, is turned by R on its way in."""
     by = turned("y", 2.0) @ turned("x", -1.0)
 
@@ -204,9 +204,7 @@ def test_a_rectified_image_has_a_frame_of_its_own_where_r_turns_the_camera(tmp_p
 
 
 @pytest.mark.parametrize("with_base", [True, False])
-def test_a_pose_of_a_part_of_the_rover_is_made_that_of_the_rover_or_of_its_camera(
-    tmp_path: Path, with_base: bool
-) -> None:
+def test_a_pose_is_transformed_to_the_rover_or_its_camera(tmp_path: Path, with_base: bool) -> None:
     camera, inclinometer = TRANSFORMS
     on_camera = camera.inverse().after(inclinometer)
 
@@ -234,7 +232,7 @@ def test_a_pose_of_a_part_of_the_rover_is_made_that_of_the_rover_or_of_its_camer
         assert np.trace(pose.covariance[:3, :3]) == pytest.approx(0.01 * (3 + 2 * lever**2))
 
 
-def test_a_frame_of_the_rover_that_is_set_must_be_one_that_the_camera_sits_on(tmp_path: Path) -> None:
+def test_the_set_base_frame_must_be_joined_to_the_camera(tmp_path: Path) -> None:
     with McapSource(base_frame="rover").open(write_sample(tmp_path / "log.mcap")) as log:
         assert log.refused["base_frame"].startswith("the source's 'base_frame' is set to 'rover', but /tf_static")
         assert "joins the camera to 'base_link' only; set it to one of these" in log.refused["base_frame"]
@@ -251,7 +249,7 @@ def test_a_frame_of_the_rover_that_is_set_must_be_one_that_the_camera_sits_on(tm
 
 
 @pytest.mark.parametrize(("told", "resting"), [("base_link", "imu_link"), ("left_optical", "base_link")])
-def test_a_pose_told_in_another_part_of_the_rover_is_none_at_rest(tmp_path: Path, told: str, resting: str) -> None:
+def test_a_pose_in_a_frame_of_the_rover_is_refused(tmp_path: Path, told: str, resting: str) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == "/odom":
             message.header.frame_id, message.child_frame_id = resting, told
@@ -273,7 +271,7 @@ def test_frames_without_names_are_not_connected(tmp_path: Path) -> None:
         assert "joins the camera (whose frame_id is empty) and the inclinometer (whose frame_id" in log.missing["mount"]
 
 
-def test_a_calibration_without_a_frame_is_of_its_images_frame(tmp_path: Path) -> None:
+def test_a_calibration_without_a_frame_has_that_of_its_images(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic.endswith("camera_info"):
             message.header.frame_id = ""
@@ -304,7 +302,7 @@ def with_transforms(path: Path, *more: Transform) -> Path:
         (Transform("", "imu_link", np.eye(3), [0, 0, 1]), "lacks the name of a frame"),
     ],
 )
-def test_a_transform_that_cannot_be_is_told_and_the_others_hold(tmp_path: Path, more: Transform, said: str) -> None:
+def test_an_invalid_transform_is_reported_and_left_out(tmp_path: Path, more: Transform, said: str) -> None:
     with McapSource().open(with_transforms(tmp_path / "log.mcap", more)) as log:
         assert log.missing == {}
         assert log.resolution.mount is not None
@@ -317,7 +315,7 @@ def test_a_transform_that_cannot_be_is_told_and_the_others_hold(tmp_path: Path, 
         raise told[0][1]
 
 
-def test_a_translation_that_is_not_finite_is_told_and_not_used(tmp_path: Path) -> None:
+def test_an_infinite_translation_is_reported_and_left_out(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == "/tf_static":
             message.transforms[0].transform.translation.x = np.nan
@@ -330,7 +328,7 @@ def test_a_translation_that_is_not_finite_is_told_and_not_used(tmp_path: Path) -
     assert told == [f"/tf_static: {what} is [nan, 0.1, 0.9], which is no place"]
 
 
-def test_a_long_chain_of_transforms_is_followed_either_way():
+def test_a_long_chain_of_transforms_is_followed():
     frames, message = TransformTree(), TRANSFORMS[0]
     links = [Transform(f"link{i}", f"link{i + 1}", np.eye(3), np.array([0.1, 0.0, 0.0])) for i in range(2000)]
     for _ in range(3):
@@ -345,7 +343,7 @@ def test_a_long_chain_of_transforms_is_followed_either_way():
     assert frames.between(message.parent, "link0") is None
 
 
-def test_a_transform_that_is_told_again_is_no_contradiction(tmp_path: Path) -> None:
+def test_a_repeated_transform_is_no_contradiction(tmp_path: Path) -> None:
     with McapSource().open(with_transforms(tmp_path / "log.mcap", *TRANSFORMS, TRANSFORMS[0].inverse())) as log:
         assert not [item for _, _, item in log.events() if isinstance(item, Exception)]
         assert log.resolution.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]

@@ -30,7 +30,7 @@ def images(path: Path, topics: dict[str, str], infos: dict[str, str]) -> Path:
     return path
 
 
-def test_cameras_of_two_places_are_not_better_or_worse_than_each_other(tmp_path: Path) -> None:
+def test_two_stereo_cameras_are_equally_good(tmp_path: Path) -> None:
     sides = ("left", "right")
     topics = [f"/{place}/{side}/{kind}" for place, kind in (("front", "image_raw"), ("rear", "image_rect"))
               for side in sides]  # fmt: skip
@@ -61,7 +61,7 @@ def test_one_camera_may_send_its_images_compressed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("raw", ["/cam/left/image_raw", "/cam/left_raw/image_raw"])
-def test_of_one_camera_the_rectified_images_are_taken(tmp_path: Path, raw: str) -> None:
+def test_rectified_images_are_preferred(tmp_path: Path, raw: str) -> None:
     names = [raw, "/cam/left/image_rect"]
     topics = [*names, *(name.replace("left", "right") for name in names)]
     path = images(tmp_path / "log.mcap", dict.fromkeys(topics, "a"), {})
@@ -71,7 +71,7 @@ def test_of_one_camera_the_rectified_images_are_taken(tmp_path: Path, raw: str) 
 
 
 @pytest.mark.parametrize(("frame", "found"), [("front_left", True), ("rear_left", False), ("", False)])
-def test_a_calibration_from_elsewhere_must_be_of_the_images_frame(tmp_path: Path, frame: str, found: bool) -> None:
+def test_a_calibration_elsewhere_must_have_the_frame_of_the_images(tmp_path: Path, frame: str, found: bool) -> None:
     topics = {f"/front/{side}/image_rect": frame.replace("left", side) for side in ("left", "right")}
     infos = {f"/calibration/{side}": f"front_{side}" if frame else "" for side in ("left", "right")}
     with McapSource().open(images(tmp_path / "log.mcap", topics, infos)) as log:
@@ -80,7 +80,7 @@ def test_a_calibration_from_elsewhere_must_be_of_the_images_frame(tmp_path: Path
             assert "no CameraInfo belongs to /front/left/image_rect" in log.missing["left"]
 
 
-def test_the_calibration_under_the_image_itself_comes_first(tmp_path: Path) -> None:
+def test_the_calibration_below_the_image_topic_is_preferred(tmp_path: Path) -> None:
     topics = {f"/cam/{side}": side for side in ("left", "right")}
     infos = {f"/cam/{side}/camera_info": side for side in topics.values()} | {"/cam/camera_info": "other"}
     with McapSource().open(images(tmp_path / "log.mcap", topics, infos)) as log:
@@ -88,14 +88,14 @@ def test_the_calibration_under_the_image_itself_comes_first(tmp_path: Path) -> N
         assert [camera.frame_id for camera in log.resolution.cameras] == ["left", "right"]
 
 
-def test_a_navigation_camera_is_a_camera(tmp_path: Path) -> None:
+def test_a_navigation_camera_is_found(tmp_path: Path) -> None:
     names = ("/nav/left/image_rect", "/nav/right/image_rect")
     with McapSource().open(write_sample(tmp_path / "log.mcap", names=names)) as log:
         assert log.missing == {}
         assert (log.topics["left"], log.topics["right"]) == names
 
 
-def test_truth_is_used_with_its_partner_where_it_is_told(tmp_path: Path) -> None:
+def test_truth_topics_are_used_only_if_set(tmp_path: Path) -> None:
     names = ("/truth/left/image_rect", "/truth/right/image_rect")
     path = write_sample(tmp_path / "log.mcap", names=names)
     with McapSource().open(path) as log:
@@ -105,7 +105,7 @@ def test_truth_is_used_with_its_partner_where_it_is_told(tmp_path: Path) -> None
         assert log.topics["right"] == names[1]
 
 
-def test_a_pose_among_results_is_named_but_not_taken(tmp_path: Path) -> None:
+def test_a_pose_among_results_is_named_but_not_used(tmp_path: Path) -> None:
     from recordings.ros2.to_msg import odometry
     from stages.data import Pose
 
@@ -142,18 +142,18 @@ def moving(path: Path, *links: tuple[str, str]) -> Path:
         ),
     ],
 )
-def test_transforms_that_tell_no_pose_or_two_are_refused(tmp_path: Path, links: list[Any], said: str) -> None:
+def test_transforms_with_no_pose_or_two_are_refused(tmp_path: Path, links: list[Any], said: str) -> None:
     with McapSource(odometry="/tf").open(moving(tmp_path / "log.mcap", *links)) as log:
         assert f"the source's 'odometry' is set to /tf, where {said}" in log.refused["odometry"]
 
 
-def test_of_map_odom_and_rover_the_pose_is_that_in_odom(tmp_path: Path) -> None:
+def test_the_pose_in_odom_is_preferred_to_that_in_map(tmp_path: Path) -> None:
     path = moving(tmp_path / "log.mcap", WHEEL, MAP, ODOM)
     assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
 
 
 @pytest.mark.parametrize("given", [None, "/odom"])
-def test_a_pose_of_something_the_camera_is_not_known_to_sit_on_is_not_taken(tmp_path: Path, given: str | None) -> None:
+def test_a_pose_of_a_frame_not_joined_to_the_camera_is_refused(tmp_path: Path, given: str | None) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == "/odom":
             message.child_frame_id = "foot"
@@ -165,19 +165,19 @@ def test_a_pose_of_something_the_camera_is_not_known_to_sit_on_is_not_taken(tmp_
         assert ("odometry" in log.refused) == (given is not None)
 
 
-def test_a_slash_in_front_of_a_frames_name_does_not_make_it_another(tmp_path: Path) -> None:
+def test_a_leading_slash_of_a_frame_is_ignored(tmp_path: Path) -> None:
     path = moving(tmp_path / "log.mcap", ("/odom", "/base_link"))
     assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
 
 
-def test_the_pose_is_that_of_the_base_frame_that_is_set(tmp_path: Path) -> None:
+def test_the_pose_is_that_of_the_set_base_frame(tmp_path: Path) -> None:
     path = moving(tmp_path / "log.mcap", MAP, ("odom", "foot"))
     poses = items_of(path, McapSource(odometry="/tf", base_frame="foot"))
     assert [pose.position[0] for _, _, pose in poses] == [number * PERIOD for number in range(5)]
 
 
 @pytest.mark.parametrize("bad", [5, FRAMES])
-def test_an_imu_without_a_single_unit_quaternion_is_no_inclinometer(tmp_path: Path, bad: int) -> None:
+def test_an_imu_without_unit_quaternions_is_no_inclinometer(tmp_path: Path, bad: int) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == TILT and number < bad:
             for name in "xyzw":
@@ -189,7 +189,7 @@ def test_an_imu_without_a_single_unit_quaternion_is_no_inclinometer(tmp_path: Pa
         assert said in log.missing["inclinometer"]
 
 
-def test_an_imu_that_begins_with_nonsense_is_still_an_inclinometer(tmp_path: Path) -> None:
+def test_an_imu_that_begins_invalid_is_an_inclinometer(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == TILT and number == 0:
             message.orientation_covariance = np.full(9, -1.0)
@@ -201,7 +201,7 @@ def test_an_imu_that_begins_with_nonsense_is_still_an_inclinometer(tmp_path: Pat
     assert [stream for stream, _ in losses] == ["inclinometer"]
 
 
-def test_an_imu_that_is_nonsense_for_long_is_still_an_inclinometer(tmp_path: Path, monkeypatch: Any) -> None:
+def test_an_imu_that_is_invalid_for_long_is_an_inclinometer(tmp_path: Path, monkeypatch: Any) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == TILT and number < FRAMES - 2:
             message.orientation_covariance = np.full(9, -1.0)

@@ -46,7 +46,7 @@ def test_rates_and_gaps_are_those_of_the_log(description: dict[str, Any]) -> Non
     assert description["missing"] == {}
 
 
-def test_calibration_transforms_and_pairs_are_told(description: dict[str, Any]) -> None:
+def test_calibration_transforms_and_pairs_are_reported(description: dict[str, Any]) -> None:
     assert description["calibration"]["baseline"] == BASELINE
     assert description["calibration"]["rectified"] is True
     assert description["transforms"] == ["base_link <- imu_link", "base_link <- left_optical"]
@@ -55,7 +55,7 @@ def test_calibration_transforms_and_pairs_are_told(description: dict[str, Any]) 
     assert (frames["left"], frames["right"], frames["pairs"], frames["with_tilt"]) == (FRAMES,) * 4
 
 
-def test_the_text_names_every_topic_its_stream_and_what_is_missing(tmp_path: Path) -> None:
+def test_the_text_lists_topics_streams_and_missing_streams(tmp_path: Path) -> None:
     path = write_sample(tmp_path / "log.mcap", lambda topic, number, m: None if topic == "/odom" else m)
     text = format_description(inventory_of(path))
     line = next(line for line in text.splitlines() if line.startswith(LEFT))
@@ -65,7 +65,7 @@ def test_the_text_names_every_topic_its_stream_and_what_is_missing(tmp_path: Pat
     assert f"{frames}; 5 left images with a tilt (readings at most 200 ms apart)" in text
 
 
-def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: Path) -> None:
+def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == RIGHT and number in (1, 2):
             message.header.stamp.nanosec += 6_000_000 if number == 1 else 4_000_000
@@ -84,7 +84,7 @@ def test_images_that_do_not_pair_and_tilts_too_far_apart_are_counted(tmp_path: P
     assert "readings at most 400 ms apart" in text
 
 
-def test_repeated_stamps_count_once_and_are_told(tmp_path: Path) -> None:
+def test_repeated_stamps_count_once_and_are_reported(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic in (LEFT, RIGHT, TILT) and number == 2:
             message.header.stamp.nanosec -= PERIOD
@@ -98,14 +98,14 @@ def test_repeated_stamps_count_once_and_are_told(tmp_path: Path) -> None:
     assert described["damage"] == [f"{topic}: {said}" for topic in (LEFT, RIGHT, TILT)]
 
 
-def test_of_cameras_that_are_missing_no_pairs_are_told(tmp_path: Path) -> None:
+def test_without_cameras_no_pairs_are_reported(tmp_path: Path) -> None:
     edit = lambda topic, _, message: None if topic.endswith("camera_info") else message  # noqa: E731
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
     assert "missing: left: no CameraInfo belongs to" in text
     assert "frames:" not in text
 
 
-def test_tilts_that_cannot_be_read_are_told_in_a_line_with_the_first_of_them(tmp_path: Path) -> None:
+def test_similar_tilt_errors_are_grouped_in_one_line(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == TILT and number:
             message.orientation.x = message.orientation.y = message.orientation.z = 0.0
@@ -120,7 +120,7 @@ def test_tilts_that_cannot_be_read_are_told_in_a_line_with_the_first_of_them(tmp
     )
 
 
-def test_streams_whose_headers_have_no_stamp_are_told_to_go_by_the_time_of_the_log(tmp_path: Path) -> None:
+def test_streams_without_stamps_are_noted(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic in (LEFT, "/odom"):
             message.header.stamp.sec = message.header.stamp.nanosec = 0
@@ -134,7 +134,7 @@ def test_streams_whose_headers_have_no_stamp_are_told_to_go_by_the_time_of_the_l
     ]
 
 
-def test_a_calibration_that_may_be_of_another_image_size_is_doubted(tmp_path: Path) -> None:
+def test_a_calibration_of_another_image_size_is_doubted(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic.endswith("camera_info"):
             message.width, message.height = 2 * message.width + 12, 2 * message.height
@@ -167,7 +167,7 @@ def test_a_calibration_that_may_be_of_another_image_size_is_doubted(tmp_path: Pa
         ),
     ],
 )  # fmt: skip
-def test_a_baseline_that_is_told_twice_or_by_the_transform_alone_is_noted(
+def test_a_baseline_from_or_against_the_transform_is_noted(
     tmp_path: Path, told: float, told_by_transform: float, note: str
 ) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
@@ -189,7 +189,7 @@ def test_a_baseline_that_is_told_twice_or_by_the_transform_alone_is_noted(
     assert f"note: right: {described['notes']['right']}" in format_description(described).splitlines()
 
 
-def test_a_missing_right_calibration_is_said_in_whole_sentences(tmp_path: Path) -> None:
+def test_a_missing_right_calibration_is_reported(tmp_path: Path) -> None:
     edit = lambda topic, _, message: None if topic == "/stereo/right/camera_info" else message  # noqa: E731
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
     listed = "the log's CameraInfo topics are /stereo/left/camera_info"
@@ -200,7 +200,7 @@ def test_a_missing_right_calibration_is_said_in_whole_sentences(tmp_path: Path) 
     ]
 
 
-def test_topics_that_cannot_be_decoded_are_listed_once(tmp_path: Path) -> None:
+def test_undecodable_topics_are_listed_once(tmp_path: Path) -> None:
     path = copied(write_sample(tmp_path / "log.mcap"), tmp_path / "odd.mcap", lambda *of: ("protobuf", of[2]))
     text = format_description(inventory_of(path))
     assert text.count("cannot be decoded") == text.count(f"{LEFT}: its messages are in 'protobuf'") == 1
@@ -209,13 +209,13 @@ def test_topics_that_cannot_be_decoded_are_listed_once(tmp_path: Path) -> None:
         assert all(f"{LEFT}: its messages" in log.missing[stream] for stream in ("left", "inclinometer", "odometry"))
 
 
-def test_one_is_not_many(tmp_path: Path) -> None:
+def test_singular_and_plural_are_correct(tmp_path: Path) -> None:
     edit = lambda topic, number, message: None if number else message  # noqa: E731
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
     assert "1 stereo pair (stamps within 5 ms) from 1 left image and 1 right image; 1 left image with" in text
 
 
-def test_damage_is_told(tmp_path: Path) -> None:
+def test_damage_is_reported(tmp_path: Path) -> None:
     path = rewritten(write_sample(tmp_path / "sample.mcap"), tmp_path / "log.mcap", chunk_size=500)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     description = inventory_of(path)
@@ -224,7 +224,7 @@ def test_damage_is_told(tmp_path: Path) -> None:
     assert "damaged: the log is cut" in format_description(description)
 
 
-def test_an_imu_without_orientation_is_not_taken_for_an_inclinometer(tmp_path: Path) -> None:
+def test_an_imu_without_orientation_is_no_inclinometer(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == TILT:
             message.orientation_covariance = np.full(9, -1.0)

@@ -48,7 +48,7 @@ def missing(path: Path, source: McapSource | None = None) -> dict[str, str]:
         return log.missing
 
 
-def test_what_was_written_is_read_bit_for_bit(sample: Path) -> None:
+def test_messages_are_read_bit_for_bit(sample: Path) -> None:
     with McapSource().open(sample) as log:
         assert (log.missing, log.frames) == ({}, FRAMES)
         assert log.topics == {"left": LEFT, "right": RIGHT, "inclinometer": TILT, "odometry": "/odom"}
@@ -81,7 +81,7 @@ def test_the_mount_comes_first_and_follows_the_static_transforms(whole: list[tup
     np.testing.assert_allclose(mount.base_from_camera([[0, 0, 2.0]]), [[2.5, 0.1, 0.9]], atol=1e-12)
 
 
-def test_the_mount_holds_for_frames_behind_a_clock_that_was_set_back(tmp_path: Path) -> None:
+def test_the_mount_holds_after_a_clock_was_set_back(tmp_path: Path) -> None:
     def set_back(topic: str, number: int, message: Any) -> Any:
         if number >= 3:
             message.header.stamp.sec -= 3600
@@ -95,7 +95,7 @@ def test_the_mount_holds_for_frames_behind_a_clock_that_was_set_back(tmp_path: P
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_layout_of_file_gives_the_same_items(
+def test_every_file_layout_gives_the_same_items(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str
 ) -> None:
     other = rewritten(sample, tmp_path / "other.mcap", **LAYOUTS[layout])
@@ -103,7 +103,7 @@ def test_every_layout_of_file_gives_the_same_items(
     assert inventory_of(other)["frames"]["pairs"] == FRAMES
 
 
-def test_messages_come_in_log_time_order_whatever_their_order_in_the_file(sample: Path, tmp_path: Path) -> None:
+def test_messages_are_read_in_log_time_order(sample: Path, tmp_path: Path) -> None:
     backwards = tmp_path / "backwards.mcap"
     with sample.open("rb") as source, backwards.open("wb") as target:
         writer = Writer(target, chunk_size=2000)
@@ -121,7 +121,7 @@ def test_messages_come_in_log_time_order_whatever_their_order_in_the_file(sample
     assert len(times) == 4 * FRAMES + 1
 
 
-def test_a_range_holds_whole_frames_and_the_tilts_around_them(sample: Path) -> None:
+def test_a_range_contains_complete_frames_and_their_tilts(sample: Path) -> None:
     with McapSource().open(sample, start=0.1, end=0.3) as log:
         assert log.frames == 2
         events = list(log.events())
@@ -166,7 +166,7 @@ def change(topic: str, **values: Any) -> Any:
         (change(INFO, k=np.zeros(9), p=np.zeros(12)), "left", "is not calibrated"),
     ],
 )  # fmt: skip
-def test_what_is_missing_is_said_with_the_remedy(tmp_path: Path, edit: Any, stream: str, said: str) -> None:
+def test_missing_streams_are_reported_with_the_remedy(tmp_path: Path, edit: Any, stream: str, said: str) -> None:
     told = missing(write_sample(tmp_path / "log.mcap", edit))
     assert stream in told
     assert re.search(said, told[stream]), told[stream]
@@ -181,7 +181,7 @@ def test_what_is_missing_is_said_with_the_remedy(tmp_path: Path, edit: Any, stre
         ("/stereoLeft/image", "/stereoRight/image"),
     ],
 )
-def test_pairs_are_found_by_the_names_cameras_go_by(tmp_path: Path, names: tuple[str, str]) -> None:
+def test_pairs_are_found_by_common_camera_names(tmp_path: Path, names: tuple[str, str]) -> None:
     with McapSource().open(write_sample(tmp_path / "log.mcap", names=names)) as log:
         assert (log.topics["left"], log.topics["right"]) == names
         assert {item.stamp for _, stream, item in log.events() if stream == "left"} == {
@@ -189,7 +189,7 @@ def test_pairs_are_found_by_the_names_cameras_go_by(tmp_path: Path, names: tuple
         }
 
 
-def test_two_equal_pairs_are_not_chosen_between_but_named(sample: Path, tmp_path: Path) -> None:
+def test_equally_good_pairs_are_named_and_none_is_chosen(sample: Path, tmp_path: Path) -> None:
     both = tmp_path / "both.mcap"
     front = write_sample(tmp_path / "front.mcap", names=("/front/left/image_rect", "/front/right/image_rect"))
     with both.open("wb") as target:
@@ -212,7 +212,7 @@ def test_two_equal_pairs_are_not_chosen_between_but_named(sample: Path, tmp_path
     assert "which is not a suitable topic of the log" in missing(both, McapSource(left="/nope"))["left"]
 
 
-def test_baseline_and_rectification_of_two_single_calibrations_come_from_their_transform(tmp_path: Path) -> None:
+def test_single_calibrations_are_joined_by_their_transform(tmp_path: Path) -> None:
     turned = Rotation.from_euler("y", 2, degrees=True).as_matrix()
     beside = Transform("left_optical", "right_optical", turned, [0.3, 0, 0.01])
 
@@ -241,7 +241,7 @@ def test_baseline_and_rectification_of_two_single_calibrations_come_from_their_t
     assert depth == pytest.approx((camera.raw[0].r @ point)[2], rel=1e-9)
 
 
-def test_one_bad_message_is_lost_alone(tmp_path: Path) -> None:
+def test_a_bad_message_is_lost_alone(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == LEFT and number == 1:
             message.data = message.data[:-5]
@@ -262,7 +262,7 @@ def test_one_bad_message_is_lost_alone(tmp_path: Path) -> None:
     assert len(events) == 4 * FRAMES + 1
 
 
-def test_a_camera_whose_images_nobody_can_read_is_missing_before_the_run(tmp_path: Path) -> None:
+def test_an_unsupported_encoding_is_reported_before_the_run(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == RIGHT:
             message.encoding = "yuv422_yuy2"
@@ -278,7 +278,7 @@ def test_a_camera_whose_images_nobody_can_read_is_missing_before_the_run(tmp_pat
 
 
 @pytest.mark.parametrize("whole", [None, FRAMES // 2])
-def test_a_camera_whose_images_are_all_broken_is_missing_before_the_run(
+def test_a_camera_with_only_broken_images_is_missing(
     tmp_path: Path, whole: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
@@ -324,7 +324,7 @@ def cropped(message: Any) -> Any:
         ),
     ],
 )  # fmt: skip
-def test_images_that_fit_no_frame_are_told_before_the_run_unless_some_do(
+def test_mismatched_images_are_reported_unless_some_match(
     tmp_path: Path, topic: str, change: Any, told: dict[str, str], odd: range
 ) -> None:
     edit = lambda name, number, message: change(message) if name == topic and number in odd else message  # noqa: E731
@@ -347,12 +347,12 @@ def bare(tmp_path: Path, x: float, y: float) -> Path:
 PITCH, ROLL = AngleField("vector.x", "deg", 1), AngleField("vector.y", "deg", -1)
 
 
-def test_bare_angles_are_not_guessed(tmp_path: Path) -> None:
+def test_plain_angles_are_not_guessed(tmp_path: Path) -> None:
     told = missing(bare(tmp_path, 10, 20))["inclinometer"]
     assert "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source" in told
 
 
-def test_bare_angles_are_read_as_the_settings_say(tmp_path: Path) -> None:
+def test_plain_angles_are_read_by_the_settings(tmp_path: Path) -> None:
     source = McapSource(pitch=PITCH, roll=ROLL, tilt_model="axis")
     tilt = next(item for _, stream, item in items_of(bare(tmp_path, 10, 20), source) if stream == "inclinometer")
     p, r = np.deg2rad([10, -20])
@@ -374,12 +374,12 @@ def test_bare_angles_are_read_as_the_settings_say(tmp_path: Path) -> None:
         ({"camera_from_inclinometer": [[1, 0], [0, 1], [0, 0], [0, 0]]}, "must be a unit quaternion"),
     ],
 )
-def test_half_told_angles_are_refused(settings_: dict[str, Any], said: str) -> None:
+def test_incomplete_angle_settings_are_refused(settings_: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         McapSource(**settings_)
 
 
-def test_a_stamp_of_zero_is_the_time_of_logging(tmp_path: Path) -> None:
+def test_a_stamp_of_zero_is_replaced_by_the_log_time(tmp_path: Path) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic in (LEFT, RIGHT):
             message.header = header(0, message.header.frame_id)
@@ -390,12 +390,12 @@ def test_a_stamp_of_zero_is_the_time_of_logging(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bounds", [{"start": float("nan")}, {"end": float("inf")}])
-def test_a_range_without_numbers_is_refused(sample: Path, bounds: dict[str, float]) -> None:
+def test_a_range_that_is_not_finite_is_refused(sample: Path, bounds: dict[str, float]) -> None:
     with pytest.raises(LogError, match="must be in seconds after the log's first message, not"):
         McapSource().open(sample, **bounds)
 
 
-def test_channels_in_other_encodings_do_no_harm(sample: Path, whole: list[Any], tmp_path: Path) -> None:
+def test_channels_in_other_encodings_are_ignored(sample: Path, whole: list[Any], tmp_path: Path) -> None:
     out = tmp_path / "mixed.mcap"
     with sample.open("rb") as source, out.open("wb") as target:
         writer = Writer(target)
