@@ -1,4 +1,4 @@
-"""What a run makes of frames that no map can be made of: it names and skips them, and leaves the others alone."""
+"""A run reports and skips frames without a map, and does not change the others."""
 
 from __future__ import annotations
 
@@ -108,11 +108,11 @@ def test_a_bad_frame_is_reported_and_the_map_stays_correct(
     log, out = rewrite(traverse, tmp_path / "log.mcap", make(stamps[BAD], traverse)), tmp_path / "out.mcap"
     capsys.readouterr()
     assert roverflow("run", log, "--set", "disparities=64", "-o", out, "--no-rrd") == 3
-    said = capsys.readouterr()
-    assert "INCOMPLETE" in said.out
-    assert all(word in said.out for word in words)
-    assert str(stamps[BAD]) in said.out
-    assert "Traceback" not in said.out + said.err
+    output = capsys.readouterr()
+    assert "INCOMPLETE" in output.out
+    assert all(word in output.out for word in words)
+    assert str(stamps[BAD]) in output.out
+    assert "Traceback" not in output.out + output.err
     maps, left = maps_of(out), [stamp for number, stamp in enumerate(stamps) if number != BAD]
     assert all(list(found) == left for found in maps.values())
     for stamp in left:
@@ -131,10 +131,10 @@ def test_a_bad_frame_is_reported_and_the_map_stays_correct(
 def test_a_run_without_points_writes_no_map(traverse: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     out, nothing = tmp_path / "out.mcap", ("--set", "cleaned.max_range=0.1 m", "--set", "cleaned.margin=0 m")
     assert roverflow("run", traverse, "--set", "disparities=64", *nothing, "-o", out, "--no-rrd") == 3
-    said = capsys.readouterr()
-    assert "INCOMPLETE: 0 of" in said.out
-    assert f"{FRAMES} failed, first: points" in said.out
-    assert "Traceback" not in said.out + said.err
+    output = capsys.readouterr()
+    assert "INCOMPLETE: 0 of" in output.out
+    assert f"{FRAMES} failed, first: points" in output.out
+    assert "Traceback" not in output.out + output.err
     counts = Counter(topic for topic, _, _ in iter_decoded(out))
     assert counts["/nav/disparity"] == FRAMES
     assert not counts.keys() & set(MAPS)
@@ -149,7 +149,7 @@ def test_a_missing_baseline_is_reported_in_one_sentence(traverse: Path, tmp_path
 
     log = rewrite(traverse, tmp_path / "log.mcap", change)
     assert roverflow("run", log, "-o", tmp_path / "out.mcap", "--no-rrd") == 2
-    said = capsys.readouterr().err
-    assert "does not contain the baseline" in said
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert "does not contain the baseline" in output
+    assert output.count("\n") == 1
     assert not (tmp_path / "out.mcap").exists()

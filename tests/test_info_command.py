@@ -1,4 +1,4 @@
-"""What `roverflow info` says of a log, and through which pipeline it looks at it."""
+"""`roverflow info` through a pipeline."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from tests.recordings.sample_log import RIGHT, TILT, write_sample
 
 def test_info_describes_a_log(traverse, capsys):
     assert roverflow("info", traverse) == 0
-    said = capsys.readouterr().out
-    assert "/stereo/left/image_rect_color" in said
-    assert f"{FRAMES}" in said
-    assert said.splitlines()[-1] == "run -p rover: can run on this log"
+    output = capsys.readouterr().out
+    assert "/stereo/left/image_rect_color" in output
+    assert f"{FRAMES}" in output
+    assert output.splitlines()[-1] == "run -p rover: can run on this log"
 
 
 def test_info_reports_why_a_run_would_refuse_the_log(traverse, capsys):
     assert roverflow("info", traverse, "-p", "paper", "--set", "source.left=/nix") == 0
-    said = capsys.readouterr().out.splitlines()[-1]
-    assert said.startswith("run -p paper: would refuse this log: the source's 'left' is set to /nix")
+    output = capsys.readouterr().out.splitlines()[-1]
+    assert output.startswith("run -p paper: would refuse this log: the source's 'left' is set to /nix")
     assert roverflow("run", traverse, "-p", "paper", "--set", "source.left=/nix") == 2
-    assert said.partition("refused: ")[2] in capsys.readouterr().err
+    assert output.partition("refused: ")[2] in capsys.readouterr().err
 
 
 def test_info_of_a_cut_log_ends_incomplete(traverse, tmp_path, capsys):
@@ -61,10 +61,10 @@ def test_info_counts_pairs_and_tilts_by_the_pipeline(tmp_path, capsys):
     assert frames() == (0, 0.005, 4, 0.2)
     assert frames("--set", "stereo.slop=10 ms") == (5, 0.01, 4, 0.2)
     assert frames("--set", "tilt.max_gap=1 ms", "--set", "logged.max_gap=2 s") == (0, 0.005, 0, 0.001)
-    for wide, said in (("5 ms", "left image has a right image"), ("10 ms", "frame has tilt readings")):
+    for wide, output in (("5 ms", "left image has a right image"), ("10 ms", "frame has tilt readings")):
         assert roverflow("info", log, "--set", f"stereo.slop={wide}", "--set", "tilt.max_gap=1 ms") == 0
         last = capsys.readouterr().out.splitlines()[-1]
-        assert last == f"run -p rover: can run on this log, but no {said} near enough in time (see frames)"
+        assert last == f"run -p rover: can run on this log, but no {output} near enough in time (see frames)"
     pipeline.write_text("""
 source: {use: recordings.McapSource}
 streams:

@@ -1,4 +1,4 @@
-"""What the command line refuses: one sentence that says what, where and what to do, before anything is written."""
+"""Refusals of the command line: one sentence with what, where and the remedy, before anything is written."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def drop(*parts: str):
 def test_an_incomplete_log_is_refused_in_one_sentence(traverse, tmp_path, capsys, change, words):
     log = rewrite(traverse, tmp_path / "lacking.mcap", change)
     assert roverflow("run", log, "-o", tmp_path / "out.mcap") == 2
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert words in printed
+    assert printed.count("\n") == 1
     assert list(tmp_path.iterdir()) == [log]
 
 
@@ -54,9 +54,9 @@ def test_a_file_of_another_format_is_refused_in_one_sentence(tmp_path, capsys, c
     log.write_bytes(content)
     for command in (("run", log), ("info", log)):
         assert roverflow(*command) == 2
-        said = capsys.readouterr().err
-        assert "odd.mcap" in said
-        assert said.count("\n") == 1
+        printed = capsys.readouterr().err
+        assert "odd.mcap" in printed
+        assert printed.count("\n") == 1
     assert roverflow("run", tmp_path / "nowhere.mcap") == 2
     assert roverflow("info", tmp_path / ("long" * 100)) == 2
 
@@ -79,9 +79,9 @@ def test_a_missing_stage_input_is_refused_before_the_run(traverse, tmp_path, cap
 def test_an_invalid_setting_is_quoted_as_written(traverse, tmp_path, capsys, change, words):
     for more in ((), ("--debug",)):  # which shows the way there, and changes no exit code
         assert roverflow("run", traverse, "--set", change, "-o", tmp_path / "out.mcap", *more) == 2
-        said = capsys.readouterr().err
-        assert said.endswith(f"{words}\n")
-        assert ("Traceback" in said) == bool(more)
+        printed = capsys.readouterr().err
+        assert printed.endswith(f"{words}\n")
+        assert ("Traceback" in printed) == bool(more)
 
 
 @pytest.mark.parametrize("option", ["-o", "--rrd", "--summary"])
@@ -201,10 +201,10 @@ def test_only_a_log_replaces_a_log_or_has_its_name(traverse, tmp_path, capsys, o
     log.write_bytes(traverse.read_bytes())
     for name in (log, tmp_path / "new.mcap"):
         assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, name) == 2
-        said = (
+        printed = (
             "has the name of a log" if name.suffix == ".mcap" else TAKEN.format(option[2:].replace("rrd", "recording"))
         )
-        assert f"{name} {said}" in capsys.readouterr().err
+        assert f"{name} {printed}" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [log]
 
 
@@ -242,7 +242,7 @@ def test_a_failed_export_does_not_block_the_next(result, tmp_path, capsys, monke
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "said"),
+    ("option", "value", "printed"),
     [
         ("--slope", "80", "--slope must be 0 to 45 degrees, not 80 degrees"),
         ("--rocks", "2", "--rocks must be 0 to 0.5, not 2"),
@@ -258,9 +258,9 @@ def test_a_failed_export_does_not_block_the_next(result, tmp_path, capsys, monke
         ("--odometry-scale", "nan", "--odometry-scale must be -50 to 100 %, not nan %"),
     ],
 )
-def test_a_simulation_beyond_its_limits_is_refused_by_option(tmp_path, capsys, option, value, said):
+def test_a_simulation_beyond_its_limits_is_refused_by_option(tmp_path, capsys, option, value, printed):
     assert roverflow("simulate", tmp_path / "log.mcap", option, value) == 2
-    assert said in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
 
 
 def test_a_section_in_place_of_a_setting_is_explained(traverse, tmp_path, capsys):
@@ -295,16 +295,16 @@ def test_a_link_to_itself_is_replaced_by_the_output(tmp_path):
         assert opened.frames == 1
 
 
-@pytest.mark.parametrize(("option", "value", "said"), [
+@pytest.mark.parametrize(("option", "value", "printed"), [
     ("--workers", "0", "must be a whole number of at least 1, not '0'"),
     ("--workers", "9" * 20, "must be at most 1024"),
     ("--start", "1e300", "at most 9e+09"),
 ])  # fmt: skip
-def test_a_huge_number_is_refused(traverse, tmp_path, option, value, said, capsys):
+def test_a_huge_number_is_refused(traverse, tmp_path, option, value, printed, capsys):
     with pytest.raises(SystemExit) as caught:
         roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, value)
     assert caught.value.code == 2
-    assert said in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "soon"])
@@ -338,10 +338,10 @@ def test_every_command_reports_an_unwritable_path_alike(traverse, result, tmp_pa
     ):  # fmt: skip
         capsys.readouterr()
         assert roverflow(*command) == 1, command
-        said = capsys.readouterr().err
-        assert "cannot write /proc/x" in said
-        assert "; choose another place for the output" in said
-        assert said.count("\n") == 1
+        printed = capsys.readouterr().err
+        assert "cannot write /proc/x" in printed
+        assert "; choose another place for the output" in printed
+        assert printed.count("\n") == 1
 
 
 def test_a_full_disk_is_reported_in_one_sentence():
@@ -367,9 +367,9 @@ def test_a_full_disk_is_reported_in_one_sentence():
 )
 def test_a_topic_that_is_set_but_absent_is_refused(traverse, tmp_path, capsys, key, topic, there):
     assert roverflow("run", traverse, "--set", f"source.{key}={topic}", "-o", tmp_path / "out.mcap") == 2
-    said = capsys.readouterr().err
-    assert f"the source's '{key}' is set to {topic}, which is not a suitable topic of the log ({there}" in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert f"the source's '{key}' is set to {topic}, which is not a suitable topic of the log ({there}" in printed
+    assert printed.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
@@ -388,9 +388,9 @@ def test_angles_of_an_absent_field_are_refused_before_the_run(traverse, tmp_path
     angles += ["--set", "source.roll={field: orientation.x, unit: deg, sign: 1}"]
     angles += ["--set", f"source.inclinometer={imu}"]
     assert roverflow("run", traverse, *angles, "-o", tmp_path / "out.mcap") == 2
-    said = capsys.readouterr().err
-    assert f"the plain angles of {imu}: " in said
-    assert words in said
+    printed = capsys.readouterr().err
+    assert f"the plain angles of {imu}: " in printed
+    assert words in printed
     assert not list(tmp_path.iterdir())
 
 
@@ -414,28 +414,28 @@ def test_a_pipeline_of_nested_aliases_is_refused_at_once(tmp_path, capsys):
     )
 
 
-@pytest.mark.parametrize(("settings", "said"), [
+@pytest.mark.parametrize(("settings", "printed"), [
     (["max_range=1km"], "stages.Clean.max_range: must be at most 200 m, not 1km"),
     (["rover.wheel=1km"], "stages.TerrainFeatures.rover.wheel: must be at most 5 m, not 1km"),
     (["cells.max_range=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
     (["regional_cells.window=400m"], "makes a map 8000 cells of 0.05 m wide, and 4000 is the most"),
 ])  # fmt: skip
-def test_maps_beyond_memory_are_refused_before_the_run(settings, said, capsys):
+def test_maps_beyond_memory_are_refused_before_the_run(settings, printed, capsys):
     assert roverflow("graph", *(text for setting in settings for text in ("--set", setting))) == 2
-    assert said in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("sinks", "said"), [
+@pytest.mark.parametrize(("sinks", "printed"), [
     (["tests.flow.toys.Keep"], "tests.flow.toys.Keep writes .txt files, but a run writes only .mcap and .rrd files"),
     (["recordings.McapSink", "another.Another"], "several sinks write .mcap files, but a run writes only one"),
 ])  # fmt: skip
-def test_a_sink_without_an_output_is_refused(traverse, tmp_path, capsys, sinks, said):
+def test_a_sink_without_an_output_is_refused(traverse, tmp_path, capsys, sinks, printed):
     (tmp_path / "another.py").write_text("from recordings import McapSink\nclass Another(McapSink):\n    pass\n")
     listed = ", ".join(f"{{use: {use}}}" for use in sinks)
     shipped = (ROOT / "flow" / "pipelines" / "paper.yaml").read_text()
     (tmp_path / "own.yaml").write_text(f"{shipped.partition('sinks:')[0]}sinks: [{listed}]\n")
     assert roverflow("run", traverse, "-p", tmp_path / "own.yaml", "-o", tmp_path / "out.mcap") == 2
-    assert said in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
     assert not (tmp_path / "out.mcap").exists()
 
 

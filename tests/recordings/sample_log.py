@@ -1,4 +1,4 @@
-"""A small stereo log with lopsided pictures, and ways to write the same messages as another kind of MCAP file."""
+"""A small stereo log with asymmetric images, and the same messages in other MCAP layouts."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ LEFT, RIGHT, TILT = "/stereo/left/image_rect", "/stereo/right/image_rect", "/imu
 
 
 def data_folder(name: str) -> Path:
-    """A folder of the real data, or a skip that says where to put it."""
+    """A folder of the real data, or a skip with its name."""
     folder = Path(os.environ.get("ROVERFLOW_DATA", "")) / name
     if "ROVERFLOW_DATA" not in os.environ or not folder.exists():
-        pytest.skip(f"needs the real data: set ROVERFLOW_DATA to the folder that holds {name}")
+        pytest.skip(f"needs the real data: set ROVERFLOW_DATA to the folder with {name}")
     return folder
 
 
@@ -45,7 +45,7 @@ def model(side: str = "left", **changes: Any) -> CameraModel:
 
 
 def picture(seed: int) -> np.ndarray:
-    """An RGB picture that no flip, transposition or exchange of channels leaves alone."""
+    """An RGB picture that changes with any flip, transposition or exchange of channels."""
     return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
@@ -134,7 +134,7 @@ def items_of(path: Path, source: McapSource | None = None, **bounds: float) -> l
 
 
 def inventory_of(path: Path, **tolerances: int) -> dict[str, Any]:
-    """What `roverflow info` finds in a log."""
+    """The inventory of a log."""
     with McapSource().open(path) as log:
         return describe(log, **tolerances)
 

@@ -1,4 +1,4 @@
-"""A small Middlebury scene: a lopsided pattern before a plane, all of whose values float32 holds exactly."""
+"""A small Middlebury scene: an asymmetric pattern in front of a plane, with values exact in float32."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def true_disparity() -> np.ndarray:
 
 
 def occlusion() -> np.ndarray:
-    """(H, W) uint8: what the box hides from the right camera lies left of it, by as much as it is nearer."""
+    """(H, W) uint8: the right camera cannot see a strip left of the box."""
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[10:40, 40 - (FRONT - BACK) : 40] = 128
     mask[:, :BACK] = 128  # beyond the right image's edge
@@ -38,7 +38,7 @@ def occlusion() -> np.ndarray:
 
 
 def images() -> tuple[np.ndarray, np.ndarray]:
-    """The left and the right image (H, W, 3) RGB; the right one is what the true disparities make of the left."""
+    """The left and the right image (H, W, 3) RGB; the right one follows from the left by the true disparities."""
     rng = np.random.default_rng(7)
     shown = np.where(np.isfinite(true_disparity()), true_disparity(), BACK).astype(int)
     left = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8), (3, 3), 0)

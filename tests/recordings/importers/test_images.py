@@ -1,4 +1,4 @@
-"""Image files become a log that any reader of rover logs understands, with the camera where it was said to be."""
+"""Image files become a rover log with the given camera attitude."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_pairs_are_found_by_name_in_order(tmp_path: Path, names: list[str], left
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("names", "sentence"),
     [
         (["a-left.png", "a-right.png", "b-right.png", "c.png"], r"b-right\.png, c\.png has no partner"),
         (["a_l.png", "a_r.png", "b_l.png"], r"b_l\.png has no partner"),
@@ -103,10 +103,10 @@ def test_pairs_are_found_by_name_in_order(tmp_path: Path, names: list[str], left
         (["left/1.png", "right/1.png", "left_raw/1.png", "right_raw/1.png"], r"several cameras \(left, left_raw\)"),
     ],
 )
-def test_no_image_is_left_out_silently(tmp_path: Path, names: list[str], said: str) -> None:
+def test_no_image_is_left_out_silently(tmp_path: Path, names: list[str], sentence: str) -> None:
     for name in names:
         save(tmp_path / name, picture(0))
-    with pytest.raises(LogError, match=said):
+    with pytest.raises(LogError, match=sentence):
         pair_images(tmp_path)
 
 
@@ -121,7 +121,7 @@ def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "sentence"),
     [
         ({"baseline": None}, "lacks 'baseline'"),
         ({"focal": 3.0}, "has the unknown 'focal'"),
@@ -132,10 +132,12 @@ def test_an_image_without_a_partner_is_named(tmp_path: Path) -> None:
         ({"width": 640}, "is 24x16, but the calibration or the first pair is 640x16"),
     ],
 )
-def test_a_wrong_calibration_is_refused_and_leaves_no_file(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+def test_a_wrong_calibration_is_refused_and_leaves_no_file(
+    tmp_path: Path, change: dict[str, Any], sentence: str
+) -> None:
     left, right = make_pairs(tmp_path, 1)
     calibration = {k: v for k, v in {**CALIBRATION, "height": 16, **change}.items() if v is not None}
-    with pytest.raises(LogError, match=said):
+    with pytest.raises(LogError, match=sentence):
         import_images(left, right, calibration, tmp_path / "out.mcap", pitch_down=0, height=1)
     assert not list(tmp_path.glob("out*"))
 

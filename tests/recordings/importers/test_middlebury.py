@@ -1,4 +1,4 @@
-"""Middlebury scenes become logs that run, and whose truth is the scene's own, to the pixel."""
+"""Middlebury scenes become logs with the ground truth of the scene."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def truth_of(log: Path) -> dict[str, Any]:
 
 
 def result(log: Path, frame: StereoFrame, pixels: np.ndarray) -> Path:
-    """A result log that holds these disparities and nothing else."""
+    """A result log with only these disparities."""
     nothing = np.zeros(pixels.shape, np.uint8)
     disparity = Disparity(frame.stamp, pixels, nothing, nothing.astype(np.float32), camera=frame.camera)
     out = log.with_name(f"{log.stem}-nav.mcap")
@@ -66,8 +66,8 @@ def test_a_pfm_is_read_from_the_bottom_in_either_byte_order(tmp_path: Path, orde
 
 
 def test_images_and_camera_of_a_scene_are_in_its_log(tmp_path: Path) -> None:
-    log, said = imported(write_scene(tmp_path / "Box"))
-    assert said.endswith("run it with --set disparities=32")
+    log, words = imported(write_scene(tmp_path / "Box"))
+    assert words.endswith("run it with --set disparities=32")
     frame = frame_of(log)
     for pixels, expected in zip((frame.left, frame.right), scenes.images(), strict=True):
         np.testing.assert_array_equal(pixels, expected)
@@ -88,8 +88,8 @@ def test_a_plane_has_its_distance(tmp_path: Path) -> None:
 
 
 def test_the_truth_is_that_of_the_scene(tmp_path: Path) -> None:
-    log, said = imported(write_scene(tmp_path / "Box"))
-    assert "with true disparities and occlusions" in said
+    log, words = imported(write_scene(tmp_path / "Box"))
+    assert "with true disparities and occlusions" in words
     truth = truth_of(log)
     true = scenes.true_disparity()
     expected = np.where(np.isfinite(true), true + np.float32(scenes.DOFFS), np.nan)
@@ -118,17 +118,17 @@ def test_the_score_counts_known_errors_exactly(tmp_path: Path) -> None:
     for image, place in (("whole_image", np.ones(scenes.WIDTH, bool)), ("cropped_image", right)):
         regions = {"nonocc": mask == 255, "all": np.isfinite(true), "occluded": mask == 128}
         for name, region in regions.items():
-            counted, told = region & place, found.disparity[image][name]
-            assert told["pixels"] == counted.sum()
-            assert told["density"] == (counted & known).sum() / counted.sum()
+            counted, problems = region & place, found.disparity[image][name]
+            assert problems["pixels"] == counted.sum()
+            assert problems["density"] == (counted & known).sum() / counted.sum()
             for limit in (0.5, 1, 2, 4):
                 bad = counted & (~known | (error > limit))
-                assert told[f"bad_{limit:g}"] == bad.sum() / counted.sum()
+                assert problems[f"bad_{limit:g}"] == bad.sum() / counted.sum()
             errors = error[counted & known].astype(np.float64)
-            assert told["rmse"] == pytest.approx(math.sqrt(np.mean(errors**2)))
-            assert told["mae"] == pytest.approx(np.mean(errors))
+            assert problems["rmse"] == pytest.approx(math.sqrt(np.mean(errors**2)))
+            assert problems["mae"] == pytest.approx(np.mean(errors))
     assert found.disparity["given_without_truth"]["pixels"] == np.isinf(true).sum()
-    assert found.missing == found.unmatched == {}  # maps, of which there is no truth, are not asked for
+    assert found.missing == found.unmatched == {}  # maps without truth are not expected
     table = format_score(found)
     assert "without the leftmost 32 columns" in table
     counted = mask == 255
@@ -149,7 +149,7 @@ def test_either_name_of_the_truth_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("without", "topics", "said"),
+    ("without", "topics", "words"),
     [
         (("disp0GT.pfm",), set(), "without truth (no disp0GT.pfm or disp0.pfm)"),
         (("disp0GT.pfm", "mask0nocc.png"), set(), "without truth"),
@@ -157,11 +157,11 @@ def test_either_name_of_the_truth_is_read(tmp_path: Path) -> None:
     ],
 )
 def test_a_scene_without_truth_is_reported(
-    tmp_path: Path, without: tuple[str, ...], topics: set[str], said: str
+    tmp_path: Path, without: tuple[str, ...], topics: set[str], words: str
 ) -> None:
     log, sentence = imported(write_scene(tmp_path / "Box", without))
     assert set(truth_of(log)) == topics
-    assert said in sentence
+    assert words in sentence
     frame = frame_of(log)
     run = result(log, frame, np.full(frame.left.shape[:2], 5, np.float32))
     if topics:
@@ -182,7 +182,7 @@ def calibrate(**changes: object):
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "words"),
     [
         (lambda folder: (folder / "im1.png").unlink(), r"cannot read .*im1\.png: No such file"),
         (lambda folder: (folder / "calib.txt").unlink(), r"cannot read .*calib\.txt: No such file"),
@@ -216,10 +216,10 @@ def calibrate(**changes: object):
         ),
     ],
 )
-def test_a_damaged_scene_is_refused_and_leaves_no_log(tmp_path: Path, damage, said: str) -> None:
+def test_a_damaged_scene_is_refused_and_leaves_no_log(tmp_path: Path, damage, words: str) -> None:
     folder = write_scene(tmp_path / "Box")
     damage(folder)
-    with pytest.raises(LogError, match=said) as caught:
+    with pytest.raises(LogError, match=words) as caught:
         imported(folder)
     assert "\n" not in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["Box"]
@@ -249,7 +249,7 @@ def test_real_scenes_score_from_their_logs_as_from_their_files(tmp_path: Path) -
         direct = errors(matched, truth, mask, levels)
         found = scoring.score(result(log, replace(frame, stamp=FIRST_STAMP), matched), log).disparity["cropped_image"]
         bad = [100 * found[region][f"bad_{t}"] for region in ("nonocc", "all") for t in ("0.5", "1", "2")]
-        # doffs, added on the way in float32, moves an error by 1e-5 px and hardly a pixel over a threshold.
+        # doffs is added in float32, so an error changes by 1e-5 px and rarely crosses a threshold.
         np.testing.assert_allclose(bad, direct[:6], atol=0.005)
         assert (found["all"]["rmse"], 100 * found["all"]["density"]) == pytest.approx(tuple(direct[6:]), rel=1e-5)
         assert found["leftmost_columns_cropped"] == [levels]

@@ -1,4 +1,4 @@
-"""Damaged and foreign logs: what can be read is read and true, what cannot is told, nothing is lost silently."""
+"""Damaged and foreign logs: the readable part is read correctly, the rest is reported as lost."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def record(opcode: int, content: bytes) -> bytes:
 
 
 def times_of(full: Path, first: int, last: float) -> tuple[float, float]:
-    """The first and last time in the chunks that lie, even in part, between two bytes; any, where none are indexed."""
+    """The first and last time in the chunks between two bytes (also partly); any time without an index."""
     with full.open("rb") as file:
         summary = make_reader(file).get_summary()
     chunks = summary.chunk_indexes if summary else []
@@ -48,13 +48,12 @@ def times_of(full: Path, first: int, last: float) -> tuple[float, float]:
 
 
 def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]], harmed: tuple[float, float]) -> None:
-    """What comes of a damaged log is what was recorded, and all of it but for the times that were harmed; what does not
-    come is told of."""
-    told: set[str] = set()
+    """A damaged log gives only recorded items, all of them outside the harmed times, and reports the lost ones."""
+    problems: set[str] = set()
     events: list[tuple[int, str, Any]] = []
     try:
         with McapSource().open(path) as log:
-            told = set(log.missing)
+            problems = set(log.missing)
             events = list(log.events())
     except LogError as error:
         events = [(0, "log", error)]
@@ -66,10 +65,10 @@ def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]]
     losses = [item for _, _, item in events if isinstance(item, Exception)]
     assert all(isinstance(item, LogError) for item in losses)
     missing = known - set(good)
-    assert not [stream for time, stream, _ in missing if stream not in told and not harmed[0] <= time <= harmed[1]]
+    assert not [stream for time, stream, _ in missing if stream not in problems and not harmed[0] <= time <= harmed[1]]
     absent = {stream for _, stream, _ in missing}
     lossy = {stream for _, stream, item in events if isinstance(item, Exception)}
-    assert "log" in lossy or absent <= told | lossy
+    assert "log" in lossy or absent <= problems | lossy
 
 
 @pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no compression", "lz4", "no index"])
@@ -258,11 +257,11 @@ def test_bytes_after_the_end_of_a_log_are_reported(
     *events, (_, stream, lost) = items_of(path)
     assert [essence(item) for _, _, item in events] == [essence(item) for _, _, item in whole]
     size = len(first) if second == "log" else 5000
-    said = (
+    sentence = (
         f"the log ends at byte {len(first)}, and the {size} bytes after it are not read; give each log as its own file"
     )
-    assert (stream, str(lost)) == ("log", f"log.mcap: {said}")
-    assert inventory_of(path)["damage"] == [said]
+    assert (stream, str(lost)) == ("log", f"log.mcap: {sentence}")
+    assert inventory_of(path)["damage"] == [sentence]
 
 
 def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample: Path, tmp_path: Path) -> None:
@@ -277,7 +276,7 @@ def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample: Path, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "sentence"),
     [
         (b"", "is empty"),
         (b"hello, I am a text file\n", "is not an MCAP log"),
@@ -286,10 +285,10 @@ def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample: Path, tmp_pa
         (b"\x89MCAP0\r\n", "contains no messages that can be read: the log is cut"),
     ],
 )
-def test_a_file_of_another_format_is_refused_by_its_name(tmp_path: Path, content: bytes, said: str) -> None:
+def test_a_file_of_another_format_is_refused_by_its_name(tmp_path: Path, content: bytes, sentence: str) -> None:
     path = tmp_path / "log.mcap"
     path.write_bytes(content)
-    with pytest.raises(LogError, match=rf"log\.mcap {said}"):
+    with pytest.raises(LogError, match=rf"log\.mcap {sentence}"):
         McapSource().open(path)
 
 

@@ -1,4 +1,4 @@
-"""A clock that was set back while a log was recorded costs what came until that time had come again, and no more."""
+"""After the recorder's clock was set back, messages are lost until its old time, and no others."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def test_messages_after_a_set_back_clock_are_lost_until_its_old_time(
     good = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
     assert good == [essence(item) for time, _, item in whole if time < START + FIRST * PERIOD]
     lost = [(time, str(item)) for time, stream, item in events if isinstance(item, Exception) and stream == "left"]
-    images = [(time, said) for time, said in lost if said.startswith(f"{LEFT}: ")]
+    images = [(time, sentence) for time, sentence in lost if sentence.startswith(f"{LEFT}: ")]
     assert [time for time, _ in images] == [START + number * PERIOD - BACK + 1000 for number in range(FIRST, FRAMES)]
-    said = "the log's clock was set back by at least 0.15 s and is not yet 1 s beyond its old time"
+    sentence = "the log's clock was set back by at least 0.15 s and is not yet 1 s beyond its old time"
     remedy = "if the clock was right and the log is only written in another order, `mcap sort` repairs it"
-    assert {told for _, told in images} == {f"{LEFT}: {said}; {remedy}"}
+    assert {errors for _, errors in images} == {f"{LEFT}: {sentence}; {remedy}"}
     with McapSource().open(path) as log:
         assert log.file.times(log.channels("left")).tolist() == [START + n * PERIOD + 1000 for n in range(FIRST)]
         surveyed = [item for events in log.excerpts(9, {"left"}) for _, stream, item in events if stream == "left"]
@@ -51,7 +51,7 @@ def test_messages_after_a_set_back_clock_are_lost_until_its_old_time(
     }
     description = inventory_of(path)
     assert description["frames"]["pairs"] == FIRST
-    assert f"{LEFT} at {images[0][0]} ns: {said}; {remedy}" in description["damage"]
+    assert f"{LEFT} at {images[0][0]} ns: {sentence}; {remedy}" in description["damage"]
 
 
 @pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
@@ -59,7 +59,7 @@ def test_nothing_is_lost_from_a_second_beyond_the_old_time(
     sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, options: dict[str, Any]
 ) -> None:
     def back_and_on(messages: list[Any]) -> list[Any]:
-        """Two seconds a frame; the clock set back before FIRST, and put right again behind it."""
+        """Two seconds per frame; the clock set back before FIRST and corrected after it."""
         for _, _, message in messages:
             is_back = (message.log_time - START) // PERIOD == FIRST
             message.log_time = START + 20 * (message.log_time - START - (BACK if is_back else 0))
@@ -77,7 +77,7 @@ def test_images_and_tilts_across_a_set_back_clock_are_not_joined(
     sample: Path, tmp_path: Path, options: dict[str, Any]
 ) -> None:
     def rare_images(messages: list[Any]) -> list[Any]:
-        """The clock set back, the left images of frames 1 and 2 left out: those alone do not show it."""
+        """The clock set back, without the left images of frames 1 and 2: they alone do not show it."""
         rare = range(START + PERIOD, START + FIRST * PERIOD)
         kept = [found for found in messages if found[1].topic != LEFT or found[2].log_time not in rare]
         return set_back(kept)
@@ -107,7 +107,7 @@ def test_a_log_written_by_topic_or_with_jitter_loses_nothing(
 def test_a_clock_set_back_to_the_start_keeps_the_sensors(
     sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mcap_messages, "_MAX_SAMPLES", 1)  # what is lost comes first, and may be more than is looked at
+    monkeypatch.setattr(mcap_messages, "_MAX_SAMPLES", 1)  # lost messages come first and may exceed the sample
 
     def far_back(messages: list[Any]) -> list[Any]:
         for _, _, message in messages:

@@ -1,4 +1,4 @@
-"""Messages become data: colours in their order, bytes in theirs, angles as directions."""
+"""ROS 2 messages to data: colour order, byte order, angles as directions."""
 
 from __future__ import annotations
 

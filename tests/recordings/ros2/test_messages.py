@@ -1,4 +1,4 @@
-"""Our data as ROS 2 messages: what others read from them is what we meant."""
+"""Our data as ROS 2 messages: other decoders read the same values."""
 
 from __future__ import annotations
 
@@ -354,7 +354,7 @@ def test_an_empty_schema_means_a_type_without_fields() -> None:
     decoder = decoder_for("test_msgs/msg/Empty", "ros2msg", b"")
     assert type(decoder(b"\0\1\0\0\0")).__name__.endswith("Empty")
     with pytest.raises(Exception, match="size mismatch"):
-        decoder(b"\0\1\0\0" + bytes(12))  # there are fields, which are not known
+        decoder(b"\0\1\0\0" + bytes(12))  # the unknown fields
 
 
 @settings(max_examples=30)

@@ -1,4 +1,4 @@
-"""How the rover is built is what its log says, and where the log contradicts itself or says nothing, that is told."""
+"""Calibration and transforms come from the log; contradictions and gaps are reported."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RECTIFIED = ("/left/image_rect", "/right/image_rect")
 
 
 def single_calibrations(path: Path, names: tuple[str, str], beside: Transform, fx: float = 20.0) -> Path:
-    """Two cameras calibrated each alone and without distortion; `beside` places the right one in the left's frame."""
+    """Two single calibrations without distortion; `beside` places the right one in the left's frame."""
 
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == "/tf_static":
@@ -97,7 +97,7 @@ def test_exchanged_cameras_are_reported(tmp_path: Path, names: tuple[str, str]) 
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "sentence"),
     [
         ({"k": np.full(9, np.nan)}, "must be finite"),
         ({"d": np.full(5, np.nan)}, "must be finite"),
@@ -110,33 +110,35 @@ def test_exchanged_cameras_are_reported(tmp_path: Path, names: tuple[str, str]) 
         ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "are impossible for a camera"),
     ],
 )
-def test_an_impossible_calibration_is_refused(tmp_path: Path, values: dict[str, Any], said: str) -> None:
+def test_an_impossible_calibration_is_refused(tmp_path: Path, values: dict[str, Any], sentence: str) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == "/stereo/left/camera_info":
             for name, value in values.items():
                 setattr(message, name, value)
         return message
 
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log, pytest.raises(LogError, match=said):
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log, pytest.raises(LogError, match=sentence):
         raise LogError(log.missing["left"])
 
 
 @pytest.mark.parametrize(
-    ("model", "count", "said"),
+    ("model", "count", "sentence"),
     [
         ("fisheye", 4, "cannot be rectified with their CameraInfo: unknown distortion model 'fisheye'"),
         ("plumb_bob", 3, "a plumb_bob camera has 0 or 4 or 5 or .* coefficients, the calibration has 3"),
-        ("plumb_bob", 8, ""),  # as many drivers call a rational polynomial
+        ("plumb_bob", 8, ""),  # the name of many drivers for a rational polynomial
     ],
 )
-def test_an_unknown_distortion_is_reported_before_the_run(tmp_path: Path, model: str, count: int, said: str) -> None:
+def test_an_unknown_distortion_is_reported_before_the_run(
+    tmp_path: Path, model: str, count: int, sentence: str
+) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic.endswith("camera_info"):
             message.distortion_model, message.d = model, np.full(count, 1e-3)
         return message
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=RAW)) as log:
-        assert re.search(said, log.missing["left"]) if said else not log.missing
+        assert re.search(sentence, log.missing["left"]) if sentence else not log.missing
 
 
 @pytest.mark.parametrize("distorted", [False, True])
@@ -155,9 +157,11 @@ def test_a_calibration_with_only_p_means_rectified_images(tmp_path: Path, distor
 
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
-@pytest.mark.parametrize(("place", "value", "said"), [((0, 0), 18.6, "fx is 20 and 18.6"), ((1, 2), 8.5, "cy is 7.5")])
+@pytest.mark.parametrize(
+    ("place", "value", "sentence"), [((0, 0), 18.6, "fx is 20 and 18.6"), ((1, 2), 8.5, "cy is 7.5")]
+)
 def test_projections_of_no_rectified_pair_are_refused(
-    tmp_path: Path, names: tuple[str, str], place: tuple[int, int], value: float, said: str
+    tmp_path: Path, names: tuple[str, str], place: tuple[int, int], value: float, sentence: str
 ) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == "/right/camera_info":
@@ -167,7 +171,7 @@ def test_projections_of_no_rectified_pair_are_refused(
         return message
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=names)) as log:
-        assert f"does not belong to a rectified pair: {said}" in log.missing["left"]
+        assert f"does not belong to a rectified pair: {sentence}" in log.missing["left"]
 
 
 def test_lenses_without_a_rectified_image_are_refused() -> None:
@@ -182,7 +186,7 @@ def test_lenses_without_a_rectified_image_are_refused() -> None:
 
 
 def test_a_rectified_image_has_its_own_frame_if_r_rotates_it(tmp_path: Path) -> None:
-    """Everything that speaks of the camera's own frame, transforms and poses, is turned by R on its way in."""
+    """Transforms and poses of the camera's own frame are rotated by R."""
     by = turned("y", 2.0) @ turned("x", -1.0)
 
     def edit(topic: str, number: int, message: Any) -> Any:
@@ -227,7 +231,7 @@ def test_a_pose_is_transformed_to_the_rover_or_its_camera(tmp_path: Path, with_b
         np.testing.assert_allclose(logged.translation, [number, 2.0, 3.0], atol=1e-9)
         given = Rotation.from_quat(tilt_quaternion(number)).as_matrix()
         np.testing.assert_allclose(logged.rotation, given, atol=1e-9)
-        # What the turn is off by, the lever makes of the place.
+        # The lever arm turns the rotation error into a position error.
         lever = float(np.linalg.norm(sits.translation))
         assert np.trace(pose.covariance[:3, :3]) == pytest.approx(0.01 * (3 + 2 * lever**2))
 
@@ -248,11 +252,11 @@ def test_the_set_base_frame_must_be_joined_to_the_camera(tmp_path: Path) -> None
         assert "no static transform joins 'rover' and the camera" in log.notes()["mount"]
 
 
-@pytest.mark.parametrize(("told", "resting"), [("base_link", "imu_link"), ("left_optical", "base_link")])
-def test_a_pose_in_a_frame_of_the_rover_is_refused(tmp_path: Path, told: str, resting: str) -> None:
+@pytest.mark.parametrize(("problems", "resting"), [("base_link", "imu_link"), ("left_optical", "base_link")])
+def test_a_pose_in_a_frame_of_the_rover_is_refused(tmp_path: Path, problems: str, resting: str) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == "/odom":
-            message.header.frame_id, message.child_frame_id = resting, told
+            message.header.frame_id, message.child_frame_id = resting, problems
         return message
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
@@ -292,7 +296,7 @@ def with_transforms(path: Path, *more: Transform) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "sentence"),
     [
         (Transform("mast", "imu_link", np.eye(3), [0, 0, 1]), "'imu_link' has two parents, 'base_link' and 'mast'"),
         (Transform("base_link", "imu_link", turned("z", 90), [0, 0, 0.4001]), "contradicts an earlier one"),
@@ -302,17 +306,17 @@ def with_transforms(path: Path, *more: Transform) -> Path:
         (Transform("", "imu_link", np.eye(3), [0, 0, 1]), "lacks the name of a frame"),
     ],
 )
-def test_an_invalid_transform_is_reported_and_left_out(tmp_path: Path, more: Transform, said: str) -> None:
+def test_an_invalid_transform_is_reported_and_left_out(tmp_path: Path, more: Transform, sentence: str) -> None:
     with McapSource().open(with_transforms(tmp_path / "log.mcap", more)) as log:
         assert log.missing == {}
         assert log.resolution.mount is not None
         np.testing.assert_allclose(
             log.resolution.mount.camera_from_inclinometer, TRANSFORMS[0].rotation.T @ TRANSFORMS[1].rotation, atol=1e-12
         )
-        told = [(stream, item) for _, stream, item in log.events() if isinstance(item, Exception)]
-    assert [stream for stream, _ in told] == ["log"]
-    with pytest.raises(LogError, match=said):
-        raise told[0][1]
+        problems = [(stream, item) for _, stream, item in log.events() if isinstance(item, Exception)]
+    assert [stream for stream, _ in problems] == ["log"]
+    with pytest.raises(LogError, match=sentence):
+        raise problems[0][1]
 
 
 def test_an_infinite_translation_is_reported_and_left_out(tmp_path: Path) -> None:
@@ -323,9 +327,9 @@ def test_an_infinite_translation_is_reported_and_left_out(tmp_path: Path) -> Non
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert "no static transform joins the camera" in log.missing["mount"]
-        told = [str(item) for _, _, item in log.events() if isinstance(item, Exception)]
+        problems = [str(item) for _, _, item in log.events() if isinstance(item, Exception)]
     what = "the translation of the transform 'base_link' <- 'left_optical'"
-    assert told == [f"/tf_static: {what} is [nan, 0.1, 0.9], which is no place"]
+    assert problems == [f"/tf_static: {what} is [nan, 0.1, 0.9], which is no place"]
 
 
 def test_a_long_chain_of_transforms_is_followed():

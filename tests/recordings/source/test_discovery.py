@@ -1,4 +1,4 @@
-"""The topics of a rover are found by what they are; what two readings of a log would allow is asked, not guessed."""
+"""The topics of a log are found by schema and name; ambiguous ones are reported, not guessed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_two_stereo_cameras_are_equally_good(tmp_path: Path) -> None:
         assert log.topics["left"] == "/front/left/image_raw"
     with McapSource(left=topics[0], right=topics[0]).open(path) as log:
         assert log.refused["right"] == f"the source's 'left' and 'right' are both set to {topics[0]}; set two topics"
-    with McapSource(left=topics[2], right=topics[1]).open(path) as log:  # whatever they are called
+    with McapSource(left=topics[2], right=topics[1]).open(path) as log:  # with any names
         assert (log.topics["left"], log.topics["right"]) == (topics[2], topics[1])
 
 
@@ -132,7 +132,7 @@ def moving(path: Path, *links: tuple[str, str]) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("links", "said"),
+    ("links", "sentence"),
     [
         ([WHEEL], "no transform places 'base_link' (they place 'wheel'); set 'base_frame' of the source"),
         ([ODOM, ("map", "base_link")], "'base_link' has two parents, 'map' and 'odom'; record"),
@@ -142,9 +142,9 @@ def moving(path: Path, *links: tuple[str, str]) -> Path:
         ),
     ],
 )
-def test_transforms_with_no_pose_or_two_are_refused(tmp_path: Path, links: list[Any], said: str) -> None:
+def test_transforms_with_no_pose_or_two_are_refused(tmp_path: Path, links: list[Any], sentence: str) -> None:
     with McapSource(odometry="/tf").open(moving(tmp_path / "log.mcap", *links)) as log:
-        assert f"the source's 'odometry' is set to /tf, where {said}" in log.refused["odometry"]
+        assert f"the source's 'odometry' is set to /tf, where {sentence}" in log.refused["odometry"]
 
 
 def test_the_pose_in_odom_is_preferred_to_that_in_map(tmp_path: Path) -> None:
@@ -160,8 +160,8 @@ def test_a_pose_of_a_frame_not_joined_to_the_camera_is_refused(tmp_path: Path, g
         return message
 
     with McapSource(odometry=given).open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        said = "/odom is the pose of 'foot', but no static transform joins it to the camera 'left_optical'"
-        assert said in log.missing["odometry"]
+        sentence = "/odom is the pose of 'foot', but no static transform joins it to the camera 'left_optical'"
+        assert sentence in log.missing["odometry"]
         assert ("odometry" in log.refused) == (given is not None)
 
 
@@ -185,8 +185,8 @@ def test_an_imu_without_unit_quaternions_is_no_inclinometer(tmp_path: Path, bad:
         return message
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        said = f"{TILT} contains no orientation (the quaternion of the inclinometer is not a rotation: [0.0, 0.0"
-        assert said in log.missing["inclinometer"]
+        sentence = f"{TILT} contains no orientation (the quaternion of the inclinometer is not a rotation: [0.0, 0.0"
+        assert sentence in log.missing["inclinometer"]
 
 
 def test_an_imu_that_begins_invalid_is_an_inclinometer(tmp_path: Path) -> None:

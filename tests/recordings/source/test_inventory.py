@@ -1,4 +1,4 @@
-"""What `roverflow info` says of a log is what is in it."""
+"""The inventory of a log for `roverflow info`."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path: Path) -> No
     path = write_sample(tmp_path / "log.mcap", edit)
     frames = inventory_of(path)["frames"]
     assert frames["pairs"] == FRAMES - 1
-    assert frames["with_tilt"] == 2  # the first and the last frame, which have a tilt of their own
+    assert frames["with_tilt"] == 2  # the first and the last frame have a tilt at their stamp
     wider = inventory_of(path, slop=6_000_000, max_gap=400_000_000)
     assert (wider["frames"]["pairs"], wider["frames"]["with_tilt"]) == (FRAMES, FRAMES)
     text = format_description(wider)
@@ -94,8 +94,8 @@ def test_repeated_stamps_count_once_and_are_reported(tmp_path: Path) -> None:
     frames = described["frames"]
     assert (frames["left"], frames["right"]) == (FRAMES, FRAMES)
     assert (frames["pairs"], frames["with_tilt"]) == (FRAMES - 1, FRAMES - 1)
-    said = "1 of 5 messages repeat a stamp; a run drops them"
-    assert described["damage"] == [f"{topic}: {said}" for topic in (LEFT, RIGHT, TILT)]
+    sentence = "1 of 5 messages repeat a stamp; a run drops them"
+    assert described["damage"] == [f"{topic}: {sentence}" for topic in (LEFT, RIGHT, TILT)]
 
 
 def test_without_cameras_no_pairs_are_reported(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_a_calibration_of_another_image_size_is_doubted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "told_by_transform", "note"),
+    ("errors", "told_by_transform", "note"),
     [
         (BASELINE, BASELINE * 1.04, ""),
         (
@@ -168,7 +168,7 @@ def test_a_calibration_of_another_image_size_is_doubted(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_baseline_from_or_against_the_transform_is_noted(
-    tmp_path: Path, told: float, told_by_transform: float, note: str
+    tmp_path: Path, errors: float, told_by_transform: float, note: str
 ) -> None:
     def edit(topic: str, number: int, message: Any) -> Any:
         if topic == "/tf_static":
@@ -176,14 +176,14 @@ def test_a_baseline_from_or_against_the_transform_is_noted(
             return transform_message([(transform, START) for transform in (*TRANSFORMS, beside)])
         if topic == "/stereo/right/camera_info":
             message.p = message.p.copy()
-            message.p[3] = -20 * told
+            message.p[3] = -20 * errors
         if topic == RIGHT:
             message.header.stamp.sec = message.header.stamp.nanosec = 0
         return message
 
     path = write_sample(tmp_path / "log.mcap", edit)
     described = inventory_of(path)
-    assert described["calibration"]["baseline"] == pytest.approx(told or told_by_transform)
+    assert described["calibration"]["baseline"] == pytest.approx(errors or told_by_transform)
     unstamped = "the header stamps are 0, so log times are used"
     assert described["notes"] == {"right": f"{unstamped}; {note}" if note else unstamped}
     assert f"note: right: {described['notes']['right']}" in format_description(described).splitlines()
@@ -205,7 +205,7 @@ def test_undecodable_topics_are_listed_once(tmp_path: Path) -> None:
     text = format_description(inventory_of(path))
     assert text.count("cannot be decoded") == text.count(f"{LEFT}: its messages are in 'protobuf'") == 1
     assert "missing: left, right: the log has no camera image" in text
-    with McapSource().open(path) as log:  # a refusal stands alone
+    with McapSource().open(path) as log:  # a refusal is complete without the others
         assert all(f"{LEFT}: its messages" in log.missing[stream] for stream in ("left", "inclinometer", "odometry"))
 
 

@@ -1,4 +1,4 @@
-"""What changes in the middle of a log, and what calls itself what it is not, costs its own messages and is told."""
+"""Changes in the middle of a log and types with wrong fields lose their own messages and are reported."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ IMAGE_LAG = 1000  # ns between an image's stamp and its log time in the sample
 
 
 def copied(source: Path, out: Path, encode: Callable[[str, int, bytes], tuple[str, bytes]]) -> Path:
-    """The same messages; `encode` says of a topic, a number in it and a schema: message encoding and schema."""
+    """The same messages; `encode`: (topic, number, schema) -> message encoding and schema."""
     with source.open("rb") as stream, out.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -78,7 +78,7 @@ def test_an_image_under_another_calibration_is_lost(tmp_path: Path, lag: int) ->
     assert [(time, stream) for time, stream, _ in lost] == [
         (START + number * PERIOD + IMAGE_LAG, "left") for number in (2, 3)
     ]
-    assert all(f"cut the log in two where it changes ({START + 2 * PERIOD} ns)" in said for _, _, said in lost)
+    assert all(f"cut the log in two where it changes ({START + 2 * PERIOD} ns)" in sentence for _, _, sentence in lost)
     left = [item.stamp for _, stream, item in events if stream == "left" and not isinstance(item, Exception)]
     assert left == [START + number * PERIOD for number in (0, 1, 4)]
     assert sum(stream == "right" for _, stream, _ in events) == FRAMES
@@ -99,7 +99,7 @@ def calibrated_once_more(path: Path, layout: str, again: Any = 2) -> Path:
 
 
 def left_of(log: Any) -> tuple[list[int], list[str]]:
-    """Numbers of the left images of an iteration, and what is said of those that are lost."""
+    """Numbers of the left images of an iteration, and the errors of the lost ones."""
     items = [(time, item) for time, stream, item in log if stream == "left"]
     lost = [str(item) for _, item in items if isinstance(item, Exception)]
     return [round((time - START) / (20 * PERIOD)) for time, item in items if not isinstance(item, Exception)], lost

@@ -1,4 +1,4 @@
-"""Reading logs: what was recorded comes out bit for bit, what is damaged is told, what is missing is said."""
+"""Reading logs: recorded data bit for bit, damage and missing streams reported."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def change(topic: str, **values: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("edit", "stream", "said"),
+    ("edit", "stream", "sentence"),
     [
         (drop("/stereo/right"), "right", f"the log has only one image topic \\({LEFT}\\), but stereo needs two"),
         (drop("/stereo"), "left", "the log has no camera image"),
@@ -166,10 +166,10 @@ def change(topic: str, **values: Any) -> Any:
         (change(INFO, k=np.zeros(9), p=np.zeros(12)), "left", "is not calibrated"),
     ],
 )  # fmt: skip
-def test_missing_streams_are_reported_with_the_remedy(tmp_path: Path, edit: Any, stream: str, said: str) -> None:
-    told = missing(write_sample(tmp_path / "log.mcap", edit))
-    assert stream in told
-    assert re.search(said, told[stream]), told[stream]
+def test_missing_streams_are_reported_with_the_remedy(tmp_path: Path, edit: Any, stream: str, sentence: str) -> None:
+    problems = missing(write_sample(tmp_path / "log.mcap", edit))
+    assert stream in problems
+    assert re.search(sentence, problems[stream]), problems[stream]
 
 
 @pytest.mark.parametrize(
@@ -203,9 +203,9 @@ def test_equally_good_pairs_are_named_and_none_is_chosen(sample: Path, tmp_path:
                         known = writer.register_channel(channel.topic, "cdr", number)
                         writer.add_message(known, message.log_time, message.data, message.publish_time)
         writer.finish()
-    told = missing(both)["left"]
-    assert "/front/left/image_rect with /front/right/image_rect" in told
-    assert "set 'left' and 'right' of the source" in told
+    problems = missing(both)["left"]
+    assert "/front/left/image_rect with /front/right/image_rect" in problems
+    assert "set 'left' and 'right' of the source" in problems
     with McapSource(left="/front/left/image_rect").open(both) as log:
         assert log.topics["right"] == "/front/right/image_rect"
         assert "left" not in log.missing
@@ -230,7 +230,7 @@ def test_single_calibrations_are_joined_by_their_transform(tmp_path: Path) -> No
     camera = left.pair_with(right).camera
     assert camera.baseline == pytest.approx(np.hypot(0.3, 0.01))
     assert camera.raw is not None
-    # A point far to the front: its rays, each turned by its camera's R and projected by its P, meet in one row.
+    # The rays to a far point, rotated by R and projected by P, have the same row in both cameras.
     point = np.array([0.4, -0.3, 5.0])
     seen_left = camera.raw[0].p @ [*(camera.raw[0].r @ point), 1]
     in_right = beside.inverse()(point)
@@ -254,11 +254,11 @@ def test_a_bad_message_is_lost_alone(tmp_path: Path) -> None:
         return message
 
     events = items_of(write_sample(tmp_path / "log.mcap", edit))
-    told = {stream: str(item) for _, stream, item in events if isinstance(item, Exception)}
-    assert f"the image is cut: it has {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in told["left"]
-    assert "image encoding 'yuv422' is not supported" in told["right"]
-    assert "the quaternion of the inclinometer is not a rotation" in told["inclinometer"]
-    assert "its stamp is damaged (4294967295 ns beyond the second)" in told["odometry"]
+    problems = {stream: str(item) for _, stream, item in events if isinstance(item, Exception)}
+    assert f"the image is cut: it has {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in problems["left"]
+    assert "image encoding 'yuv422' is not supported" in problems["right"]
+    assert "the quaternion of the inclinometer is not a rotation" in problems["inclinometer"]
+    assert "its stamp is damaged (4294967295 ns beyond the second)" in problems["odometry"]
     assert len(events) == 4 * FRAMES + 1
 
 
@@ -305,7 +305,7 @@ def cropped(message: Any) -> Any:
 
 @pytest.mark.parametrize("odd", [range(FRAMES), range(1), range(FRAMES - 1, FRAMES), range(1, FRAMES - 1)])
 @pytest.mark.parametrize(
-    ("topic", "change", "told"),
+    ("topic", "change", "problems"),
     [
         (
             RIGHT, gray,
@@ -325,14 +325,14 @@ def cropped(message: Any) -> Any:
     ],
 )  # fmt: skip
 def test_mismatched_images_are_reported_unless_some_match(
-    tmp_path: Path, topic: str, change: Any, told: dict[str, str], odd: range
+    tmp_path: Path, topic: str, change: Any, problems: dict[str, str], odd: range
 ) -> None:
     edit = lambda name, number, message: change(message) if name == topic and number in odd else message  # noqa: E731
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        assert log.missing == (told if len(odd) == FRAMES else {})
+        assert log.missing == (problems if len(odd) == FRAMES else {})
 
 
-# Bare angles
+# Plain angles
 
 
 def bare(tmp_path: Path, x: float, y: float) -> Path:
@@ -348,8 +348,8 @@ PITCH, ROLL = AngleField("vector.x", "deg", 1), AngleField("vector.y", "deg", -1
 
 
 def test_plain_angles_are_not_guessed(tmp_path: Path) -> None:
-    told = missing(bare(tmp_path, 10, 20))["inclinometer"]
-    assert "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source" in told
+    problems = missing(bare(tmp_path, 10, 20))["inclinometer"]
+    assert "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source" in problems
 
 
 def test_plain_angles_are_read_by_the_settings(tmp_path: Path) -> None:
@@ -361,7 +361,7 @@ def test_plain_angles_are_read_by_the_settings(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings_", "said"),
+    ("settings_", "sentence"),
     [
         ({"pitch": PITCH}, "needs 'roll'"),
         ({"pitch": PITCH, "roll": ROLL}, "needs 'tilt_model'"),
@@ -374,8 +374,8 @@ def test_plain_angles_are_read_by_the_settings(tmp_path: Path) -> None:
         ({"camera_from_inclinometer": [[1, 0], [0, 1], [0, 0], [0, 0]]}, "must be a unit quaternion"),
     ],
 )
-def test_incomplete_angle_settings_are_refused(settings_: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_incomplete_angle_settings_are_refused(settings_: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
         McapSource(**settings_)
 
 
