@@ -1,9 +1,8 @@
-"""What is exactly true of a simulated frame: its disparities, its map, what could be seen of that, and its rocks.
+"""The exact truth of a simulated frame: disparities, maps with their visibility, and rocks.
 
-Disparity comes per left pixel from the rays that made the images; elevation and hazards from looking straight down on
-the cell centres of the frame's own level frame, the frame a reader would build from the true tilt. A cell could be seen
-if a line of sight from each camera reaches some of its surface, tried at nine points of it, be there a pixel on that
-line or not: a map may have values between the pixels, but not behind what hides them.
+Disparity comes from the rays of the left image. Elevation and hazards come from vertical rays onto the cell centres, in
+the level frame of the true tilt. A cell is in view if a line of sight from each camera reaches any of nine points of
+its surface, whether or not a pixel is on that line: a map may have values between pixels, but not behind an obstacle.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from recordings.simulator.simulation import FrameTruth, Simulation
 from stages.compiled.jit import typed_kernel
 from stages.data import LEVEL_FRAME, Array, Cell, CellReason, Disparity, ElevationMap, NavigationMap, PixelOrigin
 
-FINE = 3  # points along each side of a cell
-SHORT = 0.002  # m before its end that a line of sight may stop
-HAZARD_ROCK = 0.2  # m, height above the ground around it
-HAZARD_SLOPE = float(np.radians(20))
-ROCKS_WITHIN = 10.0  # m of base_link
+CELL_POINTS = 3  # along each side of a cell
+SIGHT_TOLERANCE = 0.002  # m before its end that a line of sight may stop
+MIN_HAZARD_ROCK = 0.2  # m, height above the ground around it
+MAX_SAFE_SLOPE = float(np.radians(20))
+MAX_ROCK_DISTANCE = 10.0  # m from base_link
 
 
 def true_disparity(simulation: Simulation, stamp: int, truth: FrameTruth) -> Disparity:
@@ -34,9 +33,9 @@ def true_disparity(simulation: Simulation, stamp: int, truth: FrameTruth) -> Dis
 
 
 def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[ElevationMap, NavigationMap]:
-    """Elevation (top surface, rocks included) with the mask `visible`, and hazards, over the square about base_link.
+    """Elevation (top surface, rocks included) with the mask `visible`, and hazards, over the square around base_link.
 
-    The elevation map has the layers of `_map_layers` besides. A cell is a hazard if its centre lies on a rock at least
+    The elevation map also has the layers of `_map_layers`. A cell is a hazard if its centre lies on a rock at least
     0.2 m high or on ground steeper than 20 degrees. A cell is visible if a pixel that both cameras see hits it within
     the region.
     """
@@ -47,8 +46,8 @@ def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[E
     world = truth.level(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
     top, surface = raycast.tops_at(terrain.scene, world[:, 0], world[:, 1], float(terrain.scene.ceiling))
     elevation = (top - truth.level.translation[2]).reshape(x.shape).astype(np.float32)
-    on_high_rock = np.append(terrain.rocks.height >= HAZARD_ROCK, False)[np.maximum(surface, raycast.GROUND)]
-    hazard = on_high_rock | (terrain.slope(world[:, 0], world[:, 1]) > HAZARD_SLOPE)
+    on_high_rock = np.append(terrain.rocks.height >= MIN_HAZARD_ROCK, False)[np.maximum(surface, raycast.GROUND)]
+    hazard = on_high_rock | (terrain.slope(world[:, 0], world[:, 1]) > MAX_SAFE_SLOPE)
     cells = np.where(hazard, np.int8(Cell.HAZARD), np.int8(Cell.FREE)).reshape(x.shape)
     visible = visible_cells(simulation, truth, count)
     more = _map_layers(simulation, truth, x, y, elevation, visible, surface.reshape(x.shape))
@@ -89,12 +88,12 @@ def rocks_in_level(simulation: Simulation, truth: FrameTruth) -> Array:
     points = truth.level.inverse()(np.column_stack([near, terrain.rocks.base]))
     seen = rocks_in_view(simulation, truth)
     table = np.column_stack([points, terrain.rocks.diameter, terrain.rocks.height, seen])
-    return table[np.hypot(points[:, 0], points[:, 1]) <= ROCKS_WITHIN].astype(np.float32)
+    return table[np.hypot(points[:, 0], points[:, 1]) <= MAX_ROCK_DISTANCE].astype(np.float32)
 
 
 def rocks_in_view(simulation: Simulation, truth: FrameTruth) -> Array:
-    """Of each rock of the tile: the pixels that both cameras see within the region, and the part of its height that
-    these span, (N, 2) float32."""
+    """(N, 2) float32 of the tile's rocks: pixels that both cameras see within the region, and the share of the height
+    that these span."""
     rocks = simulation.terrain.rocks
     a, b, seen = _seen_within(simulation, truth)
     row, col = np.nonzero(seen & (truth.surface >= 0))
@@ -122,7 +121,7 @@ def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, t
     """Further true layers over cells with centres x, y (rows, cols), m, in the frame's level frame.
 
     top: (rows, cols) elevation, m; visible: (rows, cols), 1 where a pixel of both cameras hits the cell; surface:
-    (rows, cols) int, the rock that one meets from above at the centre, or the ground.
+    (rows, cols) int, index of the rock seen from above at the centre, or the ground.
 
     Returns float32 (rows, cols): mean, m, of the surface over the cell, NaN where it is not visible; in_view, 1 where
     both cameras could see some of it within the region, else 0; rock, m, the height of the rock at the centre, 0 for
@@ -132,7 +131,7 @@ def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, t
     near = np.hypot(x, y) <= simulation.region + step
     ahead = (visible > 0) | (near & _in_images(simulation, truth, x, y, top))
     row, col = np.nonzero(ahead)
-    offset = ((np.arange(FINE) + 0.5) / FINE - 0.5) * step
+    offset = ((np.arange(CELL_POINTS) + 0.5) / CELL_POINTS - 0.5) * step
     dx, dy = (part.ravel() for part in np.meshgrid(offset, offset))
     fine_x, fine_y = x[row, col, None] + dx, y[row, col, None] + dy
     world = truth.level(np.stack([fine_x.ravel(), fine_y.ravel(), np.zeros(fine_x.size)], axis=1))
@@ -141,7 +140,7 @@ def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, t
     mean, in_view = np.full(x.shape, np.nan, np.float32), (visible > 0).astype(np.float32)
     mean[row, col] = (heights - truth.level.translation[2]).reshape(fine_x.shape).mean(axis=1)
     mean[visible == 0] = np.nan
-    unseen = np.repeat(visible[row, col] == 0, FINE**2)
+    unseen = np.repeat(visible[row, col] == 0, CELL_POINTS**2)
     sighted = np.zeros(len(world), bool)
     sighted[unseen] = in_sight(simulation, truth, world[unseen])
     in_view[row, col] = np.maximum(in_view[row, col], sighted.reshape(fine_x.shape).any(axis=1))
@@ -165,7 +164,7 @@ def in_sight(simulation: Simulation, truth: FrameTruth, points: Array) -> Array:
 
 
 def _in_images(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, z: Array) -> Array:
-    """Which points of the level frame, of any shape, lie within both images, give or take a few pixels."""
+    """Which points of the level frame, of any shape, lie within both images, with a margin of 20 px."""
     points = truth.level(np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1))
     inside = np.ones(len(points), bool)
     for mount in simulation.mounts[:2]:
@@ -175,7 +174,7 @@ def _in_images(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, z:
 
 
 def _within_image(simulation: Simulation, points: Array, margin: float = 0.0) -> Array:
-    """Which points (N, 3) of a camera's optical frame its image holds."""
+    """Which points (N, 3) of a camera's optical frame are in its image."""
     camera = simulation.camera
     depth = np.where(points[:, 2] > 0.05, points[:, 2], np.nan)
     u, v = points[:, 0] / depth * camera.fx + camera.cx, points[:, 1] / depth * camera.fy + camera.cy
@@ -185,8 +184,8 @@ def _within_image(simulation: Simulation, points: Array, margin: float = 0.0) ->
 
 @typed_kernel
 def _clear_lines(scn: Any, eye: Any, points: Any, clear: Any) -> None:
-    """Which points (N, 3) nothing hides from `eye`, into clear (N,) bool."""
+    """Which points (N, 3) are not hidden from `eye`, into clear (N,) bool."""
     for k in range(points.shape[0]):
         dx, dy, dz = points[k, 0] - eye[0], points[k, 1] - eye[1], points[k, 2] - eye[2]
-        end = 1.0 - SHORT / np.sqrt(dx * dx + dy * dy + dz * dz)
+        end = 1.0 - SIGHT_TOLERANCE / np.sqrt(dx * dx + dy * dy + dz * dz)
         clear[k] = raycast.first_hit(scn, eye[0], eye[1], eye[2], dx, dy, dz, 0.0, end)[1] == raycast.SKY

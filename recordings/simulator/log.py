@@ -1,7 +1,4 @@
-"""The log of a simulated traverse: what a rover would record, and the exact truth under /truth.
-
-Messages are made moment by moment, as (log time, topic, message) triples.
-"""
+"""The log of a simulated traverse: the sensors of a rover, and the exact truth under /truth."""
 
 from __future__ import annotations
 
@@ -27,7 +24,23 @@ ROCK_FIELDS = ("x", "y", "z", "diameter", "height", "pixels", "shown")
 
 
 def write_log(simulation: Simulation, out: Path, progress: Callable[[int, int], None] | None = None) -> None:
-    """Write the log of a traverse. progress: called with (frames written, frames) after each frame."""
+    """Write the log of a traverse.
+
+    Parameters
+    ----------
+    simulation
+        The traverse.
+    out
+        The MCAP file to write.
+    progress
+        Called with (frames written, frames) after each frame.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from recordings.simulator import Simulation, write_log
+    >>> write_log(Simulation(frames=4), Path("traverse.mcap"))  # doctest: +SKIP
+    """
     with Ros2Writer(Path(out)) as writer:
         for _, make_messages, index in sorted(_moments(simulation), key=lambda moment: moment[0]):
             for log_time, topic, message in make_messages():
@@ -37,7 +50,7 @@ def write_log(simulation: Simulation, out: Path, progress: Callable[[int, int], 
 
 
 def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], list[Logged]], int | None]]:
-    """(log time, maker of the messages then written, frame index or None), unordered; made on demand."""
+    """(log time, function that makes the messages, frame index or None), unordered."""
     yield simulation.begin, partial(static_transforms, simulation, simulation.begin), None
     sensors = ((inclinometer, simulation.tilt_rate, 4_000_000), (odometry, simulation.odometry_rate, 9_000_000))
     for make_messages, rate, latency in sensors:
@@ -54,7 +67,7 @@ def static_transforms(simulation: Simulation, log_time: int) -> list[Logged]:
 
 
 def inclinometer(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:
-    """/imu/inclinometer: roll and pitch with noise; the heading is not known and its variance says so."""
+    """/imu/inclinometer: roll and pitch with noise; the heading is unknown, with the variance of a uniform angle."""
     rng = np.random.default_rng([simulation.seed, 4, number])
     reading = traverse.inclinometer_reading(
         simulation.base_at(stamp), simulation.mounts[2], simulation.tilt_noise, rng

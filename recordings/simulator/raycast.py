@@ -1,9 +1,9 @@
 """Rays against the simulator's terrain: exact first hits with bilinear ground and with cut ellipsoids.
 
-Rays walk through a pyramid of maxima (Tevs et al. 2008): one that stays above the highest point of a block crosses it
-in one step, however large the block; in the last block the hit is a quadratic's root, so no step size limits the
-accuracy. A stretch of a pixel row first walks as one beam, and its rays start where that may first meet something.
-All coordinates are world metres; the terrain repeats without end.
+Rays walk through a pyramid of maxima (Tevs et al. 2008): a ray above the highest point of a block crosses it in one
+step. In the last block the hit is the root of a quadratic, so no step size limits the accuracy. A span of a pixel row
+first walks as one beam, and its rays start where the beam may first hit. All coordinates are world metres; the terrain
+repeats without end.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from stages.data import Array
 
 # One bucket of rocks spans 2**BUCKET_LEVEL ground cells.
 BUCKET_LEVEL = 1
-SPAN = 16  # px of a row that one beam covers
+SPAN = 16  # px of a row in one beam
 SKY = -2
 GROUND = -1
 ROUNDED = -1
 
 
 class Scene(NamedTuple):
-    """Terrain as the compiled loops read it.
+    """The terrain for the compiled loops.
 
     ground: (n, n) float32 nodes, m; resolution: m; tops, levels: flat pyramid of the highest points, rocks included, of
     blocks of cells and where each level begins; rocks: (N, 8) centre in the tile, inverse semi-axes, cosine and sine
@@ -112,7 +112,7 @@ def _patch_hit(
     root2 = linear * linear - 4 * square * at
     if root2 < 0:
         return inf
-    # The form of Citardauq loses no digits where the quadratic is nearly a line.
+    # The Citardauq form stays exact for a nearly linear quadratic.
     q = -0.5 * (linear + (sqrt(root2) if linear > 0 else -sqrt(root2)))
     first, second = q / square, (at / q if q != 0 else inf)
     if first > second:
@@ -185,7 +185,7 @@ def first_hit(
     """Distance (in lengths of the direction), surface (GROUND, SKY or a rock's index) and facet of the first hit."""
     n, step = scn.ground.shape[0], scn.resolution
     highest = scn.levels.shape[0] - 2
-    # In cells, as all that follows but z.
+    # In cells, as everything below except z.
     per_metre = 1 / step
     gx, gy, ux, uy = px * per_metre, py * per_metre, dx * per_metre, dy * per_metre
     inverse_x, inverse_y = 1 / ux, 1 / uy
@@ -241,9 +241,9 @@ def first_hit(
 def clear_until(
     scn: Any, origin: Any, rotation: Any, a: float, b: float, reach: float, far: float
 ) -> float:  # fmt: skip
-    """Depth up to which no ray of a camera through a stretch of a row hits anything; `far` if none ever does.
+    """Depth up to which no ray through a span of a row hits anything; `far` if none ever does.
 
-    origin, rotation: as in `cast_rows`; a, b: tangents of the stretch's middle; reach: of a from there to its ends.
+    origin, rotation: as in `cast_rows`; a, b: tangents of the span's middle; reach: of a from there to its ends.
     """
     n, step = scn.ground.shape[0], scn.resolution
     highest = scn.levels.shape[0] - 2
@@ -263,7 +263,7 @@ def clear_until(
         i0, i1 = floor((min(y0, y1) - ey * leave) / size), floor((max(y0, y1) + ey * leave) / size)
         j0, j1 = floor((min(x0, x1) - ex * leave) / size), floor((max(x0, x1) + ex * leave) / size)
         if i1 - i0 > 3 or j1 - j0 > 3:
-            return t  # the stretch has become too wide for such small blocks
+            return t  # the beam is too wide for such small blocks
         low, width, clear = pz + lowest * (leave if lowest < 0 else t), n >> level, True
         for i in range(i0, i1 + 1):
             first = scn.levels[level] + (i & (width - 1)) * width
@@ -281,7 +281,7 @@ def clear_until(
 
 @typed_kernel
 def tops_at(scn: Any, x: Any, y: Any, ceiling: float) -> Any:
-    """What one meets from above at points x, y (N,): elevation (N,) float64, m, and surface (N,) int32.
+    """The first hit from above at points x, y (N,): elevation (N,) float64, m, and surface (N,) int32.
 
     ceiling: m, any height above all rocks.
     """
@@ -345,8 +345,8 @@ def seen_rows(
                 a = (span * SPAN + (SPAN - 1) / 2 - cx) / fx
                 known, clear = span, clear_until(scn, right, rotation, a, b, SPAN / 2 / fx, 1e3)
             a = (column - cx) / fx
-            # From the right camera, at unit speed along the optical axis, the point is met at t:
-            # what is met sooner hides it.
+            # From the right camera, at unit speed along the optical axis, the ray reaches the point at t:
+            # an earlier hit hides it.
             nearness = 1 / t
             dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] - (right[0] - left[0]) * nearness
             dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] - (right[1] - left[1]) * nearness

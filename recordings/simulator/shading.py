@@ -1,8 +1,8 @@
-"""What the simulator's cameras see: texture, sunlight, cast shadows, haze, and the sensor's own faults.
+"""The images of the simulator: texture, sunlight, cast shadows, haze, and the noise of the sensor.
 
-The texture is a function of place, so that both cameras see one surface. It is read from a pyramid of ever coarser
-tiles at the scale of the pixel's footprint, with several taps along the footprint's long side (anisotropic filtering):
-distant ground keeps its detail across the view and loses it along, as in a real picture.
+The texture is a function of position, so both cameras see the same surface. It is sampled from an image pyramid at the
+scale of the pixel's footprint, with several taps along the footprint's long side (anisotropic filtering): distant
+ground keeps its detail across the view and loses it along the view, as in a real image.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from stages.compiled.jit import borrowing_kernel
 from stages.data import Array
 
 TILE = 1024
-# Period of the tile laid at three scales, m. Their ratios are no round numbers, so the sum does not visibly repeat.
+# Periods of the tile at three scales, m. Their ratios are not round, so the sum does not visibly repeat.
 FINE, MIDDLE, BROAD = 2.56, 13.7, 97.0
-MOST_TAPS = 6
+MAX_TAPS = 6
 VISIBILITY = 300.0  # m, at which haze leaves 1/e of the contrast
 SUNLIGHT, SKYLIGHT = 0.86, 0.24
 EXPOSURE, GAMMA = 0.80, 1 / 1.5
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 BLUR = 0.55  # px, standard deviation of the optics' point spread
-STRIP = 32  # rows that are exposed at a time, so that they stay in the processor's cache
+STRIP_ROWS = 32  # exposed at a time, to stay in the processor's cache
 
 
 class Texture(NamedTuple):
@@ -78,7 +78,7 @@ def _bilinear(tiles: Any, start: int, size: int, x: float, y: float) -> float:
 def _sample(
     tiles: Any, levels: Any, period: float, x: float, y: float, width: float, taps: int, ux: float, uy: float
 ) -> float:
-    """The tile laid with `period`, m, averaged over about `width`, m: linear between pyramid levels.
+    """The tile repeated with `period`, m, averaged over about `width`, m: linear between pyramid levels.
 
     It is the mean of `taps` samples, (ux, uy) m apart, the middle one at (x, y), m.
     """
@@ -104,12 +104,12 @@ def _ground_albedo(
     texture: Any, x: float, y: float, width: float, length: float, ux: float, uy: float
 ) -> tuple[float, float]:
     """Grit and albedo of the ground under a footprint of width x length, m, whose long side runs along (ux, uy)."""
-    taps = min(max(ceil(length / width), 1), MOST_TAPS)
+    taps = min(max(ceil(length / width), 1), MAX_TAPS)
     apart = length / taps
     grit = _sample(texture.grit, texture.levels, FINE, x, y, max(width, apart), taps, apart * ux, apart * uy)
     cloud = _sample(texture.noise, texture.levels, MIDDLE, x, y, length, 1, 0.0, 0.0)
     broad = _sample(texture.noise, texture.levels, BROAD, x + 31.0, y + 7.0, length, 1, 0.0, 0.0)
-    # Where the broad pattern is high lies drifted sand, smooth and bright; elsewhere gravel.
+    # Drifted sand, smooth and bright, where the broad pattern is high; gravel elsewhere.
     sand = min(max(0.5 + 1.4 * (broad + 0.35 * cloud - 0.55), 0.0), 1.0)
     contrast = 1.0 - 0.72 * sand
     return 1 + contrast * (grit - 1), (1 + 0.07 * cloud - 0.04 * broad) * (0.92 + 0.16 * sand)
@@ -119,7 +119,7 @@ def _ground_albedo(
 def _rock_albedo(
     texture: Any, rock: int, x: float, y: float, z: float, nx: float, ny: float, nz: float, width: float
 ) -> float:
-    """Grain of a rock, projected along the axis that its face looks to most."""
+    """Grain of a rock, projected along the axis closest to its normal."""
     a, b = x, y
     if abs(nx) > abs(ny) and abs(nx) > abs(nz):
         a, b = y, z
@@ -133,7 +133,7 @@ def _rock_albedo(
 
 @borrowing_kernel
 def _upward(ground: Any, resolution: float, x: float, y: float) -> tuple[float, float, float]:
-    """Normal, of no particular length, of the ground smoothed over neighbouring patches: differences over two cells."""
+    """Normal, not of unit length, of the ground smoothed over two cells."""
     mask = ground.shape[0] - 1
     gx, gy = x / resolution, y / resolution
     ix, iy = floor(gx), floor(gy)
@@ -150,7 +150,7 @@ def _upward(ground: Any, resolution: float, x: float, y: float) -> tuple[float, 
 
 @borrowing_kernel
 def _nearest_repetition(value: float, near: float, extent: float) -> float:
-    """The one of value + k * extent that lies nearest to `near`."""
+    """The value + k * extent nearest to `near`."""
     return value + extent * floor((near - value) / extent + 0.5)
 
 
@@ -158,7 +158,7 @@ def _nearest_repetition(value: float, near: float, extent: float) -> float:
 def _normal_at(scn: Any, surface: int, facet: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Unit normal, towards the outside, of the surface at a point that a ray has hit.
 
-    The ground's is smoothed over neighbouring patches, so that bilinear seams do not show in the light.
+    The ground is smoothed over neighbouring patches, so bilinear seams are invisible.
     """
     if surface == GROUND:
         nx, ny, nz = _upward(scn.ground, scn.resolution, x, y)
@@ -184,7 +184,7 @@ def shade_rows(
     scn: Any, texture: Any, clear: Any, sun: Any, origin: Any, rotation: Any, fx: float, fy: float, cx: float,
     cy: float, first: int, depth: Any, surface: Any, facet: Any, radiance: Any,
 ) -> None:  # fmt: skip
-    """Light that reaches the pixels of `cast_rows` (same arguments): radiance (rows, W, 3) float32, about 0 to 1.
+    """Light at the pixels of `cast_rows` (same arguments): radiance (rows, W, 3) float32, about 0 to 1.
 
     sun: (3,) towards it; clear: its `sunlight.lit_above`.
     """
@@ -232,7 +232,7 @@ def shade_rows(
 
 
 def expose(radiance: Array, gain: float, noise: float, rng: np.random.Generator, color: bool) -> Array:
-    """The 8-bit picture a camera makes of `radiance` (H, W, 3) float32: blur, vignetting, gain, shot and read noise.
+    """The 8-bit image of `radiance` (H, W, 3) float32: blur, vignetting, gain, shot and read noise.
 
     noise: standard deviation at half the full scale, as a share of the full scale.
     """
@@ -241,8 +241,8 @@ def expose(radiance: Array, gain: float, noise: float, rng: np.random.Generator,
     y, x = np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     falloff = (gain * EXPOSURE * (1 - 0.07 * (x**2 + y**2))).astype(np.float32)
     picture = np.empty(light.shape, np.uint8)
-    for first in range(0, height, STRIP):
-        rows = slice(first, first + STRIP)
+    for first in range(0, height, STRIP_ROWS):
+        rows = slice(first, first + STRIP_ROWS)
         strip = light[rows] * (falloff[rows, :, None] if color else falloff[rows])
         np.power(np.clip(strip, 0, 1, out=strip), np.float32(GAMMA), out=strip)
         grain = rng.standard_normal(strip.shape, dtype=np.float32)

@@ -1,7 +1,7 @@
-"""A simulated traverse: one set of parameters, from which terrain, drive, images and truth all follow.
+"""A simulated traverse: one set of parameters determines terrain, drive, images and truth.
 
-Images and truth are made by the same rays, frame by frame on demand, so a long traverse needs no more memory than a
-short one; every random stream has its own seed, so equal parameters give equal bytes whatever the number of threads.
+Images and truth come from the same rays. Each frame is made on demand, so memory does not grow with the traverse. Every
+random stream has its own seed, so equal parameters give equal bytes for any number of threads.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from stages.data import Array, Pose, StereoCamera, Transform
 SECOND = 1_000_000_000
 EPOCH = 1_700_000_000 * SECOND
 DAY = 86_400 * SECOND
-DAYS = 4000  # from the epoch on; the seconds of a ROS time have no room for many more
-MARGIN = SECOND // 2  # the slow sensors run this long before the first frame and after the last
-BLOCK = 32  # rows a thread takes at a time
+MAX_DAYS = 4000  # from the epoch on; limited by the 32-bit seconds of a ROS time
+SENSOR_MARGIN = SECOND // 2  # that the slow sensors run before the first frame and after the last
+ROW_BLOCK = 32  # rows of one task of a thread
 # The Devon Island rover's rectified camera (1280 pixels wide).
 DEVON_WIDTH, DEVON_F, DEVON_CX, DEVON_CY, DEVON_HEIGHT = 1280, 968.999694824, 635.139038086, 463.537109375, 960
 
-UNITS = {"degrees": 180 / np.pi, "%": 100}  # of a limit, in those of a simulation's field
-LIMITS: dict[str, tuple[float, float, str]] = {  # per field the least and the most that it may be
+UNITS = {"degrees": 180 / np.pi, "%": 100}  # of a limit, per unit of the field
+LIMITS: dict[str, tuple[float, float, str]] = {  # field -> minimum, maximum, unit
     "frames": (1, 100_000, ""), "rate": (0.001, 100, "Hz"), "speed": (0, 10, "m/s"), "seed": (0, 10**15, ""),
     "width": (16, 8192, "px"), "height": (16, 8192, "px"), "baseline": (0.001, 10, "m"),
     "camera_height": (0.1, 100, "m"), "pitch_down": (-90, 90, "degrees"), "slope": (0, 45, "degrees"),
@@ -42,7 +42,7 @@ LIMITS: dict[str, tuple[float, float, str]] = {  # per field the least and the m
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """Everything exact about one frame.
+    """The exact geometry of one frame.
 
     depth: (H, W) float64 m, inf = sky; surface: (H, W) int32 codes of the ray caster; seen: (H, W) uint8, 255 by both
     cameras, 128 hidden from the right one, 0 no surface; images: left and right.
@@ -60,15 +60,36 @@ class FrameTruth:
 class Simulation:
     """A synthetic traverse; equal simulations write equal bytes. Lengths in m, angles in rad, times in s.
 
-    frames, rate (Hz), speed (m/s): the drive; width, height: px, the Devon camera scaled to fit; baseline;
-    camera_height above base_link, pitch_down: the mast; slope: RMS over 1 m; relief_cells, relief_resolution: the
-    repeating ground tile; abundance: k of Golombek's rock law (0.05 sparse, 0.15 dense); smallest_rock, largest_rock:
-    diameters; sun_elevation, sun_azimuth: the light; color: rgb8, else mono8; noise: image noise at half scale, share
-    of full scale; tilt_noise: of one inclinometer sample; tilt_rate, odometry_rate: Hz; odometry_scale: share by which
-    odometry overstates the way; odometry_turn: its heading's error after 1 m, one sigma, growing with the root of the
-    way (0 and 0: exact); frame_offset: of frame times after inclinometer samples; map_half_width, map_resolution: truth
-    maps; region: how far from the camera a visible cell counts; horizon: beyond it is sky; threads: change the time,
-    not the bytes.
+    Parameters
+    ----------
+    frames, rate, speed
+        The drive: number of frames, Hz, m/s.
+    width, height, baseline
+        The camera: px (Devon's camera, scaled), m.
+    camera_height, pitch_down
+        The mast: height above base_link, angle below the horizon.
+    slope, relief_cells, relief_resolution
+        The ground: RMS slope over 1 m; cells of the repeating tile and their size.
+    abundance, smallest_rock, largest_rock
+        The rocks: k of Golombek's law (0.05 sparse, 0.15 dense), diameters.
+    sun_elevation, sun_azimuth, color, noise
+        The images: sunlight; rgb8 or mono8; noise at half scale, share of full scale.
+    tilt_noise, tilt_rate, frame_offset
+        The inclinometer: one sigma of a sample, Hz, time from a sample to a frame.
+    odometry_rate, odometry_scale, odometry_turn
+        The odometry: Hz, share by which distances are overstated, heading error after 1 m (one sigma, grows with the
+        square root of the distance). It is exact for 0 and 0.
+    map_half_width, map_resolution, region, horizon
+        The truth: size and cells of the maps, largest distance of a visible cell, distance from which on is sky.
+    seed, threads
+        Of the random numbers; of the computation (the result does not depend on it).
+
+    Examples
+    --------
+    >>> from recordings.simulator import Simulation
+    >>> simulation = Simulation(frames=2, width=320, height=240, relief_cells=256)
+    >>> simulation.frame(0).depth.shape
+    (240, 320)
     """
 
     frames: int = 12
@@ -105,7 +126,7 @@ class Simulation:
     def __post_init__(self) -> None:
         for name, (low, high, unit) in LIMITS.items():
             value = getattr(self, name) * UNITS.get(unit, 1)
-            value = min(value, 1e300) if value > high else value  # no float holds every whole number
+            value = min(value, 1e300) if value > high else value  # an int may exceed every float
             if not low <= value <= high:
                 shown = f"{low:.9g} to {high:.9g} {unit}".rstrip()
                 raise ValueError(f"Simulation.{name} must be {shown}, not {value:.9g}{f' {unit}' if unit else ''}")
@@ -124,14 +145,14 @@ class Simulation:
 
     @cached_property
     def route(self) -> traverse.Route:
-        """The way of the rover, through the middle of the tile."""
+        """The path of the rover, through the middle of the tile."""
         middle = self.relief_cells * self.relief_resolution / 2
         length = self.speed * (self.frames / self.rate + 2)
         return traverse.Route((middle, middle), 0.4, 0.35, 9.0, behind=self.speed + 1, ahead=length + 1)
 
     @cached_property
     def terrain(self) -> Terrain:
-        """The ground and its rocks, without those the rover would have to climb."""
+        """The ground and its rocks, without those in the path of the rover."""
         terrain = make_terrain(
             self._rng(0), self.relief_cells, self.relief_resolution, self.slope, self.abundance, self.smallest_rock,
             self.largest_rock,
@@ -147,7 +168,7 @@ class Simulation:
 
     @cached_property
     def lit_above(self) -> Array:
-        """Per ground cell the elevation, m, above which this sun surely shines."""
+        """The elevation, m, above which each ground cell is certainly lit."""
         return sunlight.lit_above(self.terrain.scene, self.sun)
 
     @cached_property
@@ -162,8 +183,8 @@ class Simulation:
 
     @property
     def start(self) -> int:
-        """Nominal start of the drive, ns; seeds have days of their own, so that no log passes for another's truth."""
-        return EPOCH + self.seed % DAYS * DAY
+        """Nominal start of the drive, ns; each seed has its own day, so logs of two seeds share no stamps."""
+        return EPOCH + self.seed % MAX_DAYS * DAY
 
     def stamp(self, frame: int) -> int:
         """Stamp of a frame, ns."""
@@ -172,28 +193,28 @@ class Simulation:
     @property
     def begin(self) -> int:
         """Time of the first sensor sample, ns."""
-        return self.start - MARGIN
+        return self.start - SENSOR_MARGIN
 
     def sensor_stamps(self, rate: float) -> list[int]:
-        """Stamps, ns, of a sensor of so many Hz, from before the first frame until after the last."""
-        length = (self.stamp(self.frames - 1) + MARGIN - self.begin) / SECOND
+        """Stamps, ns, of a sensor of `rate` Hz, from before the first frame until after the last."""
+        length = (self.stamp(self.frames - 1) + SENSOR_MARGIN - self.begin) / SECOND
         return [self.begin + round(number / rate * SECOND) for number in range(int(np.ceil(length * rate)) + 1)]
 
-    def way(self, stamp: int) -> float:
+    def distance(self, stamp: int) -> float:
         """Metres driven since the nominal start, at a time, ns."""
         return (stamp - self.start) / SECOND * self.speed
 
     def base_at(self, stamp: int) -> Transform:
         """world <- base_link at a time, ns."""
-        return traverse.base_pose(self.terrain, self.route, self.way(stamp))
+        return traverse.base_pose(self.terrain, self.route, self.distance(stamp))
 
     @cached_property
     def odometry(self) -> tuple[Pose, ...]:
         """The odometry of the whole drive, as logged."""
         stamps = self.sensor_stamps(self.odometry_rate)
-        ways = np.array([self.way(stamp) for stamp in stamps])
+        distances = np.array([self.distance(stamp) for stamp in stamps])
         bases = [self.base_at(stamp) for stamp in stamps]
-        return tuple(dead_reckoning(stamps, bases, ways, self.odometry_scale, self.odometry_turn, self._rng(5)))
+        return tuple(dead_reckoning(stamps, bases, distances, self.odometry_scale, self.odometry_turn, self._rng(5)))
 
     def frame(self, index: int) -> FrameTruth:
         """Images and exact geometry of one frame."""
@@ -241,8 +262,8 @@ class Simulation:
         return depth, surface, radiance
 
     def _by_rows(self, pool: ThreadPoolExecutor, work: Callable[[slice], None]) -> None:
-        starts = range(0, self.height, BLOCK)
-        for _ in pool.map(work, (slice(start, min(start + BLOCK, self.height)) for start in starts)):
+        starts = range(0, self.height, ROW_BLOCK)
+        for _ in pool.map(work, (slice(start, min(start + ROW_BLOCK, self.height)) for start in starts)):
             pass
 
     def _rng(self, *stream: int) -> np.random.Generator:

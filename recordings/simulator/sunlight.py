@@ -1,8 +1,8 @@
-"""Where the sun surely shines: per ground cell the elevation from which on nothing of the terrain stands before it.
+"""Elevations that are certainly lit: per ground cell the height above which the terrain casts no shadow.
 
-Terrain and sun stand still, so most shadow rays can be answered once for all pictures. The terrain's cells are swept
-once against the light, along lines parallel to it (as Timonen and Westerholm 2010 sweep for horizons), and every
-rounding errs upwards: what lies above the bound needs no ray, and only the rest is looked at by the ray caster.
+Terrain and sun do not move, so most shadow rays are decided once for all images. The cells are swept once against the
+light, along lines parallel to it (as Timonen and Westerholm 2010 sweep for horizons). Every rounding is upwards: points
+above the bound need no ray, and only the others are left to the ray caster.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 from recordings.simulator.raycast import BUCKET_LEVEL, Scene
 from stages.data import Array
 
-# Within so many cells ground shades ground only where it rises more steeply than the light; beyond, its tops decide.
-NEAR = 3
+# Within so many cells ground shades ground only if it is steeper than the light; beyond, its tops decide.
+NEAR_CELLS = 3
 
 
 def lit_above(scn: Scene, sun: Array) -> Array:
-    """(n, n) float32 elevations, m: no ray towards `sun` (3,) from a point of the cell above them meets anything.
+    """(n, n) float32 elevations, m: no ray towards `sun` (3,) from a point of the cell above them hits anything.
 
-    The points have to lie on the ground or above it. inf: nothing is sure.
+    The points must be on the ground or above it. inf: unknown.
     """
     tops, near = scn.tops[: scn.ground.size].reshape(scn.ground.shape), _near(scn, sun)
     along, across = float(sun[0]), float(sun[1])
@@ -62,14 +62,14 @@ def _swept(tops: Array, near: Array, drift: float, rise: float) -> Array:
     lift = np.float32(rise * (1 - 2e-5))  # float32 sums stay on the safe side
     reach = min(ceil(float(np.ptp(tops)) / rise) + 1, 8 * n)
     ahead = np.full(n, -np.inf, np.float32)
-    horizon, beside = np.empty((2, n + NEAR, n), np.float32)
-    for step in range(n + NEAR + reach, -1, -1):
+    horizon, beside = np.empty((2, n + NEAR_CELLS, n), np.float32)
+    for step in range(n + NEAR_CELLS + reach, -1, -1):
         shift = floor(min(drift * step, drift * (step + 1))) % n
         ahead = np.maximum(tops[step % n, shift : shift + n], ahead - lift)
-        if step < n + NEAR:
+        if step < n + NEAR_CELLS:
             horizon[step], beside[step] = ahead, near[step % n, shift : shift + n]
-    bound = np.maximum(horizon[NEAR:] - (NEAR - 1) * lift, beside[:n])
-    for k in range(1, NEAR):
+    bound = np.maximum(horizon[NEAR_CELLS:] - (NEAR_CELLS - 1) * lift, beside[:n])
+    for k in range(1, NEAR_CELLS):
         np.maximum(bound, beside[k : k + n] - (k - 1) * lift, out=bound)
     for step in range(n):
         bound[step] = np.roll(bound[step], -floor(-max(drift * step, drift * (step + 1))))

@@ -1,8 +1,8 @@
 """The ground of the simulator: rolling fractal relief strewn with rocks of the Golombek size-frequency law.
 
-Relief is fractional Brownian motion (H = 0.7) made by inverse FFT, so the tile repeats without a seam and the ground
-has no end. Rocks follow F_k(D) = k exp(-q D), q = 1.79 + 0.152/k (Golombek et al. 2003), as partly buried ellipsoids
-cut by planes: their facets look like broken stone, and a ray meets them in closed form, so edges and truth are exact.
+Relief is fractional Brownian motion (H = 0.7) from an inverse FFT, so the tile repeats without a seam. Rocks follow
+F_k(D) = k exp(-q D), q = 1.79 + 0.152/k (Golombek et al. 2003). They are partly buried ellipsoids cut by planes: they
+look like broken stone, and rays hit them in closed form, so edges and truth are exact.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from recordings.simulator.raycast import BUCKET_LEVEL, Scene, heights_at, scene
 from stages.data import Array
 
 HURST = 0.7
-# Below this wavelength the ground is smooth: the gravel that lives there belongs to the texture.
-SHORTEST_WAVE = 0.35
+MIN_WAVELENGTH = 0.35  # m of the relief; smaller gravel is in the texture
 SHAPES = 32
 FACETS = 12
 DIAMETERS = 4000  # at which the size-frequency law is integrated
-DESCENTS = 150  # steps in which the bounds of the rocks' tops come close
+BOUND_STEPS = 150  # of the descent to the bounds of the rocks' tops
 
 
 def decay(abundance: float) -> float:
@@ -83,7 +82,7 @@ class Terrain:
 
     @cached_property
     def scene(self) -> Scene:
-        """Ground and rocks in the form that the ray caster reads."""
+        """Ground and rocks for the ray caster."""
         return _scene(self.ground, self.resolution, self.rocks, self.facets)
 
     @property
@@ -147,7 +146,7 @@ def relief(rng: np.random.Generator, cells: int, resolution: float, slope: float
     y, x = np.fft.fftfreq(cells, resolution)[:, None], np.fft.rfftfreq(cells, resolution)[None, :]
     square = (y**2 + x**2).astype(np.float32)
     square[0, 0] = np.inf
-    amplitude = square ** np.float32(-(HURST + 1) / 2) * np.exp(-((square * np.float32(SHORTEST_WAVE**2)) ** 2))
+    amplitude = square ** np.float32(-(HURST + 1) / 2) * np.exp(-((square * np.float32(MIN_WAVELENGTH**2)) ** 2))
     shape = fft.irfft2(fft.rfft2(noise) * amplitude, (cells, cells))
     metre = max(1, round(1.0 / resolution))
     rises = [np.roll(shape, metre, axis=axis) - shape for axis in (0, 1)]
@@ -156,7 +155,7 @@ def relief(rng: np.random.Generator, cells: int, resolution: float, slope: float
 
 
 def _shapes(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Sets of planes n . p <= d that cut the unit sphere, (SHAPES, FACETS, 4), and what is left of it, (SHAPES, 2):
+    """Sets of planes n . p <= d that cut the unit sphere, (SHAPES, FACETS, 4), and the size of the rest, (SHAPES, 2):
     mean horizontal diameter and height of the top above the centre."""
     normals = rng.standard_normal((SHAPES, FACETS, 3))
     normals[..., 2] = np.abs(normals[..., 2]) * 0.8
@@ -221,13 +220,14 @@ def _scene(ground: Array, resolution: float, rocks: Rocks, facets: Array) -> Sce
 
 
 def _tops(facets: Array) -> Array:
-    """Upper bounds, close ones, of how far the cut spheres `facets` (S, F, 4) reach upwards: (S,).
+    """Close upper bounds of the heights of the cut spheres `facets` (S, F, 4): (S,).
 
-    With weights w >= 0 of the planes n . p <= d, every point has z <= w . d + |up - sum w n|; the weights go downhill.
+    With weights w >= 0 of the planes n . p <= d, every point has z <= w . d + |up - sum w n|; the weights
+    descend to its minimum.
     """
     normals, distance = facets[..., :3], facets[..., 3]
     weights, least = np.zeros(distance.shape), np.ones(len(facets))
-    for step in range(DESCENTS):
+    for step in range(BOUND_STEPS):
         rest = np.array([0.0, 0.0, 1.0]) - np.einsum("sf,sfk->sk", weights, normals)
         length = np.linalg.norm(rest, axis=1)
         np.minimum(least, np.einsum("sf,sf->s", weights, distance) + length, out=least)
@@ -237,7 +237,7 @@ def _tops(facets: Array) -> Array:
 
 
 def _touched(rocks: Rocks, reach_up: Array, buckets: int, size: float) -> tuple[Array, Array, Array]:
-    """Bucket index, rock index and a bound of the rock's elevation there, for every bucket that a rock touches.
+    """For every bucket that a rock touches: bucket index, rock index and an upper bound of the rock's elevation there.
 
     reach_up: (N,) bounds of the rocks' tops above their middles, as shares of the semi-axis.
     """

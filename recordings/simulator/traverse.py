@@ -1,8 +1,8 @@
-"""The rover of the simulator: where it drives, how the ground tilts it, and what its sensors say about that.
+"""The rover of the simulator: its path, its tilt on the ground, and the readings of its inclinometer.
 
-World frame: z up. `base_link` sits on the plane that fits the ground under the body, x forward, y left; `level` shares
-its origin and heading and is not tilted. The inclinometer is bolted on askew, as real ones are, so nothing
-downstream can work by ignoring the static transforms.
+The world frame has z up. `base_link` is on the plane that fits the ground under the body, x forward, y left; `level`
+has its origin and heading, without tilt. The inclinometer is mounted at an angle, as real ones are, so nothing
+downstream works without the static transforms.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stages.data import LEVEL_FRAME, Array, Transform
 BODY_LENGTH, BODY_WIDTH = 1.0, 0.8
 LEFT_FRAME, RIGHT_FRAME = "left_camera_optical", "right_camera_optical"
 INCLINOMETER_FRAME = "inclinometer_link"
-MAST_FORWARD = 0.35  # m, of the cameras ahead of the body's centre
+MAST_FORWARD = 0.35  # m from the body's centre to the cameras
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class Route:
         places += np.asarray(self.start) - places[int(np.argmin(np.abs(way)))]
         object.__setattr__(self, "_nodes", (way, places))
 
-    def heading_at(self, way: Array | float) -> Array:
-        """Heading, rad from +x towards +y, after `way` metres."""
-        return np.asarray(self.heading + self.swing * np.sin(2 * np.pi * np.asarray(way) / self.wave))
+    def heading_at(self, distance: Array | float) -> Array:
+        """Heading, rad from +x towards +y, after `distance` metres."""
+        return np.asarray(self.heading + self.swing * np.sin(2 * np.pi * np.asarray(distance) / self.wave))
 
-    def place_at(self, way: Array | float) -> Array:
-        """Position (..., 2), m, after `way` metres."""
+    def place_at(self, distance: Array | float) -> Array:
+        """Position (..., 2), m, after `distance` metres."""
         nodes, places = self._nodes
-        return np.stack([np.interp(way, nodes, places[:, axis]) for axis in (0, 1)], axis=-1)
+        return np.stack([np.interp(distance, nodes, places[:, axis]) for axis in (0, 1)], axis=-1)
 
 
 def resting_plane(terrain: Terrain, place: Array, heading: float) -> tuple[float, Array]:
@@ -66,11 +66,11 @@ def resting_plane(terrain: Terrain, place: Array, heading: float) -> tuple[float
     return float(height), normal / np.linalg.norm(normal)
 
 
-def base_pose(terrain: Terrain, route: Route, way: float) -> Transform:
-    """world <- base_link after `way` metres."""
-    heading, place = float(route.heading_at(way)), route.place_at(way)
+def base_pose(terrain: Terrain, route: Route, distance: float) -> Transform:
+    """world <- base_link after `distance` metres."""
+    heading, place = float(route.heading_at(distance)), route.place_at(distance)
     height, up = resting_plane(terrain, place, heading)
-    # In the plane, and straight above the horizontal heading.
+    # In the plane, vertically above the horizontal heading.
     forward = np.array([np.cos(heading), np.sin(heading), -(up[0] * np.cos(heading) + up[1] * np.sin(heading)) / up[2]])
     forward /= np.linalg.norm(forward)
     rotation = np.column_stack([forward, np.cross(up, forward), up])
@@ -95,7 +95,7 @@ def mounts(baseline: float, camera_height: float, pitch_down: float) -> tuple[Tr
 
 
 def inclinometer_reading(base: Transform, mount: Transform, noise: float, rng: np.random.Generator) -> Array:
-    """Quaternion xyzw that turns the inclinometer's frame into a world with z up, its heading unknown and set to 0.
+    """Quaternion xyzw that rotates the inclinometer's frame into a world with z up; the unknown heading is 0.
 
     noise: rad, standard deviation about each horizontal axis.
     """
