@@ -86,29 +86,34 @@ class Canvas:
         _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         self.log(path, rr.EncodedImage(contents=blob, media_type="image/jpeg"), view)
 
-    def log_labels(self, view: ViewSpec, codes: Array, legend: Legend) -> None:
-        """A label image (H, W); its names are above it and appear on hover."""
+    def log_labels(self, view: ViewSpec, codes: Array, legend: Legend, beside: bool = False) -> None:
+        """A label image (H, W); its names are above or beside it and appear on hover."""
         path = view.path
         if self._legends.get(path) != legend:
             self._legends[path] = legend
             names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
             self.recording.log(path, rr.AnnotationContext(names), static=True)
         self.log(f"{path}/labels", rr.SegmentationImage(codes.astype(np.uint8)), view)
-        self.log_legend(f"{path}/legend", codes.shape, legend.values())
+        self.log_legend(f"{path}/legend", codes.shape, legend.values(), beside)
 
     def log_scale(self, path: str, shape: tuple[int, ...], low: float, high: float, unit: str, palette: int) -> None:
         """The legend of a colour map: three of its values above the picture."""
         self.log_legend(path, shape, _scale(low, high, unit, palette))
 
-    def log_legend(self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, Rgb]]) -> None:
-        """Named dots above a picture of (H, W), in rows of at most four."""
+    def log_legend(
+        self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, Rgb]], beside: bool = False
+    ) -> None:
+        """Named dots above a picture of (H, W), in rows of at most four; or beside it, in two columns."""
         height, width = shape
         content = shape, *entries
         names, colors = zip(*content[1:], strict=True)
-        rows = -(-len(names) // LEGEND_COLUMNS)
+        rows = -(-len(names) // (2 if beside else LEGEND_COLUMNS))
         columns = -(-len(names) // rows)
-        places = (divmod(number, columns) for number in range(len(names)))
-        dots = [((column + 0.5) * width / columns, (row - rows) * LEGEND_ROW * height) for row, column in places]
+        places = [divmod(number, columns) for number in range(len(names))]
+        if beside:
+            dots = [((1.25 + 0.5 * column) * width, (row + 0.25) * height / rows) for row, column in places]
+        else:
+            dots = [((column + 0.5) * width / columns, (row - rows) * LEGEND_ROW * height) for row, column in places]
         dot, pin = rr.Radius.ui_points(5.0), rr.Radius.ui_points(0.5)
         self.keep(path, content, lambda: rr.Points2D(dots, colors=colors, radii=dot, draw_order=30.0))
         # A label takes the colour of its dot, which may be as dark as the background, so labels have dots of their own.

@@ -93,7 +93,7 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     codes = np.flatnonzero(np.bincount(disparity.source.ravel(), minlength=1))
     if not {*codes.tolist()} <= {PixelOrigin.UNKNOWN, PixelOrigin.MEASURED}:
         source = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
-        canvas.log_labels(source, disparity.source, colormaps.SOURCE_LEGEND)
+        canvas.log_labels(source, disparity.source, colormaps.SOURCE_LEGEND, beside=True)
     if disparity.segments is not None:
         edges = colormaps.segment_edges(disparity.segments).astype(np.uint8) * 255
         _, lines = cv2.imencode(".png", edges, [cv2.IMWRITE_PNG_BILEVEL, 1])

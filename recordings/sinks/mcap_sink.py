@@ -1,7 +1,7 @@
-"""Writes what a pipeline made into an MCAP log, as ROS 2 messages, one set a frame.
+"""Writes the streams of a pipeline into an MCAP log, as ROS 2 messages, one set per frame.
 
-All messages of a frame carry its stamp as log time, so a result lines up with the log it was made from. Nothing that
-differs between two equal runs goes in (no times of day, no durations): equal runs give equal bytes.
+All messages of a frame have its stamp as log time, so results line up with the input log. The log contains no times of
+day and no durations: equal runs give equal bytes.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class McapSink:
         return f"McapSink cannot write '{stream}': {why}; leave it out of '{setting}'" if why else ""
 
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
-        """Start the log. about: what it was made from and with, kept as its metadata record "roverflow"."""
+        """Start the log. about: facts of the run, kept as the metadata record "roverflow"."""
         self._last_stamp, self.empty = None, any(stream in streams for stream in self._written)
         self._kinds, self._owners = dict(streams), {}
         self._writer = Ros2Writer(Path(path), keep=True, compression=self.compression)
@@ -109,7 +109,7 @@ class McapSink:
             raise
 
     def write(self, record: FrameRecord) -> None:
-        """Write a frame that is through."""
+        """Write a frame."""
         writer, stamp = self._writer, record.stamp
         for stream in self._written:
             for topic, message in self._messages(stream, record.items.get(stream), stamp):
@@ -119,20 +119,22 @@ class McapSink:
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)
         health = [_health(name, item) for name, item in record.items.items() if isinstance(item, TiltHealth)]
-        written = {name: record.items[name] for name in self._written if name in record.items}
-        begun = [_begun(name, item) for name, item in written.items() if getattr(item, "epoch", None) is not None]
-        statuses = [*_statuses(record.entries), *health, *begun]
+        maps = [(name, record.items.get(name)) for name in self._written]
+        epochs = [
+            _epoch(name, item) for name, item in maps if isinstance(item, ElevationMap) and item.epoch is not None
+        ]
+        statuses = [*_statuses(record.entries), *health, *epochs]
         writer.write("/nav/diagnostics", diagnostics(stamp, statuses), stamp)
         self._last_stamp = stamp
 
     def close(self, summary: Mapping[str, Any]) -> None:
         """Finish the log. summary: of the run: losses after the last frame ("entries"), verdict and counts."""
         writer = self._writer
-        if writer.closed:  # a write failed, which was told then
+        if writer.closed:  # a write failed and raised
             return
         entries = list(summary.get("entries", ()))
         found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
-        findings = [_finding(stream, said) for stream, said in found]
+        findings = [_finding(stream, finding) for stream, finding in found]
         if entries or (findings and self._last_stamp is not None):
             latest = max([0, *(entry.stamp for entry in entries)])
             stamp = latest if self._last_stamp is None else self._last_stamp
@@ -141,13 +143,13 @@ class McapSink:
         counts = {name: str(summary[name]) for name in _COUNTS if name in summary}
         for group in ("drops", "messages"):
             counts |= {f"{group}.{name}": str(count) for name, count in summary.get(group, {}).items()}
-        for stream, said in summary.get("findings", {}).items():
-            counts[f"findings.{stream}"] = f"{said['severity']}: {said['sentence']}"
+        for stream, finding in summary.get("findings", {}).items():
+            counts[f"findings.{stream}"] = f"{finding['severity']}: {finding['sentence']}"
         writer.metadata("roverflow.run", counts)
         writer.close()
 
     def discard(self) -> None:
-        """Give up the log; one that stood under its name stays."""
+        """Discard the log; an earlier file of its name stays."""
         self._writer.abort()
 
     @property
@@ -180,21 +182,21 @@ def _topic_part(name: str) -> str:
 
 
 def _transforms(items: Iterable[Any]) -> Iterator[Transform]:
-    """Where the clouds were seen from, and where regional maps have the frame `level`."""
+    """The poses of the sensors of clouds, and of frame `level` in regional maps."""
     for item in items:
         known = item.sensor if isinstance(item, PointCloud) else getattr(item, "level", None)
-        if known is not None:
+        if isinstance(known, Transform):  # a type of the user's own may have another `level`
             yield known
 
 
-def _finding(stream: str, said: Mapping[str, str]) -> tuple[int, str, str, dict[str, str]]:
-    """The diagnostic status of something that a run found."""
-    level = _WARN if said["severity"] == "warning" else _OK
-    return level, stream, said["sentence"], {"finding": said["sentence"], "severity": said["severity"]}
+def _finding(stream: str, finding: Mapping[str, str]) -> tuple[int, str, str, dict[str, str]]:
+    """The diagnostic status of a finding of the run."""
+    level = _WARN if finding["severity"] == "warning" else _OK
+    return level, stream, finding["sentence"], {"finding": finding["sentence"], "severity": finding["severity"]}
 
 
-def _begun(stream: str, terrain: ElevationMap) -> tuple[int, str, str, dict[str, str]]:
-    """The diagnostic status of a map of many frames: from which stamp on its layers "first" and "last" count."""
+def _epoch(stream: str, terrain: ElevationMap) -> tuple[int, str, str, dict[str, str]]:
+    """The diagnostic status of a regional map: the stamp from which its layers "first" and "last" count."""
     text = f"layers first and last count seconds from {terrain.epoch} ns"
     return _OK, stream, text, {"epoch": str(terrain.epoch)}
 
@@ -208,7 +210,7 @@ def _health(stream: str, health: TiltHealth) -> tuple[int, str, str, dict[str, s
 
 
 def _statuses(entries: Iterable[Loss]) -> list[tuple[int, str, str, dict[str, str]]]:
-    """Diagnostic statuses of losses: one each, or that there is none."""
+    """The diagnostic status of each loss, or a single one if there is none."""
     statuses = [
         (
             _ERROR, f"{entry.stage}/{entry.stream}", entry.detail,

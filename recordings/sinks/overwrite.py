@@ -1,4 +1,4 @@
-"""Whether a file is an earlier output of roverflow, which another may replace: its content tells, not its name."""
+"""Recognises earlier outputs of roverflow, which a new output may replace, by their content."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import struct
 from pathlib import Path
 
 _HEADER = b"\x89MCAP0\r\n" + struct.pack("<BQI4sI9s", 1, 21, 4, b"ros2", 9, b"roverflow")  # with profile and library
-_ABOUT = 12, struct.pack("<I9s", 9, b"roverflow")  # the record of metadata that follows it in results, and its name
-_RECORDING = b"RRF", b"/summary", b"# RUNNING"  # its magic, and what it says of the run before anything else
-_BEGINNING = 1 << 18  # bytes, in which a recording has said so
+_ABOUT = 12, struct.pack("<I9s", 9, b"roverflow")  # the metadata record that follows it in result logs, and its name
+_RECORDING = b"RRF", b"/summary", b"# RUNNING"  # its magic, and its first summary
+_BEGINNING = 1 << 18  # bytes that contain these
 _KEYS = {
     "summary": {"frames_in", "verdict"},
     "score": {"frames", "compared", "missing", "unmatched"},

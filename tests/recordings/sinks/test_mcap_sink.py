@@ -173,7 +173,7 @@ def test_the_log_has_the_given_compression_and_the_same_messages(tmp_path: Path,
     assert used == {"" if compression == "none" else compression}
     sent = [(topic, stamp, repr(message)) for topic, stamp, message in iter_decoded(write(tmp_path / "usual.mcap"))]
     assert [(topic, stamp, repr(message)) for topic, stamp, message in iter_decoded(log)] == sent
-    with pytest.raises(ValueError, match=r"compression must be one of lz4, zstd, none, not 'gzip'"):
+    with pytest.raises(ValueError, match=r"compression must be one of lz4, zstd, none, not '?gzip"):
         McapSink(compression="gzip")
 
 
