@@ -111,14 +111,16 @@ class Canvas:
         columns = -(-len(names) // rows)
         places = [divmod(number, columns) for number in range(len(names))]
         if beside:
-            dots = [((1.25 + 0.5 * column) * width, (row + 0.25) * height / rows) for row, column in places]
+            dots = [((1.1 + 0.7 * column) * width, (row + 0.5) * height / rows) for row, column in places]
+            pins = [(x + 0.33 * width, y - 0.45 * height / rows) for x, y in dots]  # a label is centred below its pin
         else:
             dots = [((column + 0.5) * width / columns, (row - rows) * LEGEND_ROW * height) for row, column in places]
+            pins = dots
         dot, pin = rr.Radius.ui_points(5.0), rr.Radius.ui_points(0.5)
         self.keep(path, content, lambda: rr.Points2D(dots, colors=colors, radii=dot, draw_order=30.0))
         # A label takes the colour of its dot, which may be as dark as the background, so labels have dots of their own.
         texts: dict[str, Any] = {"labels": names, "show_labels": True, "radii": pin, "draw_order": 31.0}
-        self.keep(f"{path}/text", content, lambda: rr.Points2D(dots, colors=[TEXT_RGB], **texts))
+        self.keep(f"{path}/text", content, lambda: rr.Points2D(pins, colors=[TEXT_RGB], **texts))
 
     def clear_missing(self) -> None:
         """Clear the entities of the last frame that this frame lacks."""
