@@ -1,9 +1,8 @@
-"""The pictures of docs/terrain.md and of the Devon Island pairs in docs/refinement.md: `make pictures` draws them anew.
+"""The pictures of docs/terrain.md and of the Devon Island pairs in docs/refinement.md: `make pictures` draws them.
 
-terrain.jpg: for three frames the left image, the elevation, the navigation map by its reasons, and what was true of
-the cells that a pixel of both cameras hits. region.jpg: the regional map of a traverse, beside it its navigation map.
-Both are of simulated traverses. devon.jpg, where ROVERFLOW_DATA names the data: of each pair disparity and source; the
-images are not ours to print.
+terrain.jpg: for three frames the left image, the elevation, the reasons of the navigation map, and the truth in the
+visible cells. region.jpg: the regional map of a traverse and its navigation map. Both are of simulated traverses.
+devon.jpg, if ROVERFLOW_DATA is set: disparity and source of each pair; the images may not be reprinted.
 """
 
 from __future__ import annotations
@@ -103,7 +102,7 @@ def devon_picture(data: Path) -> Array:
 
 
 def _ahead(painted: Array, terrain: ElevationMap) -> Array:
-    """A painted grid, from the rover's place on, as seen from above, in a panel."""
+    """A coloured grid ahead of the rover, from above, in a panel."""
     behind = round(-terrain.origin[0] / terrain.resolution)
     view = colormaps.birds_eye(painted[:, behind:])
     scale = HEIGHT / view.shape[0]

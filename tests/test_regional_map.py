@@ -1,4 +1,4 @@
-"""The regional map from the command line: made where the log has a pose, exported whole."""
+"""The regional map from the command line: computed with any pose, and exported as a whole."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.conftest import FRAMES, SMALL, rewrite, roverflow
 REGIONAL = {"/nav/regional_map", "/nav/regional_navigation_map"}
 
 
-def test_every_frame_gives_the_map_around_the_rover_in_the_pose_s_frame(result):
+def test_every_frame_has_the_regional_map_around_the_rover(result):
     maps = {topic: [] for topic in REGIONAL}
     for topic, _, message in iter_decoded(result, REGIONAL):
         maps[topic].append(message)
@@ -32,7 +32,7 @@ def test_every_frame_gives_the_map_around_the_rover_in_the_pose_s_frame(result):
 
 
 @pytest.mark.parametrize("stream", ["navigation_map", "regional_navigation_map"])
-def test_a_result_log_says_why_each_cell_is_a_hazard_or_unknown(result, stream):
+def test_a_result_log_contains_the_reason_of_every_cell(result, stream):
     grids, reasons = (
         [message for _, _, message in iter_decoded(result, [topic])]
         for topic in (f"/nav/{stream}", f"/nav/{stream}/reason")
@@ -60,7 +60,7 @@ def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tm
     assert ros2.read_grid_map(regional[-1]).layers["frames"].max() == FRAMES
 
 
-def test_a_pipeline_that_fuses_nothing_has_its_frames_exported(traverse, tmp_path, capsys):
+def test_export_without_a_regional_map_exports_the_frames(traverse, tmp_path, capsys):
     out = tmp_path / "out.mcap"
     assert roverflow("run", traverse, "-p", "paper", *SMALL, "-o", out, "--no-rrd") == 0
     counts = Counter(topic for topic, _, _ in iter_decoded(out))
@@ -93,7 +93,7 @@ def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_neighbouring_frames_join_without_a_seam_and_what_is_stated_of_the_heights_holds(tmp_path):
+def test_neighbouring_frames_join_within_their_stated_sigmas(tmp_path):
     regions = []
     for seed, abundance in RUNS:
         (tmp_path / str(seed)).mkdir()
@@ -111,11 +111,11 @@ def test_neighbouring_frames_join_without_a_seam_and_what_is_stated_of_the_heigh
     ("where", "words"),
     [("file", "is a file; give the name of a folder"), ("gone", "cannot read"), ("", "is not empty")],
 )
-def test_an_export_that_cannot_be_done_is_one_sentence(result, tmp_path, where, words, capsys):
+def test_an_impossible_export_is_refused_in_one_sentence(result, tmp_path, where, words, capsys):
     (tmp_path / "file").write_text("mine")
     log = tmp_path / "gone.mcap" if where == "gone" else result
     assert roverflow("export", log, tmp_path / where if where != "gone" else tmp_path / "maps") == 2
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("\n") == 1
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
     assert (tmp_path / "file").read_text() == "mine"

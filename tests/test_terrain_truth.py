@@ -1,4 +1,4 @@
-"""The whole chain on simulated traverses, log to score: the map is near the truth, knows it, and finds the rocks."""
+"""Simulated traverses from log to score: accurate maps with valid sigmas that contain the rocks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COMPARED = {name: pipeline for name, pipeline in RUNS.items() if pipeline == "ro
 
 
 @pytest.mark.parametrize("pipeline", ["rover", "fast", "paper"])
-def test_the_tilt_is_as_far_off_as_its_pipeline_states(pipeline: str) -> None:
+def test_tilt_errors_match_the_stated_tilt_sigma(pipeline: str) -> None:
     ground = {"frames": 30, "slope": float(SLOPE), "relief_cells": 512, "abundance": 0.0}
     errors = tilt_errors(pipeline, Simulation(**ground, tilt_noise=float(TILT_NOISE), seed=21))
     stated = next(node.actor for node in nodes(pipeline) if node.name == "points").tilt_sigma
@@ -60,7 +60,7 @@ def traverse_of(seed: int, abundance: float) -> Simulation:
     )
 
 
-def test_two_frames_have_maps_one_would_drive_on() -> None:
+def test_two_frames_have_accurate_maps() -> None:
     found = score([traverse_of(11, 0.15)], 15, COMPARED)
     assert found["rover"].tally.metrics()["rocks"]["0.2 m"]["visible"] >= 1
     check(found, alarms=0.08, slack=0.04)
@@ -69,13 +69,13 @@ def test_two_frames_have_maps_one_would_drive_on() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("abundance", "alarms"), [(0.05, 0.03), (0.15, 0.08)])
-def test_three_traverses_have_maps_one_would_drive_on(abundance: float, alarms: float) -> None:
+def test_three_traverses_have_accurate_maps(abundance: float, alarms: float) -> None:
     check(score([traverse_of(seed, abundance) for seed in (11, 12, 13)], 10, COMPARED), alarms)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 13])
-def test_the_default_beats_the_paper_from_log_to_score(tmp_path: Path, seed: int) -> None:
+def test_rover_scores_better_than_paper(tmp_path: Path, seed: int) -> None:
     log = tmp_path / "log.mcap"
     assert main(["simulate", str(log), "--frames", "4", "--size", "960x720", "--seed", str(seed)]) == 0
     scores: dict[str, Any] = {}
@@ -96,7 +96,7 @@ def test_the_default_beats_the_paper_from_log_to_score(tmp_path: Path, seed: int
 
 
 @pytest.mark.slow
-def test_two_thirds_of_the_matchers_errors_are_within_their_sigma_at_every_confidence() -> None:
+def test_disparity_sigmas_contain_68_percent_at_every_confidence() -> None:
     ratios, confidences = [], []
     for seed, abundance in ((11, 0.05), (12, 0.15)):
         for given, exact, _ in frames(traverse_of(seed, abundance), 15):

@@ -1,4 +1,4 @@
-"""A simulated drive as camera and inclinometer live through it, without its images: fast enough for statistics."""
+"""A simulated drive without images: the motion of its camera and the readings of its inclinometer."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Drive:
         return self.truth.mounts[0].rotation.T @ self.truth.mounts[2].rotation  # type: ignore[no-any-return]
 
     def ups(self, frames: int = FRAMES, late: float = 0.0) -> Array:
-        """What the inclinometer says at the frames, its stamps `late` by so many seconds."""
+        """Readings of the inclinometer at the frames, with stamps `late` by so many seconds."""
         rng, spread = np.random.default_rng([self.seed, 1]), np.radians(self.noise) * SMOOTHED
         found = []
         for stamp in self.stamps(frames):
@@ -60,7 +60,7 @@ class Drive:
         return np.array(found)
 
     def turns(self, frames: int = FRAMES) -> Array:
-        """How the images say that the camera turned since the first frame, (n, 3, 3)."""
+        """Rotation of the camera since the first frame by visual odometry, (n, 3, 3)."""
         rng, cameras = np.random.default_rng([self.seed, 2]), self.cameras(frames)
         drift, turns = Rotation.identity(), []
         for camera in cameras:
@@ -69,7 +69,7 @@ class Drive:
         return np.array(turns)
 
     def ground(self, frames: int = FRAMES) -> Array:
-        """The normal of the ground in view, which slopes by some degrees, in the camera."""
+        """Normal of the ground in view, which slopes by some degrees, in the camera."""
         rng = np.random.default_rng([self.seed, 3])
         normals = np.array([camera.rotation[2] for camera in self.cameras(frames)]) + rng.normal(0, 0.05, (frames, 3))
         return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
@@ -78,7 +78,7 @@ class Drive:
         self, frames: int = FRAMES, change: Callable[[Array], Array] | None = None, late: float = 0.0,
         turned: Array | None = None,
     ) -> Evidence:  # fmt: skip
-        """What the check of the tilt sees, of a tilt with a fault."""
+        """Evidence of a tilt with a fault for the tilt check."""
         ups = self.ups(frames, late)
         ups = np.array([change(up) for up in ups]) if change else ups
         mount = self.mount if turned is None else self.mount @ turned
@@ -88,7 +88,7 @@ class Drive:
 
 
 def motions(cameras: list[Transform], stamps: list[int], segment: int = 1) -> list[CameraMotion]:
-    """The exact motion of a camera, since the first."""
+    """Exact motion of a camera since the first frame."""
     start = cameras[0].inverse()
     return [
         CameraMotion(stamp, segment, start.after(camera), np.eye(6) * 1e-9 * count, 100)

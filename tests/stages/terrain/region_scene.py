@@ -1,4 +1,4 @@
-"""A drive over ground whose height is known anywhere, as clouds and poses for the regional map."""
+"""A drive over ground of known height, as clouds and poses for the regional map."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOUNT = Mount(START, np.eye(3), Transform("base_link", "camera", LOOKING, np.arr
 
 
 def rolling(x, y):
-    """Ground that is alike in no two places or directions."""
+    """Ground without any symmetry."""
     return 0.2 * np.sin(0.9 * x + 0.3) * np.cos(0.5 * y) + 0.03 * x - 0.02 * y
 
 

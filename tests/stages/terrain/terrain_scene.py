@@ -1,4 +1,4 @@
-"""Scenes with an exact truth for the terrain tests: a plane with rocks seen by a camera; terrain grids."""
+"""Scenes with ground truth for the terrain tests: a plane with rocks in a camera's view, and terrain grids."""
 
 from __future__ import annotations
 
@@ -39,8 +39,7 @@ def seen_disparity(rocks: tuple[tuple[float, float, float], ...] = ROCKS, camera
 
 
 def profile_disparity(profile: Callable[[Array], Array], camera: StereoCamera = CAMERA) -> Array:
-    """Exact disparity (H, W) float64 of ground whose height, m, `profile` gives for any distance ahead, the same to the
-    left and right; NaN where no ray meets it within 14 m."""
+    """Exact disparity (H, W) float64 of ground with this height profile ahead, m; NaN beyond 14 m."""
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
     rays = rays @ level_from_camera().T
@@ -64,8 +63,7 @@ def as_disparity(pixels: Array, camera: StereoCamera = CAMERA, stamp: int = 7) -
 
 @dataclass(frozen=True)
 class Terrain:
-    """A terrain grid with what is true of it: above_mean, height of the rock over the ground, m; rock, its index in a
-    cell, 0 for none."""
+    """A terrain grid with its truth: above_mean, rock height above the ground, m; rock, its index, 0 for none."""
 
     elevation: ElevationMap
     above_mean: Array

@@ -1,4 +1,4 @@
-"""The five terrain stages together: from a disparity image to a navigation map that agrees with the scene."""
+"""The terrain stages together: from a disparity image to a navigation map that agrees with the scene."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def mapped(
     return elevation, Binarise()(elevation)
 
 
-def test_a_simulated_scene_has_its_ground_at_zero_its_rocks_as_hazards_and_their_shadows_unknown() -> None:
+def test_a_scene_has_level_ground_hazard_rocks_and_unknown_shadows() -> None:
     exact = seen_disparity()
     noisy = exact + np.random.default_rng(0).normal(0, 0.2, exact.shape)
     elevation, navigation = mapped(blank_frame(), as_disparity(noisy), Tilt(7, UP), HEIGHT)
@@ -83,24 +83,24 @@ def profiled(profile: Callable[[Array], Array], seed: int = 1, **limits: Any) ->
     return np.broadcast_to(ahead, cells["cells"].shape), replace(navigation, **cells)
 
 
-BLIND = {"min_drop": 100.0}  # as if no drop were ever suspected
+BLIND = {"min_drop": 100.0}  # no drop is ever suspected
 
 
 @pytest.mark.parametrize("edge", [3.0, 4.5, 6.5])
-def test_the_edge_of_a_drop_whose_foot_is_hidden_is_not_free_and_the_way_to_it_is(edge: float) -> None:
+def test_the_edge_of_a_drop_with_a_hidden_foot_is_not_free(edge: float) -> None:
     ahead, cliff = profiled(lambda x: np.where(x < edge, 0.0, -3.0))
     brink, way = (ahead > edge - 0.1) & (ahead < edge), (ahead > 2.0) & (ahead < edge - 0.3)
     assert not (cliff.cells[brink] == Cell.FREE).any()
     assert (cliff.cells[way] == Cell.FREE).mean() > 0.98
     assert not (cliff.cells[ahead > edge] == Cell.FREE).any()
     _, blind = profiled(lambda x: np.where(x < edge, 0.0, -3.0), **BLIND)
-    assert (blind.cells[brink] == Cell.FREE).mean() > 0.5  # so the rest of the rules does not see it
+    assert (blind.cells[brink] == Cell.FREE).mean() > 0.5  # so no other rule finds it
 
 
 @pytest.mark.parametrize(
     ("edge", "depth"), [(2, 0.3), (2.5, 0.4), (2.5, 0.6), (3, 0.3), (3, 0.5), (4, 0.3), (4, 0.4), (5, 0.4)]
 )
-def test_the_edge_of_a_drop_is_not_free_where_the_ground_below_it_is_seen(edge: float, depth: float) -> None:
+def test_the_edge_of_a_drop_to_visible_ground_is_not_free(edge: float, depth: float) -> None:
     ahead, cliff = profiled(lambda x: np.where(x < edge, 0.0, -depth))
     assert not (cliff.cells[(ahead > edge - 0.1) & (ahead < edge)] == Cell.FREE).any()
     assert (cliff.cells[(ahead > 1.6) & (ahead < edge - 0.3)] == Cell.FREE).mean() > 0.98
@@ -114,7 +114,7 @@ def test_nothing_is_free_within_half_a_wheel_of_a_drop() -> None:
 
 
 @pytest.mark.parametrize(("near", "width"), [(2.5, 0.5), (4.0, 0.6), (5.5, 1.0)])
-def test_the_near_edge_of_a_ditch_whose_bottom_is_hidden_is_not_free(near: float, width: float) -> None:
+def test_the_near_edge_of_a_ditch_with_a_hidden_bottom_is_not_free(near: float, width: float) -> None:
     def ditched(x: Array) -> Array:
         return np.where((x < near) | (x > near + width), 0.0, -1.0)
 
@@ -125,12 +125,12 @@ def test_the_near_edge_of_a_ditch_whose_bottom_is_hidden_is_not_free(near: float
     assert not (ditch.cells[brink | inside] == Cell.FREE).any()
     assert (ditch.cells[before] == Cell.FREE).mean() > 0.98
     np.testing.assert_array_equal(ditch.cells[after], blind.cells[after])
-    assert (blind.cells[brink] == Cell.FREE).mean() > 0.9  # so the rest of the rules does not see it
+    assert (blind.cells[brink] == Cell.FREE).mean() > 0.9  # so no other rule finds it
 
 
 @pytest.mark.parametrize("at", [3.0, 4.5, 6.0])
 @pytest.mark.parametrize("slope", [0.0, 0.1, -0.05])
-def test_the_ground_before_and_behind_a_mere_bump_stays_free(at: float, slope: float) -> None:
+def test_the_ground_around_a_bump_stays_free(at: float, slope: float) -> None:
     def bumpy(x: Array) -> Array:
         return np.asarray(slope * x + 0.1 * np.exp(-(((x - at) / 0.25) ** 2)))
 
@@ -141,7 +141,7 @@ def test_the_ground_before_and_behind_a_mere_bump_stays_free(at: float, slope: f
     assert (bump.cells[about] == Cell.FREE).sum() > 0.98 * (blind.cells[about] == Cell.FREE).sum()
 
 
-def test_the_regional_map_knows_the_edge_of_a_drop_too() -> None:
+def test_the_edge_of_a_drop_is_not_free_in_the_regional_map() -> None:
     exact = profile_disparity(lambda x: np.where(x < 4.5, 0.0, -3.0))
     cloud = Level(camera_height=HEIGHT)(Clean()(Reproject()(blank_frame(), as_disparity(exact))), Tilt(7, UP, "camera"))
     pose = Pose(7, [100.0, 50.0, 3.0], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
