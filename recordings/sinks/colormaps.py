@@ -26,7 +26,7 @@ METRES_BEHIND = 1.0  # m behind the rover that a picture shows if nothing is kno
 UNKNOWN_RGB: Rgb = (46, 47, 54)
 _ORIGIN_RGB: tuple[Rgb, ...] = (  # by code
     UNKNOWN_RGB, (62, 150, 104), (84, 132, 222), (232, 164, 60),
-    (96, 100, 112), (150, 104, 74), (196, 70, 92), (190, 110, 190), (236, 220, 120), (18, 18, 22), (132, 186, 214),
+    (96, 100, 112), (150, 104, 74), (196, 70, 92), (190, 110, 190), (236, 220, 120), (226, 226, 232), (132, 186, 214),
 )  # fmt: skip
 SOURCE_LEGEND: Legend = {
     origin: (origin.name.lower().replace("_", " "), _ORIGIN_RGB[origin]) for origin in PixelOrigin

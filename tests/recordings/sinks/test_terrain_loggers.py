@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from recordings.sinks.colormaps import REASON_LEGEND
+from recordings.sinks.colormaps import REASON_LEGEND, SOURCE_LEGEND
 from recordings.sinks.rerun_sink import RerunSink
-from stages.data import LEVEL_FRAME, CellReason, VoxelMap
+from stages.data import LEVEL_FRAME, CellReason, PixelOrigin, VoxelMap
 from tests.recordings.sinks.recorded_scene import START, Record, entities, rows, scene
 
 
@@ -45,3 +45,8 @@ def test_voxels_are_boxes_at_the_centres_of_their_cubes(tmp_path: Path) -> None:
 def test_every_reason_has_a_colour_of_its_own() -> None:
     assert set(REASON_LEGEND) == set(CellReason)
     assert len({colour for _, colour in REASON_LEGEND.values()}) == len(REASON_LEGEND)
+
+
+def test_every_pixel_origin_has_a_colour_of_its_own() -> None:
+    assert set(SOURCE_LEGEND) == set(PixelOrigin)
+    assert len({colour for _, colour in SOURCE_LEGEND.values()}) == len(SOURCE_LEGEND)
