@@ -1,4 +1,4 @@
-"""The types that flow, stages and recordings share: what a source, a sink and a finding are. Types only, no work."""
+"""The types that flow, stages and recordings share: losses, findings, frames, sources, logs and sinks."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any, ClassVar, Protocol
 
 
 class LossReason(StrEnum):
-    """Why something was lost."""
+    """Why a message or a frame was lost."""
 
     UNREADABLE = "unreadable"  # the source could not read or decode it
-    OUT_OF_ORDER = "out of order"  # its stamp does not follow the one before it
+    OUT_OF_ORDER = "out of order"  # its stamp is not after that of the message before it
     UNMATCHED = "unmatched"  # no partner for a pair
-    UNALIGNED = "unaligned"  # another clock's stream had nothing for the frame
-    FAILED = "failed"  # a stage raised
-    ABANDONED = "abandoned"  # the run was stopped, or broke off, before the frame was through
+    UNALIGNED = "unaligned"  # no sample of another clock's stream for the frame
+    FAILED = "failed"  # a stage raised an exception
+    ABANDONED = "abandoned"  # the run ended before the frame was through
 
 
 class Verdict(StrEnum):
@@ -29,7 +29,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Loss:
-    """One loss. stamp: ns of the log's clock; stage: the node that noticed; detail: one sentence."""
+    """One loss. stamp: ns of the log's clock; stage: the node that noticed it; detail: one sentence."""
 
     stream: str
     stamp: int
@@ -38,24 +38,35 @@ class Loss:
     detail: str
 
     def as_dict(self) -> dict[str, str | int]:
-        """The entry as plain JSON values."""
+        """The loss in plain JSON values."""
         return {**asdict(self), "reason": str(self.reason)}
 
 
 @dataclass(frozen=True)
 class Absent:
-    """Stands in a frame for the item that was lost, so that nobody downstream waits for it."""
+    """Takes the place of a lost item in a frame, so that no stage waits for it."""
 
     cause: Loss
 
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What a sink is given for one frame.
+    """One frame, as a sink gets it.
 
-    index: 0, 1, ... in stamp order; items: stream -> item, without those that were lost; entries: the losses of this
-    frame, and those of the log between the frame before and this one; seconds: wall time per stage; queues: frames in
-    each stage's inbox as this one was delivered.
+    Attributes
+    ----------
+    index
+        0, 1, ... in the order of stamps.
+    stamp
+        ns of the log's clock.
+    items
+        Stream -> item, without the lost ones.
+    entries
+        The losses of this frame, and those of the log since the frame before.
+    seconds
+        Stage -> wall time.
+    queues
+        Stage -> frames in its inbox when this frame was delivered.
     """
 
     index: int
@@ -67,7 +78,7 @@ class FrameRecord:
 
 
 class Severity(StrEnum):
-    """How much a finding matters. A run prints each WARNING last, because results may be wrong."""
+    """How much a finding matters. A run prints warnings last, because results may be wrong."""
 
     NOTE = "note"
     WARNING = "warning"
@@ -75,13 +86,13 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence about a whole run or log. A finding is no loss: it changes neither the ledger nor the verdict."""
+    """One sentence about a whole run or log. It is no loss, and changes neither the ledger nor the verdict."""
 
     sentence: str
     severity: Severity = Severity.NOTE
 
     def as_dict(self) -> dict[str, str]:
-        """The finding as plain JSON values."""
+        """The finding in plain JSON values."""
         return {"severity": str(self.severity), "sentence": self.sentence}
 
 
@@ -92,25 +103,25 @@ class StageError(ValueError):
     """
 
 
-Event = tuple[int, str, Any]  # of a log: log time in ns, stream, item; an exception stands for an item that was lost
+Event = tuple[int, str, Any]  # log time in ns, stream, item; an exception takes the place of a lost item
 
 
 class Source(Protocol):
-    """Where a log comes from. streams: stream -> the type of its items, of all that a log may provide."""
+    """Opens logs. streams: every stream that its logs may provide -> the type of its items."""
 
     @property
     def streams(self) -> Mapping[str, type]:
         """See above."""
 
     def open(self, path: Any, *, start: float | None, end: float | None) -> AbstractContextManager[Log]:
-        """The log at `path`, from `start` to before `end`, s after its first message."""
+        """The log at `path`, from `start` to before `end`, in s after its first message."""
 
 
 class Log(Protocol):
-    """What a source opens: its events in the order of log time, and what it says of itself before any is read.
+    """An opened log.
 
-    missing: stream -> why the log cannot provide it; refused: setting of the source -> why the log cannot be read so,
-    whatever the graph needs; frames: how many are to come, where that is known.
+    missing: stream -> why this log does not have it; refused: setting of the source -> why this log cannot be read with
+    it; frames: the number of frames, where it is known.
     """
 
     missing: Mapping[str, str]
@@ -121,40 +132,42 @@ class Log(Protocol):
         """See above."""
 
     def events(self, streams: Collection[str]) -> Iterator[Event]:
-        """The events of these streams, from the first one on, and losses of which it is not known of which stream."""
+        """The events of these streams in the order of log time, and losses whose stream is unknown."""
 
     def notes(self) -> Mapping[str, str]:
-        """What there is to say of a stream, as a note of the run; asked at its end."""
+        """Stream -> a note about it. The run asks for them at its end."""
 
     def excerpts(self, count: int, streams: Collection[str]) -> Iterable[Iterable[Event]]:
-        """So many stretches of these streams, spread over the whole log; asked for where a stage surveys it."""
+        """`count` stretches of these streams, spread over the whole log. Only the pre-pass asks for them."""
 
 
 class Sink(Protocol):
-    """Where frames go. `write` is called once for every frame, in stamp order, by one thread at a time.
+    """Takes the frames of a run, one at a time, in the order of stamps. A sink is a dataclass; each run opens a copy.
 
-    A sink whose parameters name streams says which do, in `names_streams`, for pipeline files to be checked. Its method
-    `unwritable(stream, kind)` returns why it cannot write a stream, or an empty str, when a pipeline is loaded. With a
-    method `discard` it gives up what `open` began, where another output of the run could not be opened, or no frame
-    got through; by an attribute `empty` it says that it was given nothing worth keeping, and is to give up then, too.
+    Optional members:
+
+    - `names_streams`: the parameters that name streams, so that a pipeline file can be checked;
+    - `unwritable(stream, kind)`: why the sink cannot write a stream, or an empty str; asked when a pipeline is loaded;
+    - `discard()`: gives up the output and keeps an existing file, where no frame got through or another output failed;
+    - `empty`: whether there is nothing worth keeping; the run then calls `discard`.
     """
 
     suffix: str
-    __dataclass_fields__: ClassVar[dict[str, Any]]  # a sink is a dataclass; every run opens a copy of its own
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def wants(self, stream: str, kind: type) -> bool:
-        """Whether the sink has a use for a stream of this name and type."""
+        """Whether the sink uses a stream of this name and type."""
 
     def open(self, path: Any, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
-        """Begin an output; nothing stands under `path` itself until `close`."""
+        """Begin an output. No file with the name `path` appears before `close`."""
 
     def write(self, record: Any) -> None:
-        """Take one `flow.runtime.engine.FrameRecord`."""
+        """Write one FrameRecord."""
 
     def close(self, summary: Mapping[str, Any]) -> None:
         """Finish the output and give it its name."""
 
 
 def counted(number: int, what: str, many: str = "") -> str:
-    """A number of things in words: "1 frame", "2 frames"; many: the plural where it is not `what` with an s."""
+    """A number of things in words: "1 frame", "2 frames". many: the plural where it is not `what` with an s."""
     return f"{number} {what if number == 1 else many or what + 's'}"

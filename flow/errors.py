@@ -1,4 +1,4 @@
-"""The exceptions of the runtime: one family, each a sentence saying what is wrong, where, and what to do."""
+"""The exceptions of the program. Each is one sentence: what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130  # exit co
 
 
 class RoverflowError(Exception):
-    """Base of the family; `exit_code` is what the command line leaves with."""
+    """Base class. `exit_code` is the exit code of the command line."""
 
     exit_code = 1
 
 
 class UsageError(RoverflowError):
-    """The command was given something it cannot use."""
+    """A command cannot use an argument or a log."""
 
     exit_code = 2
 
@@ -26,7 +26,7 @@ class PipelineError(RoverflowError):
 
 
 class SinkError(RoverflowError):
-    """An output could not be written; the run was stopped and the outputs closed. `summary` tells how far it came."""
+    """An output could not be written. The run was stopped and its outputs were closed; `summary` is its summary."""
 
     def __init__(self, sentence: str, summary: dict[str, Any]) -> None:
         super().__init__(sentence)

@@ -1,4 +1,4 @@
-"""What every stage shares: parameters that carry their unit, range and meaning, and what it may say of a whole run."""
+"""What all stages share: the base class with its check of parameters, saved states, and checks of inputs."""
 
 from __future__ import annotations
 
@@ -54,7 +54,10 @@ def restore(stage: Any, saved: bytes) -> Any:
 
 
 def check_cells(what: str, width: float, resolution: float, times: int = 1) -> None:
-    """Raise ValueError for a map of more cells than memory has room for, `times` the width, m, of a parameter."""
+    """Raise ValueError for a map with a side of more than MAX_CELLS cells.
+
+    The side is `times` the width, m, of the parameter `what`.
+    """
     cells = times * width / resolution
     if cells > MAX_CELLS:
         raise ValueError(
@@ -64,21 +67,23 @@ def check_cells(what: str, width: float, resolution: float, times: int = 1) -> N
 
 
 def check_rectified(stage: Stage, frame: StereoFrame) -> None:
-    """Refuse a frame as the cameras took it."""
+    """Raise StageError for a frame that is not rectified."""
     if frame.camera.raw is not None:
         name = type(stage).__name__
         raise StageError(f"{name}: the frame is not rectified; put stages.Rectify before stages.{name}")
 
 
 def check_level(stage: Stage, cloud: PointCloud) -> None:
-    """Refuse a cloud that is not in frame `level`."""
+    """Raise StageError for a cloud that is not in frame `level`."""
     if cloud.frame_id != LEVEL_FRAME:
         name = type(stage).__name__
-        raise StageError(f"{name}: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
+        raise StageError(
+            f"{name}: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; put stages.Level before it"
+        )
 
 
 def check_joined(stage: Stage, frame: StereoFrame, disparity: Disparity) -> None:
-    """Refuse a frame that is not rectified, and a disparity that is not of its size."""
+    """Raise StageError for a frame that is not rectified, or a disparity of another size."""
     check_rectified(stage, frame)
     if disparity.pixels.shape != frame.left.shape[:2]:
         raise StageError(
@@ -88,7 +93,7 @@ def check_joined(stage: Stage, frame: StereoFrame, disparity: Disparity) -> None
 
 
 def check_same_time(stage: Stage, **stamps: int) -> None:
-    """Refuse data that are not of one time; stamps: by the name of the port."""
+    """Raise StageError for inputs with different stamps. stamps: by the name of the port."""
     if len(set(stamps.values())) > 1:
         found = ", ".join(f"{name} of {stamp} ns" for name, stamp in stamps.items())
         raise StageError(f"{type(stage).__name__}: {found}: join data that were made from one frame")

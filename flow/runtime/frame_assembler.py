@@ -1,8 +1,8 @@
-"""The feeder: turns a log's messages, in log-time order, into frames ready for the engine.
+"""The frame assembler: turns the messages of a log, in the order of log time, into frames for the engine.
 
-It runs the aligners, keeps the ledger of what finds no place, and hands a frame on once every stream that no stage
-makes has its value for that stamp, so that frames start whole and in stamp order. A stamp that jumps ahead is judged by
-the next one of its stream, so there the log is read ahead.
+It runs the aligners and enters losses into the ledger. A frame is ready when every stream that no stage makes has its
+value for that stamp, so frames start complete and in the order of stamps. Where a stamp jumps ahead, the next message
+of its stream decides whether it is damaged; until then the log is read ahead.
 """
 
 from __future__ import annotations
@@ -18,18 +18,15 @@ from flow.contracts import Absent, Event, Loss, LossReason
 from flow.runtime.graph import Graph
 from flow.runtime.ledger import Ledger
 
-# ns; a stamp that runs ahead of the log's clock by this much more than the one before it is in doubt
-DOUBT = 1_000_000_000
-# ns; by so much more it is damaged, unless the next of its stream within as long is as far ahead
-JUMP = 10_000_000_000
-# messages that are read ahead, and kept, at most
-AHEAD = 128
-SET_BACK = "; if a clock was set back, run what follows by itself (--start, a second later)"
+SUSPECT_JUMP = 1_000_000_000  # ns; a stamp that gains more than this on the log's clock is suspect
+DAMAGED_JUMP = 10_000_000_000  # ns; a suspect stamp is damaged unless the next one is as far ahead, within this
+MAX_READ_AHEAD = 128  # messages
+SET_BACK = "; if a clock was set back, run the rest of the log separately (--start, a second later)"
 
 
 @dataclass(frozen=True)
 class ReadyFrame:
-    """A frame that may enter the engine: its values by stream, and the losses noticed since the frame before."""
+    """A frame for the engine: its values by stream, and the losses since the frame before."""
 
     stamp: int
     values: dict[str, Any]
@@ -38,88 +35,89 @@ class ReadyFrame:
 
 @dataclass(eq=False)
 class _Message:
-    """An event of a log. fault: what is wrong with its stamp; doubted: whether the stream's next one may clear it."""
+    """An event of a log. fault: what is wrong with its stamp; suspect: whether the next stamp may still clear it."""
 
     log_time: int
     stream: str
     item: Any
     fault: str = ""
-    doubted: bool = False
+    suspect: bool = False
 
     @property
     def ahead(self) -> int:
-        """How far the stamp runs ahead of the log's clock, ns."""
+        """How far the stamp is ahead of the log's clock, ns."""
         return int(self.item.stamp) - self.log_time
 
 
-class _Clock:
-    """Judges the stamps of one stream, which must increase: one damaged stamp must not shut out all that follow."""
+class _StampCheck:
+    """Checks that the stamps of one stream increase. One damaged stamp must not exclude all messages after it."""
 
     def __init__(self, stream: str) -> None:
         self._stream = stream
-        self._last: _Message | None = None  # the last one that was believed
-        self._doubted: _Message | None = None
+        self._last: _Message | None = None  # the last message with a valid stamp
+        self._suspect: _Message | None = None
 
-    def judge(self, message: _Message) -> None:
-        """Find what is wrong with the stamp of a message, and settle what was in doubt.
+    def check(self, message: _Message) -> None:
+        """Set the fault of a message, and decide about a suspect one before it.
 
-        If what follows a jump goes on from there, messages were logged late, or a clock was set or is not the log's.
+        If the stamps continue from a jump, they are valid: messages were logged late, or a clock was set.
         """
-        stamp, doubted = message.item.stamp, self._doubted
-        if doubted is not None:
-            self._settle(doubted, stamp > doubted.item.stamp and message.ahead - doubted.ahead <= JUMP)
+        stamp, suspect = message.item.stamp, self._suspect
+        if suspect is not None:
+            self._decide(suspect, stamp > suspect.item.stamp and message.ahead - suspect.ahead <= DAMAGED_JUMP)
         last, jump = self._last, self._jump(message)
-        if jump > DOUBT:
+        if jump > SUSPECT_JUMP:
             message.fault = f"its stamp jumps {jump / 1e9:.1f} s ahead of the log's clock"
-            message.doubted, self._doubted = True, message
+            message.suspect, self._suspect = True, message
         elif last is not None and stamp == last.item.stamp:
             message.fault = f"it repeats the stamp of the {self._stream} message before it"
         elif last is not None and stamp < last.item.stamp:
             back = last.item.stamp - stamp
             message.fault = f"its stamp is {back / 1e6:.1f} ms before that of the {self._stream} message read before it"
-            message.fault += SET_BACK if back > JUMP else ""
+            message.fault += SET_BACK if back > DAMAGED_JUMP else ""
         else:
             self._last = message
 
     def tick(self, log_time: float) -> None:
-        """Settle what has been in doubt for too long: a first stamp that none contradicts is believed."""
-        doubted = self._doubted
-        if doubted is not None and doubted.log_time + JUMP < log_time:
-            self._settle(doubted, self._last is None or self._jump(doubted) <= JUMP)
+        """Decide about a stamp that has been suspect for too long. A first stamp without a contradiction is valid."""
+        suspect = self._suspect
+        if suspect is not None and suspect.log_time + DAMAGED_JUMP < log_time:
+            self._decide(suspect, self._last is None or self._jump(suspect) <= DAMAGED_JUMP)
 
     def _jump(self, message: _Message) -> int:
-        """How much farther a stamp runs ahead of the log's clock than the one before it, ns."""
+        """How much a stamp gains on the log's clock since the one before it, ns."""
         return message.ahead - (self._last.ahead if self._last is not None else 0)
 
-    def _settle(self, doubted: _Message, believed: bool) -> None:
-        self._doubted, doubted.doubted = None, False
-        if believed:
-            doubted.fault, self._last = "", doubted
+    def _decide(self, suspect: _Message, valid: bool) -> None:
+        self._suspect, suspect.suspect = None, False
+        if valid:
+            suspect.fault, self._last = "", suspect
 
 
-def _judged(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:
-    """The events in their order; what is wrong with the stamps of `streams` stands in them."""
-    clocks = {stream: _Clock(stream) for stream in sorted(streams)}
+def _checked(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:
+    """The events in their order, with the faults of the stamps of `streams`."""
+    checks = {stream: _StampCheck(stream) for stream in sorted(streams)}
     waiting = deque[_Message]()
     for event in events:
         message = _Message(*event)
-        for clock in clocks.values() if waiting else ():
-            clock.tick(message.log_time)
-        if message.stream in clocks and not isinstance(message.item, Exception):
-            clocks[message.stream].judge(message)
+        if waiting:
+            for check in checks.values():
+                check.tick(message.log_time)
+        if message.stream in checks and not isinstance(message.item, Exception):
+            checks[message.stream].check(message)
         waiting.append(message)
-        if len(waiting) == AHEAD:
-            for clock in clocks.values():
-                clock.tick(math.inf)
-        while waiting and not waiting[0].doubted:
+        if len(waiting) == MAX_READ_AHEAD:
+            for check in checks.values():
+                check.tick(math.inf)
+        while waiting and not waiting[0].suspect:
             yield waiting.popleft()
-    for clock in clocks.values():
-        clock.tick(math.inf)
+    for check in checks.values():
+        check.tick(math.inf)
     yield from waiting
 
 
 class FrameAssembler:
-    """Feeds the events of one log through the aligners of a graph."""
+    """Makes frames of one log with the aligners of a graph."""
 
     def __init__(self, graph: Graph, ledger: Ledger) -> None:
         self._ledger = ledger
@@ -136,12 +134,9 @@ class FrameAssembler:
         self.messages: Counter[str] = Counter()
 
     def frames(self, events: Iterable[Event]) -> Iterator[ReadyFrame]:
-        """The frames of the log, as they become ready.
-
-        An event is (log time, stream, item); an item that is an exception stands for a message that was lost.
-        """
+        """The frames of the log, as soon as each is ready."""
         log_time = 0
-        for message in _judged(events, self._wanted):
+        for message in _checked(events, self._wanted):
             log_time, stream, item = message.log_time, message.stream, message.item
             for name, aligner in self._aligners.items():
                 self._answer(name, log_time, aligner.tick(log_time))
@@ -160,18 +155,18 @@ class FrameAssembler:
 
     @property
     def late_entries(self) -> list[Loss]:
-        """Losses noticed after the last frame that entered the engine."""
+        """The losses after the last frame that entered the engine."""
         tokens = [token for queue in self._waiting.values() for token in queue]
         return [*self._entries, *(token.value.cause for token in tokens if isinstance(token.value, Absent))]
 
     def give_back(self, frame: ReadyFrame) -> None:
-        """Take back a frame that was not admitted: of what is not in the run, only its losses are told."""
+        """Take back a frame that the engine did not admit, so that its losses count as late entries."""
         for stream, value in frame.values.items():
             self._waiting[stream].appendleft(Token(frame.stamp, value))
         self._entries = [*frame.entries, *self._entries]
 
     def _take(self, stream: str, log_time: int, token: Token) -> None:
-        """Give a token to the aligners that read its stream, and to the frame it belongs to."""
+        """Give a token to the aligners that read its stream, and to its frame."""
         if stream in self._waiting:
             self._waiting[stream].append(token)
         for name, port in self._ports.get(stream, ()):
@@ -192,7 +187,6 @@ class FrameAssembler:
     def _ready(self) -> Iterator[ReadyFrame]:
         while self._entry_streams and all(self._waiting.values()):
             tokens = {stream: queue.popleft() for stream, queue in self._waiting.items()}
+            stamp = next(iter(tokens.values())).stamp
             entries, self._entries = self._entries, []
-            yield ReadyFrame(
-                next(iter(tokens.values())).stamp, {stream: token.value for stream, token in tokens.items()}, entries
-            )
+            yield ReadyFrame(stamp, {stream: token.value for stream, token in tokens.items()}, entries)

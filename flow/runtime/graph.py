@@ -1,8 +1,8 @@
 """The graph of a pipeline: a source, nodes joined by named typed streams, and sinks.
 
-Every stream has a clock, the stream whose messages give it its stamps: a source stream has its own, a pair founds one,
-an aligned stream takes the clock it is aligned to, and a stage's output that of its inputs. The stages and sinks of a
-graph share one clock; joining others is the aligners' work.
+Every stream has a clock, the stream whose messages give it its stamps. A source stream is its own clock, and so are
+pairs. A sampled stream has the clock that it is aligned to, and the output of a stage has the clock of its inputs. All
+stages and sinks of a graph share one clock; aligners join the others.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class YamlLocation:
     used_at: YamlLocation | None = None
 
     def error(self, sentence: str) -> PipelineError:
-        """The error to raise about it."""
+        """The error about this place."""
         return PipelineError(f"{self._shown}: {sentence}{self._uses}")
 
     @property
@@ -59,7 +59,7 @@ class Node:
 
     @property
     def aligns(self) -> bool:
-        """Whether the actor is an aligner, fed in log order, and not a stage."""
+        """Whether the actor is an aligner, which gets messages in log order, and not a stage."""
         return is_aligner(type(self.actor))
 
     @property
@@ -78,9 +78,12 @@ class TemplateUse:
 
 @dataclass(frozen=True)
 class Graph:
-    """A checked pipeline. nodes: in an order in which every stream comes before its use; left_out: the optional streams
-    that a log cannot have, and why; templates: stream -> the template whose output it is. The other streams of that
-    template are called `stream/...`."""
+    """A checked pipeline: configuration that no run changes.
+
+    nodes: every stream comes before its use; kinds: stream -> type; left_out: optional stream -> why a log does not
+    have it; templates: stream -> the template whose output it is. The other streams of that template are called
+    `stream/...`.
+    """
 
     name: str
     text: str
@@ -94,7 +97,7 @@ class Graph:
 
     @property
     def clock(self) -> str:
-        """The one clock of all stages."""
+        """The clock of all stages."""
         return next(node.clock for node in self.nodes if not node.aligns)
 
     @property
@@ -104,26 +107,26 @@ class Graph:
 
     @property
     def aligners(self) -> tuple[Node, ...]:
-        """The nodes that align."""
+        """The nodes that are aligners."""
         return tuple(node for node in self.nodes if node.aligns)
 
     @property
     def frame_streams(self) -> dict[str, type]:
-        """The streams that every frame has one item of, in order: what sinks can be given."""
+        """The streams with one item in every frame, in order; sinks can get these."""
         clocks = {node.name: node.clock for node in self.nodes} | {self.clock: self.clock}
         return {name: self.kinds[name] for name in clocks if clocks[name] == self.clock}
 
     @property
     def source_streams(self) -> set[str]:
-        """The source's streams that the nodes read."""
+        """The streams of the source that the nodes read."""
         made = {node.name for node in self.nodes}
         return {stream for node in self.nodes for stream in node.inputs.values()} - made
 
     def without(self, missing: Mapping[str, str]) -> Graph:
         """The graph without the optional nodes that need a stream in `missing` (stream -> why it is missing).
 
-        A port that may stay unconnected is left so. Raises PipelineError with that sentence where a node that is not
-        optional needs the stream, or cannot work without it, or no stage is left.
+        Ports that need no connection stay open. Raises PipelineError with the reason where a node that is not optional
+        needs the stream, or where no stage is left.
         """
         gone = dict(missing)
         kept = []
@@ -140,13 +143,13 @@ class Graph:
             else:
                 raise PipelineError(needed[0])
         if all(node.aligns for node in kept):
-            raise PipelineError(f"nothing of the pipeline {self.name} is left to do: {next(iter(gone.values()))}")
+            raise PipelineError(f"no stage of the pipeline {self.name} can run: {next(iter(gone.values()))}")
         made = {node.name for node in self.nodes}
         return replace(self, nodes=tuple(kept), left_out={name: why for name, why in gone.items() if name in made})
 
 
 def unfit(name: str, actor: Any, inputs: Collection[str]) -> str:
-    """Why the stage of stream `name` cannot work with these of its ports connected; empty where it can."""
+    """Why the stage of stream `name` cannot work with only these ports connected; empty where it can."""
     try:
         getattr(actor, "check_inputs", lambda inputs: None)(set(inputs))
     except ValueError as error:
@@ -155,12 +158,12 @@ def unfit(name: str, actor: Any, inputs: Collection[str]) -> str:
 
 
 def is_aligner(kind: type) -> bool:
-    """Whether objects of this class align streams (see `flow.align`) rather than being called once per frame."""
+    """Whether this is a class of aligners (see `flow.align`), and not of stages."""
     return hasattr(kind, "start") and hasattr(kind, "ports")
 
 
 def start(stages: Iterable[Node]) -> dict[str, Any]:
-    """Stream -> state, made for one run, of those stages that have one; raises PipelineError where that fails."""
+    """Stream -> new state, for one run, of the stages that have one; raises PipelineError where `start` fails."""
     states = {}
     for node in stages:
         if node.stateful:
@@ -172,15 +175,15 @@ def start(stages: Iterable[Node]) -> dict[str, Any]:
 
 
 def has_state(kind: type) -> bool:
-    """Whether a stage class makes a state for each run, which `__call__` takes as its keyword-only argument `state`."""
+    """Whether stages of this class have a state: `start` makes it for a run, `__call__` takes it as `state`."""
     return hasattr(kind, "start")
 
 
 def ports_of(kind: type) -> tuple[dict[str, Any], set[str]]:
-    """Input ports of a stage or aligner class (name -> type), and which of them may stay unconnected.
+    """The input ports of a stage or aligner class (name -> type), and those that need no connection.
 
-    The argument `state` of a stage with `start` is no port. Raises TypeError for a stage that does not say the name and
-    type of an input, or has one of `start` and `state` without the other.
+    The argument `state` is no port. Raises TypeError for a stage with an input without name or type, or with only one
+    of `start` and `state`.
     """
     if is_aligner(kind):
         return dict.fromkeys(kind.ports, object), set()  # type: ignore[attr-defined]
@@ -203,10 +206,10 @@ def ports_of(kind: type) -> tuple[dict[str, Any], set[str]]:
 
 
 def hints_of(annotated: Any) -> dict[str, Any]:
-    """The types that a class or function is annotated with; raises TypeError where they name what is not there."""
+    """The annotated types of a class or function; raises TypeError where they cannot be resolved."""
     try:
         return get_type_hints(annotated)
-    except Exception as error:  # whatever an annotation of the user's own may come to
+    except Exception as error:  # an annotation may be any expression
         raise TypeError(f"the annotations of {annotated.__qualname__} cannot be read: {error}") from error
 
 
@@ -228,7 +231,7 @@ def is_item(value: Any, kind: Any) -> bool:
 
 
 def output_of(actor: Any, kinds: dict[str, type], place: YamlLocation) -> type:
-    """The type of the stream that `actor` makes out of inputs of these types."""
+    """The type of the stream that `actor` makes from inputs of these types."""
     if is_aligner(type(actor)):
         try:
             return actor.output(kinds)  # type: ignore[no-any-return]
@@ -261,7 +264,7 @@ def in_order(inputs: Mapping[str, Iterable[str]], places: Mapping[str, YamlLocat
             return
         if name in path:
             cycle = " -> ".join([*path[path.index(name) :], name])
-            raise places[name].error(f"the streams run in a circle: {cycle}")
+            raise places[name].error(f"the streams form a cycle: {cycle}")
         path.append(name)
         for stream in inputs[name]:
             visit(stream)

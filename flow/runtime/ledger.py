@@ -1,7 +1,7 @@
-"""The ledger: every message or frame that did not make it, with stream, stamp, stage and reason.
+"""The ledger: an entry for every lost message and frame, with stream, stamp, stage and reason.
 
-Nothing is ever dropped without an entry here. A run is COMPLETE when there is none, its log was read to the end and its
-outputs are whole.
+Nothing is dropped without an entry. A run is COMPLETE if there is none, its log was read to the end and all outputs
+were written.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ def failure(error: BaseException) -> str:
 
 
 class Ledger:
-    """The entries of one run, in the order they were made; safe to share between threads."""
+    """The losses of one run. Threads may share it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._entries: list[Loss] = []
 
     def add(self, entry: Loss) -> Loss:
-        """Record a loss."""
+        """Enter a loss, and return it."""
         with self._lock:
             self._entries.append(entry)
         return entry
 
     @property
     def entries(self) -> tuple[Loss, ...]:
-        """All entries, sorted by stamp, stage and stream, so that equal runs give equal ledgers."""
+        """All entries, by stamp, stage and stream, so that equal runs have equal ledgers."""
         with self._lock:
             return tuple(sorted(self._entries, key=lambda entry: (entry.stamp, entry.stage, entry.stream)))
 

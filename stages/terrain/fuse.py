@@ -117,7 +117,9 @@ class Fuse(Stage):
 
     def _check(self, cloud: PointCloud, state: FusedMap) -> None:
         if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
-            raise StageError(f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; it needs Level")
+            raise StageError(
+                f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; put stages.Level before it"
+            )
         if cloud.stamp <= state.last:
             raise StageError(f"Fuse: the cloud of {cloud.stamp} ns is not later than the last one, {state.last} ns")
 

@@ -127,7 +127,7 @@ def test_a_key_of_a_setting_is_replaced_wherever_it_is_named_or_in_one_place_alo
         ("a: twice, ", "", 6, ["lacks its input 'a'"]),
         ("a: twice", "a: height", 6, ["takes Couple as 'a'", "'height' is Number"]),
         ("couple: both", "couple: left", 5, ["takes Couple", "'left' is Number"]),
-        ("couple: both", "couple: sum", 5, ["circle", "twice -> sum -> twice"]),
+        ("couple: both", "couple: sum", 5, ["cycle", "twice -> sum -> twice"]),
         ("right: right", "right: words", 3, ["a Number cannot be paired with a Text"]),
         ("stream: level", "stream: words", 4, ["a Text cannot be interpolated"]),
         ("right: right", "right: left", 3, ["'both' aligns 'left' with itself"]),
