@@ -61,8 +61,9 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     _check_parts(tree)
     own = mapping(tree.value["templates"], "'templates'") if "templates" in tree.value else {}
     streams = mapping(tree.value["streams"], "'streams'")
-    expansion = expand(streams, Library(path, SHIPPED, own), changes)
-    return _graph(path.stem, text, tree.value, expansion)
+    library = Library(path, SHIPPED, own)
+    expansion = expand(streams, library, changes)
+    return _graph(path.stem, text + library.comments(), tree.value, expansion)
 
 
 def _text(path: Path) -> str:

@@ -137,6 +137,12 @@ class Library:
     def __init__(self, file: Path, shipped: Path, own: Mapping[str, Value]) -> None:
         self._file, self._shipped = file, shipped
         self._known = {name: Template.read(name, item) for name, item in own.items()}
+        self._texts: dict[str, str] = {}
+
+    def comments(self) -> str:
+        """The files of the templates found so far, as comments for the end of the pipeline file."""
+        lines = [line for name, text in self._texts.items() for line in (f"{name}:", *text.splitlines())]
+        return "".join(f"# {line}\n" for line in lines)
 
     def find(self, name: Value) -> Template:
         """The template that `template: name` means: a name, or the path of a YAML file from the pipeline's folder."""
@@ -162,6 +168,7 @@ class Library:
         except (OSError, UnicodeDecodeError) as error:
             raise name.place.error(f"cannot read the template {found}: {error}") from error
         shown = name.value if is_path else parts
+        self._texts[shown] = text
         return Template.read(found.stem, read(text, lambda line: YamlLocation(shown, line)))
 
 

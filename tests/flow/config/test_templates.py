@@ -181,7 +181,9 @@ def test_a_template_is_found_in_a_file_beside_the_pipeline(tmp_path):
     assert factors(loaded(tmp_path, text)) == {"out/first": 0.25, "out": 3.0}
     (tmp_path / "another.yaml").write_text(textwrap.dedent(own).replace("3 m", "4 m"))
     by_path = text.replace("template: scaled_twice", "template: another.yaml")
-    assert factors(loaded(tmp_path, by_path)) == {"out/first": 0.25, "out": 4.0}
+    graph = loaded(tmp_path, by_path)
+    assert factors(graph) == {"out/first": 0.25, "out": 4.0}
+    assert "# another.yaml:\n# inputs: {couple: Couple}\n" in graph.text  # so that the result log contains it
     (tmp_path / "another.yaml").write_text(textwrap.dedent(own).replace("3 m", "4 s"))
     assert refusal(tmp_path, by_path).startswith("another.yaml:2: tests.flow.toys.Scale.factor: '4 s' is a time")
 
