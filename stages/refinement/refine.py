@@ -98,7 +98,7 @@ class Refine(Stage):
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         image, other = eight_bit(frame.left, frame.right)
         guide, right = gray(image), gray(other)
-        matches, weights = trusted_matches(
+        matches, weights, reasons = trusted_matches(
             disparity.pixels, disparity.source, disparity.confidence, self.min_confidence,
             _burnt_out(frame.left, guide, SATURATION_LEVEL, self.threads), self.threads,
         )  # fmt: skip
@@ -114,7 +114,7 @@ class Refine(Stage):
         refined = self._sharpened(self._bilateral(filled, guide), guessed, guide)
         source, confidence = label_origin(
             matches, disparity.confidence, agreed, kinds, refined,
-            self._borne_out(refined, guessed, guide, right), INLIER_DISTANCE, TRUST, self.threads,
+            self._borne_out(refined, guessed, guide, right), reasons, INLIER_DISTANCE, TRUST, self.threads,
         )  # fmt: skip
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
 

@@ -13,7 +13,7 @@ from stages.refinement.kernels.holes import KEPT, MISMATCH
 
 F32 = np.float32
 OWN = 0.5, 0.75, 1.0
-UNKNOWN, MEASURED, PLANE, FILLED = (int(code) for code in list(PixelOrigin)[:4])
+MEASURED, PLANE, FILLED = int(PixelOrigin.MEASURED), int(PixelOrigin.PLANE), int(PixelOrigin.FILLED)
 
 
 class Trust(NamedTuple):
@@ -28,14 +28,15 @@ class Trust(NamedTuple):
 
 
 def label_origin(
-    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, borne_out: Array, moved: float,
-    trust: Trust, threads: int = 1,
+    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, borne_out: Array, reasons: Array,
+    moved: float, trust: Trust, threads: int = 1,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Source and confidence of each pixel, (H, W) uint8 codes of `PixelOrigin` and float32.
 
     matches: (H, W) float32, px, NaN = none, before refinement; confidence: (H, W) float32, theirs; agreed: (H, W) bool,
     where a plane had its say; kinds: (H, W) uint8 of `holes.fill_holes`; refined: (H, W) float32, the result;
-    borne_out: (H, W) bool, where the images bear it out: elsewhere a match is a guess; moved: px that a match may have
+    borne_out: (H, W) bool, where the images bear it out: elsewhere a match is a guess; reasons: (H, W) uint8, codes of
+    the pixels that stay unknown; moved: px that a match may have
     moved and still be MEASURED.
     """
     source, worth = np.empty(matches.shape, np.uint8), np.empty(matches.shape, np.float32)
@@ -46,8 +47,8 @@ def label_origin(
     def name(first: int, end: int) -> None:
         rows = slice(first, end)
         _name(
-            matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], borne_out[rows], F32(moved),
-            tables, others, source[rows], worth[rows],
+            matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], borne_out[rows], reasons[rows],
+            F32(moved), tables, others, source[rows], worth[rows],
         )  # fmt: skip
 
     by_bands(shared_by(threads), len(matches), name)
@@ -55,13 +56,13 @@ def label_origin(
 
 
 @kernel
-def _name(matches, confidence, agreed, kinds, refined, borne_out, moved, tables, others, source, worth):
+def _name(matches, confidence, agreed, kinds, refined, borne_out, reasons, moved, tables, others, source, worth):
     replaced, plane, mismatch, occlusion = others
     for y in range(matches.shape[0]):
         for x in range(matches.shape[1]):
             d, match = refined[y, x], matches[y, x]
             if d != d:
-                source[y, x], worth[y, x] = UNKNOWN, F32(0)
+                source[y, x], worth[y, x] = reasons[y, x], F32(0)
             elif abs(d - match) <= moved and not borne_out[y, x]:
                 source[y, x], worth[y, x] = FILLED, mismatch
             elif abs(d - match) <= moved:
@@ -77,8 +78,8 @@ def _name(matches, confidence, agreed, kinds, refined, borne_out, moved, tables,
 
 
 def name_sources_reference(
-    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, borne_out: Array, moved: float,
-    trust: Trust,
+    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, borne_out: Array, reasons: Array,
+    moved: float, trust: Trust,
 ) -> tuple[Array, Array]:  # fmt: skip
     """`label_origin` in plain numpy."""
     own = np.rint(np.clip(confidence, 0, 1) * F32(255)).astype(np.float64) / 255
@@ -87,7 +88,7 @@ def name_sources_reference(
         np.isnan(refined), stayed & ~borne_out, stayed & agreed, stayed, np.isfinite(matches), kinds == KEPT,
         kinds == MISMATCH,
     ]  # fmt: skip
-    codes = [UNKNOWN, FILLED, MEASURED, MEASURED, PLANE, PLANE, FILLED]
+    codes: list[Any] = [reasons.astype(int), FILLED, MEASURED, MEASURED, PLANE, PLANE, FILLED]
     tables = [np.interp(own, OWN, values) for values in (trust.agreed, trust.alone)]
     worths: list[Any] = [0.0, trust.mismatch, *tables, trust.replaced, trust.plane, trust.mismatch]
     source = np.select(conditions, codes, FILLED).astype(np.uint8)

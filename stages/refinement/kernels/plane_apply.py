@@ -8,31 +8,37 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.compiled.parallel import by_bands, shared_by, with_margin
-from stages.data import Array, PixelOrigin
+from stages.data import Array, PixelOrigin, known
 from stages.refinement.kernels.holes import APART
 from stages.refinement.kernels.valid_extent import Extent
 
 F32 = np.float32
-MEASURED = int(PixelOrigin.MEASURED)
+UNKNOWN, MEASURED, OUT_OF_VIEW, UNIQUENESS, SKY = (
+    int(PixelOrigin[name]) for name in ("UNKNOWN", "MEASURED", "OUT_OF_VIEW", "UNIQUENESS", "SKY")
+)
+_known = part(known)
 
 
 def trusted_matches(
-    pixels: Array, source: Array, confidence: Array, least: float, excluded: Array, threads: int = 1
-) -> tuple[Array, Array]:
-    """The measured disparities of at least that confidence, (H, W) float32, NaN elsewhere; and that, or 0.
+    pixels: Array, source: Array, confidence: Array, min_confidence: float, saturated: Array, threads: int = 1
+) -> tuple[Array, Array, Array]:
+    """The MEASURED disparities that count as matches.
 
-    One that is not within the width of the image is none. excluded: (H, W) bool, what is no match all the same.
+    A saturated one, (H, W) bool, does not count, nor one as large as the image is wide. Returns the matches, (H, W)
+    float32, NaN = none; their confidence, 0 = none; and `PixelOrigin` codes, (H, W) uint8: why the pixel is unknown
+    if nothing fills it. Codes of unknown pixels are kept. A dropped match has SKY, OUT_OF_VIEW or UNIQUENESS.
     """
     matches, weights = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.float32)
-    layers = pixels, source, confidence, excluded, matches, weights
+    reasons = np.empty(pixels.shape, np.uint8)
+    layers = pixels, source, confidence, saturated, matches, weights, reasons
 
     def trust(first: int, end: int) -> None:
-        _trust(F32(least), *(layer[first:end] for layer in layers))
+        _trust(F32(min_confidence), *(layer[first:end] for layer in layers))
 
     by_bands(shared_by(threads), len(pixels), trust)
-    return matches, weights
+    return matches, weights, reasons
 
 
 def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Array:
@@ -72,11 +78,15 @@ def pull_to_planes(
 
 
 def trusted_matches_reference(
-    pixels: Array, source: Array, confidence: Array, least: float, excluded: Array
-) -> tuple[Array, Array]:
+    pixels: Array, source: Array, confidence: Array, min_confidence: float, saturated: Array
+) -> tuple[Array, Array, Array]:
     """`trusted_matches` in plain numpy."""
-    trusted = (source == MEASURED) & (confidence >= F32(least)) & (np.abs(pixels) < pixels.shape[1]) & ~excluded
-    return np.where(trusted, pixels, F32(np.nan)), np.where(trusted, confidence, F32(0))
+    measured, doubted, outside = source == MEASURED, confidence < F32(min_confidence), abs(pixels) >= pixels.shape[1]
+    trusted = measured & ~doubted & ~outside & ~saturated & ~np.isnan(pixels)
+    dropped = [measured & saturated, measured & outside, measured & doubted, known(source)]
+    reasons = np.select(dropped, [SKY, OUT_OF_VIEW, UNIQUENESS, UNKNOWN], source.astype(int)).astype(np.uint8)
+    reasons[trusted] = UNKNOWN
+    return np.where(trusted, pixels, F32(np.nan)), np.where(trusted, confidence, F32(0)), reasons
 
 
 def near_median_reference(matches: Array, side: int, near: float) -> Array:
@@ -89,11 +99,20 @@ def near_median_reference(matches: Array, side: int, near: float) -> Array:
 
 
 @kernel
-def _trust(least, pixels, source, confidence, excluded, matches, weights):
+def _trust(min_confidence, pixels, source, confidence, saturated, matches, weights, reasons):
+    width = pixels.shape[1]
     for y in range(pixels.shape[0]):
-        for x in range(pixels.shape[1]):
-            good = (source[y, x] == MEASURED) & (confidence[y, x] >= least) & (abs(pixels[y, x]) < pixels.shape[1])
-            good &= not excluded[y, x]
+        for x in range(width):
+            code, size = source[y, x], abs(pixels[y, x])
+            good = (code == MEASURED) & (confidence[y, x] >= min_confidence) & (size < width) & (not saturated[y, x])
+            reasons[y, x] = UNKNOWN if _known(code) else code
+            if code == MEASURED and not good:
+                if saturated[y, x]:
+                    reasons[y, x] = SKY
+                elif size >= width:
+                    reasons[y, x] = OUT_OF_VIEW
+                elif confidence[y, x] < min_confidence:
+                    reasons[y, x] = UNIQUENESS
             matches[y, x] = pixels[y, x] if good else F32(np.nan)
             weights[y, x] = confidence[y, x] if good else F32(0)
 

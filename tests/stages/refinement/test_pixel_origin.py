@@ -21,7 +21,8 @@ def test_names_are_those_of_the_reference(height, width, seed, threads):
     refined[rng.random(shape) < 0.2] = np.nan
     kinds = np.where(np.isnan(matches), rng.integers(0, 4, shape), KEPT).astype(np.uint8)
     confidence = rng.uniform(-0.1, 1.1, shape).astype(np.float32)
-    given = matches, confidence, rng.random(shape) < 0.5, kinds, refined, rng.random(shape) < 0.8, 0.5, TRUST
+    reasons = rng.choice(np.array([0, 4, 6, 10], np.uint8), shape)
+    given = matches, confidence, rng.random(shape) < 0.5, kinds, refined, rng.random(shape) < 0.8, reasons, 0.5, TRUST
     source, worth = label_origin(*given, threads)
     expected, expected_worth = name_sources_reference(*given)
     assert np.array_equal(source, expected)
@@ -35,8 +36,9 @@ def test_every_origin_has_its_own_worth():
     kinds = np.array([[KEPT, KEPT, KEPT, KEPT, KEPT, MISMATCH, OCCLUSION, OPEN]], np.uint8)
     agreed = np.array([[True, False, False, True, True, False, False, False]])
     borne_out = np.array([[True, True, False, True, True, True, True, True]])
+    reasons = np.full((1, 8), PixelOrigin.LEFT_RIGHT, np.uint8)
     own = np.full((1, 8), 0.75, np.float32)
-    source, worth = label_origin(matches, own, agreed, kinds, refined, borne_out, 0.5, TRUST)
+    source, worth = label_origin(matches, own, agreed, kinds, refined, borne_out, reasons, 0.5, TRUST)
     names = [PixelOrigin(code).name for code in source[0]]
-    assert names == ["MEASURED", "MEASURED", "FILLED", "PLANE", "PLANE", "FILLED", "FILLED", "UNKNOWN"]
+    assert names == ["MEASURED", "MEASURED", "FILLED", "PLANE", "PLANE", "FILLED", "FILLED", "LEFT_RIGHT"]
     assert np.allclose(worth[0], [0.98, 0.86, 0.58, 0.83, 0.84, 0.58, 0.56, 0], atol=1e-3)

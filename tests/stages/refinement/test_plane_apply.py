@@ -4,6 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stages.data import PixelOrigin
 from stages.refinement.kernels.plane_apply import (
     near_median,
     near_median_reference,
@@ -51,11 +52,11 @@ def test_the_median_is_that_of_sorted_windows(height, width, side, near, seed, t
 def test_trusted_matches_are_those_of_the_reference(height, width, seed, threads):
     pixels, *_ = scene(height, width, seed)
     rng = np.random.default_rng(seed)
-    source = rng.integers(0, 4, pixels.shape, dtype=np.uint8)
+    source = rng.integers(0, len(PixelOrigin), pixels.shape, dtype=np.uint8)
     confidence = rng.choice(np.array([0.2, 0.5, 0.7], np.float32), pixels.shape)
-    excluded = rng.random(pixels.shape) < 0.1
-    ours = trusted_matches(pixels, source, confidence, 0.5, excluded, threads)
-    for made, plain in zip(ours, trusted_matches_reference(pixels, source, confidence, 0.5, excluded), strict=True):
+    saturated = rng.random(pixels.shape) < 0.1
+    ours = trusted_matches(pixels, source, confidence, 0.5, saturated, threads)
+    for made, plain in zip(ours, trusted_matches_reference(pixels, source, confidence, 0.5, saturated), strict=True):
         np.testing.assert_array_equal(made, plain)
 
 
@@ -63,7 +64,16 @@ def test_only_measured_finite_and_trusted_pixels_are_matches():
     pixels = np.array([[1, 2, np.inf, 4, np.nan], [1, 2, 3, 4, 5]], np.float32)
     source = np.array([[1, 2, 1, 1, 1], [0, 1, 3, 1, 1]], np.uint8)
     confidence = np.array([[0.9, 0.9, 0.9, 0.4, 0.9], [0.9, 0.5, 0.9, 0.9, 0.49]], np.float32)
-    kept, weights = trusted_matches(pixels, source, confidence, 0.5, np.zeros(pixels.shape, bool))
+    kept, weights, _ = trusted_matches(pixels, source, confidence, 0.5, np.zeros(pixels.shape, bool))
     np.testing.assert_array_equal(weights, np.where(np.isfinite(kept), confidence, 0))
     nan = np.nan
     assert np.array_equal(kept, np.array([[1, nan, nan, nan, nan], [nan, 2, nan, 4, nan]], np.float32), equal_nan=True)
+
+
+def test_a_dropped_match_has_a_reason_and_unknown_pixels_keep_theirs():
+    codes = PixelOrigin.MEASURED, PixelOrigin.MEASURED, PixelOrigin.MEASURED, PixelOrigin.PLANE, PixelOrigin.SPECKLE
+    pixels = np.array([[3, 9, 3, 3, np.nan]], np.float32)
+    confidence = np.array([[0.9, 0.9, 0.4, 0.9, 0]], np.float32)
+    saturated = np.array([[True, False, False, False, True]])
+    _, _, reasons = trusted_matches(pixels, np.array([codes], np.uint8), confidence, 0.5, saturated)
+    assert [PixelOrigin(code).name for code in reasons[0]] == ["SKY", "OUT_OF_VIEW", "UNIQUENESS", "UNKNOWN", "SPECKLE"]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from stages.data import Disparity, PixelOrigin, StereoCamera, StereoFrame
+from stages.data import known as known_origin
 from stages.refinement import refine as module
 from stages.refinement.refine import EVEN, Refine, _burnt_out
 from tests.bench.stereo_scores import paper_stages
@@ -54,7 +55,7 @@ def test_every_pixel_says_where_it_comes_from(box):
     assert near[matched].mean() > 0.9
     assert np.array_equal(refined.source == PixelOrigin.MEASURED, near)
     assert (refined.source[matched & ~near] == PixelOrigin.PLANE).all()
-    assert np.array_equal(refined.source == PixelOrigin.UNKNOWN, ~known)
+    assert np.array_equal(known_origin(refined.source), known)
     confidence = {code: refined.confidence[refined.source == code] for code in list(PixelOrigin)[:4]}
     # as calibrated: of matches by their own confidence, 0.8, and by whether a plane agrees
     assert np.unique(confidence[PixelOrigin.MEASURED]) == pytest.approx([0.882, 0.984], abs=0.002)
@@ -340,6 +341,17 @@ def test_no_match_at_all_stays_no_disparity(box, refine):
     assert (refined.source == PixelOrigin.UNKNOWN).all()
 
 
+def test_pixels_that_stay_unknown_keep_the_reason_of_the_matcher(box):
+    frame, matches, _ = box
+    reasons = np.random.default_rng(8).integers(PixelOrigin.OUT_OF_VIEW, PixelOrigin.SKY, SHAPE).astype(np.uint8)
+    matched = np.isfinite(matches.pixels)
+    refined = Refine()(frame, replace(matches, source=np.where(matched, matches.source, reasons)))
+    unknown = np.isnan(refined.pixels)
+    assert np.array_equal(refined.source[unknown], reasons[unknown])
+    assert unknown.any()
+    assert np.array_equal(refined.pixels, Refine()(frame, matches).pixels, equal_nan=True)
+
+
 def test_a_disparity_of_another_size_is_refused(box):
     frame, matches, _ = box
     small = Disparity(5, matches.pixels[:50], matches.source[:50], matches.confidence[:50])
@@ -388,6 +400,7 @@ def test_matches_of_a_burnt_out_sky_do_not_count(monkeypatch):
     pixels[:50] = 60
     sky = StereoFrame(5, image, image, frame.camera)
     refined = Refine(max_extrapolation=5)(sky, Disparity(5, pixels, source, confidence))
+    assert (refined.source[:42] == PixelOrigin.SKY).all()
     assert np.isnan(refined.pixels[:42]).all()  # the last rows show the ground in their windows, and 5 px are margin
     assert (refined.pixels[50:] < 9).all()
     monkeypatch.setattr(module, "SATURATION_LEVEL", 256)
