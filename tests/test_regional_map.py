@@ -68,7 +68,7 @@ def test_export_without_a_regional_map_exports_the_frames(traverse, tmp_path, ca
     assert roverflow("export", out, tmp_path / "maps") == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "holds no /nav/regional_map, only " in said
+    assert "contains no /nav/regional_map, only " in said
     assert "--frames" in said
     assert roverflow("export", out, tmp_path / "maps", "--frames") == 0
     assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == FRAMES
