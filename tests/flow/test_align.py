@@ -58,7 +58,7 @@ def test_a_missing_right_costs_one_left_and_nothing_else():
     assert [(a.stream, a.stamp) for a in answers if isinstance(a, Loss)] == [("left", 100)]
 
 
-def test_a_partner_that_does_not_come_is_given_up_after_the_patience_of_log_time():
+def test_a_missing_partner_is_given_up_after_the_patience():
     answers = pairing(("left", 0, 1.0, 0), ("left", 1, 1.0, 2000 * MS), slop=5)
     first = answers[0]
     assert isinstance(first, Loss)
@@ -66,7 +66,7 @@ def test_a_partner_that_does_not_come_is_given_up_after_the_patience_of_log_time
     assert "1 s" in first.detail
 
 
-def test_partners_too_far_apart_are_told_by_how_much_and_which_setting_decides():
+def test_a_pair_too_far_apart_reports_the_distance_and_the_setting():
     frames = [(side, at * MS + (side == "right") * 8_020_000, 1.0) for at in (0, 500) for side in ("left", "right")]
     details = [entry.detail for entry in pairing(*frames)]
     assert details[:3] == [
@@ -77,7 +77,7 @@ def test_partners_too_far_apart_are_told_by_how_much_and_which_setting_decides()
     assert len(pairing(*frames, slop=10 * MS)) == 2
 
 
-def test_a_partner_logged_too_late_is_told_by_how_much_and_which_setting_decides():
+def test_a_partner_logged_too_late_reports_the_delay_and_the_setting():
     frames = [(side, at * MS, 1.0, (at + 1500 * (side == "right")) * MS) for at in range(0, 3000, 500)
               for side in ("left", "right")]  # fmt: skip
     frames.sort(key=lambda frame: frame[3])
@@ -139,7 +139,7 @@ CONFIGS = [Interpolate(), Nearest(), Latest(patience=1000 * MS)]
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: type(config).__name__)
-def test_samples_logged_too_late_are_told_to_have_been_waited_for_and_by_which_setting(config):
+def test_samples_logged_too_late_report_the_wait_and_its_setting(config):
     messages = [("at", 100 * MS, 0.0), *(("stream", at * MS, 0.0, (at + 2500) * MS) for at in range(0, 300, 50))]
     (answer,) = sampling(config, *messages)
     assert answer.value.cause.detail == "no level sample within 1 s of log time (tilt.patience)"
@@ -147,7 +147,7 @@ def test_samples_logged_too_late_are_told_to_have_been_waited_for_and_by_which_s
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: type(config).__name__)
-def test_clocks_that_are_far_apart_are_told_by_how_much(config):
+def test_clocks_that_are_far_apart_report_the_distance(config):
     hour = 3_600_000 * MS
     (early,) = sampling(config, ("stream", hour, 0.0, 0), ("at", 0, 0.0, 0))
     assert "3600 s " in early.value.cause.detail
@@ -262,19 +262,19 @@ def test_smoothing_takes_all_samples_about_the_stamp_and_waits_for_them():
     assert found == [(100, pytest.approx(9.967, abs=1e-3)), (205, pytest.approx(20.5))]
 
 
-def test_smoothing_reaches_as_far_back_as_ahead_even_where_frames_follow_each_other_fast():
+def test_smoothing_reaches_equally_far_back_and_ahead():
     ramp = [(10 * count, float(count)) for count in range(30)]
     found = values(smoothing(ramp, [100, 110, 120, 130], 50))
     assert found == [(stamp, pytest.approx(stamp / 10)) for stamp in (100, 110, 120, 130)]
 
 
-def test_smoothing_keeps_the_samples_that_the_next_frame_wants_as_well():
+def test_smoothing_keeps_the_samples_that_the_next_frame_needs():
     bent = [(10 * count, float(count**2)) for count in range(30)]
     found = values(smoothing(bent, [100, 110, 120, 130], 50))  # of five samples to either side the mean is 10 more
     assert found == [(stamp, pytest.approx((stamp / 10) ** 2 + 10)) for stamp in (100, 110, 120, 130)]
 
 
-def test_smoothing_does_not_lag_at_either_end_of_the_stream_and_gaps_are_gaps():
+def test_smoothing_does_not_lag_at_the_ends_of_a_stream():
     ramp = [(10 * count, float(count)) for count in range(8)]
     assert values(smoothing(ramp, [5, 12, 65], 50)) == [(5, 0.5), (12, pytest.approx(1.0)), (65, 6.5)]
     assert reasons(smoothing([(0, 0.0), (10, 1.0), (90, 9.0), (100, 10.0)], [50], 50)) == [LossReason.UNALIGNED]

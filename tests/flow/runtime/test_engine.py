@@ -26,7 +26,7 @@ def test_every_stream_of_every_frame_arrives_in_stamp_order(tmp_path):
     assert 0 < summary["start_seconds"] <= summary["wall_seconds"]
 
 
-def test_a_stage_that_remembers_sees_the_frames_in_order(tmp_path):
+def test_a_stage_with_state_gets_the_frames_in_order(tmp_path):
     sink, _ = replayed(graph(tmp_path, nap=0.003), traverse(30), workers=4)
     assert list(sink.values("total").values()) == [float(sum(2 * j for j in range(i + 1))) for i in range(30)]
 
@@ -126,7 +126,7 @@ class SlowAdd:
 
 
 @pytest.mark.parametrize("workers", [2, 8])
-def test_the_inbox_of_a_join_stays_bounded_while_its_inputs_are_being_made(tmp_path, monkeypatch, workers):
+def test_the_inbox_of_a_join_stays_bounded(tmp_path, monkeypatch, workers):
     text = (
         PIPELINE[: PIPELINE.index("  twice:")]
         + """
@@ -166,7 +166,7 @@ def frame(index):
     return {"both": Couple(index, 1.0), "height": Number(index, 0.0)}
 
 
-def test_a_sink_that_is_at_work_is_waited_for_whatever_is_stopped(tmp_path):
+def test_a_stopped_engine_waits_for_a_sink_at_work(tmp_path):
     inside, gate, ledger = threading.Event(), threading.Event(), Ledger()
 
     class Slow(Keep):
@@ -183,7 +183,7 @@ def test_a_sink_that_is_at_work_is_waited_for_whatever_is_stopped(tmp_path):
     assert (len(sink.records), engine.through, len(ledger)) == (1, 1, 0)
 
 
-def test_what_a_frame_lost_before_it_was_abandoned_is_told_and_what_becomes_of_it_later_is_not(tmp_path, monkeypatch):
+def test_an_abandoned_frame_reports_only_its_losses_so_far(tmp_path, monkeypatch):
     inside, gate, told, ledger, stages = threading.Event(), threading.Event(), [], Ledger(), graph(tmp_path).stages
 
     def hang(self, couple):
@@ -246,9 +246,7 @@ def dataflows(draw):
     flow=dataflows(), lost=st.sets(st.integers(0, 11), max_size=4),
     workers=st.integers(1, 5), capacity=st.integers(1, 3), sinks=st.integers(0, 2),
 )  # fmt: skip
-def test_whatever_the_graph_and_whatever_fails_every_frame_arrives_as_computed_by_hand(
-    flow, lost, workers, capacity, sinks
-):
+def test_random_graphs_with_failures_give_the_values_computed_by_hand(flow, lost, workers, capacity, sinks):
     names = {-1: "entry", **{i: f"s{i}" for i in range(len(flow))}}
     place = YamlLocation("random", 1)
     sums = [(OrderedSum if ordered else Sum)(bad) for _, ordered, bad in flow]

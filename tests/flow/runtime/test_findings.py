@@ -50,7 +50,7 @@ def test_frames_that_the_user_gave_up_are_no_losses_of_the_log():
     assert said_of(interrupted=True, verdict="COMPLETE") == "COMPLETE: 18 of 18 frames complete"
 
 
-def test_what_a_stage_found_is_said_at_the_end_to_the_user_and_to_the_sinks(tmp_path):
+def test_findings_reach_the_summary_and_the_sinks(tmp_path):
     sink, summary = replayed(graph(tmp_path), traverse(5))
     said = {"total": {"severity": "note", "sentence": "the sum is 20.0"}}
     assert summary["findings"] == sink.summary["findings"] == said

@@ -76,7 +76,7 @@ def result_of(tmp_path, log, bad="", stop=None):
 EVENTS = [event for stamp in range(1, 9) for event in both(stamp, float(stamp))]
 
 
-def test_the_first_whole_frame_of_each_excerpt_is_shown_through_the_stages_before(tmp_path):
+def test_a_survey_sees_the_first_complete_frame_of_each_excerpt(tmp_path):
     log = Excerpted(EVENTS, [(0, 6), (7, 12), (12, 16)])  # the second begins between a left and its right
     summary, sink = result_of(tmp_path, log)
     assert said(summary) == f"mean {2 * (1 + 5 + 7) / 3:g} of 3"
@@ -109,7 +109,7 @@ def test_a_survey_without_frames_says_so_and_the_run_goes_on(tmp_path):
     assert summary["frames_out"] == 8
 
 
-def test_a_survey_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
+def test_a_survey_that_fails_is_a_warning_and_the_run_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(Centre, "survey", lambda self, couple: 1 // 0)
     summary, _ = result_of(tmp_path, Excerpted(EVENTS, [(0, 6)]))
     assert summary["surveys"]["centred"]["severity"] == "warning"
@@ -117,7 +117,7 @@ def test_a_survey_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
     assert summary["drops"] == {"failed": 8}  # this stage cannot do without
 
 
-def test_a_stage_that_remembers_cannot_stand_before_a_survey(tmp_path):
+def test_a_stage_with_state_cannot_come_before_a_survey(tmp_path):
     file = tmp_path / "p.yaml"
     remembering = (PIPELINE % "").replace("toys.Scale, couple: pair, factor: 2 m, bad: []", "toys.Total, couple: pair")
     file.write_text(remembering)
@@ -125,7 +125,7 @@ def test_a_stage_that_remembers_cannot_stand_before_a_survey(tmp_path):
         run(load(str(file)), Excerpted(EVENTS, [(0, 6)]), {})
 
 
-def test_an_interrupt_during_the_survey_ends_the_run_before_any_output_is_begun(tmp_path):
+def test_an_interrupt_during_the_survey_opens_no_output(tmp_path):
     stop = Stop()
     stop.request()
     summary, sink = result_of(tmp_path, Excerpted(EVENTS, [(0, 6)]), stop=stop)
