@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
+from flow.parameters import check_parameters, is_required, parameter
 from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import LAST_STAMP
@@ -34,8 +36,25 @@ CAMERA_FRAMES = {"left": "left_camera_optical", "right": "right_camera_optical"}
 # Ground truth beside the images of data sets, such as Middlebury's mask0nocc.png.
 _NOT_CAMERAS = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
 _MAX_LISTED = 5  # files in a sentence
-_MAX_VALUE = 1e9  # px or m
-_REQUIRED, _OPTIONAL = ("fx", "cx", "cy", "baseline"), ("fy", "cx_right", "width", "height")
+_POSITIVE: dict[str, Any] = {"low": 1e-6, "high": 1e9}
+_ANY: dict[str, Any] = {"low": -1e9, "high": 1e9}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageCalibration:
+    """The calibration file of `import_images`."""
+
+    fx: float = parameter(MISSING, "focal length", unit="px", **_POSITIVE)
+    cx: float = parameter(MISSING, "principal point of the left image", unit="px", **_ANY)
+    cy: float = parameter(MISSING, "principal point", unit="px", **_ANY)
+    baseline: float = parameter(MISSING, "distance of the cameras", unit="m", **_POSITIVE)
+    fy: float | None = parameter(None, "vertical focal length, by default fx", unit="px", **_POSITIVE)
+    cx_right: float | None = parameter(None, "principal point of the right image, by default cx", unit="px", **_ANY)
+    width: float | None = parameter(None, "width of the images", unit="px", **_POSITIVE)
+    height: float | None = parameter(None, "height of the images", unit="px", **_POSITIVE)
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
 
 
 def import_images(
@@ -138,7 +157,7 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
         If there are no pairs, or an image has no partner.
     """
     if not folder.is_dir():
-        raise LogError(f"{folder} is not a folder; give the folder that holds the left and right images")
+        raise LogError(f"{folder} is not a folder; give the folder with the left and right images")
     candidates = (f for pattern in ("*", "[!.]*/*") for f in folder.glob(pattern))
     files = sorted((f for f in candidates if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
     named = {file.relative_to(folder).as_posix(): file for file in files}
@@ -183,32 +202,28 @@ def _natural(file: Path, folder: Path) -> list[tuple[int, int, str]]:
 
 def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
     """All values of the calibration. Raises LogError."""
-    where = "the calibration" if isinstance(given, Mapping) else str(given)
-    if isinstance(given, Mapping):
-        loaded: Any = dict(given)
-    else:
+    where, loaded = "the calibration", given
+    if not isinstance(given, Mapping):
+        where = str(given)
         try:
-            loaded = yaml.safe_load(Path(given).read_text())
-        except OSError as error:
-            raise LogError(f"cannot read the calibration {given}: {error.strerror or error}") from error
-        except (UnicodeDecodeError, yaml.YAMLError) as error:
+            loaded = yaml.safe_load(read_bytes(given))
+        except yaml.YAMLError as error:
             raise LogError(
                 f"the calibration {given} is not plain YAML; write fx, cx, cy and baseline into a file of their own"
             ) from error
-    if not isinstance(loaded, dict):
-        raise LogError(f"{where} must map names to numbers: {', '.join(_REQUIRED)}")
-    for name in _REQUIRED:
-        if name not in loaded:
-            raise LogError(
-                f"{where} lacks '{name}'; it needs {', '.join(_REQUIRED)} and may have {', '.join(_OPTIONAL)}"
-            )
-    for name, value in loaded.items():
-        if name not in (*_REQUIRED, *_OPTIONAL):
-            raise LogError(f"{where} has the unknown '{name}'; it may have {', '.join((*_REQUIRED, *_OPTIONAL))}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MAX_VALUE:
-            raise LogError(f"{where}: '{name}' must be a number up to {_MAX_VALUE:g}, not {value!r}")
-        if name in ("fx", "fy", "baseline", "width", "height") and value <= 0:
-            raise LogError(f"{where}: '{name}' must be positive, not {value}")
+    required = [known.name for known in fields(ImageCalibration) if is_required(known)]
+    optional = [known.name for known in fields(ImageCalibration) if not is_required(known)]
+    if not isinstance(loaded, Mapping):
+        raise LogError(f"{where} must map names to numbers: {', '.join(required)}")
+    if missing := [name for name in required if name not in loaded]:
+        lists = f"{', '.join(required)} and may have {', '.join(optional)}"
+        raise LogError(f"{where} lacks '{missing[0]}'; it needs {lists}")
+    if unknown := [name for name in loaded if name not in (*required, *optional)]:
+        raise LogError(f"{where} has the unknown '{unknown[0]}'; it may have {', '.join((*required, *optional))}")
+    try:
+        ImageCalibration(**loaded)
+    except ValueError as error:
+        raise LogError(f"{where}: {error}") from error
     return {"fy": loaded["fx"], "cx_right": loaded["cx"], **loaded}
 
 
@@ -256,12 +271,17 @@ def _write_images(writer: Ros2Writer, frame: StereoFrame) -> None:
         writer.write(f"/stereo/{side}/image_rect", image(frame.stamp, CAMERA_FRAMES[side], pixels), frame.stamp)
 
 
-def _pixels(path: Path) -> Array:
-    """Gray or RGB pixels of an image file."""
+def read_bytes(path: Path) -> bytes:
+    """The content of a file. Raises LogError."""
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
+        return Path(path).read_bytes()
     except OSError as error:
         raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def _pixels(path: Path) -> Array:
+    """Gray or RGB pixels of an image file."""
+    data = np.frombuffer(read_bytes(path), np.uint8)
     pixels = unpacked_pixels(data)
     if pixels is None:
         raise LogError(f"{path} is not a readable image of 8 or 16 bit")

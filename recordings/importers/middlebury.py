@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.importers.images import CAMERA_FRAMES, FIRST_STAMP, read_frame, write_frames
+from recordings.importers.images import CAMERA_FRAMES, FIRST_STAMP, read_bytes, read_frame, write_frames
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, image
 from recordings.scoring.stereo_metrics import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns
@@ -74,11 +74,9 @@ def import_scene(folder: Path, out: Path) -> str:
         If a file cannot be used.
     """
     scene = read_scene(folder)
-
-    def write_truth(writer: Ros2Writer, frame: StereoFrame) -> None:
-        _write_truth(writer, scene)
-
-    write_frames([scene.frame], out, pitch_down=0.0, height=HEIGHT, write_more=write_truth)
+    write_frames(
+        [scene.frame], out, pitch_down=0.0, height=HEIGHT, write_more=lambda writer, _: _write_truth(writer, scene)
+    )
     if scene.truth is None:
         content = f"without truth (no {' or '.join(TRUTHS)})"
     elif scene.occlusion is None:
@@ -127,7 +125,7 @@ def read_pfm(path: Path) -> Array:
 
     A negative scale in its header means little-endian; its size is ignored. Raises LogError.
     """
-    data = _bytes(path)
+    data = read_bytes(path)
     header = _PFM.match(data)
     if header is None:
         raise LogError(f"{path} is not a PFM file of one channel ('Pf', width, height, scale); get it again")
@@ -151,7 +149,7 @@ def _is_scene(folder: Path) -> bool:
 def _calibration(path: Path) -> tuple[dict[str, str], dict[str, float]]:
     """The entries of calib.txt as text, and as fx, fy, cx, cy, cx_right, width, height, ndisp (px), baseline (m)."""
     try:
-        lines = _bytes(path).decode("utf-8-sig").splitlines()
+        lines = read_bytes(path).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise LogError(f"{path} is not a text file; get it again") from error
     text = {key.strip(): value.strip() for key, found, value in (line.partition("=") for line in lines) if found}
@@ -181,7 +179,7 @@ def _matrix(text: str) -> Array:
 
 
 def _codes(path: Path) -> Array:
-    data = np.frombuffer(_bytes(path), np.uint8)
+    data = np.frombuffer(read_bytes(path), np.uint8)
     mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
     if mask is None:
         raise LogError(f"{path} is not a readable image; get it again")
@@ -197,13 +195,6 @@ def _same_size(truth: Array, frame: StereoFrame, path: Path) -> Array:
         size = f"{truth.shape[1]}x{truth.shape[0]}"
         raise LogError(f"{path} is {size}, but the images are {width}x{height}; use files of one size")
     return truth
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
 
 
 def _write_truth(writer: Ros2Writer, scene: Scene) -> None:

@@ -231,6 +231,6 @@ def read_occupancy_grid(message: Any, reasons: Any = None) -> NavigationMap:
     reason[cells == Cell.UNKNOWN] = CellReason.UNOBSERVED
     if reasons is not None:
         reason = _layers(reasons)["reason"].astype(np.uint8)
-    resolution = float(str(np.float32(info.resolution)))  # the message holds float32: 0.05 stays 0.05
+    resolution = float(str(np.float32(info.resolution)))  # of float32, so 0.05 stays 0.05
     origin = (float(info.origin.position.x), float(info.origin.position.y))
     return NavigationMap(stamp_of(message.header), cells, reason, resolution, origin, message.header.frame_id)

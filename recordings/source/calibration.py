@@ -87,7 +87,9 @@ def calibrated_pair(
     by_name = [looks_rectified(topic) for topic in topics]
     states = [name or is_ideal(model) for name, model in zip(by_name, (left, right), strict=True)]
     if any(by_name) and not all(states):
-        raise LogError(f"only one of {topics[0]} and {topics[1]} is rectified; set 'left' and 'right' to two alike")
+        raise LogError(
+            f"only one of {topics[0]} and {topics[1]} is rectified; set 'left' and 'right' to two of one kind"
+        )
     singles = left.p[0, 3] == 0 and right.p[0, 3] == 0
     right_in_left = _right_in_left(names, tree) if singles else None
     rectified = all(states) and (right_in_left is None or _is_parallel(left, right, right_in_left))
@@ -198,7 +200,7 @@ def _right_in_left(names: tuple[str, str], tree: TransformTree) -> Transform:
 
 
 def _is_parallel(left: CameraModel, right: CameraModel, right_in_left: Transform) -> bool:
-    """Whether two cameras look in parallel from two places along x, with alike lenses."""
+    """Whether two cameras look in parallel from two places along x, with equal lenses."""
     angle = Rotation.from_matrix(left.r @ right_in_left.rotation @ right.r.T).magnitude()
     x, y, z = left.r @ right_in_left.translation
     return angle < MAX_PARALLEL_RAD and max(abs(y), abs(z)) < MAX_OFFSET_SHARE * abs(x) and not left.unlike(right)

@@ -98,7 +98,7 @@ def _mismatches(
         return reasons
     if _kind(left) != _kind(right):
         one, other = topics["left"], topics["right"]
-        why = f"the images on {one} are {_kind(left)}, those on {other} {_kind(right)}; record both alike"
+        why = f"the images on {one} are {_kind(left)}, those on {other} are {_kind(right)}; record both in one format"
         reasons.update(left=why, right=why)
     return reasons
 

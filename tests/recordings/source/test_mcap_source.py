@@ -311,8 +311,8 @@ def cropped(message: Any) -> Any:
             RIGHT, gray,
             dict.fromkeys(
                 ("left", "right"),
-                f"the images on {LEFT} are 24x16 colour of 8 bit, those on {RIGHT} 24x16 gray of 8 bit; "
-                "record both alike",
+                f"the images on {LEFT} are 24x16 colour of 8 bit, those on {RIGHT} are 24x16 gray of 8 bit; "
+                "record both in one format",
             ),
         ),
         (
