@@ -34,7 +34,7 @@ OTHERS = (
 UNITS = {"ns": "s, ms", "rad": "rad, deg"}
 STAGES_INTRO = """# Stages and their parameters
 
-This page is generated from the code by `make docs`.
+This page is generated from the code by `make docs`. `roverflow stages [NAME]` prints the same on a terminal.
 
 Inputs and outputs name the types of `stages.data`. In a pipeline file, write times, lengths and angles with a unit:
 `5 ms`, `20 cm`, `20 deg`. [pipelines.md](pipelines.md) shows how to use a stage.
