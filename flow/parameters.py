@@ -61,9 +61,9 @@ def check(value: Any, known: Field[Any], given: Any = None) -> None:
     """
     if value is None and known.default is None:
         return
-    about, shown = known.metadata, value if given is None else given
-    low, high, unit, choices = (about.get(key) for key in ("low", "high", "unit", "choices"))
-    of_unit = f" in {unit}" if unit else ""
+    low, high, unit, choices = (known.metadata.get(key) for key in ("low", "high", "unit", "choices"))
+    shown = _shown(value, unit) if given is None else given
+    of_unit = f" in {unit}" if unit and unit != "share" else ""
     if choices is not None and value not in choices:
         raise ValueError(f"must be one of {', '.join(map(str, choices))}, not {shown}")
     if is_dataclass(known.default) and not isinstance(value, type(known.default)):
@@ -127,9 +127,19 @@ def _number(value: Any, kind: type, known: Field[Any]) -> float | int:
 
 
 def _limit(value: float, unit: str | None) -> str:
-    """A limit with its unit, even where it is 0."""
+    """A number with its unit, even where it is 0."""
     text = as_written(value, unit or "")
-    return text if text[-1].isalpha() else f"{text} {unit or ''}".rstrip()
+    return f"{text} {unit or ''}".rstrip() if text[-1].isdigit() else text
+
+
+def _shown(value: Any, unit: str | None) -> Any:
+    """A value as the message about it contains it."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return value
+    try:
+        return _limit(float(value), unit)
+    except OverflowError:  # a whole number beyond every float
+        return value
 
 
 def is_required(known: Field[Any]) -> bool:

@@ -22,11 +22,12 @@ UNITS: dict[str, tuple[str, float]] = {
     "px": ("number of pixels", 1.0),
     "Hz": ("frequency", 1.0),
     "%": ("share", 1e-2),
+    "share": ("share", 1.0),
     "": ("number", 1.0),
 }
 
 # what nobody writes bare, for 20 may be meant as cm or as m -> the units to write it with
-_WRITTEN = {"time": ("ms", "s"), "length": ("cm", "m"), "angle": ("deg", "rad")}
+_WRITTEN = {"time": ("ms", "s"), "length": ("cm", "m"), "angle": ("deg", "rad"), "share": ("%",)}
 
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z%]*)\s*$")
 

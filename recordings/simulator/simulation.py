@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from flow.parameters import check_parameters, parameter
 from recordings.simulator import raycast, shading, sunlight, traverse
 from recordings.simulator.odometry import dead_reckoning
 from recordings.simulator.terrain import Terrain, make_terrain
@@ -27,17 +28,9 @@ ROW_BLOCK = 32  # rows of one task of a thread
 # The Devon Island rover's rectified camera (1280 pixels wide).
 DEVON_WIDTH, DEVON_F, DEVON_CX, DEVON_CY, DEVON_HEIGHT = 1280, 968.999694824, 635.139038086, 463.537109375, 960
 
-UNITS = {"degrees": 180 / np.pi, "%": 100}  # of a limit, per unit of the field
-LIMITS: dict[str, tuple[float, float, str]] = {  # field -> minimum, maximum, unit
-    "frames": (1, 100_000, ""), "rate": (0.001, 100, "Hz"), "speed": (0, 10, "m/s"), "seed": (0, 10**15, ""),
-    "width": (16, 8192, "px"), "height": (16, 8192, "px"), "baseline": (0.001, 10, "m"),
-    "camera_height": (0.1, 100, "m"), "pitch_down": (-90, 90, "degrees"), "slope": (0, 45, "degrees"),
-    "relief_resolution": (0.001, 10, "m"), "abundance": (0, 0.5, ""), "smallest_rock": (0.01, 10, "m"),
-    "sun_elevation": (0.1, 90, "degrees"), "noise": (0, 1, ""), "tilt_noise": (0, 45, "degrees"),
-    "tilt_rate": (1, 1000, "Hz"), "odometry_rate": (1, 1000, "Hz"), "odometry_scale": (-50, 100, "%"),
-    "odometry_turn": (0, 90, "degrees"), "map_half_width": (0.5, 100, "m"), "map_resolution": (0.001, 10, "m"),
-    "threads": (1, 1024, ""),
-}  # fmt: skip
+
+def _rad(degrees: float) -> float:
+    return float(np.radians(degrees))
 
 
 @dataclass(frozen=True)
@@ -60,30 +53,6 @@ class FrameTruth:
 class Simulation:
     """A synthetic traverse; equal simulations write equal bytes. Lengths in m, angles in rad, times in s.
 
-    Parameters
-    ----------
-    frames, rate, speed
-        The drive: number of frames, Hz, m/s.
-    width, height, baseline
-        The camera: px (Devon's camera, scaled), m.
-    camera_height, pitch_down
-        The mast: height above base_link, angle below the horizon.
-    slope, relief_cells, relief_resolution
-        The ground: RMS slope over 1 m; cells of the repeating tile and their size.
-    abundance, smallest_rock, largest_rock
-        The rocks: k of Golombek's law (0.05 sparse, 0.15 dense), diameters.
-    sun_elevation, sun_azimuth, color, noise
-        The images: sunlight; rgb8 or mono8; noise at half scale, share of full scale.
-    tilt_noise, tilt_rate, frame_offset
-        The inclinometer: one sigma of a sample, Hz, time from a sample to a frame.
-    odometry_rate, odometry_scale, odometry_turn
-        The odometry: Hz, share by which distances are overstated, heading error after 1 m (one sigma, grows with the
-        square root of the distance). It is exact for 0 and 0.
-    map_half_width, map_resolution, region, horizon
-        The truth: size and cells of the maps, largest distance of a visible cell, distance from which on is sky.
-    seed, threads
-        Of the random numbers; of the computation (the result does not depend on it).
-
     Examples
     --------
     >>> from recordings.simulator import Simulation
@@ -92,44 +61,45 @@ class Simulation:
     (240, 320)
     """
 
-    frames: int = 12
-    rate: float = 2.0
-    speed: float = 0.5
-    width: int = 1280
-    height: int = 960
-    baseline: float = 0.24
-    camera_height: float = 0.9
-    pitch_down: float = float(np.radians(15))
-    slope: float = float(np.radians(4))
-    relief_cells: int = 2048
-    relief_resolution: float = 0.04
-    abundance: float = 0.10
-    smallest_rock: float = 0.06
-    largest_rock: float = 1.5
-    sun_elevation: float = float(np.radians(38))
-    sun_azimuth: float = float(np.radians(140))
-    color: bool = True
-    noise: float = 0.008
-    tilt_noise: float = float(np.radians(0.1))
-    tilt_rate: float = 20.0
-    odometry_rate: float = 10.0
-    odometry_scale: float = 0.01
-    odometry_turn: float = float(np.radians(0.2))
-    frame_offset: float = 0.013
-    map_half_width: float = 8.0
-    map_resolution: float = 0.05
-    region: float = 8.0
-    horizon: float = 300.0
-    seed: int = 1
-    threads: int = 2
+    frames: int = parameter(12, "number of stereo frames", low=1, high=100_000)
+    rate: float = parameter(2.0, "frames per second", unit="Hz", low=0.001, high=100)
+    speed: float = parameter(0.5, "speed of the rover", unit="m/s", low=0, high=10)
+    width: int = parameter(1280, "width of an image of the Devon camera, scaled", unit="px", low=16, high=8192)
+    height: int = parameter(960, "height of an image", unit="px", low=16, high=8192)
+    baseline: float = parameter(0.24, "distance between the cameras", unit="m", low=0.001, high=10)
+    camera_height: float = parameter(0.9, "height of the cameras above base_link", unit="m", low=0.1, high=100)
+    pitch_down: float = parameter(_rad(15), "camera below the horizon", unit="rad", low=_rad(-90), high=_rad(90))
+    slope: float = parameter(_rad(4), "RMS slope of the ground over 1 m", unit="rad", low=0, high=_rad(45))
+    relief_cells: int = parameter(2048, "cells along a side of the repeating ground tile")
+    relief_resolution: float = parameter(0.04, "size of a cell of the ground tile", unit="m", low=0.001, high=10)
+    abundance: float = parameter(0.10, "k of Golombek's law of rocks (0.05 sparse, 0.15 dense)", low=0, high=0.5)
+    smallest_rock: float = parameter(0.06, "diameter of the smallest rock", unit="m", low=0.01, high=10)
+    largest_rock: float = parameter(1.5, "diameter of the largest rock", unit="m")
+    sun_elevation: float = parameter(_rad(38), "sun above the horizon", unit="rad", low=_rad(0.1), high=_rad(90))
+    sun_azimuth: float = parameter(_rad(140), "direction of the sun", unit="rad")
+    color: bool = parameter(True, "images in rgb8, or else in mono8")
+    noise: float = parameter(0.008, "image noise at half scale, as a share of full scale", low=0, high=1)
+    tilt_noise: float = parameter(_rad(0.1), "one sigma of a tilt sample", unit="rad", low=0, high=_rad(45))
+    tilt_rate: float = parameter(20.0, "tilt samples per second", unit="Hz", low=1, high=1000)
+    odometry_rate: float = parameter(10.0, "poses per second", unit="Hz", low=1, high=1000)
+    odometry_scale: float = parameter(
+        0.01, "share by which odometry overstates distances; exact for 0, with odometry_turn 0", unit="share",
+        low=-0.5, high=1,
+    )  # fmt: skip
+    odometry_turn: float = parameter(
+        _rad(0.2), "heading error of odometry after 1 m, one sigma; grows with the square root of the distance",
+        unit="rad", low=0, high=_rad(90),
+    )  # fmt: skip
+    frame_offset: float = parameter(0.013, "time from a tilt sample to a frame", unit="s")
+    map_half_width: float = parameter(8.0, "half the width of the truth maps", unit="m", low=0.5, high=100)
+    map_resolution: float = parameter(0.05, "cells of the truth maps", unit="m", low=0.001, high=10)
+    region: float = parameter(8.0, "largest distance of a visible cell", unit="m")
+    horizon: float = parameter(300.0, "distance beyond which is sky", unit="m")
+    seed: int = parameter(1, "seed of the random numbers", low=0, high=10**15)
+    threads: int = parameter(2, "threads of the computation; the result does not depend on it", low=1, high=1024)
 
     def __post_init__(self) -> None:
-        for name, (low, high, unit) in LIMITS.items():
-            value = getattr(self, name) * UNITS.get(unit, 1)
-            value = min(value, 1e300) if value > high else value  # an int may exceed every float
-            if not low <= value <= high:
-                shown = f"{low:.9g} to {high:.9g} {unit}".rstrip()
-                raise ValueError(f"Simulation.{name} must be {shown}, not {value:.9g}{f' {unit}' if unit else ''}")
+        check_parameters(self)
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
 
