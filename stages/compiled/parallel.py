@@ -1,4 +1,8 @@
-"""How a kernel shares a frame between two cores: two functions, or bands of rows, in turn or at once."""
+"""Threads in a kernel: how one frame is shared between two cores, with the same bits as on one.
+
+A stage passes its `threads` to `shared_by`, which returns a function that calls two functions: one after the other, or
+on two threads. `by_bands` applies that to bands of rows. Compiled code releases Python's lock, so both threads run.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +19,14 @@ Fork = Callable[[Callable[[], Any], Callable[[], Any]], tuple[Any, Any]]
 
 
 class _Others:
-    """The threads of second functions: kept, for one takes a tenth of a millisecond to start."""
+    """The pool of second threads. It is kept, because a thread takes a tenth of a millisecond to start."""
 
     def __init__(self) -> None:
         self.renew()
-        os.register_at_fork(after_in_child=self.renew)  # the threads stay behind
+        os.register_at_fork(after_in_child=self.renew)  # threads do not survive a fork
 
     def renew(self) -> None:
-        """Begin anew, without threads."""
+        """Replace the pool by an empty one: a forked process does not inherit threads."""
         self.pool = ThreadPoolExecutor(thread_name_prefix="second")
 
 
@@ -30,15 +34,15 @@ _others = _Others()
 
 
 def in_turn(one: Callable[[], Any], other: Callable[[], Any]) -> tuple[Any, Any]:
-    """Both results, of the two functions called one after the other."""
+    """Call two functions one after the other; return both results."""
     return one(), other()
 
 
 def at_once(one: Callable[[], Any], other: Callable[[], Any]) -> tuple[Any, Any]:
-    """Both results, of the two functions called at once.
+    """Call two functions on two threads; return both results.
 
-    Whatever happens, neither runs any more when this is through: they may work in memory that others are waiting for.
-    `other` must not call this in its turn, or all threads could come to wait for one that is free.
+    Both have ended when this returns or raises, because they may work in shared memory. `other` must not call
+    `at_once` itself: all threads of the pool could wait for a free one.
     """
     elsewhere = _others.pool.submit(other)
     try:
@@ -50,14 +54,16 @@ def at_once(one: Callable[[], Any], other: Callable[[], Any]) -> tuple[Any, Any]
 
 
 def shared_by(threads: int) -> Fork:
-    """What calls two functions and gives both results: at once if there are 2 threads or more, else in turn."""
+    """The function that calls two functions: `at_once` for 2 threads or more, else `in_turn`."""
     return in_turn if threads < 2 else at_once
 
 
-def by_bands(both: Fork, rows: int, work: Callable[[int, int], Any]) -> None:
-    """Call `work(first, end)` for all rows once: in bands, of which a thread that is free takes the next, or all the
-    rows in one call where there is one thread."""
-    count = 1 if both is in_turn else BANDS
+def by_bands(run_both: Fork, rows: int, work: Callable[[int, int], Any]) -> None:
+    """Call `work(first, end)` once for all rows: in bands, which free threads take in turn, or in one call.
+
+    One call is made on one thread.
+    """
+    count = 1 if run_both is in_turn else BANDS
     cuts = [rows * i // count for i in range(count + 1)]
     bands = iter([(first, end) for first, end in itertools.pairwise(cuts) if first < end])
 
@@ -65,10 +71,10 @@ def by_bands(both: Fork, rows: int, work: Callable[[int, int], Any]) -> None:
         for first, end in bands:
             work(first, end)
 
-    both(take, take)
+    run_both(take, take)
 
 
 def with_margin(image: Array, first: int, end: int, margin: int) -> tuple[Array, slice]:
-    """Rows first to end of an image and `margin` more to either side, where there are; and where in them they are."""
+    """Rows first to end of an image with up to `margin` more on either side, and the slice of first to end in them."""
     start = max(first - margin, 0)
     return image[start : end + margin], slice(first - start, end - start)

@@ -1,17 +1,16 @@
 """Explicit vectors of unsigned bytes for numba kernels: the layer under the matcher, and its one trick for speed.
 
-numba compiles loops over scalars and hopes that LLVM turns them into vector code. For bytes that hope fails: numba
-widens every sum of two bytes to 64 bits, and 3 of 4 lanes of the machine are lost. Here a kernel names its vectors
-itself. A value of type `Lanes(n, bits)` is n unsigned numbers of `bits` bits, and each function below is one LLVM
-instruction on all of them at once, on whatever the machine has: LLVM divides a vector into 16 (SSE), 32 (AVX2) or 64
-bytes (AVX-512).
+numba compiles loops over scalars, and LLVM turns them into vector code. That fails for bytes: numba widens every sum of
+two bytes to 64 bits, which wastes most of the machine's lanes. Here a kernel names its vectors itself. A value of type
+`Lanes(n, bits)` is n unsigned numbers of `bits` bits, and each function below is one LLVM instruction on all of them.
+LLVM divides a vector into 16 (SSE), 32 (AVX2) or 64 bytes (AVX-512).
 
 How to read a kernel that uses it:
     n = lanes_in(width)                    # a constant of the compiled code
     costs = load(row, x * n, width)        # n bytes of a uint8 array (1-D, contiguous), from index x * n on
-    best = lesser(costs, spread(90, width))  # spread: the same number in all lanes
+    best = lesser(costs, broadcast(90, width))  # the same number in all lanes
     store(row, x * n, best)
-How many lanes there are must be known when a kernel is compiled, so it is an argument's *type*: `Width(128)` is an
+The number of lanes must be known when a kernel is compiled, so it is an argument's *type*: `Width(128)` is an
 object whose numba type differs from that of `Width(192)`, and numba compiles (and caches) a kernel for each width it
 is called with. Sums wrap around at 256 (`plus`) or stop at 255 (`plus_capped`). Nothing checks bounds: an index
 outside the array reads or overwrites foreign memory.
@@ -33,7 +32,7 @@ from numba.core import cgutils
 from numba.extending import NativeValue, intrinsic, models, register_model, typeof_impl, unbox
 from numba.np.arrayobj import make_array
 
-LARGEST_CHUNK = 64
+MAX_CHUNK = 64
 _unbox: Any = unbox
 _intrinsic: Any = intrinsic(prefer_literal=True)
 _tuple_of: Any = types.Tuple
@@ -46,7 +45,7 @@ class Lanes(types.Type):
 
     def __init__(self, n: int, bits: int) -> None:
         self.n, self.bits = n, bits
-        self.chunk = min(LARGEST_CHUNK, n & -n)
+        self.chunk = min(MAX_CHUNK, n & -n)
         self.count = n // self.chunk
         super().__init__(name=f"Lanes({n} x u{bits})")
 
@@ -71,7 +70,7 @@ class _LanesModel(models.PrimitiveModel):
 
 @dataclass(frozen=True)
 class Width:
-    """How many lanes the vectors of a kernel have: a multiple of 16; best a power of two or multiple of 64."""
+    """The number of lanes of a kernel's vectors: a multiple of 16, best a power of two or a multiple of 64."""
 
     lanes: int
 
@@ -92,7 +91,7 @@ def _typeof_width(value: Width, _context: Any) -> _WidthType:
 
 @_unbox(_WidthType)
 def _unbox_width(kind: Any, value: Any, c: Any) -> Any:
-    nothing: Any = NativeValue  # all there is to know is in the type
+    nothing: Any = NativeValue  # the type holds all information
     return nothing(c.context.get_dummy_value())
 
 
@@ -134,7 +133,7 @@ def _sized(b: Any, value: Any, bits: int) -> Any:
     return b.trunc(value, kind) if width > bits else b.zext(value, kind) if width < bits else value
 
 
-def _spread(b: Any, kind: Lanes, scalar: Any) -> Any:
+def _broadcast(b: Any, kind: Lanes, scalar: Any) -> Any:
     """One chunk with `scalar` in all lanes."""
     nothing = ir.Constant(kind.vector, ir.Undefined)
     first = b.insert_element(nothing, _sized(b, scalar, kind.bits), _I32(0))
@@ -189,15 +188,15 @@ plus_capped = _named("uadd.sat")  # stops at 255
 minus_capped = _named("usub.sat")  # stops at 0
 plus = _on_chunks(lambda b, kind, x, y: b.add(x, y))
 difference = _on_chunks(_difference)  # of the larger and the smaller
-exclusive_or = _on_chunks(lambda b, kind, x, y: b.xor(x, y))
-either = _on_chunks(lambda b, kind, x, y: b.or_(x, y))
-both = _on_chunks(lambda b, kind, x, y: b.and_(x, y))
+bit_xor = _on_chunks(lambda b, kind, x, y: b.xor(x, y))
+bit_or = _on_chunks(lambda b, kind, x, y: b.or_(x, y))
+bit_and = _on_chunks(lambda b, kind, x, y: b.and_(x, y))
 average = _on_chunks(_average)  # (x + y + 1) // 2, as if in wider numbers
 
 
 @_intrinsic
 def load(typing_context: Any, array: Any, index: Any, width: Any) -> Any:
-    """Elements of `array` from `index` on, as many as `width` says; the lanes are as wide as they are."""
+    """Elements of `array` from `index` on, `width` of them; lanes have the width of the elements."""
     kind = Lanes(width.lanes, array.dtype.bitwidth)
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
@@ -234,12 +233,12 @@ def byte(typing_context: Any, array: Any, index: Any) -> Any:
 
 
 @_intrinsic
-def spread(typing_context: Any, scalar: Any, width: Any) -> Any:
+def broadcast(typing_context: Any, scalar: Any, width: Any) -> Any:
     """Bytes that all hold `scalar`."""
     kind = Lanes(width.lanes, 8)
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        return _joined(b, kind, [_spread(b, kind, args[0])] * kind.count)
+        return _joined(b, kind, [_broadcast(b, kind, args[0])] * kind.count)
 
     return kind(scalar, width), generate
 
@@ -257,8 +256,8 @@ def count_up(typing_context: Any, width: Any, array: Any) -> Any:
 
 
 @_intrinsic
-def ones(typing_context: Any, value: Any) -> Any:
-    """How many bits of each lane are set."""
+def count_ones(typing_context: Any, value: Any) -> Any:
+    """The number of set bits of each lane."""
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
         name = f"llvm.ctpop.v{value.chunk}i{value.bits}"
@@ -281,7 +280,7 @@ def _smallest(b: Any, kind: Lanes, value: Any) -> Any:
     return _call(b, "llvm.vector.reduce.umin.v8i16", ir.IntType(16), [b.bitcast(_lesser(b, rest, high), wide)])
 
 
-def _spread_smallest(b: Any, kind: Lanes, least: Any) -> Any:
+def _broadcast_smallest(b: Any, kind: Lanes, least: Any) -> Any:
     """One chunk with the result of `_smallest` in all lanes, which never leaves the vector registers."""
     first = b.bitcast(b.zext(least, ir.IntType(128)), ir.VectorType(ir.IntType(8), 16))
     return b.shuffle_vector(first, first, _indices([0] * kind.chunk))
@@ -298,7 +297,7 @@ def above_smallest(typing_context: Any, value: Any) -> Any:
     """The bytes less the smallest of them."""
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        least = _spread_smallest(b, value, _smallest(b, value, args[0]))
+        least = _broadcast_smallest(b, value, _smallest(b, value, args[0]))
         return _joined(b, value, [b.sub(chunk, least) for chunk in _chunks(b, args[0], value)])
 
     return value(value), generate
@@ -310,7 +309,7 @@ def first_smallest(typing_context: Any, value: Any) -> Any:
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
         least, found, mask = _smallest(b, value, args[0]), _I64(0), ir.IntType(value.chunk)
-        wanted = _spread_smallest(b, value, least)
+        wanted = _broadcast_smallest(b, value, least)
         for i, chunk in reversed(list(enumerate(_chunks(b, args[0], value)))):
             equal = b.bitcast(b.icmp_unsigned("==", chunk, wanted), mask)
             zeros = _call(b, f"llvm.cttz.i{value.chunk}", mask, [equal, ir.Constant(ir.IntType(1), 0)])
@@ -339,7 +338,7 @@ def shifted(typing_context: Any, value: Any, fill: Any, step: Any) -> Any:
     up = step.literal_value > 0
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        size, chunks, edge = value.chunk, _chunks(b, args[0], value), _spread(b, value, args[1])
+        size, chunks, edge = value.chunk, _chunks(b, args[0], value), _broadcast(b, value, args[1])
         if up:
             pairs = zip([edge, *chunks[:-1]], chunks, strict=True)
             lanes = _indices(range(size - 1, 2 * size - 1))
@@ -370,7 +369,7 @@ def shifted_in_memory(typing_context: Any, value: Any, array: Any, index: Any, f
     up = step.literal_value > 0
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        size, chunks, edge, moved = value.chunk, _chunks(b, args[0], value), _spread(b, value, args[3]), []
+        size, chunks, edge, moved = value.chunk, _chunks(b, args[0], value), _broadcast(b, value, args[3]), []
         for i, chunk in enumerate(chunks):
             if up and i == 0:
                 moved.append(b.shuffle_vector(edge, chunk, _indices(range(size - 1, 2 * size - 1))))

@@ -1,7 +1,7 @@
-"""Union-find over numbered things: the root that a thing hangs from is the first of its set.
+"""Union-find over indices: the root of a set is its smallest index.
 
-parent: (n,) integers, the thing that each hangs from, itself for a root. Paths are halved as they are walked (Tarjan
-and van Leeuwen, 1984), which keeps them short without ranks.
+parent: (n,) integers, the parent of each index; a root is its own parent. Path halving (Tarjan and van Leeuwen, 1984)
+keeps the paths short without ranks.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def root(parent, i):
 
 @part
 def join(parent, one, other):
-    """Make one set of those of two things; the earlier root becomes the root of both."""
+    """Join the sets of two indices; the smaller root becomes the root of both."""
     one, other = root(parent, one), root(parent, other)
     if one < other:
         parent[other] = one

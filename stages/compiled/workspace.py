@@ -1,5 +1,4 @@
-"""Memory that kernels work in, kept from one call to the next: the operating system hands out fresh pages slowly, and
-takes them back whenever a large array is freed."""
+"""Memory of kernels that is kept from one call to the next, because fresh pages of large arrays are slow."""
 
 from __future__ import annotations
 
@@ -21,9 +20,9 @@ class Workspace:
         self.used = 0
 
     def reserve(self, size: int) -> None:
-        """Have `size` bytes ready; what was handed out before is free again."""
+        """Reserve `size` bytes; arrays of earlier calls become invalid."""
         if self.whole.size < size:
-            self.whole = np.empty(0, np.uint8)  # the old memory goes before the new comes
+            self.whole = np.empty(0, np.uint8)  # frees the old memory before the new is taken
             self.whole = np.empty(size, np.uint8)
         self.used = 0
 
@@ -36,14 +35,14 @@ class Workspace:
         return self.whole[start : self.used]
 
     def array(self, shape: tuple[int, ...], kind: Any) -> Array:
-        """An array with arbitrary content; takes up to 63 bytes more than it holds."""
+        """An array with arbitrary content; it takes up to 63 extra bytes."""
         size = int(np.prod(shape)) * np.dtype(kind).itemsize
         items: Array = self.bytes(size).view(kind)
         return items.reshape(shape)
 
 
 class Workspaces:
-    """As many workspaces as calls run at once."""
+    """A pool of workspaces, one for each concurrent call."""
 
     def __init__(self) -> None:
         self.idle: list[Workspace] = []
@@ -51,7 +50,7 @@ class Workspaces:
 
     @contextmanager
     def one(self) -> Iterator[Workspace]:
-        """A workspace for one call; one that another call has left, where there is any."""
+        """A workspace for one call; an idle one if there is any."""
         with self.lock:
             space = self.idle.pop() if self.idle else Workspace()
         try:

@@ -11,8 +11,8 @@ import numpy as np
 from flow.contracts import StageError
 from stages.data.arrays import Array, publish_image, publish_stamp, publish_vector
 
-ALIKE = 1e-3  # of a focal length or of cy, by which those of a rectified pair may differ: a pixel at 1000 px
-_OPENCV = (0, 4, 5, 8, 12, 14)  # coefficients; how many there are tells the model, whatever a driver calls it
+CALIBRATION_RTOL = 1e-3  # by which focal lengths or cy of a rectified pair may differ: a pixel at 1000 px
+_OPENCV = (0, 4, 5, 8, 12, 14)  # numbers of coefficients; they define the model, whatever a driver calls it
 DISTORTION_SIZES = {"plumb_bob": _OPENCV, "rational_polynomial": _OPENCV, "equidistant": (4,)}
 
 
@@ -20,9 +20,30 @@ DISTORTION_SIZES = {"plumb_bob": _OPENCV, "rational_polynomial": _OPENCV, "equid
 class CameraModel:
     """Calibration of one camera, the fields of sensor_msgs/CameraInfo.
 
-    k: (3, 3) intrinsics of the raw image, px; d: (n,) distortion coefficients; model: "plumb_bob",
-    "rational_polynomial" or "equidistant"; r: (3, 3) rectifying rotation; p: (3, 4) projection of the rectified image,
-    px, with p[0, 3] = -fx * baseline for the right camera of a pair.
+    Parameters
+    ----------
+    width, height
+        Size of the image, px.
+    k
+        (3, 3) intrinsics of the raw image, px.
+    d
+        (n,) distortion coefficients.
+    r
+        (3, 3) rectifying rotation.
+    p
+        (3, 4) projection of the rectified image, px; p[0, 3] = -fx * baseline for the right camera of a pair.
+    model
+        "plumb_bob", "rational_polynomial" or "equidistant".
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from stages import CameraModel, StereoCamera
+    >>> k = np.array([[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+    >>> left, right = np.c_[k, [0, 0, 0]], np.c_[k, [-60, 0, 0]]
+    >>> models = [CameraModel(640, 480, k=k, d=np.zeros(5), r=np.eye(3), p=p) for p in (left, right)]
+    >>> StereoCamera.from_models(*models, frame_id="camera", rectified=True).baseline
+    0.12
     """
 
     width: int
@@ -43,15 +64,15 @@ class CameraModel:
         return bool(np.allclose(self.r @ self.r.T, np.eye(3), atol=1e-3) and np.linalg.det(self.r) > 0)
 
     def unlike(self, right: CameraModel) -> str:
-        """By what the projections of two cameras differ that a rectified pair has in common; empty where by nothing."""
+        """The difference of two projections that a rectified pair must not have; empty if there is none."""
         shared = {"fx": (0, 0), "fy": (1, 1), "cy": (1, 2)}
         pairs = {name: (float(self.p[place]), float(right.p[place])) for name, place in shared.items()}
-        differing = [name for name, pair in pairs.items() if not math.isclose(*pair, rel_tol=ALIKE)]
+        differing = [name for name, values in pairs.items() if not math.isclose(*values, rel_tol=CALIBRATION_RTOL)]
         return " and ".join(f"{name} is {pairs[name][0]:.6g} and {pairs[name][1]:.6g} px" for name in differing)
 
     @property
     def unusable(self) -> str:
-        """Why a raw image cannot be rectified with it, empty where it can."""
+        """Why a raw image cannot be rectified with this calibration; empty if it can."""
         sizes = DISTORTION_SIZES.get(self.model)
         if sizes is None:
             return f"unknown distortion model '{self.model}'; use {', '.join(DISTORTION_SIZES)}"
@@ -69,8 +90,26 @@ class CameraModel:
 class StereoCamera:
     """A rectified stereo camera: Z = fx * baseline / (d + cx_right - cx), x_right = x_left - d.
 
-    fx, fy, cx, cy, cx_right: px of the left rectified image; baseline: m, > 0; width, height: px; frame_id: the left
-    optical frame; raw: both cameras' own calibration where the images still have to be rectified, else None.
+    Parameters
+    ----------
+    fx, fy, cx, cy, cx_right
+        Intrinsics of the rectified images, px; `cx_right` is `cx` by default.
+    baseline
+        Distance of the cameras, m, above 0.
+    width, height
+        Size of the images, px.
+    frame_id
+        The left optical frame.
+    raw
+        Calibrations of the left and the right camera if the images are not rectified yet, else None.
+
+    Examples
+    --------
+    >>> from stages import StereoCamera
+    >>> camera = StereoCamera(fx=500, fy=500, cx=320, cy=240, baseline=0.12, width=640, height=480)
+    >>> disparity = 20
+    >>> camera.fx * camera.baseline / (disparity + camera.cx_right - camera.cx)
+    3.0
     """
 
     fx: float
@@ -95,9 +134,12 @@ class StereoCamera:
 
     @classmethod
     def from_models(cls, left: CameraModel, right: CameraModel, frame_id: str, rectified: bool) -> StereoCamera:
-        """The rectified camera that two CameraInfo messages describe through their projection matrices.
+        """The rectified camera of two projection matrices.
 
-        Raises ValueError where these are not those of a rectified pair.
+        Raises
+        ------
+        ValueError
+            If the projections are not those of a rectified pair.
         """
         if differing := left.unlike(right):
             raise StageError(f"the cameras' P are not those of a rectified pair: {differing}")
@@ -110,23 +152,33 @@ class StereoCamera:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What the calibration says that hardly any camera has, a sentence each: it may be of another image size."""
-        size, said = f"{self.width}x{self.height}", []
+        """Unusual values of the calibration, a sentence each: it may be for another image size."""
+        size, doubts = f"{self.width}x{self.height}", []
         for name, extent in (("cx", self.width), ("cx_right", self.width), ("cy", self.height)):
             if not 0.2 * extent <= getattr(self, name) <= 0.8 * extent:
                 outer = f"{name} of {getattr(self, name):g} px lies in the outer fifth of {size} images"
-                said.append(f"{outer}: check that the calibration is for this size")
+                doubts.append(f"{outer}: check that the calibration is for this size")
         if self.baseline > 5:
-            said.append(f"the baseline is {self.baseline:g} m: check that it is given in metres")
-        return tuple(said)
+            doubts.append(f"the baseline is {self.baseline:g} m: check that it is given in metres")
+        return tuple(doubts)
 
 
 @dataclass(frozen=True, eq=False)
 class CameraImage:
     """One image of one camera, with its calibration.
 
-    pixels: uint8 or uint16, (H, W) or (H, W, 3) RGB; frame_id: the camera's optical frame; rectified: whether `pixels`
-    are rectified already.
+    Parameters
+    ----------
+    stamp
+        Nanoseconds.
+    pixels
+        (H, W) gray or (H, W, 3) RGB, uint8 or uint16.
+    model
+        The calibration.
+    frame_id
+        The camera's optical frame.
+    rectified
+        Whether `pixels` are rectified.
     """
 
     stamp: int
@@ -140,14 +192,32 @@ class CameraImage:
         publish_image(self, "pixels")
 
     def pair_with(self, right: CameraImage) -> StereoFrame:
-        """The stereo frame of this (left) image and its right partner; it carries the left image's stamp."""
+        """The stereo frame of this (left) image and the right one, with the stamp of the left image."""
         camera = StereoCamera.from_models(self.model, right.model, self.frame_id, self.rectified and right.rectified)
         return StereoFrame(self.stamp, self.pixels, right.pixels, camera)
 
 
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """A pair of images taken at one time. left, right: uint8 or uint16, (H, W) or (H, W, 3) RGB."""
+    """Left and right image, taken at one time.
+
+    Parameters
+    ----------
+    stamp
+        Nanoseconds.
+    left, right
+        (H, W) gray or (H, W, 3) RGB, uint8 or uint16.
+    camera
+        The stereo camera.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from stages import StereoCamera, StereoFrame
+    >>> camera = StereoCamera(fx=500, fy=500, cx=320, cy=240, baseline=0.12, width=640, height=480)
+    >>> StereoFrame(0, np.zeros((480, 640), np.uint8), np.zeros((480, 640), np.uint8), camera).left.shape
+    (480, 640)
+    """
 
     stamp: int
     left: Array

@@ -1,4 +1,4 @@
-"""Disparity images, the origin of each pixel, and how well the nearest ground was matched."""
+"""Disparity images, the origin of each pixel, and the matched share of the nearest ground."""
 
 from __future__ import annotations
 
@@ -40,9 +40,29 @@ def known(source: Any) -> Any:
 class Disparity:
     """A disparity image in the left rectified frame.
 
-    pixels: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `PixelOrigin`; confidence: (H, W) float32
-    in [0, 1]; segments: (H, W) int32 superpixel labels where refinement made them, else None; camera: the rectified
-    camera it was made for, where known.
+    Parameters
+    ----------
+    stamp
+        Nanoseconds.
+    pixels
+        (H, W) float32, px, NaN = unknown.
+    source
+        (H, W) uint8, codes of `PixelOrigin`; see `known`.
+    confidence
+        (H, W) float32 in [0, 1].
+    segments
+        (H, W) int32 superpixel labels of refinement, or None.
+    camera
+        The rectified camera, if it is known.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from stages import Disparity, PixelOrigin, known
+    >>> pixels = np.array([[12.5, np.nan]], np.float32)
+    >>> source = np.array([[PixelOrigin.MEASURED, PixelOrigin.SPECKLE]], np.uint8)
+    >>> known(Disparity(0, pixels, source, np.array([[0.9, 0.0]], np.float32)).source)
+    array([[ True, False]])
     """
 
     stamp: int
@@ -63,7 +83,7 @@ class Disparity:
 
 @dataclass(frozen=True)
 class MatchHealth:
-    """How much of a frame is matched: shares of all pixels and of those of the nearest ground in view."""
+    """The matched shares of all pixels of a frame (`all`) and of the nearest ground in view (`near`)."""
 
     stamp: int
     all: float

@@ -1,7 +1,7 @@
-"""Left-right check between two matchings of a pair (Hirschmüller, 2008, section 2.4), each from its own camera's view.
+"""Left-right check between two disparity images, one of each camera's view (Hirschmüller, 2008, section 2.4).
 
-The matcher's own check asks the same sums twice, and paths that follow the left image's edges favour what the left
-image shows. A second matching follows the right image's, so what only one camera sees is exposed.
+The matcher's own check uses the same sums twice, and their paths follow the edges of the left image. A second matching
+follows the edges of the right image, so it reveals surfaces that only one camera sees.
 """
 
 from __future__ import annotations
@@ -11,20 +11,19 @@ from dataclasses import dataclass, replace
 
 from flow.contracts import StageError
 from stages.data import Disparity
-from stages.matching.kernels.lr_check import drop_contradicted
+from stages.matching.kernels.lr_check import drop_inconsistent
 from stages.stage import Stage, check_same_time, parameter
 
 
 @dataclass(frozen=True)
 class LeftRightCheck(Stage):
-    """The disparity without the pixels that the right image's disparity contradicts.
+    """The disparity without pixels whose partner in the right image has another disparity.
 
-    `backward` is the disparity of the swapped frame (stages.SwapViews). Where it is unknown it contradicts nothing.
-    What it was not searched for it takes for something else: nearer pixels, from a prior, are not asked
-    (`disparities`).
+    `backward` is the disparity of the swapped frame (stages.SwapViews). Pixels whose partner is unknown are kept, and
+    so are pixels with a disparity that `backward` was not searched for (`disparities`).
     """
 
-    lr_tolerance: float = parameter(1.0, "largest difference that is no contradiction", unit="px", low=0)
+    lr_tolerance: float = parameter(1.0, "largest left-right difference", unit="px", low=0)
     disparities: int = parameter(0, "search range of `backward`; 0: that of `disparity`", unit="px", low=0)
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
@@ -35,8 +34,8 @@ class LeftRightCheck(Stage):
                 "match the swapped frame at the same size"
             )
         check_same_time(self, disparity=disparity.stamp, backward=backward.stamp)
-        found, theirs = ((layer.pixels, layer.source, layer.confidence) for layer in (disparity, backward))
-        pixels, source, confidence = drop_contradicted(
-            found, theirs, self.lr_tolerance, self.disparities or math.inf, self.threads
+        found, right = ((layer.pixels, layer.source, layer.confidence) for layer in (disparity, backward))
+        pixels, source, confidence = drop_inconsistent(
+            found, right, self.lr_tolerance, self.disparities or math.inf, self.threads
         )
         return replace(disparity, pixels=pixels, source=source, confidence=confidence)

@@ -1,7 +1,7 @@
-"""Semi-global matching (Hirschmüller, 2008; section 3.1 of the paper), compiled, in bytes, on any number of cores.
+"""Semi-global matching (Hirschmüller, 2008; section 3.1 of the paper), compiled, on one or two threads.
 
-The cost is the census transform, by default with the truncated gradient difference, smoothed over 3x3. The sums of 8
-paths decide the disparity, its fraction of a pixel, and whether left and right agree, in one go
+The cost is the census transform, by default with the truncated gradient difference, smoothed over 3x3. Byte vectors
+hold the sums of 8 paths. One pass over these sums gives the disparity, its fraction of a pixel and the left-right check
 (stages.matching.kernels.semiglobal).
 """
 
@@ -18,27 +18,31 @@ from flow.contracts import StageError
 from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.matching.kernels.prior_cost import prior_costs
-from stages.matching.kernels.row_ranges import Range, lanes_for, ranges_of, whole_range
-from stages.matching.kernels.semiglobal import match
-from stages.matching.kernels.sgm_local import SearchWindows, windows
+from stages.matching.kernels.row_ranges import Range, lanes_for, row_ranges, whole_range
+from stages.matching.kernels.semiglobal import Matches, match
+from stages.matching.kernels.sgm_local import SearchWindows, windows_around
 from stages.matching.kernels.sgm_params import SgmParams
 from stages.stage import Stage, check_rectified, parameter
 
-SMALLEST_SIDE = 16
-BEYOND = 2.0  # px; a prior so far outside the range says that the match is not in it
-LARGEST_BYTE = 255
+MIN_SIDE = 16  # px, of an image
+MAX_BYTE = 255
+RANGE_TOLERANCE = 2.0  # px; a prior farther outside the search range shows that the match is not in it
+P2_EDGE_SCALE = 10.0  # gray levels, the step of brightness that halves p2
+MAX_PRIOR_DISTANCE = 4.0  # px, from which the prior's cost grows no more
+SPECKLE_RANGE = 1.0  # px, the disparity step that separates patches
+SearchArea = SearchWindows | list[Range]
 
 
 class Cost(NamedTuple):
-    """A matching cost, and what suits it: found on the eight quarter-size Middlebury scenes."""
+    """A matching cost and the constants that suit it, fitted to the eight quarter-size Middlebury scenes."""
 
-    largest: int
-    unseen: int  # where the partner lies outside the right image
+    max_cost: int
+    unseen_cost: int  # where the partner lies outside the right image
     p1: int
     p2: int
-    # Share of matches within 1 px of the truth (among those kept, occluded pixels included, every scene counting the
-    # same) by their lead: by how much the best sum of paths beat all but its neighbours. Least squares, monotone.
-    right: tuple[float, ...]
+    # Share of matches within 1 px of the truth, by their lead (`LEADS`): the difference between the best sum of paths
+    # and the best of all but its neighbours. Occluded pixels count, every scene counts the same. Monotone fit.
+    confidence: tuple[float, ...]
 
 
 LEADS = (0, 20, 40, 60, 80, 100, 120, 140, 160, 180, 200, 220, 240, 254, 255)
@@ -54,136 +58,100 @@ COSTS = {
 
 @dataclass(frozen=True)
 class Match(Stage):
-    """Disparities of a rectified frame; unknown where no unique and consistent match was found.
+    """Disparities of a rectified frame by semi-global matching; `source` says why a pixel has none.
 
-    Penalties count in units of the matching cost: census bits that differ, or with the gradient 1.5 units for each.
-    Colour is converted to gray. `prior`, an earlier or coarser result of the same size, draws the search towards it; it
-    is no evidence, and where it is unknown it says nothing. What it measured nearer than the search range stays
-    unknown, or with `out_of_range` prior as the prior has it: a coarse search reaches nearer, and so near that is no
-    loss. With `max_depth`, what it measured beyond stays unknown, too. Without a prior some of both is taken for
-    something within the range.
+    `prior`, an earlier or coarser result of the same size, attracts the search; it is no evidence. The confidence is
+    the probability that the disparity is right within 1 px, for the default penalties and 8 paths. See
+    docs/matching.md.
 
-    With `search_radius` only what is near to the prior is searched: in a fraction of the time, beyond the range, too,
-    and not at all where the prior is unknown or beyond `max_depth`. Of each pixel `2 search_radius + 7` disparities,
-    rounded up to 16, are searched, which take 2 bytes each, whatever `max_memory` is.
+    References
+    ----------
+    H. Hirschmüller, "Stereo Processing by Semiglobal Matching and Mutual Information", PAMI 30(2), 2008.
 
-    With a `band_height` each band of rows is searched for what the prior has in it, but for a thousandth at either end,
-    and for 8 px more to either side, in all for 64 or 128 disparities or, where that is not enough or the prior knows
-    less than half of the band, the whole range. Rows of ground need little of it, and so less time: the prior should
-    have few holes, for what is in them is found in the band's range only, and what it has outside that is unknown.
-
-    The confidence is the probability that the disparity is right within 1 px, as far as the lead of the best sum of
-    paths over the others tells, with the penalties that suit the cost and 8 paths.
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from stages import Match, StereoCamera, StereoFrame
+    >>> scene = np.random.default_rng(0).integers(0, 256, (48, 85), np.uint8)
+    >>> camera = StereoCamera(fx=100, fy=100, cx=40, cy=24, baseline=0.1, width=80, height=48)
+    >>> disparity = Match(disparities=16)(StereoFrame(0, scene[:, :80], scene[:, 5:], camera))
+    >>> disparity.pixels.shape, round(float(np.nanmedian(disparity.pixels)), 1)
+    ((48, 80), 5.0)
     """
 
     disparities: int = parameter(
-        192, "size of the search range, of which the first and the last only bound the others and are not found",
-        unit="px", low=1, high=1024,
-    )  # fmt: skip
-    min_disparity: int = parameter(0, "smallest disparity searched", unit="px", low=-1024, high=1024)
-    max_depth: float = parameter(
-        0.0, "depth beyond which nothing is of interest and disparities are not searched; 0: no limit", unit="m", low=0
+        192, "number of disparities searched; the two end values are never reported", unit="px", low=1, high=1024
     )
-    cost: str = parameter("census+gradient", "what is compared", choices=tuple(COSTS))
+    min_disparity: int = parameter(0, "smallest disparity searched", unit="px", low=-1024, high=1024)
+    max_depth: float = parameter(0.0, "depth beyond which disparities are not searched; 0: no limit", unit="m", low=0)
+    cost: str = parameter("census+gradient", "matching cost", choices=tuple(COSTS))
     paths: int = parameter(8, "directions of aggregation", choices=(4, 8))
-    p1: int = parameter(0, "penalty of a step of 1 px; 0: the one that suits the cost", low=0, high=100)
-    p2: int = parameter(0, "penalty of a larger step where the image is even; 0: the one that suits", low=0, high=230)
-    p2_edge_scale: float = parameter(10.0, "step of brightness that halves p2", unit="gray levels", low=0.1)
-    uniqueness: int = parameter(0, "by how much the best sum of paths must beat the next", low=0, high=254)
+    p1: int = parameter(
+        0, "penalty of a disparity step of 1 px, in units of the cost (census: bits that differ; with the gradient 1.5"
+        " per bit); 0: suits the cost",
+        low=0, high=100,
+    )  # fmt: skip
+    p2: int = parameter(
+        0, "penalty of a larger step where the image has no edge; 0: suits the cost", low=0, high=230
+    )  # fmt: skip
+    uniqueness: int = parameter(0, "margin by which the best sum of paths must beat the next", low=0, high=254)
     lr_tolerance: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
     max_speckle_size: int = parameter(40, "largest isolated patch that is dropped, in pixels", low=0)
-    speckle_range: float = parameter(1.0, "disparity step that separates patches", unit="px", low=0)
     prior_weight: float = parameter(0.5, "cost of each pixel of distance from the prior", low=0, high=16)
-    max_prior_distance: float = parameter(
-        4.0, "distance from which the prior's cost grows no more", unit="px", low=0, high=64
-    )
     search_radius: int = parameter(
-        0, "how far about the prior, at least, and nowhere else is searched; 0: the whole range",
+        0, "distance from the prior that is searched at least; pixels without a prior are not searched; 0: the whole"
+        " range everywhere",
         unit="px", low=0, high=64,
     )  # fmt: skip
     band_height: int = parameter(
-        0, "of bands of rows, each of which is searched only for what the prior has in it; 0: the whole range",
+        0, "height of bands of rows, each searched for the prior's range of disparities in it; 0: the whole range",
         unit="px", low=0,
     )  # fmt: skip
     out_of_range: str = parameter(
-        "unknown", "what becomes of matches that the prior has nearer than the range", choices=("unknown", "prior")
-    )
+        "unknown", "pixels that the prior has nearer than the range: unknown, or copied from the prior",
+        choices=("unknown", "prior"),
+    )  # fmt: skip
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
     max_memory: int = parameter(
-        400, "for the sums of paths; larger frames are swept in parts, to the same result", unit="MB", low=1
-    )
+        400, "memory for the sums of paths; larger frames are matched in stripes, with the same result",
+        unit="MB", low=1,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.search_radius and self.band_height:
-            raise ValueError(
-                "Match.band_height means nothing with Match.search_radius, which searches less; let one of them be 0"
-            )
-        largest, (p1, p2) = COSTS[self.cost].largest, self._penalties()
+            raise ValueError("Match.band_height has no effect with Match.search_radius; set one of them to 0")
+        max_cost, (p1, p2) = COSTS[self.cost].max_cost, self._penalties()
         if not p2 > p1:
             raise ValueError(f"Match.p2 must be above Match.p1 = {p1}, not {p2}")
-        if largest + p2 > LARGEST_BYTE:
-            raise ValueError(f"Match.p2 must be at most {LARGEST_BYTE - largest} with cost {self.cost}, not {p2}")
+        if max_cost + p2 > MAX_BYTE:
+            raise ValueError(f"Match.p2 must be at most {MAX_BYTE - max_cost} with cost {self.cost}, not {p2}")
 
     def check_inputs(self, inputs: Collection[str]) -> None:
-        """Refuse to search about a prior where none is among the `inputs`, names of ports."""
+        """Raise ValueError if a search near a prior has no prior among the `inputs`, names of ports."""
         for name, value in (("search_radius", self.search_radius), ("band_height", self.band_height)):
             if value and "prior" not in inputs:
-                raise ValueError(f"Match.{name} = {value} px needs a `prior` to search about; name one, or let it be 0")
+                raise ValueError(f"Match.{name} = {value} px needs a `prior`: connect one, or set {name} to 0")
 
     def __call__(self, frame: StereoFrame, prior: Disparity | None = None) -> Disparity:
         self._check(frame, prior)
-        search = self._search(frame.camera)
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
-        where = self._where(prior, search, len(left))
-        guide = None if prior is None else self._guide(prior, search, where)
-        excluded = None if prior is None else self._excluded(prior, search, where)
-        found = match(left, right, self._rule(search), guide, where, excluded, self.threads, self.max_memory << 20)
-        layers = found.pixels, found.source, found.confidence
+        search = self._search_range(frame.camera)
+        area = self._search_area(prior, search, len(left))
+        guide = None if prior is None else self._prior_costs(prior, search, area)
+        excluded = None if prior is None else self._excluded(prior, search, area)
+        found = match(left, right, self._params(search), guide, area, excluded, self.threads, self.max_memory << 20)
         if prior is not None and self.out_of_range == "prior" and not self.search_radius:
-            # The search loses what lies within a pixel or two of its end, too.
-            taken = np.isnan(found.pixels) & (prior.source == PixelOrigin.MEASURED)
-            taken &= (prior.pixels > search.stop - BEYOND) & (prior.pixels < frame.camera.width)
-            for layer, known in zip(layers, (prior.pixels, prior.source, prior.confidence), strict=True):
-                np.copyto(layer, known, where=taken)
-        if self.max_depth:  # what bounds the range reaches a little beyond
-            beyond = found.pixels < self._reach(frame.camera)
-            for layer, unknown in zip(layers, (np.nan, PixelOrigin.OUT_OF_RANGE, 0), strict=True):
-                layer[beyond] = unknown
-        return Disparity(frame.stamp, *layers, camera=frame.camera)
-
-    def _where(self, prior: Disparity | None, search: range, rows: int) -> SearchWindows | list[Range]:
-        """Where to search, and what for."""
-        if prior is not None and self.search_radius:
-            return windows(prior.pixels, self.search_radius, search.start, self.threads)
-        if prior is not None and self.band_height:
-            return ranges_of(prior.pixels, self.band_height, search.start, len(search), self.threads)
-        return whole_range(rows, len(search))
-
-    def _excluded(self, prior: Disparity, search: range, where: SearchWindows | list[Range]) -> Array:
-        """Why pixels are excluded from the search, (H, W) uint8: codes of `PixelOrigin`, 0 where they are searched.
-
-        The prior shows that their match is not in the range. With `search_radius`, pixels without a prior are excluded
-        too, for the prior's own reason where it has one.
-        """
-        if isinstance(where, SearchWindows):
-            guided = (prior.pixels >= search.start - BEYOND) & (prior.pixels < prior.pixels.shape[1])
-            reason = np.where(prior.source > PixelOrigin.FILLED, prior.source, np.uint8(PixelOrigin.OUT_OF_RANGE))
-            return np.where(guided, np.uint8(0), reason)
-        excluded = np.empty(prior.pixels.shape, bool)
-        for each in where:
-            rows, first = slice(each.top, each.end), search.start + each.first
-            excluded[rows] = prior.pixels[rows] > first + min(each.width.lanes, len(search)) + BEYOND
-            if first > self.min_disparity:
-                excluded[rows] |= prior.pixels[rows] < first - BEYOND
-        excluded &= prior.source == PixelOrigin.MEASURED
-        return excluded * np.uint8(PixelOrigin.OUT_OF_RANGE)
+            _copy_nearer(prior, search, found)
+        if self.max_depth:
+            _drop_farther(self._max_depth_disparity(frame.camera), found)
+        return Disparity(frame.stamp, *found, camera=frame.camera)
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
         height, width = frame.left.shape[:2]
         check_rectified(self, frame)
-        if min(height, width) < SMALLEST_SIDE:
-            raise StageError(f"Match: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
+        if min(height, width) < MIN_SIDE:
+            raise StageError(f"Match: images are {width}x{height}, each side must be at least {MIN_SIDE} px")
         if not -width < self.min_disparity < width:
             raise StageError(
                 f"Match.min_disparity = {self.min_disparity} px leaves nothing to compare in images {width} px wide"
@@ -194,47 +162,88 @@ class Match(Stage):
         if prior is not None and prior.pixels.shape != (height, width):
             raise StageError(
                 f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; "
-                "stages.Upsample makes a coarser one fit"
+                "enlarge a coarser prior by stages.Upsample"
             )
+
+    def _search_range(self, camera: StereoCamera) -> range:
+        """The disparities that are searched; with `search_radius` only its start counts."""
+        search = range(self.min_disparity, self.min_disparity + self.disparities)
+        if not self.max_depth:
+            return search
+        last = camera.width if self.search_radius else search.stop - 1
+        reach = self._max_depth_disparity(camera)
+        if reach >= last:
+            raise StageError(
+                f"Match.max_depth = {self.max_depth} m leaves nothing to search: a depth of {self.max_depth} m is a "
+                f"disparity of {reach:.0f} px, and {last} px is the largest searched"
+            )
+        first = math.floor(reach) - 1  # the first value of a range is never reported
+        return range(max(search.start, first), max(search.stop, first + 1))
+
+    def _max_depth_disparity(self, camera: StereoCamera) -> float:
+        return camera.fx * camera.baseline / self.max_depth - (camera.cx_right - camera.cx)
+
+    def _search_area(self, prior: Disparity | None, search: range, rows: int) -> SearchArea:
+        """The disparities that are searched at each pixel, or in each band of rows."""
+        if prior is not None and self.search_radius:
+            return windows_around(prior.pixels, self.search_radius, search.start, self.threads)
+        if prior is not None and self.band_height:
+            return row_ranges(prior.pixels, self.band_height, search.start, len(search), self.threads)
+        return whole_range(rows, len(search))
+
+    def _prior_costs(self, prior: Disparity, search: range, area: SearchArea) -> tuple[Array, Array]:
+        if isinstance(area, SearchWindows):
+            first, lanes = area.first, area.width.lanes
+        else:
+            firsts = [np.full((each.end - each.top, 1), search.start + each.first, np.int32) for each in area]
+            first, lanes = np.concatenate(firsts), lanes_for(len(search))
+        return prior_costs(prior.pixels, first, lanes, self.prior_weight, MAX_PRIOR_DISTANCE, self.threads)
+
+    def _excluded(self, prior: Disparity, search: range, area: SearchArea) -> Array:
+        """Why pixels are excluded from the search, (H, W) uint8: codes of `PixelOrigin`, 0 where they are searched.
+
+        The prior shows that their match is not in the range. With `search_radius`, pixels without a prior are excluded
+        as well, for the prior's own reason where it has one.
+        """
+        if isinstance(area, SearchWindows):
+            guided = (prior.pixels >= search.start - RANGE_TOLERANCE) & (prior.pixels < prior.pixels.shape[1])
+            reason = np.where(prior.source > PixelOrigin.FILLED, prior.source, np.uint8(PixelOrigin.OUT_OF_RANGE))
+            return np.where(guided, np.uint8(0), reason)
+        excluded = np.empty(prior.pixels.shape, bool)
+        for each in area:
+            rows, first = slice(each.top, each.end), search.start + each.first
+            excluded[rows] = prior.pixels[rows] > first + min(each.width.lanes, len(search)) + RANGE_TOLERANCE
+            if first > self.min_disparity:
+                excluded[rows] |= prior.pixels[rows] < first - RANGE_TOLERANCE
+        excluded &= prior.source == PixelOrigin.MEASURED
+        return excluded * np.uint8(PixelOrigin.OUT_OF_RANGE)
 
     def _penalties(self) -> tuple[int, int]:
         cost = COSTS[self.cost]
         return self.p1 or cost.p1, self.p2 or cost.p2
 
-    def _search(self, camera: StereoCamera) -> range:
-        """The disparities that are searched; with `search_radius` the first of them counts."""
-        search = range(self.min_disparity, self.min_disparity + self.disparities)
-        if not self.max_depth:
-            return search
-        largest = camera.width if self.search_radius else search.stop - 1
-        reach = self._reach(camera)
-        if reach >= largest:
-            raise StageError(
-                f"Match.max_depth = {self.max_depth} m leaves nothing to search: a depth of {self.max_depth} m is a "
-                f"disparity of {reach:.0f} px, and {largest} px is the largest searched"
-            )
-        limit = math.floor(reach) - 1  # the first that is searched is not found
-        return range(max(search.start, limit), max(search.stop, limit + 1))
-
-    def _reach(self, camera: StereoCamera) -> float:
-        """The disparity of `max_depth`, px."""
-        return camera.fx * camera.baseline / self.max_depth - (camera.cx_right - camera.cx)
-
-    def _rule(self, search: range) -> SgmParams:
+    def _params(self, search: range) -> SgmParams:
         cost, (p1, p2) = COSTS[self.cost], self._penalties()
-        falling = np.maximum(p1 + 2, np.round(p2 / (1 + np.arange(256) / self.p2_edge_scale)))
-        confidence = np.interp(np.arange(256), LEADS, cost.right).astype(np.float32)
+        falling = np.maximum(p1 + 2, np.round(p2 / (1 + np.arange(256) / P2_EDGE_SCALE)))
+        confidence = np.interp(np.arange(256), LEADS, cost.confidence).astype(np.float32)
         confidence[0] = 0  # unknown
         return SgmParams(
-            self.cost == "census+gradient", self.paths == 8, p1, np.minimum(falling, p2).astype(np.uint8), cost.unseen,
-            len(search), search.start, self.uniqueness, self.lr_tolerance, self.speckle_range, self.max_speckle_size,
-            confidence,
+            gradient=self.cost == "census+gradient", diagonals=self.paths == 8, p1=p1,
+            p2_table=np.minimum(falling, p2).astype(np.uint8), unseen_cost=cost.unseen_cost, disparities=len(search),
+            min_disparity=search.start, uniqueness=self.uniqueness, lr_tolerance=self.lr_tolerance,
+            speckle_range=SPECKLE_RANGE, max_speckle_size=self.max_speckle_size, confidence_of=confidence,
         )  # fmt: skip
 
-    def _guide(self, prior: Disparity, search: range, where: SearchWindows | list[Range]) -> tuple[Array, Array]:
-        if isinstance(where, SearchWindows):
-            first, lanes = where.first, where.width.lanes
-        else:
-            firsts = [np.full((each.end - each.top, 1), search.start + each.first, np.int32) for each in where]
-            first, lanes = np.concatenate(firsts), lanes_for(len(search))
-        return prior_costs(prior.pixels, first, lanes, self.prior_weight, self.max_prior_distance, self.threads)
+
+def _copy_nearer(prior: Disparity, search: range, found: Matches) -> None:
+    """Copy into `found` the pixels that the prior measures at or beyond the near end of the search range."""
+    copied = np.isnan(found.pixels) & (prior.source == PixelOrigin.MEASURED)
+    copied &= (prior.pixels > search.stop - RANGE_TOLERANCE) & (prior.pixels < prior.pixels.shape[1])
+    for layer, known in zip(found, (prior.pixels, prior.source, prior.confidence), strict=True):
+        np.copyto(layer, known, where=copied)
+
+
+def _drop_farther(reach: float, found: Matches) -> None:
+    """Drop disparities below `reach`, px: the search range extends a little farther."""
+    farther = found.pixels < reach
+    found.pixels[farther], found.source[farther], found.confidence[farther] = np.nan, PixelOrigin.OUT_OF_RANGE, 0

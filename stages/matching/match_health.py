@@ -1,7 +1,7 @@
-"""CheckMatches: is the ground right before the rover matched?
+"""CheckMatches: the share of the nearest ground that is matched.
 
-It is the ground with the most texture and the largest disparities. Where it is not matched, the search ends short of
-it, or something is wrong with the images; and what is found there all the same is noise, which makes pits in a map.
+The nearest ground has the most texture and the largest disparities. If it is not matched, the search range is too small
+or the images are unsuitable, and the matches that remain are noise, which makes pits in a map.
 """
 
 from __future__ import annotations
@@ -10,49 +10,51 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flow.contracts import Finding, Severity, counted
+from flow.contracts import Finding, Severity
 from stages.data import Disparity, MatchHealth, Mount, PixelOrigin, Tilt
 from stages.stage import Stage, parameter
+
+NEAR_ROWS = 0.125  # share of the rows that show the nearest ground
 
 
 @dataclass(frozen=True)
 class CheckMatches(Stage):
-    """Counts matches, and warns at the end if in most frames the ground before the rover had few; it remembers."""
+    """The matched share of each frame, and a warning at the end of a run if little of the nearest ground is matched.
 
-    near_rows: float = parameter(
-        0.125, "share of the rows that show that ground: the lowest, of a camera that hangs the highest",
-        low=0.01, high=1.0,
-    )  # fmt: skip
-    min_matched: float = parameter(0.7, "share of it that must be matched", low=0.0, high=1.0)
+    The nearest ground is in the lowest eighth of the rows, or in the highest if the camera hangs upside down.
+    """
+
+    min_matched: float = parameter(
+        0.7, "share of the nearest ground that must be matched, in the median of the frames", low=0.0, high=1.0
+    )
 
     def start(self) -> list[float]:
-        """The share that was matched in each frame of one run; none yet."""
+        """The matched shares of the nearest ground, one for each frame of a run; none yet."""
         return []
 
     def __call__(
         self, disparity: Disparity, tilt: Tilt | None = None, mount: Mount | None = None, *, state: list[float]
     ) -> MatchHealth:
-        """What is matched, of the right half of the image: part of the left one no other camera sees.
+        """The matched share of the right half of the image; the right camera does not see all of the left half.
 
-        tilt, mount: tell a camera that hangs; without them it is taken to stand.
+        tilt, mount: the direction of gravity in the camera; without them the camera is assumed to be upright.
         """
         height, width = disparity.pixels.shape
         source = disparity.source[:, width // 2 :]
         matched = (source == PixelOrigin.MEASURED) | (source == PixelOrigin.PLANE)
-        rows = max(1, round(self.near_rows * height))
+        rows = max(1, round(NEAR_ROWS * height))
         hangs = tilt is not None and mount is not None and (mount.camera_from_inclinometer @ tilt.up)[1] > 0
         near = float((matched[:rows] if hangs else matched[-rows:]).mean())
         state.append(near)
         return MatchHealth(disparity.stamp, float(matched.mean()), near)
 
     def finding(self, state: list[float]) -> Finding | None:
-        """A warning where that is less than `min_matched` in the median of the frames."""
+        """A warning if the median of the frames is below `min_matched`."""
         if not state or np.median(state) >= self.min_matched:
             return None
         return Finding(
-            f"of the nearest ground in view {100 * np.median(state):.0f} % is matched (median of "
-            f"{counted(len(state), 'frame')}), what else the map has there may be wrong: set `disparities` larger "
-            "if that ground is nearer than the search reaches; or else the images are dark, blurred, bare, or left for "
-            "right",
+            f"Only {100 * np.median(state):.0f} % of the nearest ground is matched, so the map is unreliable there. If "
+            "that ground is closer than the search range, increase `disparities`; otherwise check for dark, blurred or "
+            "textureless images, or swapped cameras.",
             Severity.WARNING,
         )

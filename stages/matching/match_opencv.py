@@ -1,7 +1,7 @@
 """Semi-global matching (Hirschmüller, 2008; section 3.1 of the paper), by OpenCV's StereoSGBM.
 
-The images are widened to the left by the disparity range, so that the left margin, where the matcher would otherwise
-stay silent, keeps the matches that lie inside the right image; those that would lie outside are dropped.
+The images are widened to the left by the disparity range, because StereoSGBM returns no disparities in the left margin.
+Matches whose partner lies outside the right image are dropped.
 """
 
 from __future__ import annotations
@@ -18,19 +18,33 @@ from stages.stage import Stage, check_rectified, parameter
 
 F32 = np.float32
 MODES = {3: cv2.STEREO_SGBM_MODE_SGBM_3WAY, 5: cv2.STEREO_SGBM_MODE_SGBM, 8: cv2.STEREO_SGBM_MODE_HH}
-SMALLEST_SIDE = 32
-NEIGHBOURHOOD = 31  # side, px, of the window in which the share of known disparities is counted
-DEVIATION = 0.5  # px from the local median that halve the confidence
-UNKNOWN_LEVEL = -1e4  # stands for unknown in the median only: a pixel in the minority of a hole's rim agrees with none
+MIN_SIDE = 32
+DENSITY_WINDOW = 31  # px, side of the window in which the share of known disparities is counted
+HALF_CONFIDENCE_DEVIATION = 0.5  # px from the local median that halve the confidence
+UNKNOWN_LEVEL = -1e4  # stands for unknown in the median, so a pixel surrounded by holes agrees with none
 
 
 @dataclass(frozen=True)
 class MatchOpenCV(Stage):
-    """Disparities of a rectified frame, to 1/16 px; unknown where no unique, consistent and textured match was found.
+    """Disparities of a rectified frame by OpenCV's StereoSGBM, to 1/16 px.
 
-    `disparities` is rounded up to a multiple of 16. The confidence is a heuristic, not a probability: a match counts
-    for less the more of its neighbourhood found none and the farther it is from the median around it. (On the eight
-    quarter-size Middlebury scenes this ranks wrong matches better than texture or photometric difference do.)
+    `disparities` is rounded up to a multiple of 16. The confidence is a heuristic, not a probability: it falls with the
+    share of unknown pixels in the neighbourhood and with the distance from the local median. On the quarter-size
+    Middlebury scenes it ranks wrong matches better than texture or photometric difference.
+
+    References
+    ----------
+    https://docs.opencv.org/4.x/d2/d85/classcv_1_1StereoSGBM.html
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from stages import MatchOpenCV, StereoCamera, StereoFrame
+    >>> scene = np.random.default_rng(0).integers(0, 256, (48, 85), np.uint8)
+    >>> camera = StereoCamera(fx=100, fy=100, cx=40, cy=24, baseline=0.1, width=80, height=48)
+    >>> disparity = MatchOpenCV(disparities=16)(StereoFrame(0, scene[:, :80], scene[:, 5:], camera))
+    >>> float(np.nanmedian(disparity.pixels))
+    5.0
     """
 
     disparities: int = parameter(192, "size of the search range", unit="px", low=16, high=1024)
@@ -42,9 +56,9 @@ class MatchOpenCV(Stage):
     p1: float = parameter(2.0, "penalty of a step of 1 px, times channels * block^2 (as the paper's authors)", low=0.1)
     p2: float = parameter(24.0, "penalty of a larger step, times channels * block^2; above p1", low=0)
     prefilter_cap: int = parameter(
-        63, "largest horizontal gradient that the matching cost tells apart, gray levels", low=1, high=63
+        63, "largest horizontal gradient that the matching cost distinguishes, gray levels", low=1, high=63
     )
-    uniqueness: int = parameter(1, "percent by which the best cost must beat the next", low=0, high=100)
+    uniqueness: int = parameter(1, "margin in percent by which the best cost must beat the next", low=0, high=100)
     lr_tolerance: int = parameter(1, "largest left-right difference", unit="px", low=1, high=64)
     max_speckle_size: int = parameter(100, "largest isolated patch that is dropped, in pixels", low=0)
     speckle_range: int = parameter(1, "disparity step that separates patches", unit="px", low=1)
@@ -76,15 +90,15 @@ class MatchOpenCV(Stage):
         source. StereoSGBM does not report why the uniqueness or left-right check failed: that is UNKNOWN.
         """
         height, width = left.shape[:2]
-        if min(height, width) < SMALLEST_SIDE:
-            raise StageError(f"MatchOpenCV: images are {width}x{height}, each side must be at least {SMALLEST_SIDE} px")
+        if min(height, width) < MIN_SIDE:
+            raise StageError(f"MatchOpenCV: images are {width}x{height}, each side must be at least {MIN_SIDE} px")
         levels = -(-self.disparities // 16) * 16
         before, after = max(0, self.min_disparity + levels), max(0, -self.min_disparity)
         left, right = (
             cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right)
         )  # fmt: skip
         scale = (1 if left.ndim == 2 else 3) * self.block_size**2
-        # A matcher keeps its buffers and is not re-entrant; a new one per frame costs little and leaves nothing behind.
+        # A matcher keeps its buffers and is not re-entrant; a new one for each frame costs little.
         matcher = cv2.StereoSGBM.create(
             minDisparity=self.min_disparity, numDisparities=levels, blockSize=self.block_size,
             P1=max(1, round(self.p1 * scale)), P2=round(self.p2 * scale), disp12MaxDiff=self.lr_tolerance,
@@ -115,9 +129,9 @@ def _texture(image: Array, block: int) -> Array:
 
 
 def _agreement(pixels: Array, known: Array) -> Array:
-    """How well each known disparity is backed by those around it, (H, W) float32 in [0, 1]; 0 where unknown."""
+    """The agreement of each disparity with its neighbours, (H, W) float32 in [0, 1]; 0 where unknown."""
     median = cv2.medianBlur(np.where(known, pixels, F32(UNKNOWN_LEVEL)), 5)
-    density = cv2.blur(known.astype(np.float32), (NEIGHBOURHOOD, NEIGHBOURHOOD))
+    density = cv2.blur(known.astype(np.float32), (DENSITY_WINDOW, DENSITY_WINDOW))
     with np.errstate(invalid="ignore"):
-        agreement = density**4 / (1 + np.abs(median - pixels) / F32(DEVIATION))
+        agreement = density**4 / (1 + np.abs(median - pixels) / F32(HALF_CONFIDENCE_DEVIATION))
     return np.where(known, np.minimum(agreement, 1), F32(0))

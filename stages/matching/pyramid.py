@@ -1,7 +1,7 @@
-"""Half size and back: how a coarse result becomes the prior of a fine one, and the pair as the right camera sees it.
+"""The match pyramid (coarse to fine): frames at half size, disparities at double size, and the views swapped.
 
-At half size the pixels are a quarter as many, and as long a range reaches twice as near. Noise averages out and weak
-texture gains contrast. What is found there guides the search at full size.
+A frame at half size has a quarter of the pixels, and the same search range reaches twice as near. Noise averages out
+and weak texture gains contrast. The result guides the search at full size.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import cv2
 from flow.contracts import StageError
 from stages.data import Disparity, StereoFrame
 from stages.matching.kernels.resample import doubled, halved
-from stages.matching.match import SMALLEST_SIDE
+from stages.matching.match import MIN_SIDE
 from stages.stage import Stage, check_rectified, check_same_time, parameter
 
 
@@ -26,13 +26,13 @@ class Halve(Stage):
         full_height, full_width = frame.left.shape[:2]
         left, right = halved(frame.left), halved(frame.right)
         height, width = left.shape[:2]
-        if min(height, width) < SMALLEST_SIDE:
+        if min(height, width) < MIN_SIDE:
             raise StageError(
                 f"Halve: images are {full_width}x{full_height}, too small to be matched at half size: each side must "
-                f"be at least {2 * SMALLEST_SIDE - 1} px; use a pipeline without stages.Halve, such as paper"
+                f"be at least {2 * MIN_SIDE - 1} px; use a pipeline without stages.Halve, such as paper"
             )
         camera = frame.camera
-        # Pixel centres are whole numbers: what was at u is at (u + 0.5) / 2 - 0.5.
+        # Pixel centres are whole numbers: u becomes (u + 0.5) / 2 - 0.5.
         cx, cy, cx_right = ((value + 0.5) / 2 - 0.5 for value in (camera.cx, camera.cy, camera.cx_right))
         small = replace(
             camera, fx=camera.fx / 2, fy=camera.fy / 2, cx=cx, cy=cy, cx_right=cx_right, width=width, height=height
@@ -42,10 +42,9 @@ class Halve(Stage):
 
 @dataclass(frozen=True)
 class Upsample(Stage):
-    """A disparity image of half size at the size of a frame: a prior for matching the frame.
+    """A disparity image of half size, enlarged to the size of a frame: a prior for matching the frame.
 
-    Each value, twice as large, stands for the pixel and, between pixels of one surface, for the line between them.
-    Source and confidence are those of the nearest pixel.
+    Disparities are doubled, and interpolated within a surface. Source and confidence are those of the nearest pixel.
     """
 
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
@@ -66,7 +65,7 @@ class Upsample(Stage):
 
 @dataclass(frozen=True)
 class SwapViews(Stage):
-    """The pair as the right camera sees it: the images exchanged and mirrored, so that disparities stay positive.
+    """The frame of the right camera's view: the images exchanged and mirrored, so that disparities stay positive.
 
     The disparity of a swapped frame, mirrored back, is that of the right image.
     """

@@ -1,11 +1,11 @@
 """Rectification: both images resampled so that corresponding points lie on the same row.
 
-Each camera's undistortion and rectifying rotation are folded into one table of source positions (Bouguet's method, as
-in image_pipeline), computed once per camera and then only looked up. What the calibration leaves of a row offset is
-measured (stages.rectification.row_offset) and folded into the right camera's table.
+One table of source positions combines undistortion and rectifying rotation (Bouguet's method, as in image_pipeline).
+It is computed once per camera. The row offset that the calibration leaves is measured (stages.rectification.row_offset)
+and added to the right camera's table.
 
-A right camera whose principal point lies farther right than the left one's has disparities below 0 for all that is far
-off, which no matcher searches by itself: then its image is moved to the left by whole columns.
+If the principal point of the right camera lies farther right than that of the left one, distant points have negative
+disparities, which matchers do not search by default. Then the right image is moved to the left by whole columns.
 """
 
 from __future__ import annotations
@@ -27,32 +27,44 @@ from stages.matching.intensity import eight_bit, gray
 from stages.rectification.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
 from stages.stage import Stage, parameter
 
-LARGEST_OFFSET = 64.0  # px
-UNUSUAL = 8.0  # px, more than a calibration leaves
-MOST_CROSSED = 0.5  # of the features
-LEAST_NEGATIVE = 0.05  # of them, where chance makes less than 0.01
+MAX_ROW_OFFSET = 64.0  # px
+UNUSUAL_ROW_OFFSET = 8.0  # px, more than a calibration leaves
+MAX_CROSSED_SHARE = 0.5  # of the features, beyond infinity
+MIN_NEGATIVE_SHARE = 0.05  # of the features, with negative disparity; chance makes less than 0.01
 
 
 @dataclass(frozen=True)
 class Rectify(Stage):
-    """A stereo frame with row-aligned images; rectified input passes through but for these corrections.
+    """A stereo frame with row-aligned images; rectified input is only corrected by row offset and columns.
 
-    Pixels that no raw pixel maps to are 0. A run measures row offset and columns once, on frames from all over the log
-    (`survey`), and corrects all frames alike; called on a single frame the stage measures that frame's own.
+    Pixels without a raw pixel are 0. A run measures row offset and columns once, on frames of the whole log (`survey`),
+    and corrects all frames alike. A call on a single frame measures them on that frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from stages import CameraModel, Rectify, StereoCamera, StereoFrame
+    >>> k, p = np.diag([100, 100, 1]), np.diag([100, 100, 1, 0])[:3]
+    >>> raw = CameraModel(width=80, height=48, k=k, d=np.zeros(5), r=np.eye(3), p=p)
+    >>> camera = StereoCamera(100, 100, 0, 0, baseline=0.1, width=80, height=48, raw=(raw, raw))
+    >>> image = np.full((48, 80), 7, np.uint8)
+    >>> rectified = Rectify(row_offset=0.0)(StereoFrame(0, image, image, camera))
+    >>> rectified.camera.raw is None, bool((rectified.left == image).all())
+    (True, True)
     """
 
     row_offset: float | tuple[float, ...] | None = parameter(
         None,
-        "rows by which rectification leaves a point lower in the left image than in the right one (v_left - v_right);"
-        " the right image is moved down by as many. A number, or the weights of 1, x, y, xy, y^2 (from the centre, in"
-        " widths and heights); by default measured, and corrected where the evidence is clear",
+        "rows by which a point lies lower in the left rectified image than in the right one (v_left - v_right); the"
+        " right image is moved down by them. A number, or the weights of 1, x, y, xy, y^2 (from the centre, in widths"
+        " and heights); default: measured, and corrected if the evidence is clear",
         unit="px",
     )
     columns: int | None = parameter(
         None,
-        "columns by which the right image is moved to the left; by default as many as its principal point lies farther"
-        " right, where the images show that this much is needed for disparities not to be below 0. What is nearest has"
-        " then larger disparities, and of a rectified image as many columns at its left edge are lost",
+        "columns by which the right image is moved to the left, which adds them to all disparities; a rectified image"
+        " loses them at its left edge. Default: the distance of the principal points, if the images show that it is"
+        " needed for disparities of at least 0",
         unit="px", low=0, high=1024,
     )  # fmt: skip
 
@@ -63,9 +75,9 @@ class Rectify(Stage):
             object.__setattr__(self, "row_offset", tuple(given))
         terms = given if isinstance(given, tuple | list) else (0.0 if given is None else given,)
         numbers = all(isinstance(term, Real) and not isinstance(term, bool) for term in terms)
-        if not (numbers and 1 <= len(terms) <= MODELS[0] and all(abs(term) <= LARGEST_OFFSET for term in terms)):
+        if not (numbers and 1 <= len(terms) <= MODELS[0] and all(abs(term) <= MAX_ROW_OFFSET for term in terms)):
             raise ValueError(
-                f"Rectify.row_offset must be one to {MODELS[0]} numbers, each at most {LARGEST_OFFSET:g} px, "
+                f"Rectify.row_offset must be one to {MODELS[0]} numbers, each at most {MAX_ROW_OFFSET:g} px, "
                 f"not {given!r}"
             )
 
@@ -81,14 +93,14 @@ class Rectify(Stage):
 
     @property
     def surveys(self) -> bool:
-        """Whether the stage wants to see frames of the whole log before it is called: unless it is told all."""
+        """Whether the stage needs frames of the whole log before the first call: unless both parameters are set."""
         return self.row_offset is None or self.columns is None
 
     def survey(self, frame: Sequence[StereoFrame]) -> tuple[Rectify, Finding | None]:
-        """The stage with the row offset and the columns that suit all frames, and what there is to say about it."""
+        """The stage with the row offset and the columns that suit all frames, and a finding about them."""
         plain = []
         for each in frame:
-            with suppress(ValueError):  # the run will meet the frame again, and say what is the matter with it
+            with suppress(ValueError):  # the run reports this frame when it reaches it
                 plain.append(_rectified(each))
         camera = plain[0].camera if plain else None
         moves = camera is not None and self._may_move(camera)
@@ -103,15 +115,15 @@ class Rectify(Stage):
         return replace(stage, columns=columns), _joined(found)
 
     def _may_move(self, camera: StereoCamera) -> bool:
-        """Whether the images have to tell if the right one is moved."""
+        """Whether the images decide if the right one is moved."""
         return self.columns is None and _infinity(camera) < 0
 
     def _fitted(self, plain: Sequence[StereoFrame], offset: RowOffset | None) -> tuple[Rectify, Finding]:
-        """The stage with the row offset of frames that are rectified but for it, and what there is to say of that."""
+        """The stage with the row offset measured on rectified frames, and a finding about it."""
         if offset is None:
             unclear = "the row offset is not clear from the images; none is corrected"
             return replace(self, row_offset=0.0), Finding(unclear)
-        if offset.crossed > MOST_CROSSED:
+        if offset.crossed > MAX_CROSSED_SHARE:
             swapped = (
                 f"{offset.crossed:.0%} of the features that both images show look farther than infinity: left and "
                 "right are swapped, or the calibration is not that of these images; exchange 'left' and 'right' of the "
@@ -126,7 +138,7 @@ class Rectify(Stage):
         if not offset.clear:
             return replace(self, row_offset=0.0), Finding(f"{found}: too little to correct")
         severity = Severity.NOTE
-        if offset.largest > UNUSUAL:
+        if offset.largest > UNUSUAL_ROW_OFFSET:
             severity = Severity.WARNING
             found += "; so much is unusual: are the images rectified, and with this calibration?"
         sentence = f"{found}; corrected, as row_offset={list(terms)} would"
@@ -158,14 +170,13 @@ def _measured(frames: Sequence[StereoFrame]) -> RowOffset | None:
 
 
 def _columns_needed(camera: StereoCamera, offset: RowOffset | None) -> int:
-    """By how much to move the right image to the left, as far as the features of `offset` tell. Near scenes that were
-    taken by such cameras may well lack disparities below 0."""
-    shown = offset is not None and offset.negative >= LEAST_NEGATIVE and offset.crossed <= MOST_CROSSED
+    """The columns by which to move the right image to the left: 0 unless enough features have negative disparities."""
+    shown = offset is not None and offset.negative >= MIN_NEGATIVE_SHARE and offset.crossed <= MAX_CROSSED_SHARE
     return math.ceil(max(-_infinity(camera), 0.0)) if shown else 0
 
 
 def _rectified(frame: StereoFrame, row_terms: tuple[float, ...] = (), columns: int = 0) -> StereoFrame:
-    """The frame rectified, its right image moved down by the offset of these terms, and to the left."""
+    """The rectified frame, its right image moved down by the row offset and to the left by `columns`."""
     camera, terms = frame.camera, row_terms if any(row_terms) else ()
     left, right = frame.left, frame.right
     if camera.raw is not None:
@@ -189,15 +200,17 @@ def _frozen(model: CameraModel) -> tuple[str, int, int, bytes]:
 def _rectifying_maps(
     model: str, width: int, height: int, values: bytes, terms: tuple[float, ...], first: int
 ) -> tuple[Array, Array]:
-    """Where in the raw image each rectified pixel lies, moved down by the offset, in cv2.remap's fixed point; from the
-    rectified column `first` on."""
+    """Positions of the rectified pixels in the raw image, moved down by the row offset, from column `first` on.
+
+    They are in cv2.remap's fixed point.
+    """
     numbers = np.frombuffer(values)
     k, r, p, d = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:30].reshape(3, 4), numbers[30:]
     if wrong := CameraModel(width, height, k, d, r, p, model).unusable:
         raise StageError(f"Rectify: {wrong}")
     undistort = cv2.fisheye.initUndistortRectifyMap if model == "equidistant" else cv2.initUndistortRectifyMap
     down = offset_field(terms, width, height, first)
-    above = int(np.ceil(np.abs(down).max())) if terms else 0  # rows beyond the image that the offset may look up
+    above = int(np.ceil(np.abs(down).max())) if terms else 0  # rows beyond the image that the offset may need
     projection = p[:, :3].copy()
     projection[:2, 2] += -first, above
     x, y = undistort(k, d, r, projection, (width, height + 2 * above), cv2.CV_32FC1)

@@ -18,8 +18,10 @@ WINDOW = 5  # px, of the census
 
 
 def contrast(image: Array, first: int, end: int) -> Array:
-    """By how much the gray levels in the windows of the pixels of rows first to end of an image (H, W) uint8 differ,
-    (end - first, W) uint8."""
+    """The range of the gray levels in the window of each pixel of rows first to end, (end - first, W) uint8.
+
+    image: (H, W) uint8.
+    """
     rows, own = with_margin(image, first, end, WINDOW // 2)
     return np.asarray(cv2.morphologyEx(rows, cv2.MORPH_GRADIENT, np.ones((WINDOW, WINDOW), np.uint8))[own])
 

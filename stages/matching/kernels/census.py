@@ -1,9 +1,9 @@
 """Census cost: how many of the 24 comparisons of a pixel with its 5x5 neighbourhood differ between left and right.
 
-(Zabih and Woodfill, 1994.) Each comparison, "is the neighbour darker", is a bit, so that the cost does not feel a
-change of exposure or gain. The trick is the layout. The bits are kept as 3 planes of bytes, and the right image runs
-backwards: then the right partners of one left pixel, disparity after disparity, are neighbours in memory, and 64
-costs are three times one load, one exclusive or and one count of bits.
+(Zabih and Woodfill, 1994.) Each comparison, "is the neighbour darker", is a bit, so the cost does not depend on
+exposure and gain. The trick is the layout: the bits are 3 planes of bytes, and the right image is mirrored. Then the
+partners of a left pixel, disparity after disparity, are neighbours in memory, and 64 costs take three times one load,
+one exclusive or and one count of bits.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 from stages.compiled.jit import kernel, part
 from stages.compiled.simd import (
     Width,
-    both,
+    bit_and,
+    bit_or,
+    bit_xor,
+    broadcast,
     byte,
-    either,
-    exclusive_or,
+    count_ones,
     lanes_in,
     load,
     minus_capped,
-    ones,
     plus,
-    spread,
     store,
     where_less,
 )  # fmt: skip
@@ -32,24 +32,24 @@ from stages.data import Array
 BITS = 24
 PLANES = BITS // 8
 OFFSETS = tuple((dy, dx) for dy in range(-2, 3) for dx in range(-2, 3) if (dy, dx) != (0, 0))
-BLOCK = 64  # pixels described at a time
+LANES = 64  # pixels at a time
 
 
 def census(image: Array, planes: Array, mirrored: bool = False) -> None:
     """Write the comparisons of each pixel into `planes`.
 
     image: (H, W) uint8, its own border replicated beyond; planes: (H, at least 3, at least W rounded up to 64) uint8,
-    of which the first three are written, and more than W columns; mirrored: the image is flipped left to right, and
-    the bits are to be those it had before.
+    whose first three planes are written, in more than W columns; mirrored: the image is flipped left to right, and the
+    bits are those of the image before the flip.
     """
-    columns = -(-image.shape[1] // BLOCK) * BLOCK
+    columns = -(-image.shape[1] // LANES) * LANES
     padded = cv2.copyMakeBorder(image, 2, 2, 2, 2 + columns - image.shape[1], cv2.BORDER_REPLICATE)
-    _census(padded, -1 if mirrored else 1, planes, columns, Width(BLOCK))
+    _census(padded, -1 if mirrored else 1, planes, columns, Width(LANES))
 
 
 @kernel
 def _census(image, sign, planes, columns, width):
-    nothing, stride = spread(0, width), image.shape[1]
+    nothing, stride = broadcast(0, width), image.shape[1]
     for y in range(planes.shape[0]):
         for x in range(0, columns, lanes_in(width)):
             at = (y + 2) * stride + x + 2
@@ -59,7 +59,7 @@ def _census(image, sign, planes, columns, width):
                 for dx in range(-2, 3):
                     if dy != 0 or dx != 0:
                         neighbour = load(image, at + dy * stride + sign * dx, width)
-                        plane = either(plane, where_less(neighbour, centre, spread(1 << (bit & 7), width), nothing))
+                        plane = bit_or(plane, where_less(neighbour, centre, broadcast(1 << (bit & 7), width), nothing))
                         bit += 1
                         if bit & 7 == 0:
                             store(planes[y, (bit >> 3) - 1], x, plane)
@@ -78,37 +78,36 @@ def census_reference(image: Array, mirrored: bool = False) -> Array:
 
 
 @part
-def census_costs(left, right, pair, unseen, x, i, width):
+def census_costs(left, right, inputs, unseen_cost, x, i, width):
     """The costs of pixel x of a row at each disparity.
 
-    left, right: the row's planes in pair, `pair.MatchingInputs`, of which the right ones run backwards; i: where they
-    hold the partner at the first disparity, followed by the others; unseen: the cost where a partner is outside the
-    image.
+    left, right: planes of the row in `inputs`; i: the index in `right` of the partner at the first disparity, which the
+    other partners follow; unseen_cost: the cost of partners outside the image.
     """
-    return seen_costs(differing_bits(left, right, x, i, width), pair, unseen, i, width)
+    return in_view_costs(differing_bits(left, right, x, i, width), inputs, unseen_cost, i, width)
 
 
 @part
 def differing_bits(left, right, x, i, width):
-    """How many of the 24 comparisons differ between pixel x and its partners, from i on."""
-    bits = ones(exclusive_or(spread(byte(left[0], x), width), load(right[0], i, width)))
-    bits = plus(bits, ones(exclusive_or(spread(byte(left[1], x), width), load(right[1], i, width))))
-    return plus(bits, ones(exclusive_or(spread(byte(left[2], x), width), load(right[2], i, width))))
+    """The number of comparisons that differ between pixel x and its partners, from index i on."""
+    bits = count_ones(bit_xor(broadcast(byte(left[0], x), width), load(right[0], i, width)))
+    bits = plus(bits, count_ones(bit_xor(broadcast(byte(left[1], x), width), load(right[1], i, width))))
+    return plus(bits, count_ones(bit_xor(broadcast(byte(left[2], x), width), load(right[2], i, width))))
 
 
 @part
-def seen_costs(costs, pair, unseen, i, width):
-    """`costs` of partners from i on, but `unseen` where they are outside the right image."""
-    if pair.whole_from <= i < pair.whole_to:
+def in_view_costs(costs, inputs, unseen_cost, i, width):
+    """`costs` of partners from index i on, with `unseen_cost` for those outside the right image."""
+    if inputs.in_view_from <= i < inputs.in_view_to:
         return costs
-    outside = load(pair.outside, i, width)
-    return either(minus_capped(costs, outside), both(outside, spread(unseen, width)))
+    outside = load(inputs.outside, i, width)
+    return bit_or(minus_capped(costs, outside), bit_and(outside, broadcast(unseen_cost, width)))
 
 
-def census_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen: int) -> Array:
-    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 3, W) uint8, neither of them mirrored."""
+def census_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen_cost: int) -> Array:
+    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 3, W) uint8, not mirrored."""
     height, _, columns = left.shape
-    costs = np.full((height, columns, lanes), unseen, np.uint8)
+    costs = np.full((height, columns, lanes), unseen_cost, np.uint8)
     for x in range(columns):
         for lane in range(lanes):
             partner = x - minimum - lane

@@ -1,10 +1,10 @@
 """The default matching cost: census and gradient difference of the pixels, smoothed over 3x3.
 
 raw = 2 * (census bits that differ, 0..24) + 5 * min(|difference of dx| + |difference of dy|, 6)
-Census tells textured patches apart whatever the exposure; the truncated gradient difference adds what census throws
-away, how much darker. The sum over 3 columns (at most 234) and the binomial mean (1, 2, 1) over 3 rows fit a byte. The
-trick: only column sums of the two rows passed last are kept, and the next row's are made as the sweep reaches them, so
-that no cost is ever stored for the whole image.
+Census distinguishes textured patches at any exposure; the truncated gradient difference adds the amount of contrast,
+which census ignores. The sum over 3 columns (at most 234) and the binomial mean (1, 2, 1) over 3 rows fit a byte. The
+trick: only the column sums of the last two rows are kept, and those of the next row are computed when the sweep reaches
+it, so no cost is ever stored for the whole image.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from stages.compiled.jit import kernel, part
 from stages.compiled.simd import (
     Width,
     average,
+    broadcast,
     byte,
     difference,
     lanes_in,
@@ -24,29 +25,28 @@ from stages.compiled.simd import (
     minus_capped,
     plus,
     plus_capped,
-    spread,
     store,
 )  # fmt: skip
 from stages.data import Array
-from stages.matching.kernels.census import census_costs_reference, differing_bits, seen_costs
+from stages.matching.kernels.census import census_costs_reference, differing_bits, in_view_costs
 
 DX, DY = 3, 4  # after the planes of census
 PLANES = 5
-BLOCK = 64
-LARGEST = 6
-MIDDLE = 128  # stands for no gradient
+LANES = 64  # pixels at a time
+MAX_GRADIENT_DIFFERENCE = 6
+NO_GRADIENT = 128
 
 
 def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
     """Write dx and dy of each pixel (Sobel / 4, gray levels a pixel, plus 128, within 1 to 255) into `planes`.
 
     image: (H, W) uint8, its own border replicated beyond; planes: (H, 5, at least W rounded up to 64) uint8, of which
-    the last two are written, and more than W columns; mirrored: the image is flipped left to right, and dx is to be
-    what it was before.
+    the last two are written, in more than W columns; mirrored: the image is flipped left to right, and dx is that of
+    the image before the flip.
     """
-    columns = -(-image.shape[1] // BLOCK) * BLOCK
+    columns = -(-image.shape[1] // LANES) * LANES
     padded = cv2.copyMakeBorder(image, 1, 1, 1, 1 + columns - image.shape[1], cv2.BORDER_REPLICATE)
-    _gradients(padded, -1 if mirrored else 1, planes, columns, Width(BLOCK))
+    _gradients(padded, -1 if mirrored else 1, planes, columns, Width(LANES))
 
 
 @kernel
@@ -64,15 +64,15 @@ def _gradients(image, sign, planes, columns, width):
 
 @part
 def _smooth(image, at, stride, width):
-    """Mean of three pixels `stride` apart, the middle one, at `at`, twice."""
+    """Weighted mean of three pixels `stride` apart; the middle one, at `at`, counts twice."""
     ends = average(load(image, at - stride, width), load(image, at + stride, width))
     return average(ends, load(image, at, width))
 
 
 @part
 def _signed_difference(more, less, width):
-    most = spread(MIDDLE - 1, width)
-    above = plus_capped(spread(MIDDLE, width), lesser(minus_capped(more, less), most))
+    most = broadcast(NO_GRADIENT - 1, width)
+    above = plus_capped(broadcast(NO_GRADIENT, width), lesser(minus_capped(more, less), most))
     return minus_capped(above, lesser(minus_capped(less, more), most))
 
 
@@ -87,29 +87,29 @@ def gradients_reference(image: Array, mirrored: bool = False) -> Array:
 
     columns, rows = mean(padded[:-2], padded[1:-1], padded[2:]), mean(padded[:, :-2], padded[:, 1:-1], padded[:, 2:])
     planes = np.stack([columns[:, 2:] - columns[:, :-2], rows[2:] - rows[:-2]], axis=1)
-    result: Array = np.clip(planes + MIDDLE, 1, 255).astype(np.uint8)
+    result: Array = np.clip(planes + NO_GRADIENT, 1, 255).astype(np.uint8)
     return result
 
 
 @part
-def smoothed_costs(pair, unseen, first_lane, ahead, column_sums, costs, width):
+def smoothed_costs(inputs, unseen_cost, first_lane, ahead, column_sums, costs, width):
     """The costs of the row before row `ahead` of a sweep, all pixels and disparities: costs (W * n,) uint8.
 
-    pair, unseen: as of `census_costs`; first_lane: the disparity of the first lane, less the smallest searched; ahead:
+    first_lane: the disparity of the first lane, less the smallest searched; ahead:
     may be one row outside the image, whose border then counts twice; column_sums: (2, W * n) uint8, those of the two
-    rows before `ahead`; the older are replaced by those of `ahead`.
+    rows before `ahead`; the sums of `ahead` replace the older ones.
     """
     n = lanes_in(width)
     columns = costs.size // n
     older, newer = column_sums[ahead & 1], column_sums[1 - (ahead & 1)]
-    inside = min(max(ahead, 0), pair.left.shape[0] - 1)
-    left, right = pair.left[inside], pair.right[inside]
-    nothing = spread(0, width)
+    inside = min(max(ahead, 0), inputs.left.shape[0] - 1)
+    left, right = inputs.left[inside], inputs.right[inside]
+    nothing = broadcast(0, width)
     before = here = nothing
     for x in range(-1, columns):
         beside = min(x + 1, columns - 1)
-        after = raw_costs(left, right, pair, unseen, beside, columns - 1 - beside + first_lane, width)
-        if x < 0:  # beyond the border, its pixel again
+        after = raw_costs(left, right, inputs, unseen_cost, beside, columns - 1 - beside + first_lane, width)
+        if x < 0:  # the border pixel counts twice
             before = here = after
             continue
         three = plus(plus(before, here), after)
@@ -120,29 +120,29 @@ def smoothed_costs(pair, unseen, first_lane, ahead, column_sums, costs, width):
 
 
 @part
-def raw_costs(left, right, pair, unseen, x, i, width):
-    """The costs of pixel x, not smoothed; all as of `census_costs`."""
+def raw_costs(left, right, inputs, unseen_cost, x, i, width):
+    """The costs of pixel x, not smoothed; arguments as in `census_costs`."""
     bits = differing_bits(left, right, x, i, width)
-    dx = difference(spread(byte(left[DX], x), width), load(right[DX], i, width))
-    dy = difference(spread(byte(left[DY], x), width), load(right[DY], i, width))
-    step = lesser(plus_capped(dx, dy), spread(LARGEST, width))
+    dx = difference(broadcast(byte(left[DX], x), width), load(right[DX], i, width))
+    dy = difference(broadcast(byte(left[DY], x), width), load(right[DY], i, width))
+    step = lesser(plus_capped(dx, dy), broadcast(MAX_GRADIENT_DIFFERENCE, width))
     twice = plus(step, step)
     cost = plus(plus(plus(bits, bits), step), plus(twice, twice))
-    return seen_costs(cost, pair, unseen, i, width)
+    return in_view_costs(cost, inputs, unseen_cost, i, width)
 
 
-def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen: int) -> Array:
-    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 5, W) uint8, neither of them mirrored."""
+def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen_cost: int) -> Array:
+    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 5, W) uint8, not mirrored."""
     bits = census_costs_reference(left[:, :DX], right[:, :DX], lanes, minimum, 0).astype(np.int64)
     columns = left.shape[2]
     left, right = left.astype(np.int64), right.astype(np.int64)
-    raw = np.full(bits.shape, unseen)
+    raw = np.full(bits.shape, unseen_cost)
     for x in range(columns):
         for lane in range(lanes):
             partner = x - minimum - lane
             if 0 <= partner < columns:
                 step = np.abs(left[:, DX:, x] - right[:, DX:, partner]).sum(axis=1)
-                raw[:, x, lane] = 2 * bits[:, x, lane] + 5 * np.minimum(step, LARGEST)
+                raw[:, x, lane] = 2 * bits[:, x, lane] + 5 * np.minimum(step, MAX_GRADIENT_DIFFERENCE)
     wide = np.pad(raw, ((0, 0), (1, 1), (0, 0)), mode="edge")
     three = np.pad(wide[:, :-2] + wide[:, 1:-1] + wide[:, 2:], ((1, 1), (0, 0), (0, 0)), mode="edge")
     mean = ((three[:-2] + three[2:] + 1) // 2 + three[1:-1] + 1) // 2

@@ -1,4 +1,4 @@
-"""Where the disparity of the right image contradicts that of the left: each pixel asks its partner for its own."""
+"""Left-right check: each pixel compares its disparity with that of its partner in the right image."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ _known = part(known)
 Layers = tuple[Array, Array, Array]
 
 
-def drop_contradicted(found: Layers, backward: Layers, tolerance: float, largest: float, threads: int = 1) -> Layers:
+def drop_inconsistent(
+    found: Layers, backward: Layers, tolerance: float, max_disparity: float, threads: int = 1
+) -> Layers:
     """The layers of `found` without the pixels whose partner's disparity differs by more than `tolerance` px.
 
-    found: pixels (H, W) float32, px, NaN = unknown, source (H, W) uint8 and confidence (H, W) float32; backward: the
-    same of the swapped frame, that is, mirrored. An unknown disparity, one above `largest` px and one whose partner is
-    unknown or outside the image stays as it is.
+    Disparities above `max_disparity` px, and those whose partner is unknown or outside the image, are kept.
+    found: pixels (H, W) float32, px, NaN = unknown; source (H, W) uint8; confidence (H, W) float32; backward: the same
+    of the swapped frame, so mirrored.
     """
     left = tuple(np.empty(layer.shape, layer.dtype) for layer in found)
 
     def drop(first: int, end: int) -> None:
         rows = slice(first, end)
         given, made = ([layer[rows] for layer in layers] for layers in (found, left))
-        _drop(*given, backward[0][rows], backward[1][rows], F32(tolerance), F32(largest), *made)
+        _drop(*given, backward[0][rows], backward[1][rows], F32(tolerance), F32(max_disparity), *made)
 
     by_bands(shared_by(threads), len(found[0]), drop)
     return left[0], left[1], left[2]
@@ -34,7 +36,16 @@ def drop_contradicted(found: Layers, backward: Layers, tolerance: float, largest
 
 @kernel
 def _drop(
-    pixels, source, confidence, backward, backward_source, tolerance, largest, left_pixels, left_source, left_confidence
+    pixels,
+    source,
+    confidence,
+    backward,
+    backward_source,
+    tolerance,
+    max_disparity,
+    left_pixels,
+    left_source,
+    left_confidence,
 ):
     last = pixels.shape[1] - 1
     for y in range(pixels.shape[0]):
@@ -42,7 +53,7 @@ def _drop(
             d = pixels[y, x]
             partner = np.rint(x - d)
             differs = False
-            if d <= largest and partner >= 0 and partner <= last:
+            if d <= max_disparity and partner >= 0 and partner <= last:
                 there = last - np.int64(partner)
                 differs = _known(backward_source[y, there]) and abs(backward[y, there] - d) > tolerance
             left_pixels[y, x] = F32(np.nan) if differs else d
@@ -50,7 +61,7 @@ def _drop(
             left_confidence[y, x] = F32(0) if differs else confidence[y, x]
 
 
-def drop_contradicted_reference(found: Layers, backward: Layers, tolerance: float, largest: float) -> Layers:
+def drop_inconsistent_reference(found: Layers, backward: Layers, tolerance: float, max_disparity: float) -> Layers:
     """`drop_contradicted` in plain numpy."""
     pixels = found[0]
     theirs = np.where(known(backward[1]), backward[0], F32(np.nan))[:, ::-1]
@@ -58,7 +69,7 @@ def drop_contradicted_reference(found: Layers, backward: Layers, tolerance: floa
     inside = (partner >= 0) & (partner < pixels.shape[1])
     asked = np.take_along_axis(theirs, np.where(inside, partner, 0).astype(int), axis=1)
     with np.errstate(invalid="ignore"):
-        wrong = inside & (pixels <= largest) & (np.abs(asked - pixels) > F32(tolerance))
+        wrong = inside & (pixels <= max_disparity) & (np.abs(asked - pixels) > F32(tolerance))
     left = [layer.copy() for layer in found]
     left[0][wrong], left[1][wrong], left[2][wrong] = np.nan, LEFT_RIGHT, 0
     return left[0], left[1], left[2]

@@ -1,4 +1,4 @@
-"""What the matcher's searches read of the images, made once for a frame."""
+"""The planes of bytes that semi-global matching reads, computed once for a frame."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)
 
 
 class MatchingInputs(NamedTuple):
-    """What the searches read of the images, with n lanes."""
+    """Planes of the images for a search with n lanes."""
 
     left: Array  # (H, planes, >= W) uint8: bits of census, gradients
     right: Array  # (H, planes, >= W + n) uint8: the same of the right image, backwards from the smallest disparity on
     steps: Array  # of `brightness_steps`
     outside: Array  # (W + n,) uint8: 255 where an element of `right` is outside the image
-    whole_from: int  # elements of `right` from which n and more, of the whole range, are inside
-    whole_to: int
+    in_view_from: int  # elements of `right` from which n and more, of the whole range, are inside
+    in_view_to: int
     prior: Array  # (H, W) int32: where in `prior_costs` the costs of a pixel begin; or none
     prior_costs: Array  # (m,) uint8
 
 
-def describe(
+def matching_inputs(
     left: Array,
     right: Array,
-    rule: SgmParams,
+    params: SgmParams,
     width: Width,
     prior: tuple[Array, Array] | None = None,
-    both: Fork = in_turn,
+    run_both: Fork = in_turn,
 ) -> MatchingInputs:
-    """What the searches read of gray images, (H, W) uint8. prior: of `prior.prior_costs`, or None."""
+    """The planes of gray images, (H, W) uint8. prior: the result of `prior_cost.prior_costs`, or None."""
     columns = left.shape[1]
-    (left_planes, steps), right_planes = both(
-        lambda: (_described(left, rule), brightness_steps(left)), lambda: _described(right, rule, width)
+    (left_planes, steps), right_planes = run_both(
+        lambda: (_planes(left, params), brightness_steps(left)), lambda: _planes(right, params, width)
     )
-    place = np.arange(columns + width.lanes) + rule.minimum
+    place = np.arange(columns + width.lanes) + params.min_disparity
     outside = np.where((place < 0) | (place > columns - 1), np.uint8(255), np.uint8(0))
-    whole_from, whole_to = max(0, -rule.minimum), columns + 1 - rule.minimum - width.lanes
-    return MatchingInputs(left_planes, right_planes, steps, outside, whole_from, whole_to, *(prior or NO_PRIOR))
+    in_view_from, in_view_to = max(0, -params.min_disparity), columns + 1 - params.min_disparity - width.lanes
+    return MatchingInputs(left_planes, right_planes, steps, outside, in_view_from, in_view_to, *(prior or NO_PRIOR))
 
 
-def _described(image: Array, rule: SgmParams, width: Width | None = None) -> Array:
-    """The planes of an image; with `width` those of the right image: backwards, moved to the smallest disparity."""
+def _planes(image: Array, params: SgmParams, width: Width | None = None) -> Array:
+    """The planes of an image; with `width` those of the right image, mirrored and shifted by the smallest disparity."""
     backwards, after = width is not None, 0
     if width is not None:
-        before, after = max(0, -rule.minimum), max(0, rule.minimum)
+        before, after = max(0, -params.min_disparity), max(0, params.min_disparity)
         image = cv2.copyMakeBorder(cv2.flip(image, 1), 0, 0, before, after + width.lanes, cv2.BORDER_REPLICATE)
-    planes = np.empty((image.shape[0], 5 if rule.gradient else 3, -(-image.shape[1] // 64) * 64), np.uint8)
+    planes = np.empty((image.shape[0], 5 if params.gradient else 3, -(-image.shape[1] // 64) * 64), np.uint8)
     census(image, planes, backwards)
-    if rule.gradient:
+    if params.gradient:
         gradients(image, planes, backwards)
     return planes if after == 0 else np.ascontiguousarray(planes[:, :, after:])

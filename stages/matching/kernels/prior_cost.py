@@ -1,8 +1,8 @@
-"""A prior disparity as a cost: what is searched for is pulled towards what is known already.
+"""A prior disparity as a cost that attracts the search to it.
 
-Each disparity costs more the farther it is from the prior, up to a limit, beyond which the images alone decide. The
-trick: the costs of all disparities of a pixel are a stretch of one table, so the pixel needs no more than the place
-where its stretch begins. Four tables serve priors of a quarter pixel; a fifth, of zeros, pixels that have none.
+A disparity costs more the farther it is from the prior, up to a limit beyond which the images alone decide. The trick:
+the costs of all disparities of a pixel are a stretch of one table, so a pixel only stores where its stretch begins.
+Four tables serve priors in steps of a quarter pixel; a fifth, of zeros, serves pixels without a prior.
 """
 
 from __future__ import annotations
@@ -14,23 +14,25 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
 PHASES = 4
-MARGIN = 16
+TABLE_MARGIN = 16  # lanes
 
 
 def prior_costs(
-    prior: Array, minimum: int | Array, lanes: int, weight: float, reach: float, threads: int = 1
+    prior: Array, minimum: int | Array, lanes: int, weight: float, max_distance: float, threads: int = 1
 ) -> tuple[Array, Array]:
-    """Where each pixel's costs begin, and the table.
+    """The index at which each pixel's costs begin, and the table of costs.
 
     prior: (H, W) float32, px, NaN = none; minimum: the smallest disparity searched, px, or that of each pixel, int32
-    that broadcasts to (H, W); weight: cost per pixel of distance, in the units of the matching cost; reach: px beyond
-    which it costs no more; threads: 2 share the work, to the same result. Returns (H, W) int32 and (m,) uint8.
+    that broadcasts to (H, W); weight: cost per pixel of distance, in units of the matching cost; max_distance: px, from
+    which the cost grows no more; threads: 2 share the work, with the same result. Returns (H, W) int32 and (m,) uint8.
     """
-    far = lanes + int(np.ceil(reach)) + MARGIN  # a prior so far outside the search range costs the same everywhere
+    far = (
+        lanes + int(np.ceil(max_distance)) + TABLE_MARGIN
+    )  # a prior so far outside the search range costs the same everywhere
     length = 2 * far + lanes
     place = np.arange(length) - far
     phase = np.arange(PHASES)[:, np.newaxis] / PHASES
-    costs = np.clip(np.round(weight * np.minimum(np.abs(place - phase), reach)), 0, 255)
+    costs = np.clip(np.round(weight * np.minimum(np.abs(place - phase), max_distance)), 0, 255)
     table = np.concatenate([costs.ravel(), np.zeros(lanes)]).astype(np.uint8)
     begin, least = np.empty(prior.shape, np.int32), np.broadcast_to(minimum, prior.shape)
 

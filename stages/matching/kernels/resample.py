@@ -1,5 +1,4 @@
-"""Half the size of an image, and back: a disparity image is doubled along the line between its values on a surface, and
-at the edge of one takes the nearest."""
+"""Images at half size, and disparity images at double size: interpolated within a surface, nearest at its edge."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
 F32 = np.float32
-LARGEST_STEP = 1.0  # px of the small image, within a surface
+MAX_STEP = 1.0  # px of the small image, between the pixels of one surface
 
 
 def halved(image: Array) -> Array:
@@ -24,8 +23,10 @@ def halved(image: Array) -> Array:
 
 
 def doubled(small: Array, height: int, width: int, threads: int = 1) -> Array:
-    """Values twice as large at every pixel of an image (height, width) float32 that `small`, (H, W) float32, is half of
-    (rounded up); NaN = unknown."""
+    """A disparity image at double size with doubled values, (height, width) float32, px, NaN = unknown.
+
+    small: (H, W) float32, of half the size, rounded up.
+    """
     large = np.empty((height, width), np.float32)
     by_bands(shared_by(threads), height, lambda first, end: _double(small, large, first, end))
     return large
@@ -43,7 +44,7 @@ def _double(small, large, first, end):
             along = F32(0.75) * nearest + F32(0.25) * small[row, next_col]
             other = F32(0.75) * small[beside, col] + F32(0.25) * small[beside, next_col]
             smooth = F32(0.75) * along + F32(0.25) * other
-            large[y, x] = F32(2) * (smooth if abs(smooth - nearest) < F32(LARGEST_STEP) else nearest)
+            large[y, x] = F32(2) * (smooth if abs(smooth - nearest) < F32(MAX_STEP) else nearest)
 
 
 def doubled_reference(small: Array, height: int, width: int) -> Array:
@@ -57,5 +58,5 @@ def doubled_reference(small: Array, height: int, width: int) -> Array:
     other = F32(0.75) * small[beside, col] + F32(0.25) * small[beside, next_col]
     smooth = F32(0.75) * along + F32(0.25) * other
     with np.errstate(invalid="ignore"):
-        large: Array = F32(2) * np.where(np.abs(smooth - nearest) < F32(LARGEST_STEP), smooth, nearest)
+        large: Array = F32(2) * np.where(np.abs(smooth - nearest) < F32(MAX_STEP), smooth, nearest)
     return large

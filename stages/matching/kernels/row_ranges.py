@@ -1,8 +1,8 @@
-"""Which disparities a band of rows is searched for: a row of a rover's image shows ground at much the same distance, so
-no more than what a prior has there, and some.
+"""Search ranges of bands of rows: a row of a rover's image shows ground at similar distances, so its range is small.
 
-Bands may differ in where their range begins and in how many lanes hold it. Between two of them the costs of the paths
-are moved to where the other band has those disparities; what only one of them has was "not searched".
+Each band is searched for the disparities of a prior in it, plus a margin. Ranges differ in their first disparity and
+in their number of lanes. Between two bands the costs of the paths are moved to the lanes that have the same disparities
+in the other band; disparities of one band only count as "not searched".
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.compiled.simd import Width
 from stages.data import Array
 
-MARGIN = 8  # px to either side of what the prior has in a band
-OUTLIERS = 0.001  # share of a band's prior, at either end, that does not count: it is less than a speck
-LEAST_KNOWN = 0.5  # share of a band's pixels below which its prior does not tell the range
-NARROW = (64, 128)  # lanes, but for the whole range; each number is compiled when it comes first
+RANGE_MARGIN = 8  # px to either side of the prior's disparities in a band
+OUTLIER_SHARE = 0.001  # of a band's prior, at either end, is ignored: less than a speckle
+MIN_KNOWN_SHARE = 0.5  # of a band's pixels; with fewer known pixels the whole range is searched
+NARROW_LANES = (64, 128)  # of ranges shorter than the whole; each number is compiled at its first use
 
 
 class Range(NamedTuple):
-    """What rows top to end (exclusive) are searched for."""
+    """The search range of rows top to end (exclusive)."""
 
     top: int
     end: int
@@ -34,19 +34,19 @@ class Range(NamedTuple):
 
 
 def lanes_for(disparities: int) -> int:
-    """The number of lanes that hold a search range: what the processor divides well, not less than 16."""
+    """The number of lanes for a search range: at least 16, and a size that suits the processor."""
     return next((n for n in (16, 32, 64, 96) if disparities <= n), -(-disparities // 64) * 64)
 
 
 def whole_range(rows: int, disparities: int) -> list[Range]:
-    """The one band of an image of which all rows are searched for all disparities."""
+    """One band: all rows are searched for all disparities."""
     return [Range(0, rows, 0, Width(lanes_for(disparities)))]
 
 
-def ranges_of(prior: Array, height: int, minimum: int, disparities: int, threads: int = 1) -> list[Range]:
+def row_ranges(prior: Array, height: int, minimum: int, disparities: int, threads: int = 1) -> list[Range]:
     """The bands of an image, of `height` rows each, and their ranges.
 
-    prior: (H, W) float32, px, NaN = unknown; minimum, disparities: px, the whole range; threads: 2 share the work, to
+    prior: (H, W) float32, px, NaN = unknown; minimum, disparities: px, the whole range; threads: 2 share the work, with
     the same result.
     """
     rows, columns = prior.shape
@@ -61,12 +61,12 @@ def ranges_of(prior: Array, height: int, minimum: int, disparities: int, threads
     most, ranges = lanes_for(disparities), []
     for (top, end), number in zip(itertools.pairwise(cuts), counts, strict=True):
         up_to = np.cumsum(number)
-        ignored = int(OUTLIERS * up_to[-1])
+        ignored = int(OUTLIER_SHARE * up_to[-1])
         low, high = np.searchsorted(up_to, [ignored, up_to[-1] - ignored - 1], side="right").tolist()
-        low, high = max(low - MARGIN, 0), min(high + MARGIN, disparities - 1)
+        low, high = max(low - RANGE_MARGIN, 0), min(high + RANGE_MARGIN, disparities - 1)
         needed = high - low + 1
-        lanes = next((n for n in NARROW if needed <= n < most), most)
-        if lanes == most or up_to[-1] < LEAST_KNOWN * (end - top) * columns:
+        lanes = next((n for n in NARROW_LANES if needed <= n < most), most)
+        if lanes == most or up_to[-1] < MIN_KNOWN_SHARE * (end - top) * columns:
             ranges.append(Range(top, end, 0, Width(most)))
         else:
             first = low - (lanes - needed) // 2
@@ -74,8 +74,8 @@ def ranges_of(prior: Array, height: int, minimum: int, disparities: int, threads
     return ranges
 
 
-def within(rows: range, ranges: list[Range]) -> Iterator[tuple[range, Range]]:
-    """`rows`, in their order, range by range."""
+def by_range(rows: range, ranges: list[Range]) -> Iterator[tuple[range, Range]]:
+    """The parts of `rows` that lie in one range each, in the order of `rows`."""
     low, high = min(rows[0], rows[-1]), max(rows[0], rows[-1])
     for each in ranges if rows.step > 0 else reversed(ranges):
         part = range(max(low, each.top), min(high + 1, each.end))
@@ -85,7 +85,7 @@ def within(rows: range, ranges: list[Range]) -> Iterator[tuple[range, Range]]:
 
 @kernel
 def _count(prior, top, end, minimum, counts):
-    """Add up how many of rows top to end have each disparity; what is beyond the range is at its end."""
+    """Add the histogram of the disparities in rows top to end; those beyond the range count at its end."""
     last = np.float32(counts.size - 1)
     for y in range(top, end):
         for x in range(prior.shape[1]):
@@ -96,8 +96,10 @@ def _count(prior, top, end, minimum, counts):
 
 @kernel
 def move_paths(paths, lanes, later, moved, other_lanes):
-    """Costs of paths, `lanes` for each place, as those of a range that begins `later` and has `other_lanes`: what it
-    has and the other had not is 255, not searched."""
+    """Move the costs of paths to a range that begins `later` px farther and has `other_lanes`.
+
+    Disparities that only the new range has get 255, not searched.
+    """
     begin = min(max(-later, 0), other_lanes)
     stop = max(min(lanes - later, other_lanes), begin)
     moved[:] = 255

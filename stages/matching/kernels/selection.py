@@ -1,11 +1,11 @@
-"""Selection: the disparity of each pixel from the sums of its paths, and whether it can be believed.
+"""Selection: the disparity of each pixel from the sums of its paths, and whether it is reliable.
 
-The smallest sum wins, to a fraction of a pixel by two lines through it and its neighbours, of equal and opposite slopes
-(Shimizu and Okutomi, 2001): the sums fall and rise like a V, and a parabola through them would draw disparities towards
-whole numbers, by up to 0.1 px more. A winner must beat every disparity that is not its neighbour (uniqueness), and the
-right image's pixel must choose the same from the same sums (left-right check). That choice needs all sums of a row
-along a diagonal; the trick is to keep the best so far of n right pixels in the lanes of one vector, which moves by one
-lane from pixel to pixel, as the partners do.
+The smallest sum wins. Two lines of equal and opposite slopes through it and its neighbours give the fraction of a pixel
+(Shimizu and Okutomi, 2001): the sums fall and rise like a V, and a parabola would pull disparities towards whole
+numbers by up to 0.1 px more. A winner must beat every disparity that is not its neighbour (uniqueness), and the right
+image's pixel must choose the same from the same sums (left-right check). That choice needs all sums of a row along a
+diagonal. The trick is to keep the best so far of n right pixels in the lanes of one vector, which moves by one lane
+from pixel to pixel, as the partners do.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import numpy as np
 
 from stages.compiled.jit import part
 from stages.compiled.simd import (
+    bit_or,
+    broadcast,
     byte,
     count_up,
-    either,
     first_smallest,
     lanes_in,
     lesser,
@@ -24,7 +25,6 @@ from stages.compiled.simd import (
     outermost,
     shifted,
     smallest,
-    spread,
     store,
     where_less,
 )  # fmt: skip
@@ -41,17 +41,17 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):
     """The best disparity of each pixel of a row, left and right; the smallest of equals.
 
     total: (W * n,) uint8, the sums; beyond: (n,) uint8, 255 for lanes that are no disparities; guard: (2 n,) uint8, 255
-    at n - 1, n, n + 1, else 0; step: direction in which to go through the row, with the same result. Into winner (W,)
+    at n - 1, n, n + 1, else 0; step: direction through the row, with the same result. Into winner (W,)
     int16, votes (4, W) uint16: sum of the winner, of its lower and upper neighbour, and the smallest of the others; and
     right (W + n,) uint8 or uint16: the right image's winners, backwards, that of the partner of left
     pixel x at disparity d at W - 1 - x + d.
     """
     n, columns = lanes_in(width), winner.size
     lanes, outside = count_up(width, right), load(beyond, 0, width)
-    best, index = spread(255, width), lanes
+    best, index = broadcast(255, width), lanes
     if step > 0:
         for x in range(columns):
-            sums = either(load(total, x * n, width), outside)
+            sums = bit_or(load(total, x * n, width), outside)
             find_winner(sums, total, guard, x, winner, votes, width)
             best, index = shifted(best, 255, 1), shifted(index, 0, 1)
             index, best = where_less(sums, best, lanes, index), lesser(sums, best)
@@ -59,7 +59,7 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):
         store(right, 0, index)
     else:
         for x in range(columns - 1, -1, -1):
-            sums = either(load(total, x * n, width), outside)
+            sums = bit_or(load(total, x * n, width), outside)
             find_winner(sums, total, guard, x, winner, votes, width)
             best, index = shifted(best, 255, -1), shifted(index, 0, -1)
             index, best = where_less(best, sums, index, lanes), lesser(sums, best)
@@ -69,26 +69,26 @@ def find_winners(total, beyond, guard, step, winner, votes, right, width):
 
 @part
 def find_winner(sums, total, guard, x, winner, votes, width):
-    """The best disparity of pixel x, and what else `find_winners` says of it. sums: of the pixel, as in `total`."""
+    """The winner and the votes of pixel x, as `find_winners` defines them. sums: of the pixel, as in `total`."""
     n = lanes_in(width)
     low, d = first_smallest(sums)
     winner[x] = d
     votes[0, x] = low
     votes[1, x] = byte(total, x * n + max(d - 1, 0))
     votes[2, x] = byte(total, x * n + min(d + 1, n - 1))
-    votes[3, x] = smallest(either(sums, load(guard, n - d, width)))
+    votes[3, x] = smallest(bit_or(sums, load(guard, n - d, width)))
 
 
 @part
 def find_partners(winner, right, partners):
-    """What the winner's partner in the right image chose, (W,) int16. winner, right: of `find_winners`."""
+    """The choice of the winner's partner in the right image, into (W,) int16. winner, right: of `find_winners`."""
     columns = winner.size
     for x in range(columns):
         partners[x] = right[np.uint64(columns - 1 - x + winner[x])]
 
 
 @part
-def fit_row(winner, votes, partners, first, top, rule, pixels, evidence, source):
+def fit_row(winner, votes, partners, first, top, params, pixels, evidence, source):
     """Disparities of a row, to a fraction of a pixel, where the winner is reliable, the evidence, and the reasons.
 
     winner, votes, partners: of `find_winners` and `find_partners`; first: (W,) int32, disparity of the first lane;
@@ -101,7 +101,7 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence, source)
     """
     columns = winner.size
     last, top = np.int32(columns - 1), np.int32(top)
-    tolerance, margin = np.int32(rule.consistency), np.int32(rule.uniqueness)
+    tolerance, margin = np.int32(params.lr_tolerance), np.int32(params.uniqueness)
     for x in range(columns):
         d = np.int32(winner[x])
         low, next_best = np.int32(votes[0, x]), np.int32(votes[3, x])
@@ -122,7 +122,7 @@ def fit_row(winner, votes, partners, first, top, rule, pixels, evidence, source)
         source[x] = reason if in_view else OUT_OF_VIEW
 
 
-def select_reference(total: Array, first: Array, lowest: int, n: int, rule: SgmParams) -> tuple[Array, Array, Array]:
+def select_reference(total: Array, first: Array, lowest: int, n: int, params: SgmParams) -> tuple[Array, Array, Array]:
     """Disparities, evidence and source of a row in plain numpy.
 
     total: (W, m) the sums of all paths, from disparity `lowest` on, 255 where not searched; first: (W,) the disparity
@@ -146,9 +146,9 @@ def select_reference(total: Array, first: Array, lowest: int, n: int, rule: SgmP
             continue
         low, before, after = sums[x, d], sums[x, d - 1], sums[x, d + 1]
         lead = min([255, *sums[x, : d - 1], *sums[x, d + 2 :]]) - low
-        if lead <= rule.uniqueness:
+        if lead <= params.uniqueness:
             source[x] = PixelOrigin.UNIQUENESS
-        elif abs(right[partner] - d - lowest) > rule.consistency:
+        elif abs(right[partner] - d - lowest) > params.lr_tolerance:
             source[x] = PixelOrigin.LEFT_RIGHT
         else:
             rise = max(max(before, after) - low, 1)

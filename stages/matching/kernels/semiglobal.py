@@ -1,14 +1,14 @@
-"""Semi-global matching of a whole image: cost, aggregation and selection, row by row, on any number of threads.
+"""Semi-global matching of a whole image: cost, aggregation and selection, row by row, on one or two threads.
 
-One sweep runs down the image and one up; the second to reach a row finds the other's sums there and selects the row's
-disparities. Meeting in the middle lets two threads share a frame: one sweeps the upper half down while the other sweeps
-the lower half up, then each goes on through the other's half. No path is cut, so the result has the same bits.
+One sweep runs down the image and one up. The second sweep to reach a row finds the sums of the first there, and selects
+the disparities of the row. Two threads share a frame: one sweeps the upper half down while the other sweeps the lower
+half up, then each continues through the other half. No path is cut, so the result has the same bits.
 
-The sums of a large image would not fit the memory. Then the first visit to a half leaves only the path costs at the
-head of each stripe of rows, and before the second sweep enters a stripe, its sums are made again from there: exact too,
-at 1.4 times the time.
+The sums of a large image may not fit the memory. Then the first sweep of a half keeps only the path costs at the head
+of each stripe of rows. Before the second sweep enters a stripe, its sums are computed again from there, with the same
+bits, in 1.4 times the time.
 
-Rows may be searched for a part of the range only, each band of them for its own (stages.matching.kernels.row_ranges).
+Each band of rows may be searched for a part of the range only (stages.matching.kernels.row_ranges).
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from stages.data import Array
 from stages.matching.kernels.aggregation import aggregate_row
 from stages.matching.kernels.blank_windows import contrast, drop_unmatchable
 from stages.matching.kernels.gradient import smoothed_costs
-from stages.matching.kernels.matching_inputs import MatchingInputs, describe
-from stages.matching.kernels.row_ranges import Range, lanes_for, move_paths, within
+from stages.matching.kernels.matching_inputs import MatchingInputs, matching_inputs
+from stages.matching.kernels.row_ranges import Range, by_range, lanes_for, move_paths
 from stages.matching.kernels.selection import find_partners, find_winners, fit_row
-from stages.matching.kernels.sgm_local import SearchWindows, search_around
+from stages.matching.kernels.sgm_local import SearchWindows, match_windows
 from stages.matching.kernels.sgm_params import SgmParams
 from stages.matching.kernels.speckles import drop_speckles
 
@@ -41,7 +41,7 @@ Layers = tuple[Array, Array, Array]  # disparities, evidence, source
 
 
 class Matches(NamedTuple):
-    """What `match` finds, (H, W) each."""
+    """The result of `match`, (H, W) each."""
 
     pixels: Array  # float32, px, NaN = unknown
     source: Array  # uint8, codes of `PixelOrigin`
@@ -49,7 +49,7 @@ class Matches(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Rows in the making, one set for each thread and number of lanes."""
+    """Memory for the current row, one set for each thread and number of lanes."""
 
     costs: Array
     column_sums: Array
@@ -64,62 +64,72 @@ class Scratch(NamedTuple):
 
 
 def match(
-    left: Array, right: Array, rule: SgmParams, prior: tuple[Array, Array] | None, search: SearchWindows | list[Range],
-    excluded: Array | None, threads: int, memory: int,
+    left: Array, right: Array, params: SgmParams, prior: tuple[Array, Array] | None,
+    search: SearchWindows | list[Range], excluded: Array | None, threads: int, max_memory: int,
 ) -> Matches:  # fmt: skip
     """Disparities of a rectified pair of gray images.
 
-    left, right: (H, W) uint8; prior: of `prior.prior_costs`, from where each pixel's search begins, or None; search:
-    where, and what for; excluded: (H, W) uint8, why a pixel has no match in the range (a code of `PixelOrigin`, or 0),
-    or None; threads: more than 2 have nothing to do; memory: bytes that the sums of paths may take.
+    Parameters
+    ----------
+    left, right
+        (H, W) uint8.
+    prior
+        The result of `prior_cost.prior_costs` for the first disparity searched at each pixel, or None.
+    search
+        The disparities searched at each pixel, or in each band of rows.
+    excluded
+        (H, W) uint8, why a pixel has no match in the range: a code of `PixelOrigin`, or 0. None excludes no pixel.
+    threads
+        At most two are used.
+    max_memory
+        Bytes for the sums of paths.
     """
     pixels, evidence, source = (np.empty(left.shape, kind) for kind in (np.float32, np.uint8, np.uint8))
     layers = pixels, evidence, source
     if excluded is None:
         excluded = np.empty((0, 0), np.uint8)
-    both = shared_by(threads)
+    run_both = shared_by(threads)
     with _workspaces.one() as space:
         if isinstance(search, SearchWindows):
-            seen = rule._replace(minimum=0)
-            search_around(
-                describe(left, right, seen, search.width, prior, both), rule, search, layers, space, both
-            )  # fmt: skip
+            from_zero = params._replace(min_disparity=0)
+            inputs = matching_inputs(left, right, from_zero, search.width, prior, run_both)
+            match_windows(inputs, params, search, layers, space, run_both)
         else:
-            _search_rows(left, right, rule, prior, search, memory, layers, space, both)
+            _match_ranges(left, right, params, prior, search, max_memory, layers, space, run_both)
 
         def drop(first: int, end: int) -> None:
             rows = (layer[first:end] for layer in (excluded, *layers))
             drop_unmatchable(contrast(left, first, end), contrast(right, first, end), *rows)
 
-        by_bands(both, len(left), drop)
-        drop_speckles(pixels, evidence, source, rule.speckle_range, rule.speckle_size, space, both)
-    return Matches(pixels, source, cv2.LUT(evidence, rule.calibration))
+        by_bands(run_both, len(left), drop)
+        drop_speckles(pixels, evidence, source, params.speckle_range, params.max_speckle_size, space, run_both)
+    return Matches(pixels, source, cv2.LUT(evidence, params.confidence_of))
 
 
-def _search_rows(
-    left: Array, right: Array, rule: SgmParams, prior: tuple[Array, Array] | None, ranges: list[Range], memory: int,
-    layers: Layers, space: Workspace, both: Fork,
+def _match_ranges(
+    left: Array, right: Array, params: SgmParams, prior: tuple[Array, Array] | None, ranges: list[Range],
+    max_memory: int, layers: Layers, space: Workspace, run_both: Fork,
 ) -> None:  # fmt: skip
-    """Fill in disparities, evidence and source; what that takes but the workspace is given back."""
-    pair = describe(left, right, rule, Width(lanes_for(rule.disparities)), prior, both)
-    upper, lower = _halves(pair, rule, space, ranges, memory, layers)
-    both(upper.arrive, lower.arrive)
-    both(lambda: upper.cross(lower), lambda: lower.cross(upper))
+    """Write disparities, evidence and source into `layers`; memory outside the workspace is freed on return."""
+    inputs = matching_inputs(left, right, params, Width(lanes_for(params.disparities)), prior, run_both)
+    upper, lower = _halves(inputs, params, space, ranges, max_memory, layers)
+    run_both(upper.arrive, lower.arrive)
+    run_both(lambda: upper.cross(lower), lambda: lower.cross(upper))
 
 
 @kernel
-def _sweep(pair, rule, layers, width, scratch, first_lane, top, paths, y, end, step, sums, origin, stride, final):
+def _sweep(inputs, params, layers, width, scratch, first_lane, top, paths, y, end, step, sums, origin, stride, final):
     """Rows y to end (exclusive) in steps of 1 or -1; the sums of row y are at (y - origin) * stride of `sums`."""
     pixels, evidence, source = layers
-    if rule.gradient:
+    if params.gradient:
         for ahead in (y - step, y):  # smoothed_costs needs the column sums of two rows before it can begin
-            smoothed_costs(pair, rule.unseen, first_lane, ahead, scratch.column_sums, scratch.costs, width)
+            smoothed_costs(inputs, params.unseen_cost, first_lane, ahead, scratch.column_sums, scratch.costs, width)
     while y != end:
-        if rule.gradient:
-            smoothed_costs(pair, rule.unseen, first_lane, y + step, scratch.column_sums, scratch.costs, width)
+        if params.gradient:
+            smoothed_costs(inputs, params.unseen_cost, first_lane, y + step, scratch.column_sums, scratch.costs, width)
         aggregate_row(
-            pair, rule, first_lane, scratch.costs, paths, y, step, sums, (y - origin) * stride, scratch.total, final,
-            width,
+            inputs, params, first_lane, scratch.costs, paths, y, step, sums, (y - origin) * stride, scratch.total,
+            final, width,
         )  # fmt: skip
         if final:
             find_winners(
@@ -127,37 +137,37 @@ def _sweep(pair, rule, layers, width, scratch, first_lane, top, paths, y, end, s
             )
             find_partners(scratch.winner, scratch.right, scratch.partners)
             fit_row(
-                scratch.winner, scratch.votes, scratch.partners, scratch.first, top, rule, pixels[y], evidence[y],
+                scratch.winner, scratch.votes, scratch.partners, scratch.first, top, params, pixels[y], evidence[y],
                 source[y],
             )  # fmt: skip
         y += step
 
 
 def _halves(
-    pair: MatchingInputs,
-    rule: SgmParams,
+    inputs: MatchingInputs,
+    params: SgmParams,
     space: Workspace,
     ranges: list[Range],
-    memory: int,
+    max_memory: int,
     layers: Layers,
 ) -> list[_Half]:
-    """Both halves of the image, in stripes whose sums take no more than `memory` bytes together."""
+    """Both halves of the image, in stripes whose sums take at most `max_memory` bytes together."""
     height, columns = layers[0].shape
     size = columns * max(each.width.lanes for each in ranges)
     middle = height // 2
     largest = height - middle
-    # Shorter stripes would take more for their heads than they save.
-    stripe = largest if 2 * largest * size <= memory else max(memory // (2 * size), math.isqrt(3 * largest))
+    # Shorter stripes would need more memory for their heads than they save.
+    stripe = largest if 2 * largest * size <= max_memory else max(max_memory // (2 * size), math.isqrt(3 * largest))
     heads = 0 if stripe == largest else -(-largest // stripe)
     moves = 2 if len(ranges) > 1 else 0  # of paths, from one range to another
     space.reserve(2 * (size * (10 + stripe + 3 * (heads + moves)) + 64 * (8 + heads + moves)))
-    sweep = functools.partial(_sweep, pair, rule, layers)
+    sweep = functools.partial(_sweep, inputs, params, layers)
     rows = range(middle), range(height - 1, middle - 1, -1)
-    return [_Half(part, stripe, heads > 0, space, sweep, ranges, columns, rule) for part in rows]
+    return [_Half(part, stripe, heads > 0, space, sweep, ranges, columns, params) for part in rows]
 
 
 class _Paths:
-    """The costs of the paths that a sweep has come with, for the range of the row it has come to."""
+    """The costs of the paths of a sweep, for the disparity range of its current row."""
 
     def __init__(self, space: Workspace, size: int, moves: bool) -> None:
         """size: bytes of a row; moves: whether there are several ranges."""
@@ -165,15 +175,15 @@ class _Paths:
         self.at: Range | None = None
 
     def begin(self) -> None:
-        """Be at the image's border, where all paths begin."""
+        """Set all costs to 0: at the border of the image all paths begin."""
         self.whole[:], self.at = 0, None
 
     def take(self, other: _Paths) -> None:
-        """Be where the other is."""
+        """Copy the costs of another sweep."""
         self.whole[:], self.at = other.whole, other.at
 
     def enter(self, at: Range, columns: int) -> Array:
-        """The costs, (3 * W * n,) uint8, for a range of n lanes."""
+        """The costs, (3 * W * n,) uint8, moved to the range `at` of n lanes."""
         lanes, size = at.width.lanes, 3 * columns * at.width.lanes
         if self.spare is not None and self.at is not None and (at.first, at.width) != (self.at.first, self.at.width):
             move_paths(self.whole, self.at.width.lanes, at.first - self.at.first, self.spare[:size], lanes)
@@ -187,23 +197,23 @@ class _Half:
 
     def __init__(
         self, rows: range, stripe: int, striped: bool, space: Workspace, sweep: Callable[..., None],
-        ranges: list[Range], columns: int, rule: SgmParams,
+        ranges: list[Range], columns: int, params: SgmParams,
     ) -> None:  # fmt: skip
-        """rows: from the end inwards; stripe: how many at a time; striped: one of the halves does not fit into a
-        stripe, so that either has its sums made again, in the memory of the sweep that crosses it."""
+        """rows: from the border inwards; stripe: rows of a stripe; striped: a half does not fit into one stripe, so the
+        sums of both are computed again, in the memory of the sweep that crosses."""
         widths = {each.width.lanes for each in ranges}
-        self.sweep, self.ranges, self.columns, self.minimum = sweep, ranges, columns, rule.minimum
+        self.sweep, self.ranges, self.columns, self.minimum = sweep, ranges, columns, params.min_disparity
         self.size = size = columns * max(widths)
         self.stripes = [rows[i : i + stripe] for i in range(0, len(rows), stripe)]
         self.paths, self.again = (_Paths(space, size, len(ranges) > 1) for _ in range(2))
         self.sums = space.bytes(stripe * size)
         self.heads = [_Paths(space, size, False) for _ in self.stripes] if striped else []
         rows_of_bytes = space.bytes(size), space.bytes(2 * size), space.bytes(size)
-        self.scratch = {lanes: _scratch(lanes, columns, rule.disparities, *rows_of_bytes) for lanes in widths}
-        self.tops = {lanes: min(lanes, rule.disparities) - 1 for lanes in widths}
+        self.scratch = {lanes: _scratch(lanes, columns, params.disparities, *rows_of_bytes) for lanes in widths}
+        self.tops = {lanes: min(lanes, params.disparities) - 1 for lanes in widths}
 
     def arrive(self) -> None:
-        """Sweep to the middle. The sums stay, or else the path costs at the head of each stripe."""
+        """Sweep to the middle. Keep the sums, or in stripes the path costs at the head of each stripe."""
         self.paths.begin()
         for i, stripe in enumerate(self.stripes):
             if self.heads:
@@ -211,7 +221,7 @@ class _Half:
             self._sweep(stripe, self.paths, self.sums, final=False)
 
     def cross(self, other: _Half) -> None:
-        """Sweep on from the middle to the other end, and select the disparities of that half."""
+        """Continue from the middle through the other half, and select its disparities."""
         for i, stripe in reversed(list(enumerate(other.stripes))):
             sums = other.sums
             if other.heads:
@@ -222,7 +232,7 @@ class _Half:
 
     def _sweep(self, rows: range, paths: _Paths, sums: Array, final: bool) -> None:
         origin = min(rows[0], rows[-1])
-        for part, at in within(rows, self.ranges):
+        for part, at in by_range(rows, self.ranges):
             lanes = at.width.lanes
             scratch = self.scratch[lanes]
             scratch.first[:] = self.minimum + at.first
@@ -233,7 +243,7 @@ class _Half:
 
 
 def _scratch(lanes: int, columns: int, disparities: int, costs: Array, column_sums: Array, total: Array) -> Scratch:
-    """Rows of so many lanes, in memory with room for them: of W * lanes bytes, of twice as many, and of as many."""
+    """Rows of `lanes` lanes in the given memory: W * lanes bytes, twice as many, and as many."""
     size = columns * lanes
     index = np.uint8 if lanes <= 256 else np.uint16
     guard = np.abs(np.arange(2 * lanes) - lanes) <= 1

@@ -1,4 +1,4 @@
-"""What the matcher's searches are told."""
+"""Parameters of semi-global matching, as the kernels read them."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from stages.data import Array
 
 
 class SgmParams(NamedTuple):
-    """How to match: see `stages.Match` for the meaning of each."""
+    """The parameters of one search; `stages.Match` documents their meaning."""
 
     gradient: bool  # census and gradient, or census alone
     diagonals: bool  # 8 paths, or 4
     p1: int
-    table: Array  # (256,) uint8, p2 for each step of brightness
-    unseen: int  # cost of a partner outside the right image
+    p2_table: Array  # (256,) uint8, p2 for each step of brightness
+    unseen_cost: int  # cost of a partner outside the right image
     disparities: int
-    minimum: int
+    min_disparity: int
     uniqueness: int
-    consistency: int
+    lr_tolerance: int
     speckle_range: float
-    speckle_size: int
-    calibration: Array  # (256,) float32, confidence for each amount of evidence
+    max_speckle_size: int
+    confidence_of: Array  # (256,) float32, confidence for each value of the evidence

@@ -1,8 +1,8 @@
-"""Speckle removal: patches of the disparity image that are too small to be believed are dropped.
+"""Speckle removal: small isolated patches of the disparity image are dropped.
 
-A patch is a set of pixels joined through neighbours (left, right, above, below) whose disparities differ by no more
-than `step`. The trick: what is joined are not pixels but runs, stretches of a row without such a step, by union-find;
-a row has a hundred times fewer of them, and a patch is dropped run by run.
+A patch is a set of pixels joined through neighbours (left, right, above, below) whose disparities differ by at most
+`step`. The trick: union-find joins runs, stretches of a row without a larger step, instead of pixels. A row has a
+hundred times fewer runs than pixels, and a patch is dropped run by run.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ SPECKLE = int(PixelOrigin.SPECKLE)
 
 
 def drop_speckles(
-    disparity: Array, evidence: Array, source: Array, step: float, largest: int, space: Workspace, both: Fork = in_turn
-) -> None:
-    """Set patches of at most `largest` pixels to NaN, their evidence to 0 and their source to SPECKLE, in place.
+    disparity: Array, evidence: Array, source: Array, step: float, max_size: int, space: Workspace,
+    run_both: Fork = in_turn,
+) -> None:  # fmt: skip
+    """Set patches of at most `max_size` pixels to NaN, their evidence to 0 and their source to SPECKLE, in place.
 
     disparity: (H, W) float32, px, NaN = unknown; evidence, source: (H, W) uint8; step: px; space: memory for the runs;
-    both: calls two functions, on one thread or two.
+    run_both: calls two functions, on one thread or two.
     """
-    if largest == 0:
+    if max_size == 0:
         return
     columns, limit = disparity.shape[1], np.float32(step)
     space.reserve(4 * (4 * disparity.size + 64))
-    # As many runs as pixels at most. What is not touched never becomes memory.
+    # There are at most as many runs as pixels. Pages that are not touched take no memory.
     runs = tuple(space.array((disparity.size,), np.int32) for _ in ("start", "end", "parent", "area"))
-    bands = dict[int, tuple[int, Array]]()  # first row -> end of the runs; those of the first and the last row
+    bands = dict[int, tuple[int, Array]]()  # first row -> end of the runs; the runs of its first and last row
 
     def find(first: int, end: int) -> None:
         seams, goes_on = np.full((2, columns), -1, np.int32), np.zeros(columns + 1, np.bool_)
@@ -44,20 +45,21 @@ def drop_speckles(
 
     def drop(first: int, _: int) -> None:
         layers = disparity.reshape(-1), evidence.reshape(-1), source.reshape(-1)
-        _drop(*layers, runs, first * columns, bands[first][0], largest)
+        _drop(*layers, runs, first * columns, bands[first][0], max_size)
 
-    by_bands(both, len(disparity), find)
+    by_bands(run_both, len(disparity), find)
     for upper, lower in itertools.pairwise(sorted(bands)):
         _join_bands(disparity, lower, limit, runs, bands[upper][1][1], bands[lower][1][0])
-    by_bands(both, len(disparity), drop)
+    by_bands(run_both, len(disparity), drop)
 
 
 @kernel
 def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):
-    """Runs of some rows, joined among themselves, from place first_row * W on; returns the place behind the last.
+    """Write the runs of some rows, joined with each other, from index first_row * W on; return the end index.
 
-    `seams`, (2, W), all -1, takes the runs of the first and of the last row, pixel by pixel.
-    A run that is its own parent has the area of its patch, in pixels. goes_on: (W + 1,) bool, False at both ends.
+    A run that is its own parent has the area of its patch, in pixels.
+    seams: (2, W), all -1, receives the runs of the first and the last row, pixel by pixel; goes_on: (W + 1,) bool,
+    False at both ends.
     """
     start, end, parent, area = runs
     pixels, columns = disparity.reshape(-1), disparity.shape[1]
@@ -73,7 +75,7 @@ def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):
             x += 1
             if row[first] != row[first]:
                 continue
-            while goes_on[x]:  # ends at the row's end, where there is always False
+            while goes_on[x]:  # False at the end of the row
                 x += 1
             start[count], end[count], parent[count], area[count] = origin + first, origin + x, count, x - first
             while above < above_end and end[above] + columns <= start[count]:
@@ -111,18 +113,18 @@ def _join_bands(disparity, y, step, runs, above, below):
 
 
 @kernel
-def _drop(pixels, strength, source, runs, first, last, largest):
+def _drop(pixels, strength, source, runs, first, last, max_size):
     start, end, parent, area = runs
     for run in range(first, last):
         patch = run
-        while parent[patch] != patch:  # two threads at once: read only
+        while parent[patch] != patch:  # two threads read at once: no path halving
             patch = parent[patch]
-        if area[patch] <= largest:
+        if area[patch] <= max_size:
             for i in range(start[run], end[run]):
                 pixels[i], strength[i], source[i] = np.nan, 0, SPECKLE
 
 
-def drop_speckles_reference(disparity: Array, evidence: Array, source: Array, step: float, largest: int) -> None:
+def drop_speckles_reference(disparity: Array, evidence: Array, source: Array, step: float, max_size: int) -> None:
     """`drop_speckles` by the connected components of a graph of pixels."""
     index = np.arange(disparity.size).reshape(disparity.shape)
     with np.errstate(invalid="ignore"):
@@ -132,5 +134,5 @@ def drop_speckles_reference(disparity: Array, evidence: Array, source: Array, st
     second = np.concatenate([index[:, 1:][beside], index[1:][above]])
     graph = coo_array((np.ones(len(first), np.uint8), (first, second)), shape=(index.size, index.size))
     labels = connected_components(graph, directed=False)[1].reshape(disparity.shape)
-    small = (np.bincount(labels.ravel())[labels] <= largest) & np.isfinite(disparity)
+    small = (np.bincount(labels.ravel())[labels] <= max_size) & np.isfinite(disparity)
     disparity[small], evidence[small], source[small] = np.nan, 0, SPECKLE

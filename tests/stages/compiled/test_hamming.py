@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.compiled.hamming import MOST, clear_partners, nearest_two, nearest_two_reference
+from stages.compiled.hamming import MAX_OTHERS, clear_partners, nearest_two, nearest_two_reference
 from stages.data import Array
 
 
@@ -50,7 +50,7 @@ def test_too_few_have_no_clear_partner_and_too_many_are_refused() -> None:
     assert [len(part) for part in clear_partners(descriptors(3, 1), descriptors(1, 1), 64, 0.8)] == [0, 0]
     assert [len(part) for part in clear_partners(descriptors(0, 1), descriptors(3, 1), 64, 0.8)] == [0, 0]
     with pytest.raises(ValueError, match="2 to 16320 descriptors, not 16321"):
-        nearest_two(descriptors(1, 1), np.zeros((MOST + 1, 32), np.uint8))
+        nearest_two(descriptors(1, 1), np.zeros((MAX_OTHERS + 1, 32), np.uint8))
     codes = descriptors(50, 1)
-    many = np.concatenate([codes, descriptors(MOST, 2)])  # as of a pattern of dots; none is lost for that
+    many = np.concatenate([codes, descriptors(MAX_OTHERS, 2)])  # as of a pattern of dots; none is lost for that
     np.testing.assert_array_equal(clear_partners(codes, many, 64, 0.8)[1], np.arange(50))

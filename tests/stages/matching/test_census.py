@@ -7,33 +7,33 @@ from numba import njit
 from stages.compiled.simd import Width, lanes_in, store
 from stages.matching.kernels.census import census, census_costs, census_costs_reference, census_reference
 from stages.matching.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
-from stages.matching.kernels.matching_inputs import describe
+from stages.matching.kernels.matching_inputs import matching_inputs
 from stages.matching.kernels.row_ranges import lanes_for
 from stages.matching.kernels.sgm_params import SgmParams
 from tests.stages.matching.test_match_opencv import textured
 
 
 @njit
-def rows_of_census(pair, unseen, costs, width):
+def rows_of_census(inputs, unseen_cost, costs, width):
     n = lanes_in(width)
     columns = costs.shape[1] // n
     for y in range(costs.shape[0]):
         for x in range(columns):
-            made = census_costs(pair.left[y], pair.right[y], pair, unseen, x, columns - 1 - x, width)
+            made = census_costs(inputs.left[y], inputs.right[y], inputs, unseen_cost, x, columns - 1 - x, width)
             store(costs[y], x * n, made)
 
 
 @njit
-def rows_smoothed(pair, unseen, costs, sums, step, width):
+def rows_smoothed(inputs, unseen_cost, costs, sums, step, width):
     height = costs.shape[0]
     first = 0 if step > 0 else height - 1
     for ahead in (first - step, first):
-        smoothed_costs(pair, unseen, 0, ahead, sums, costs[first], width)
+        smoothed_costs(inputs, unseen_cost, 0, ahead, sums, costs[first], width)
     for i in range(height):
-        smoothed_costs(pair, unseen, 0, first + (i + 1) * step, sums, costs[first + i * step], width)
+        smoothed_costs(inputs, unseen_cost, 0, first + (i + 1) * step, sums, costs[first + i * step], width)
 
 
-def rule_of(gradient, disparities, minimum):
+def params_of(gradient, disparities, minimum):
     nothing = np.zeros(256, np.uint8)
     return SgmParams(gradient, True, 9, nothing, 11, disparities, minimum, 0, 1, 1.0, 0, nothing.astype(np.float32))
 
@@ -73,15 +73,15 @@ def test_costs_are_those_of_the_references_at_every_pixel_and_disparity(images, 
     planes = [np.concatenate([b, gradients_reference(i)], axis=1) for b, i in zip(bits, images, strict=True)]
     costs = np.empty((21, 77 * lanes), np.uint8)
     for gradient in (False, True):
-        rule = rule_of(gradient, disparities, minimum)
-        pair = describe(left, right, rule, width)
+        params = params_of(gradient, disparities, minimum)
+        inputs = matching_inputs(left, right, params, width)
         if gradient:
-            expected = smoothed_costs_reference(*planes, lanes, minimum, rule.unseen)
+            expected = smoothed_costs_reference(*planes, lanes, minimum, params.unseen_cost)
             for step in (1, -1):
                 costs[:] = 7
-                rows_smoothed(pair, rule.unseen, costs, np.empty((2, 77 * lanes), np.uint8), step, width)
+                rows_smoothed(inputs, params.unseen_cost, costs, np.empty((2, 77 * lanes), np.uint8), step, width)
                 assert np.array_equal(costs.reshape(expected.shape), expected)
         else:
-            expected = census_costs_reference(*bits, lanes, minimum, rule.unseen)
-            rows_of_census(pair, rule.unseen, costs, width)
+            expected = census_costs_reference(*bits, lanes, minimum, params.unseen_cost)
+            rows_of_census(inputs, params.unseen_cost, costs, width)
             assert np.array_equal(costs.reshape(expected.shape), expected)

@@ -28,7 +28,7 @@ def test_the_warning_asks_for_the_lowest_rows_and_for_most_frames():
     check(disparity_with(ground))
     found = check.finding()
     assert found.severity == Severity.WARNING
-    assert "0 % is matched (median of 5 frames)" in found.sentence
+    assert "Only 0 % of the nearest ground is matched" in found.sentence
 
 
 @pytest.mark.parametrize(("up", "near"), [([0.0, -1.0, -0.3], 1), ([0.0, 1.0, -0.3], 0), (None, 1)])
@@ -43,7 +43,7 @@ def test_of_a_camera_that_hangs_upside_down_the_nearest_ground_is_above(up, near
 def test_a_search_range_that_ends_short_of_the_ground_is_a_warning_and_one_that_does_not_is_none(pipeline):
     simulation = Simulation(frames=1, width=320, height=240, seed=1, abundance=0.1)
     frame = StereoFrame(1, *simulation.frame(0).images, simulation.camera)  # of ground up to 46 px near
-    for disparities, words in ((48, None), (16, None), (8, "set `disparities` larger")):
+    for disparities, words in ((48, None), (16, None), (8, "increase `disparities`")):
         check = Running(CheckMatches())
         check(stereo_part(pipeline, frame, disparities, entry="rectified")["disparity"])
         found = check.finding()

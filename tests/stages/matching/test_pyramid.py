@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages import Disparity, Halve, LeftRightCheck, Match, PixelOrigin, StereoCamera, StereoFrame, SwapViews, Upsample
-from stages.matching.kernels.lr_check import drop_contradicted, drop_contradicted_reference
+from stages.matching.kernels.lr_check import drop_inconsistent, drop_inconsistent_reference
 from stages.matching.kernels.resample import doubled, doubled_reference, halved
 
 
@@ -81,8 +81,8 @@ def test_contradictions_equal_the_reference(height, width, tolerance, seed, thre
     sources, worth = rng.integers(0, 11, maps.shape, np.uint8), rng.random(maps.shape).astype(np.float32)
     found, backward = zip(maps, sources, worth, strict=True)
     for largest in (np.inf, 5.0):
-        left = drop_contradicted(found, backward, tolerance, largest, threads)
-        for ours, plain in zip(left, drop_contradicted_reference(found, backward, tolerance, largest), strict=True):
+        left = drop_inconsistent(found, backward, tolerance, largest, threads)
+        for ours, plain in zip(left, drop_inconsistent_reference(found, backward, tolerance, largest), strict=True):
             np.testing.assert_array_equal(ours, plain)
 
 

@@ -13,22 +13,22 @@ from stages.matching.kernels.aggregation import aggregate_reference
 from stages.matching.kernels.blank_windows import contrast, drop_unmatchable_reference
 from stages.matching.kernels.census import census_costs_reference
 from stages.matching.kernels.gradient import smoothed_costs_reference
-from stages.matching.kernels.matching_inputs import describe
+from stages.matching.kernels.matching_inputs import matching_inputs
 from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
 from stages.matching.kernels.row_ranges import (
-    LEAST_KNOWN,
-    MARGIN,
-    NARROW,
+    MIN_KNOWN_SHARE,
+    NARROW_LANES,
+    RANGE_MARGIN,
     Range,
+    by_range,
     lanes_for,
     move_paths,
-    ranges_of,
-    within,
+    row_ranges,
 )
 from stages.matching.kernels.selection import select_reference
 from stages.matching.kernels.semiglobal import match
 from stages.matching.match import Match
-from tests.stages.matching.test_census import rule_of
+from tests.stages.matching.test_census import params_of
 from tests.stages.matching.test_match import same
 from tests.stages.matching.test_match_opencv import slanted_pair
 from tests.stages.matching.test_sgm_local import views
@@ -44,7 +44,7 @@ def test_every_row_is_in_one_band_whose_range_holds_its_prior(rows, columns, ban
     middle = rng.uniform(minimum, minimum + disparities, (rows, 1))
     prior = (middle + rng.uniform(-20, 20, (rows, columns))).astype(np.float32)
     prior[rng.random(prior.shape) < 0.3] = np.nan
-    found = ranges_of(prior, band, minimum, disparities)
+    found = row_ranges(prior, band, minimum, disparities)
     assert [row for each in found for row in range(each.top, each.end)] == list(range(rows))
     for each in found:
         assert each.end - each.top <= band
@@ -56,11 +56,11 @@ def test_every_row_is_in_one_band_whose_range_holds_its_prior(rows, columns, ban
         assert each.first + each.width.lanes <= disparities
         known = prior[each.top : each.end]
         known = np.clip(known[np.isfinite(known)], minimum, minimum + disparities - 1)
-        assert each.width.lanes in NARROW
-        assert np.isfinite(prior[each.top : each.end]).mean() >= LEAST_KNOWN
-        assert first <= max(known.min() - MARGIN + 1, minimum)
-        assert last >= min(known.max() + MARGIN - 1, minimum + disparities - 1)
-    assert found == ranges_of(prior, band, minimum, disparities, threads=2)
+        assert each.width.lanes in NARROW_LANES
+        assert np.isfinite(prior[each.top : each.end]).mean() >= MIN_KNOWN_SHARE
+        assert first <= max(known.min() - RANGE_MARGIN + 1, minimum)
+        assert last >= min(known.max() + RANGE_MARGIN - 1, minimum + disparities - 1)
+    assert found == row_ranges(prior, band, minimum, disparities, threads=2)
 
 
 def test_specks_do_not_widen_a_range_and_a_band_that_knows_little_has_the_whole():
@@ -68,7 +68,7 @@ def test_specks_do_not_widen_a_range_and_a_band_that_knows_little_has_the_whole(
     prior[3, :30], prior[5, :30] = 150, 2  # 60 of 64000 pixels
     prior[7, :3] = 1e30, -1e30, np.inf
     prior[64:, 450:] = np.nan
-    one, other = ranges_of(prior, 64, 0, 192)
+    one, other = row_ranges(prior, 64, 0, 192)
     assert (one.first, one.width.lanes) == (40 - 31, 64)
     assert (other.first, other.width.lanes) == (0, 192)
 
@@ -76,7 +76,7 @@ def test_specks_do_not_widen_a_range_and_a_band_that_knows_little_has_the_whole(
 @pytest.mark.parametrize("step", [1, -1])
 def test_rows_are_taken_in_their_order(step):
     ranges = [Range(0, 4, 0, Width(16)), Range(4, 7, 0, Width(16)), Range(7, 20, 0, Width(16))]
-    parts = list(within(range(2, 9)[::step], ranges))
+    parts = list(by_range(range(2, 9)[::step], ranges))
     assert [y for part, _ in parts for y in part] == list(range(2, 9))[::step]
     assert all(each.top <= y < each.end for part, each in parts for y in part)
     assert len(parts) == 3
@@ -111,36 +111,36 @@ def test_disparities_are_those_of_a_search_that_lacks_the_rest_of_the_range(
         first = 0 if lanes == whole else int(rng.integers(0, disparities - lanes + 1))
         ranges.append(Range(top, end, first, Width(lanes)))
     table = np.round(12 + 90 / (1 + np.arange(256) / 10)).astype(np.uint8)
-    rule = rule_of(gradient, disparities, minimum)._replace(
-        diagonals=diagonals, table=table, uniqueness=1, calibration=np.linspace(0, 1, 256).astype(np.float32)
+    params = params_of(gradient, disparities, minimum)._replace(
+        diagonals=diagonals, p2_table=table, uniqueness=1, confidence_of=np.linspace(0, 1, 256).astype(np.float32)
     )
     first = np.concatenate([np.full((each.end - each.top, 1), minimum + each.first) for each in ranges])
     guide = prior_costs(prior, first, whole, 0.5, 4.0)
-    found = match(left, right, rule, guide, ranges, None, 1, 1 << 30)
+    found = match(left, right, params, guide, ranges, None, 1, 1 << 30)
 
-    pair = describe(left, right, rule, Width(whole))
-    planes = describe(right, right, rule, Width(whole)).left[:, :, :columns]
+    inputs = matching_inputs(left, right, params, Width(whole))
+    planes = matching_inputs(right, right, params, Width(whole)).left[:, :, :columns]
     raw_costs = smoothed_costs_reference if gradient else census_costs_reference
-    costs = raw_costs(pair.left[:, :, :columns], planes, whole, minimum, rule.unseen)
+    costs = raw_costs(inputs.left[:, :, :columns], planes, whole, minimum, params.unseen_cost)
     costs = np.minimum(costs + prior_costs_reference(prior, minimum, whole, 0.5, 4.0).astype(int), 255)
     searched = np.zeros(costs.shape, bool)
     for each in ranges:
         searched[each.top : each.end, :, each.first : each.first + each.width.lanes] = True
-    down, up = (aggregate_reference(pair.steps, rule, costs, searched, sign, beside=False) for sign in (1, -1))
+    down, up = (aggregate_reference(inputs.steps, params, costs, searched, sign, beside=False) for sign in (1, -1))
     pixels, evidence, source = (np.empty(truth.shape, kind) for kind in (np.float32, np.uint8, np.uint8))
     for each in ranges:
         n, least = min(each.width.lanes, disparities), minimum + each.first
         total = np.minimum(down + up, 255)[:, :, each.first : each.first + n]
         for y in range(each.top, each.end):
-            row = select_reference(total[y], np.full(columns, least), least, n, rule)
+            row = select_reference(total[y], np.full(columns, least), least, n, params)
             pixels[y], evidence[y], source[y] = row
     contrasts = (contrast(image, 0, len(image)) for image in (left, right))
     drop_unmatchable_reference(*contrasts, np.empty((0, 0), np.uint8), pixels, evidence, source)
     np.testing.assert_array_equal(found.pixels, pixels)
     np.testing.assert_array_equal(found.source, source)
-    np.testing.assert_array_equal(found.confidence, rule.calibration[evidence])
+    np.testing.assert_array_equal(found.confidence, params.confidence_of[evidence])
     for threads, memory in ((2, 1 << 30), (1, 1), (2, 1)):
-        again = match(left, right, rule, guide, ranges, None, threads, memory)
+        again = match(left, right, params, guide, ranges, None, threads, memory)
         np.testing.assert_array_equal(again.pixels, found.pixels)
         np.testing.assert_array_equal(again.source, found.source)
         np.testing.assert_array_equal(again.confidence, found.confidence)
@@ -183,5 +183,5 @@ def test_a_match_that_the_prior_has_outside_its_bands_range_is_unknown(slope):
 def test_bands_need_a_prior(slope):
     with pytest.raises(ValueError, match=r"Match.band_height = 16 px needs a `prior`"):
         Match(band_height=16)(slope[0])
-    with pytest.raises(ValueError, match=r"band_height means nothing with Match.search_radius"):
+    with pytest.raises(ValueError, match=r"band_height has no effect with Match.search_radius"):
         Match(band_height=16, search_radius=4)

@@ -14,14 +14,14 @@ from stages.matching.kernels.blank_windows import drop_unmatchable, drop_unmatch
 from stages.matching.kernels.row_ranges import lanes_for
 from stages.matching.kernels.selection import find_partners, find_winners, fit_row, select_reference
 from stages.matching.kernels.speckles import drop_speckles, drop_speckles_reference
-from tests.stages.matching.test_census import rule_of
+from tests.stages.matching.test_census import params_of
 
 
 @njit
-def select(total, beyond, guard, step, winner, votes, right, partners, first, rule, layers, width):
+def select(total, beyond, guard, step, winner, votes, right, partners, first, params, layers, width):
     find_winners(total, beyond, guard, step, winner, votes, right, width)
     find_partners(winner, right, partners)
-    fit_row(winner, votes, partners, first, rule.disparities - 1, rule, *layers)
+    fit_row(winner, votes, partners, first, params.disparities - 1, params, *layers)
 
 
 @pytest.mark.parametrize("disparities", [9, 64, 90, 300])
@@ -36,15 +36,15 @@ def test_a_row_is_selected_as_by_the_reference_in_either_direction(disparities, 
         total[x, max(0, d - 1) : d + 2] = (4, 2, 3)[: len(total[x, max(0, d - 1) : d + 2])]
     guard = np.where(np.abs(np.arange(2 * lanes) - lanes) <= 1, 255, 0).astype(np.uint8)
     beyond = np.where(np.arange(lanes) < disparities, 0, 255).astype(np.uint8)
-    rule = rule_of(True, disparities, minimum)._replace(uniqueness=1, consistency=1)
-    expected = select_reference(total[:, :disparities], np.full(columns, minimum), minimum, disparities, rule)
+    params = params_of(True, disparities, minimum)._replace(uniqueness=1, lr_tolerance=1)
+    expected = select_reference(total[:, :disparities], np.full(columns, minimum), minimum, disparities, params)
     index = np.uint8 if lanes <= 256 else np.uint16
     for step in (1, -1):
         rows = np.empty(columns, np.int16), np.empty((4, columns), np.uint16), np.empty(columns + lanes, index)
         layers = tuple(np.empty(columns, kind) for kind in (np.float32, np.uint8, np.uint8))
         partners, first = np.empty(columns, np.int16), np.full(columns, minimum, np.int32)
         flat = np.append(total.ravel(), np.zeros(64, np.uint8))
-        select(flat, beyond, guard, step, *rows, partners, first, rule, layers, width)
+        select(flat, beyond, guard, step, *rows, partners, first, params, layers, width)
         for ours, plain in zip(layers, expected, strict=True):
             np.testing.assert_array_equal(ours, plain)
     if disparities >= 64 and minimum == 0:
@@ -63,8 +63,8 @@ def test_speckles_are_the_small_components_of_a_graph(height, columns, largest, 
     drop_speckles_reference(*wanted, 1.0, largest)
     for threads in (1, 2):
         found = disparity.copy(), evidence.copy(), source.copy()
-        both = shared_by(threads)
-        drop_speckles(*found, 1.0, largest, Workspace(), both)
+        run_both = shared_by(threads)
+        drop_speckles(*found, 1.0, largest, Workspace(), run_both)
         for ours, plain in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(ours, plain)
 

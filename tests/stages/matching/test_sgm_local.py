@@ -8,10 +8,16 @@ from hypothesis import strategies as st
 from stages.compiled.parallel import shared_by
 from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace
-from stages.matching.kernels.matching_inputs import describe
+from stages.matching.kernels.matching_inputs import matching_inputs
 from stages.matching.kernels.prior_cost import prior_costs
-from stages.matching.kernels.sgm_local import EDGE, SearchWindows, search_around, search_around_reference, windows
-from tests.stages.matching.test_census import rule_of
+from stages.matching.kernels.sgm_local import (
+    WINDOW_EDGE,
+    SearchWindows,
+    match_windows,
+    match_windows_reference,
+    windows_around,
+)
+from tests.stages.matching.test_census import params_of
 from tests.stages.matching.test_match_opencv import textured
 
 
@@ -23,13 +29,13 @@ def views(height, columns, disparity):
     return left.astype(np.uint8), right.astype(np.uint8)
 
 
-def searched(images, rule, found, guide, threads):
+def searched(images, params, found, guide, threads):
     left, right = images
     layers = tuple(np.empty(left.shape, kind) for kind in (np.float32, np.uint8, np.uint8))
-    both = shared_by(threads)
-    pair = describe(left, right, rule._replace(minimum=0), found.width, guide, both)
-    search_around(pair, rule, found, layers, Workspace(), both)
-    return pair, layers
+    run_both = shared_by(threads)
+    inputs = matching_inputs(left, right, params._replace(min_disparity=0), found.width, guide, run_both)
+    match_windows(inputs, params, found, layers, Workspace(), run_both)
+    return inputs, layers
 
 
 @pytest.mark.parametrize("gradient", [True, False])
@@ -47,11 +53,11 @@ def test_disparities_and_evidence_are_those_of_the_reference(gradient, diagonals
     found = SearchWindows(first, Width(lanes))
     guide = prior_costs((prior - first).astype(np.float32), 0, lanes, 0.5, 4.0)
     table = np.round(12 + 90 / (1 + np.arange(256) / 10)).astype(np.uint8)
-    rule = rule_of(gradient, 64, 0)._replace(diagonals=diagonals, table=table, uniqueness=1)
-    pair, layers = searched(images, rule, found, guide, 1)
-    expected = search_around_reference(pair, rule, found)
+    params = params_of(gradient, 64, 0)._replace(diagonals=diagonals, p2_table=table, uniqueness=1)
+    inputs, layers = searched(images, params, found, guide, 1)
+    expected = match_windows_reference(inputs, params, found)
     assert np.isfinite(layers[0]).mean() > 0.2
-    for one, two, plain in zip(layers, searched(images, rule, found, guide, 2)[1], expected, strict=True):
+    for one, two, plain in zip(layers, searched(images, params, found, guide, 2)[1], expected, strict=True):
         np.testing.assert_array_equal(one, plain)
         np.testing.assert_array_equal(two, plain)
 
@@ -62,23 +68,23 @@ def test_a_window_reaches_as_far_as_asked_to_either_side_of_the_prior(height, co
     rng = np.random.default_rng(seed)
     prior = rng.uniform(-60, 320, (height, columns)).astype(np.float32)
     prior[rng.random(prior.shape) < 0.2] = np.nan
-    first, width = windows(prior, reach, least)
+    first, width = windows_around(prior, reach, least)
     x = np.arange(columns)
     assert (first <= x).all()  # it begins in the image
     assert (first >= x - columns + 1).all()
     assert (first >= np.minimum(least, x)).all()
     free = np.isfinite(prior) & (first < x) & (first > np.maximum(least, x - columns + 1))
-    assert (first + EDGE <= prior - reach)[free].all()
-    assert (prior + reach <= first + width.lanes - 1 - EDGE)[free].all()
+    assert (first + WINDOW_EDGE <= prior - reach)[free].all()
+    assert (prior + reach <= first + width.lanes - 1 - WINDOW_EDGE)[free].all()
 
 
 def test_an_image_of_one_row_and_one_without_any_prior_are_searched():
     images = views(1, 40, 8.0)
-    rule = rule_of(True, 64, 0)
+    params = params_of(True, 64, 0)
     nothing = np.full((1, 40), np.nan, np.float32)
     for prior in (np.full((1, 40), 8, np.float32), nothing):
-        found = windows(prior, 4, 0)
+        found = windows_around(prior, 4, 0)
         guide = prior_costs(np.subtract(prior, found.first, dtype=np.float32), 0, 16, 0.5, 4.0)
-        pair, layers = searched(images, rule, found, guide, 2)
-        for ours, plain in zip(layers, search_around_reference(pair, rule, found), strict=True):
+        inputs, layers = searched(images, params, found, guide, 2)
+        for ours, plain in zip(layers, match_windows_reference(inputs, params, found), strict=True):
             np.testing.assert_array_equal(ours, plain)
