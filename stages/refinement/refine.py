@@ -1,9 +1,8 @@
-"""Superpixel refinement of a disparity image (sections 3.2 and 3.3 of the paper): SLIC, planes, filling, bilateral;
-and depth edges moved to where the image has them.
+"""Superpixel refinement of a disparity image (sections 3.2 and 3.3 of the paper): SLIC, planes, filling, bilateral.
 
-The paper's idea is kept, its trust in planes is not: a plane counts only where the segment's own matches agree on it,
-it pulls the matches near to it and leaves the others alone, and what no evidence explains stays unknown. Planes come
-in two sizes, of superpixels and of surfaces, groups of them, because walls and sand show too little for the small ones.
+The paper's idea is kept, but not its trust in planes. A plane counts only where the matches of its segment agree on it.
+It pulls the matches near it and leaves the others alone. What no evidence explains stays unknown. Planes come in two
+sizes, of superpixels and of regions of them, because walls and sand show too little for the small ones.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.refinement.kernels.pixel_origin import Trust, label_origin
 from stages.refinement.kernels.plane_apply import near_median, pull_to_planes, trusted_matches
 from stages.refinement.kernels.plane_fit import Planes, fit_planes
-from stages.refinement.kernels.region_merging import surfaces
+from stages.refinement.kernels.region_merging import merge_regions
 from stages.refinement.kernels.slic import superpixels
 from stages.refinement.kernels.subpixel import fit_brightness
 from stages.refinement.kernels.valid_extent import Extent, extent
@@ -36,11 +35,11 @@ MAX_CORRECTION = 1.0  # px; a match farther from its median or plane stays as it
 INLIER_DISTANCE = 0.5  # px, from a plane
 MIN_INLIER_SHARE, MIN_VALID_SHARE = 0.8, 0.6  # of a superpixel with an accepted plane; a surface needs half the matches
 MAX_GRADIENT = 0.5  # px/px, of an accepted plane
-EVEN = 6  # gray levels within a census window that a camera's noise and compression make of one
+MAX_EVEN_CONTRAST = 6  # gray levels in a census window: noise and compression of a uniform patch
 COMPACTNESS = 10.0  # SLIC's weight of position against colour, CIELAB units
 BILATERAL_GRAY, BILATERAL_DISPARITY = 10.0, 1.0  # scales of the bilateral filter, gray levels and px
-JUMP = 2.0  # px, between neighbours, beyond which there is an edge of depth
-JUMP_GRAY = 10.0  # gray levels over which a neighbour's weight falls to 1/e there
+DEPTH_EDGE = 2.0  # px between neighbours at an edge of depth
+DEPTH_EDGE_GRAY = 10.0  # gray levels over which a neighbour's weight falls to 1/e there
 # Measured with the pipeline `rover` by tests/study.py: the mean of eight Middlebury scenes and of simulated frames.
 TRUST = Trust(
     agreed=(0.88, 0.98, 0.998), alone=(0.62, 0.86, 0.97), replaced=0.81, plane=0.79, mismatch=0.72, occlusion=0.66
@@ -49,82 +48,106 @@ TRUST = Trust(
 
 @dataclass(frozen=True)
 class Refine(Stage):
-    """A denser and smoother disparity image, with the superpixels it was made with.
+    """A denser and smoother disparity image, with its superpixels.
 
-    Only MEASURED pixels are matches; all others count as holes. First brightness tells their fraction of a pixel, which
-    matching draws to 0. What then moves by at most INLIER_DISTANCE stays MEASURED, where the images bear it out;
-    where they do not, as in a noisy sky, it becomes FILLED.
-    A match that moves farther has been replaced by what lies about it: it becomes PLANE, as a hole that a plane fills.
-    Without planes, `plane_weight` 0 and no `plane_fill`, no superpixels are made.
-    With `fill` the other holes are filled from what lies about them and looks like them, from the farther surface where
-    there are two. The confidence is the share of pixels of that origin that were right within 1 px.
+    A match that moves by at most 0.5 px stays MEASURED if left and right image correlate there, else it becomes FILLED.
+    A match that moves farther becomes PLANE, as does a hole that a plane fills. Other filled holes are FILLED. The
+    confidence is the calibrated fraction of such pixels that are right within 1 px. See docs/refinement.md.
+
+    References
+    ----------
+    Lu et al., arXiv 2509.05645, sections 3.2 and 3.3; Hirschmueller, 2008, section 2.5.3 (filling).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from stages import Disparity, Refine, StereoCamera, StereoFrame
+    >>> camera = StereoCamera(fx=50.0, fy=50.0, cx=20.0, cy=15.0, baseline=0.1, width=40, height=30)
+    >>> image = np.random.default_rng(0).integers(60, 190, (30, 48)).astype(np.uint8)
+    >>> frame = StereoFrame(0, image[:, :40].copy(), image[:, 5:45].copy(), camera)
+    >>> pixels = np.full((30, 40), 5, np.float32)
+    >>> pixels[10:14, 20:24] = np.nan
+    >>> matched = Disparity(0, pixels, np.isfinite(pixels).astype(np.uint8), np.ones((30, 40), np.float32))
+    >>> bool(np.isfinite(Refine()(frame, matched).pixels[10:14, 20:24]).all())
+    True
     """
 
-    min_confidence: float = parameter(0.5, "confidence below which a match is treated as unknown", low=0, high=1)
+    min_confidence: float = parameter(0.5, "confidence below which a match counts as unknown", low=0, high=1)
     subpixel_radius: int = parameter(
-        2, "radius of the windows by which brightness tells the fraction of a pixel of a match, 0 = not asked",
+        2, "radius of the windows that fit subpixel fractions to brightness; 0: no fit",
         unit="px", low=0, high=16,
     )  # fmt: skip
-    median_size: int = parameter(5, "side of the median filter over matches, 0 = none", unit="px", choices=(0, 3, 5))
-    superpixels: int = parameter(4000, "number of superpixels aimed at", low=1)
+    median_size: int = parameter(5, "side of the median filter over matches; 0: none", unit="px", choices=(0, 3, 5))
+    superpixels: int = parameter(4000, "number of superpixels that SLIC aims at", low=1)
     min_superpixel_size: int = parameter(
-        300, "pixels that a superpixel shall have on average; a small image gets fewer", unit="px", low=1
+        300, "smallest mean size of a superpixel; a small image gets fewer superpixels", unit="px", low=1
     )
-    surface_size: int = parameter(16, "superpixels in a surface, the larger support of planes; 0 = none", low=0)
-    hypotheses: int = parameter(16, "planes tried per segment", low=1)
-    plane_weight: float = parameter(0.5, "weight of the plane against a match near to it", low=0, high=1)
+    surface_size: int = parameter(16, "superpixels in a region, the larger support of planes; 0: none", low=0)
+    hypotheses: int = parameter(16, "planes tried in each segment", low=1)
+    plane_weight: float = parameter(0.5, "weight of the plane against a match near it", low=0, high=1)
     plane_fill: bool = parameter(True, "whether an accepted plane also fills the holes of its segment")
     fill: bool = parameter(True, "whether the remaining holes are filled from the background")
     max_fill_distance: float = parameter(
-        64.0, "distance from which a hole is still filled; what is hidden here, from any", unit="px", low=0
+        64.0, "largest distance to a disparity that fills a hole (occlusions: any distance)", unit="px", low=0
     )
     max_extrapolation: int = parameter(
-        16, "how far beyond the last match, at the image's border or towards the sky", unit="px", low=0
+        16, "how far holes are filled beyond the last match, at the border or towards the sky", unit="px", low=0
     )
     bilateral_radius: int = parameter(
-        3, "radius of the bilateral filter and its scale in the image, 0 = none", unit="px", low=0, high=32
+        3, "radius and spatial sigma of the bilateral filter; 0: none", unit="px", low=0, high=32
     )
     edge_radius: int = parameter(
-        3, "radius of the weighted median that puts depth edges where the image has them, 0 = none", unit="px", low=0,
+        3, "radius of the weighted median that moves depth edges to edges of the image; 0: none", unit="px", low=0,
         high=16,
     )  # fmt: skip
     min_correlation: float = parameter(
-        0.5, "of the images about a match, below which it counts as a guess, 0 = not asked", low=0, high=1
+        0.5, "correlation of the images around a match below which it becomes FILLED; 0: no test", low=0, high=1
     )
-    threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
+    threads: int = parameter(
+        1, "largest number of cores for one frame (two are used); does not change the result", low=1
+    )
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         check_joined(self, frame, disparity)
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         image, other = eight_bit(frame.left, frame.right)
         guide, right = gray(image), gray(other)
-        matches, weights, reasons = trusted_matches(
-            disparity.pixels, disparity.source, disparity.confidence, self.min_confidence,
-            _burnt_out(frame.left, guide, SATURATION_LEVEL, self.threads), self.threads,
-        )  # fmt: skip
-        if self.subpixel_radius:
-            matches = fit_brightness(guide, right, matches, self.subpixel_radius, self.threads)
-        pixels = near_median(matches, self.median_size, MAX_CORRECTION, self.threads) if self.median_size else matches
-        within, labels, agreed = extent(pixels, self.threads), None, np.zeros(pixels.shape, bool)
-        if self.plane_weight or self.plane_fill:
-            labels, count = superpixels(image, self._count(pixels.size), COMPACTNESS, threads=self.threads)
-            pixels, agreed = self._with_planes(pixels, weights, within, image, labels, count, disparity.stamp)
-        filled, kinds = self._filled(pixels, within, image)
-        guessed = kinds != KEPT
-        refined = self._sharpened(self._bilateral(filled, guide), guessed, guide)
+        saturated = _saturated(frame.left, guide, SATURATION_LEVEL, self.threads)
+        matches, weights, reasons = self._matches(disparity, saturated, guide, right)
+        smoothed = self._median(matches)
+        within = extent(smoothed, self.threads)
+        planar, labels, agreed = self._with_planes(smoothed, weights, within, image, disparity.stamp)
+        filled, kinds = self._filled(planar, within, image)
+        refined = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
+        consistent = self._consistent(refined, kinds != KEPT, guide, right)
         source, confidence = label_origin(
-            matches, disparity.confidence, agreed, kinds, refined,
-            self._borne_out(refined, guessed, guide, right), reasons, INLIER_DISTANCE, TRUST, self.threads,
+            matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, INLIER_DISTANCE, TRUST,
+            self.threads,
         )  # fmt: skip
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
+
+    def _matches(self, disparity: Disparity, saturated: Array, guide: Array, right: Array) -> tuple[Array, ...]:
+        """Trusted matches with subpixel fractions fitted to brightness, their weights, and reasons of the others."""
+        matches, weights, reasons = trusted_matches(
+            disparity.pixels, disparity.source, disparity.confidence, self.min_confidence, saturated, self.threads
+        )
+        if self.subpixel_radius:
+            matches = fit_brightness(guide, right, matches, self.subpixel_radius, self.threads)
+        return matches, weights, reasons
+
+    def _median(self, matches: Array) -> Array:
+        return near_median(matches, self.median_size, MAX_CORRECTION, self.threads) if self.median_size else matches
 
     def _count(self, pixels: int) -> int:
         return max(1, min(self.superpixels, pixels // self.min_superpixel_size))
 
     def _with_planes(
-        self, pixels: Array, weights: Array, within: Extent, image: Array, labels: Array, count: int, seed: int
-    ) -> tuple[Array, Array]:
-        """Matches near their planes drawn towards them, holes filled from them, (H, W) float32; where, (H, W) bool."""
+        self, pixels: Array, weights: Array, within: Extent, image: Array, seed: int
+    ) -> tuple[Array, Array | None, Array]:
+        """Matches pulled to their planes and holes filled from them; the superpixels; where a plane agreed."""
+        if not (self.plane_weight or self.plane_fill):
+            return pixels, None, np.zeros(pixels.shape, bool)
+        labels, count = superpixels(image, self._count(pixels.size), COMPACTNESS, threads=self.threads)
         margin = self.max_extrapolation if self.plane_fill else -1
         planes = fit_planes(pixels, labels, count, weights, self.hypotheses, INLIER_DISTANCE, seed, self.threads)
         accepted = self._accepted(planes, MIN_VALID_SHARE)
@@ -132,14 +155,14 @@ class Refine(Stage):
             pixels, accepted, labels, within, MAX_CORRECTION, self.plane_weight, margin, self.threads
         )
         if not self.surface_size:
-            return pixels, agreed
-        group, groups = surfaces(
+            return pixels, labels, agreed
+        group, groups = merge_regions(
             image, labels, count, max(1, count // self.surface_size), COMPACTNESS, threads=self.threads
         )
-        # Every other pixel of every other row is plenty for a surface.
+        # Every other pixel of every other row is enough for a region.
         few = np.s_[::2, ::2]
         sparse, regions = (layer[few].copy() for layer in (pixels, labels))
-        sparse[weights[few] == 0] = np.nan  # what the first planes filled is no evidence for the second
+        sparse[weights[few] == 0] = np.nan  # filled pixels are no evidence for the second planes
         planes = fit_planes(
             sparse, group.take(regions), groups, np.ascontiguousarray(weights[few]), self.hypotheses,
             INLIER_DISTANCE, seed + 1, self.threads,
@@ -148,11 +171,10 @@ class Refine(Stage):
         pixels, again = pull_to_planes(
             pixels, accepted, labels, within, MAX_CORRECTION / 2, self.plane_weight, margin, self.threads
         )
-        return pixels, agreed | again
+        return pixels, labels, agreed | again
 
     def _accepted(self, planes: Planes, valid_share: float, spacing: int = 1) -> Array:
-        """The coefficients (n, 3) of the planes that the evidence supports, of pixels `spacing` px apart; NaN for the
-        others."""
+        """The coefficients (n, 3) of the supported planes, of pixels `spacing` px apart; NaN for the others."""
         slope = np.hypot(planes.coefficients[:, 0], planes.coefficients[:, 1])
         supported = (planes.inlier_share >= MIN_INLIER_SHARE) & (planes.valid_share >= valid_share)
         return np.where((supported & (slope <= MAX_GRADIENT * spacing))[:, None], planes.coefficients, np.nan)
@@ -168,8 +190,8 @@ class Refine(Stage):
             return pixels
         return joint_bilateral(pixels, guide, self.bilateral_radius, BILATERAL_GRAY, BILATERAL_DISPARITY, self.threads)
 
-    def _borne_out(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> Array:
-        """Where the images vary alike, so shifted, (H, W) bool."""
+    def _consistent(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> Array:
+        """Where left and right image correlate at the refined disparity, (H, W) bool."""
         if self.min_correlation == 0:
             return np.ones(pixels.shape, bool)
         return correlation(pixels, guessed, guide, right, self.threads) >= F32(self.min_correlation)
@@ -177,19 +199,19 @@ class Refine(Stage):
     def _sharpened(self, pixels: Array, guessed: Array, guide: Array) -> Array:
         if self.edge_radius == 0:
             return pixels
-        return sharpen_edges(pixels, guessed, guide, self.edge_radius, JUMP, JUMP_GRAY, self.threads)
+        return sharpen_edges(pixels, guessed, guide, self.edge_radius, DEPTH_EDGE, DEPTH_EDGE_GRAY, self.threads)
 
 
-def _burnt_out(image: Array, guide: Array, level: int, threads: int) -> Array:
-    """Where the image is even and a colour of it burnt out, (H, W) bool: what is matched there is noise."""
-    burnt = np.zeros(guide.shape, bool)
+def _saturated(image: Array, guide: Array, level: int, threads: int) -> Array:
+    """Where the image is even and saturated in a colour, (H, W) bool: matches there are noise."""
+    found = np.zeros(guide.shape, bool)
 
     def mark(first: int, end: int) -> None:
         rows = image[first:end]
         bright = rows >= level if image.ndim == 2 else cv2.inRange(rows, (0,) * 3, (level - 1,) * 3) == 0
         if bright.any():
-            burnt[first:end] = bright & (contrast(guide, first, end) <= EVEN)
+            found[first:end] = bright & (contrast(guide, first, end) <= MAX_EVEN_CONTRAST)
 
-    if image.dtype == np.uint8:  # of more bits nothing tells where the sensor ends
+    if image.dtype == np.uint8:  # the saturation level of more bits is unknown
         by_bands(shared_by(threads), len(image), mark)
-    return burnt
+    return found

@@ -19,7 +19,7 @@ ITERATIONS = 3
 AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])
 
 
-def surfaces(
+def merge_regions(
     image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, threads: int = 1
 ) -> tuple[Array, int]:
     """Group superpixels into about `groups` surfaces.
@@ -96,7 +96,7 @@ def _sum_up(image, labels, first, sums):
             total[5] += 1
 
 
-def surfaces_reference(
+def merge_regions_reference(
     image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0
 ) -> tuple[Array, int]:
     """`surfaces` in plain numpy, superpixel after superpixel."""

@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.refinement.kernels.depth_edges import sharpen_edges, sharpen_edges_reference
-from stages.refinement.refine import JUMP, JUMP_GRAY
+from stages.refinement.refine import DEPTH_EDGE, DEPTH_EDGE_GRAY
 
 
 def sharpened(disparity, image):
-    return sharpen_edges(disparity, np.zeros(disparity.shape, bool), image, 3, JUMP, JUMP_GRAY)
+    return sharpen_edges(disparity, np.zeros(disparity.shape, bool), image, 3, DEPTH_EDGE, DEPTH_EDGE_GRAY)
 
 
 @settings(max_examples=30, deadline=None)
@@ -20,7 +20,7 @@ def test_the_median_is_that_of_the_reference(height, width, radius, seed):
     disparity = np.float32(random.choice([-900.0, 3.0, 40.0], (height, width)) + random.normal(0, 0.2, (height, width)))
     disparity[random.random(disparity.shape) < 0.2] = np.nan
     image = random.integers(0, 60, (height, width), np.uint8)
-    everything = disparity, random.random(disparity.shape) < 0.3, image, radius, JUMP, JUMP_GRAY
+    everything = disparity, random.random(disparity.shape) < 0.3, image, radius, DEPTH_EDGE, DEPTH_EDGE_GRAY
     sharp = sharpen_edges(*everything)
     np.testing.assert_array_equal(sharp, sharpen_edges_reference(*everything))
     np.testing.assert_array_equal(sharp, sharpen_edges(*everything, threads=2))
@@ -50,13 +50,13 @@ def test_guesses_do_not_outvote_a_match_but_follow_it():
     disparity, image = np.full((20, 20), 10, np.float32), np.full((20, 20), 90, np.uint8)
     disparity[9:11, 9:11] = 30
     guessed = disparity == 10
-    assert np.array_equal(sharpen_edges(disparity, guessed, image, 3, JUMP, JUMP_GRAY), disparity)
-    assert (sharpen_edges(disparity, ~guessed, image, 3, JUMP, JUMP_GRAY) == 10).all()
+    assert np.array_equal(sharpen_edges(disparity, guessed, image, 3, DEPTH_EDGE, DEPTH_EDGE_GRAY), disparity)
+    assert (sharpen_edges(disparity, ~guessed, image, 3, DEPTH_EDGE, DEPTH_EDGE_GRAY) == 10).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1)])
 def test_images_of_a_row_or_a_column_work(shape):
     disparity = np.arange(np.prod(shape), dtype=np.float32).reshape(shape) * 4
     image = np.zeros(shape, np.uint8)
-    everything = disparity, np.zeros(shape, bool), image, 3, JUMP, JUMP_GRAY
+    everything = disparity, np.zeros(shape, bool), image, 3, DEPTH_EDGE, DEPTH_EDGE_GRAY
     assert np.array_equal(sharpen_edges(*everything), sharpen_edges_reference(*everything))

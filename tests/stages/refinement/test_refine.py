@@ -10,7 +10,7 @@ import pytest
 from stages.data import Disparity, PixelOrigin, StereoCamera, StereoFrame
 from stages.data import known as known_origin
 from stages.refinement import refine as module
-from stages.refinement.refine import EVEN, Refine, _burnt_out
+from stages.refinement.refine import MAX_EVEN_CONTRAST, Refine, _saturated
 from tests.bench.stereo_scores import paper_stages
 
 SHAPE = HEIGHT, WIDTH = 120, 160
@@ -412,8 +412,8 @@ def test_what_is_burnt_out_does_not_depend_on_bands(threads):
     image = cv2.blur(np.random.default_rng(3).integers(0, 256, (97, 60, 3), dtype=np.uint8), (9, 9))
     image[24:72, 10:] = 253  # bands begin where it begins and ends
     guide = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    even = cv2.morphologyEx(guide, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) <= EVEN
-    np.testing.assert_array_equal(_burnt_out(image, guide, 250, threads), even & (image >= 250).any(axis=2))
+    even = cv2.morphologyEx(guide, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) <= MAX_EVEN_CONTRAST
+    np.testing.assert_array_equal(_saturated(image, guide, 250, threads), even & (image >= 250).any(axis=2))
 
 
 def test_a_match_that_the_images_do_not_bear_out_is_a_guess():

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage import data
 
-from stages.refinement.kernels.region_merging import surfaces, surfaces_reference
+from stages.refinement.kernels.region_merging import merge_regions, merge_regions_reference
 from stages.refinement.kernels.slic import superpixels
 
 
@@ -18,8 +18,8 @@ def test_groups_are_those_of_the_reference(height, width, aimed, groups, seed, t
     shape = (height, width, 3) if seed % 2 else (height, width)
     image = rng.integers(0, 256, shape, dtype=np.uint8)
     labels, count = superpixels(image, aimed)
-    surface, total = surfaces(image, labels, count, groups, threads=threads)
-    expected, expected_total = surfaces_reference(image, labels, count, groups)
+    surface, total = merge_regions(image, labels, count, groups, threads=threads)
+    expected, expected_total = merge_regions_reference(image, labels, count, groups)
     assert np.array_equal(surface, expected)
     assert total == expected_total
 
@@ -28,8 +28,8 @@ def test_groups_of_a_photo_are_those_of_the_reference():
     image = np.ascontiguousarray(data.astronaut()[:200, 100:340])
     labels, count = superpixels(image, 300)
     for compactness in (2.0, 10.0):
-        surface, total = surfaces(image, labels, count, 20, compactness)
-        assert np.array_equal(surface, surfaces_reference(image, labels, count, 20, compactness)[0])
+        surface, total = merge_regions(image, labels, count, 20, compactness)
+        assert np.array_equal(surface, merge_regions_reference(image, labels, count, 20, compactness)[0])
         assert 10 <= total <= 30
 
 
@@ -38,7 +38,7 @@ def test_a_surface_does_not_cross_an_edge_that_its_superpixels_keep(threads):
     image = np.full((120, 160), 60, np.uint8)
     image[:, 83:] = 180
     labels, count = superpixels(image, 120)
-    surface, total = surfaces(image, labels, count, 8, threads=threads)
+    surface, total = merge_regions(image, labels, count, 8, threads=threads)
     regions = surface[labels]
     assert set(regions[:, :83].ravel()) & set(regions[:, 83:].ravel()) == set()
     assert 4 <= total <= 12
