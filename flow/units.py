@@ -6,7 +6,7 @@ import math
 import re
 from fractions import Fraction
 
-# unit -> (what it measures, its size); sizes are whole numbers where they can be, so that conversions stay exact
+# unit -> (quantity, size); sizes are whole numbers where possible, so that conversions are exact
 UNITS: dict[str, tuple[str, float]] = {
     "ns": ("time", 1.0),
     "us": ("time", 1e3),
@@ -26,7 +26,7 @@ UNITS: dict[str, tuple[str, float]] = {
     "": ("number", 1.0),
 }
 
-# what nobody writes bare, for 20 may be meant as cm or as m -> the units to write it with
+# quantities that need a unit in a pipeline file, and the units to suggest
 _WRITTEN = {"time": ("ms", "s"), "length": ("cm", "m"), "angle": ("deg", "rad"), "share": ("%",)}
 
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z%]*)\s*$")

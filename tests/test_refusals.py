@@ -72,7 +72,7 @@ def test_a_missing_stage_input_is_refused_before_the_run(traverse, tmp_path, cap
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ("disparity=96", "disparity.param=value; did you mean 'disparities'?"),
+        ("disparity=96", "disparity.parameter=value; did you mean 'disparities'?"),
         ("rover.max_slope=95deg", "must be at most 89 deg, not 95deg"),
     ],
 )
@@ -265,7 +265,7 @@ def test_a_simulation_beyond_its_limits_is_refused_by_option(tmp_path, capsys, o
 
 def test_a_section_in_place_of_a_setting_is_explained(traverse, tmp_path, capsys):
     assert roverflow("run", traverse, "--set", "settings.disparities=64", "-o", tmp_path / "out.mcap") == 2
-    assert "settings are set by their names alone, as in disparities=value" in capsys.readouterr().err
+    assert "a setting has no prefix; write disparities=value" in capsys.readouterr().err
 
 
 def test_an_output_without_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys):

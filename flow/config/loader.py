@@ -1,7 +1,7 @@
 """Pipeline files: YAML in, a checked `Graph` out.
 
-Everything is checked against the stages' own dataclasses and annotations before anything runs. An error names the
-file, the line, and the nearest name that would have been valid.
+The file is read, its settings are filled in and changed, its templates are expanded, and the graph is checked against
+the dataclasses and annotations of the stages. An error names the file, the line and the nearest valid name.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def shipped() -> list[str]:
 
 
 def _checked_keys(tree: Value) -> Value:
-    """The file, refused where it has unknown parts, which hide the ones that they should be."""
+    """The file, if it has no unknown key. A misspelt key would otherwise show as a missing one."""
     if tree.value is None:
         raise tree.place.error(f"the file is empty; {_BEGIN}")
     for key, value in mapping(tree, "the pipeline").items():
@@ -118,7 +118,7 @@ def _graph(name: str, text: str, parts: Mapping[str, Value], expansion: Expansio
     sinks = tuple((entry.use, entry.made()) for entry in to_sinks)
     for entry in to_sinks:
         if [use for use, _ in sinks].count(entry.use) > 1:
-            raise entry.place.error(f"{entry.use} is twice among the sinks")
+            raise entry.place.error(f"{entry.use} is listed twice under 'sinks'")
     nodes, kinds = _nodes(expansion, dict(source.streams))
     _check_clock(nodes, parts["streams"].place)
     graph = Graph(name, text, source, from_source.use, tuple(nodes), sinks, kinds, templates=expansion.templates)
@@ -128,7 +128,7 @@ def _graph(name: str, text: str, parts: Mapping[str, Value], expansion: Expansio
 
 
 def _nodes(expansion: Expansion, kinds: dict[str, type]) -> tuple[list[Node], dict[str, type]]:
-    """The nodes in the order of their work, and the types of all streams; kinds: of the streams of the source."""
+    """The nodes in the order of work, and the types of all streams; kinds: those of the source's streams."""
     clocks, streams = {name: name for name in kinds}, expansion.streams
     for name, spec in streams.items():
         if name in kinds:
@@ -154,7 +154,7 @@ def _check_known(stream: str, known: Collection[str], place: YamlLocation) -> No
 
 
 def _check_declared(scope: Scope | None, kinds: Mapping[str, type]) -> None:
-    """Whether the streams given to a template, as far as their types are known, are of the declared types."""
+    """Check the types of the streams given to a template, as far as they are known."""
     for name, given in (scope.inputs if scope else {}).items():
         kind = kinds.get(given.stream)
         if kind is not None and given.kind not in [base.__name__ for base in getattr(kind, "__mro__", (kind,))]:
@@ -164,7 +164,7 @@ def _check_declared(scope: Scope | None, kinds: Mapping[str, type]) -> None:
 
 
 def _inputs(name: str, entry: NodeSpec, known: list[str], scope: Scope | None) -> dict[str, str]:
-    """Port -> stream, as the entry of stream `name` wires them."""
+    """The stream of each input port of the stream `name`."""
     try:
         ports, unneeded = ports_of(entry.kind)
     except TypeError as error:
@@ -185,12 +185,12 @@ def _inputs(name: str, entry: NodeSpec, known: list[str], scope: Scope | None) -
         twice = f"'{name}' aligns '{next(iter(inputs.values()))}' with itself; name two streams"
         raise place_at_fault([entry.item.value[port] for port in inputs], entry.place).error(twice)
     if not inputs:
-        raise entry.place.error(f"'{name}' has no input: give it a stream, for it works once for each item of one")
+        raise entry.place.error(f"'{name}' has no input; give it at least one stream")
     return inputs
 
 
 def _node(name: str, entry: NodeSpec, inputs: dict[str, str], kinds: dict[str, type], clocks: dict[str, str]) -> Node:
-    """The node that makes the stream `name`; kinds, clocks: of the streams before it."""
+    """The node that makes the stream `name`; kinds, clocks: those of the streams before it."""
     actor = entry.made({*inputs, "optional"})
     wanted, _ = ports_of(entry.kind)
     for port, stream in inputs.items():
@@ -209,7 +209,7 @@ def _node(name: str, entry: NodeSpec, inputs: dict[str, str], kinds: dict[str, t
 
 
 def _check_clock(nodes: list[Node], place: YamlLocation) -> None:
-    """Whether all stages share one clock, and all alignment comes before them; place: of the streams."""
+    """Check that all stages share one clock and that aligners come before them; place: the line of `streams`."""
     stages = [node for node in nodes if not node.aligns]
     if not stages:
         raise place.error("the pipeline has no stage")
@@ -226,7 +226,7 @@ def _check_clock(nodes: list[Node], place: YamlLocation) -> None:
 
 
 def _check_streams(sink: Any, entry: NodeSpec, graph: Graph) -> None:
-    """Whether the streams that a sink's entry names are there, of the frames, and of types that it can write."""
+    """Check that the streams in a sink's entry exist, belong to the frames, and have types that it can write."""
     keys = set(getattr(sink, "names_streams", ())) & entry.given().keys()
     for key in keys:
         for name in entry.item.value[key].plain():
@@ -234,8 +234,7 @@ def _check_streams(sink: Any, entry: NodeSpec, graph: Graph) -> None:
                 raise entry.place_of(key).error(f"there is no stream '{name}'{nearest(str(name), graph.kinds)}")
             if name not in graph.frame_streams:
                 raise entry.place_of(key).error(
-                    f"'{name}' is not of the frames, which run on the clock of '{graph.clock}'; align it first "
-                    "(flow.align)"
+                    f"'{name}' does not run on the clock of the frames, '{graph.clock}'; align it first (flow.align)"
                 )
     for name, kind in graph.frame_streams.items() if hasattr(sink, "unwritable") else ():
         if why := sink.unwritable(name, kind):

@@ -1,4 +1,4 @@
-"""An entry of a pipeline file: the class that it uses, and the object that its parameters make of that."""
+"""An entry of a pipeline file: its class, and the object of that class with the parameters of the entry."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROLES = {  # the attributes that a class of that role needs
 
 @dataclass(frozen=True)
 class NodeSpec:
-    """The source, a stream or a sink as the file describes it; `kind` is the class that it names by `use`."""
+    """The source, a stream or a sink as the file describes it; `kind` is the class under `use`."""
 
     item: Value
     use: str
@@ -30,10 +30,10 @@ class NodeSpec:
 
     @classmethod
     def read(cls, item: Value, what: str, role: str) -> NodeSpec:
-        """The entry, its class found and fit for its role; what: it is, in words."""
+        """The entry with its class, which must fit the role; what: the name of the entry in messages."""
         use = mapping(item, what).get("use")
         if use is None:
-            raise item.place.error(f"{what} does not say which class to 'use'")
+            raise item.place.error(f"{what} lacks 'use', its class, such as stages.Match")
         if not isinstance(use.value, str) or not all(use.value.split(".")) or "." not in use.value:
             raise use.place.error(f"'use: {use.plain()}' must be a module and a class, such as stages.Match")
         kind = _class(use.value, use.place)
@@ -43,15 +43,15 @@ class NodeSpec:
 
     @property
     def place(self) -> YamlLocation:
-        """Where it begins."""
+        """The line of the entry."""
         return self.item.place
 
     def place_of(self, key: str) -> YamlLocation:
-        """Where a key of it stands."""
+        """The line of one of its keys."""
         return self.item.value[key].place  # type: ignore[no-any-return]
 
     def given(self, but: Collection[str] = ()) -> dict[str, Value]:
-        """What it says beside its class, but for some keys."""
+        """Its keys except `use` and those in `but`."""
         return {key: value for key, value in self.item.value.items() if key != "use" and key not in but}
 
     def parameters(self) -> dict[str, Field[Any]]:
@@ -59,7 +59,7 @@ class NodeSpec:
         return {item.name: item for item in fields(self.kind) if item.init}
 
     def made(self, inputs: Collection[str] = ()) -> Any:
-        """The object that it describes; `inputs` are no parameters."""
+        """The object that the entry describes; inputs: keys that are no parameters."""
         try:
             return _constructed(self.kind, self.use, self.given(but=inputs), self.place)
         except TypeError as error:
@@ -67,7 +67,7 @@ class NodeSpec:
 
 
 def _constructed(kind: type, name: str, given: Mapping[str, Value], place: YamlLocation) -> Any:
-    """The object of a dataclass with the given parameters; name: of it in messages. Raises TypeError for annotations
+    """An object of a dataclass with the given parameters; name: its name in messages. Raises TypeError for annotations
     that cannot be read."""
     hints, values = hints_of(kind), {}
     parameters = {item.name: item for item in fields(kind) if item.init}
@@ -90,14 +90,14 @@ def _constructed(kind: type, name: str, given: Mapping[str, Value], place: YamlL
             raise place.error(f"{name} needs its parameter '{key}'")
     try:
         return kind(**values)
-    except (Exception, SystemExit) as error:  # whatever a stage of the user's own may raise
+    except (Exception, SystemExit) as error:  # a user's class may raise anything
         named = [key for key in values if f"{kind.__name__}.{key}" in str(error)]
         at = given[named[-1]].place if named else place_at_fault(given.values(), place)
         raise at.error(str(error) if isinstance(error, ValueError) else failure(error)) from error
 
 
 def dataclass_of(hint: Any) -> type | None:
-    """The dataclass that a parameter is annotated with, also beside None."""
+    """The dataclass in the type of a parameter, or None."""
     for kind in get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,):
         if isinstance(kind, type) and is_dataclass(kind):
             return kind
@@ -105,26 +105,26 @@ def dataclass_of(hint: Any) -> type | None:
 
 
 def place_at_fault(values: Iterable[Value], place: YamlLocation) -> YamlLocation:
-    """Where to report an error: the last of the values that the command line set, or else `place`."""
+    """The place of the last value that the command line set, or else `place`."""
     by_hand = [value.place for value in values if value.place.line is None]
     return by_hand[-1] if by_hand else place
 
 
 def _class(use: str, place: YamlLocation) -> type:
-    """The dataclass of that name."""
+    """The dataclass that an entry names."""
     module_name, _, name = use.rpartition(".")
     try:
         module = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:  # whatever a module of the user's own may raise
+    except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise place.error(f"cannot import '{module_name}': {type(error).__name__}: {error}") from error
     kind = getattr(module, name, None)
     if isinstance(kind, type) and is_dataclass(kind):
         return kind
     if hasattr(module, name):
-        raise place.error(f"{use} is no dataclass, and a pipeline uses no other class; give it @dataclass")
+        raise place.error(f"{use} is no dataclass; decorate it with @dataclass")
     listed = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
     known = [n for n in listed if is_dataclass(getattr(module, n, None))]
-    raise place.error(f"'{module_name}' has no '{name}' that a pipeline can use{nearest(name, known)}")
+    raise place.error(f"'{module_name}' has no dataclass '{name}'{nearest(name, known)}")
 
 
 def lacking(kind: type, role: str) -> list[str]:
@@ -143,7 +143,7 @@ def type_name(kind: Any) -> str:
 
 
 def mapping(item: Value, what: str) -> dict[str, Value]:
-    """The keys of an entry that has such; what: it is, in words."""
+    """The keys of an entry; what: the name of the entry in messages."""
     if not isinstance(item.value, dict):
         raise item.place.error(f"{what} must be a mapping of names to values")
     return item.value

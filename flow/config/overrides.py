@@ -27,7 +27,7 @@ class Change:
         if names[0] == "sinks" and len(names) > 1:
             names = names[1:]
         if not (separator and all(names)):
-            raise UsageError(f"--set {override}: expected stream.param=value, or name=value of the pipeline's settings")
+            raise UsageError(f"--set {override}: write stream.parameter=value, or setting=value")
         value = read(text, lambda line: YamlLocation(f"--set {override}", None))
         return cls(names[0], tuple(names[1:]), value)
 
@@ -59,7 +59,7 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
     used = set(_texts(tree, leave_out="templates"))
     for name, given in _settings(tree).items():
         if any(isinstance(text, str) and text.startswith("$") for text in _texts(settings[name])):
-            raise settings[name].place.error(f"the setting '{name}' names another; give it a value of its own")
+            raise settings[name].place.error(f"the setting '{name}' refers to another setting; give it a value")
         if f"${name}" not in used:
             raise given.place.error(f"the setting '{name}' is used nowhere; write ${name} where it belongs")
     of_streams = []
@@ -94,11 +94,11 @@ def _unknown(change: Change, entries: Iterable[str], settings: Mapping[str, Valu
     """The sentence about a change whose target is neither an entry nor a setting."""
     target, keys = change.target, change.keys
     if keys and target == "settings":
-        return f"settings are set by their names alone, as in {keys[0]}=value"
+        return f"a setting has no prefix; write {keys[0]}=value"
     if keys:
         return f"there is no stream '{target}'{nearest(target, [*entries, *settings])}"
     if target in entries:
-        return f"say which parameter of '{target}' to set, as in {target}.param=value{nearest(target, settings)}"
+        return f"name the parameter of '{target}', as in {target}.parameter=value{nearest(target, settings)}"
     return f"the pipeline has no setting '{target}'{nearest(target, settings)}"
 
 
@@ -133,7 +133,7 @@ def _with_value(item: Value, what: str, keys: Sequence[str], value: Value) -> Va
     if not keys:
         return value
     if not isinstance(item.value, dict):
-        raise value.place.error(f"'{what}' is no mapping of names to values")
+        raise value.place.error(f"'{what}' is not a mapping")
     inner = item.value.get(keys[0], Value({}, value.place))
     changed = _with_value(inner, f"{what}.{keys[0]}", keys[1:], value)
     return Value({**item.value, keys[0]: changed}, value.place)

@@ -166,7 +166,7 @@ def test_a_template_that_uses_itself_is_refused(tmp_path):
         ("out.secnd=1 m", "neither template 'scaled_twice' nor its output, tests.flow.toys.Scale, has 'secnd'; did"),
         ("out.second=1 s", "tests.flow.toys.Scale.factor: '1 s' is a time"),
         ("out/first.factor=1", "tests.flow.toys.Scale.factor: 1 needs a unit"),
-        ("out=1", "say which parameter of 'out' to set"),
+        ("out=1", "name the parameter of 'out', as in out.parameter=value"),
     ],
 )  # fmt: skip
 def test_a_bad_setting_of_a_template_is_named(tmp_path, override, message):
