@@ -249,7 +249,7 @@ def print_skies(cases: list[Case]) -> None:
             shares.setdefault(name, []).append((measured[case.mask == 0].mean(), measured[known].mean()))
     (sky, ground), (sky_else, ground_else) = (100 * np.mean(values, axis=0) for values in shares.values())
     print(f"measured: {sky:.1f} % of the sky, {ground:.1f} % of the ground; {sky_else:.1f} %, {ground_else:.1f} % if")
-    print("what the images do not bear out counted as well")
+    print("matches that fail the correlation check counted as well")
 
 
 def print_worth(cases: list[Case]) -> None:
@@ -263,7 +263,7 @@ def print_worth(cases: list[Case]) -> None:
     for name, source in (("replaced", 2), ("plane", 2), ("mismatch", 3), ("occlusion", 3)):
         value = np.float32(getattr(TRUST, name))
         origins[name] = lambda found, source=source, value=value: (found.source == source) & (found.confidence == value)
-    assert len({*TRUST[2:]}) == 4, "origins of equal confidence could not be told apart"
+    assert len({*TRUST[2:]}) == 4, "origins of equal confidence cannot be distinguished"
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for case in cases:
         found = stereo_part("rover", case.frame, case.disparities, entry="rectified")["disparity"]

@@ -1,4 +1,4 @@
-"""The house's own rules: who may import whom, and that a package speaks of nothing it does not know."""
+"""Rules of the code base: which folder may import which, and the words that each may use."""
 
 import ast
 from pathlib import Path

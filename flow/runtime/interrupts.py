@@ -30,8 +30,8 @@ class Stop:
 
 
 @contextmanager
-def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
-    """Turn SIGINT, SIGTERM and SIGHUP into requests to `stop`, and report each by `tell`.
+def interrupts(stop: Stop, report: Callable[[str], None]) -> Iterator[None]:
+    """Turn SIGINT, SIGTERM and SIGHUP into requests to `stop`, and report each by `report`.
 
     SIGHUP stays ignored where it is, as under nohup. The handlers from before are restored at the end.
     """
@@ -40,7 +40,7 @@ def interrupts(stop: Stop, tell: Callable[[str], None]) -> Iterator[None]:
         stop.request()
         abandoning = stop.abandoning()
         with suppress(Exception):  # the terminal may be gone; the run must still end properly
-            tell("abandoning the frames in flight" if abandoning else "interrupted: finishing the frames in flight")
+            report("abandoning the frames in flight" if abandoning else "interrupted: finishing the frames in flight")
         if abandoning and stop.reading:
             raise KeyboardInterrupt  # leaves a source that does not answer
 

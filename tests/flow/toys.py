@@ -104,7 +104,7 @@ class Either:
     both: bool = False
 
     def check_inputs(self, connected: set[str]) -> None:
-        """Wants both, where it is told to."""
+        """Needs both inputs if `both` is set."""
         if self.both and "b" not in connected:
             raise ValueError("Either.both needs a `b`")
 

@@ -1,4 +1,4 @@
-"""Whether the program's threads share one heap, by what glibc itself says of its heaps."""
+"""Whether the program's threads share one heap, as glibc reports its heaps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The error of poses is that of the way they tell, wherever their frame of reference has its origin and heading."""
+"""Pose errors are errors of the path; origin and heading of the frame of reference do not matter."""
 
 from __future__ import annotations
 

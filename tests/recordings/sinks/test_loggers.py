@@ -75,7 +75,7 @@ def test_the_surface_has_no_triangle_across_a_hole(rrd: Path) -> None:
     assert np.isfinite(vertices).all()
     corners = vertices[triangles][..., :2]
     assert np.ptp(corners, axis=1).max() == pytest.approx(terrain.resolution, abs=1e-5)
-    # 29 x 39 squares, of which the 5 x 6 that touch the 4 x 5 hole are gone, but for the halves at two of its corners.
+    # 29 x 39 squares less the 5 x 6 that touch the 4 x 5 hole, plus the halves at two of its corners.
     assert len(triangles) == 2 * (29 * 39 - 5 * 6) + 2
 
 

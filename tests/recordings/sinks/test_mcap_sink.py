@@ -137,7 +137,7 @@ def test_the_diagnostics_contain_the_epoch_of_a_regional_map(tmp_path: Path) -> 
     sink.open(tmp_path / "out.mcap", {"regional_map": ElevationMap}, ABOUT)
     for frame in range(3):
         cloud, pose = drive(frame)
-        pose = replace(pose, frame_id="odom" if frame == 0 else "odom/2")  # the map begins anew
+        pose = replace(pose, frame_id="odom" if frame == 0 else "odom/2")  # the map starts again
         sink.write(Record(cloud.stamp, {"regional_map": fuse(cloud, pose, MOUNT)}))
     sink.close({})
     told = {}

@@ -176,7 +176,7 @@ def test_an_unwritable_path_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it was not foreseen, rerun tells it only to its log: the sink has to find out."""
+    """rerun reports an unexpected full disk only in its log, so the sink checks for it."""
     monkeypatch.setattr("recordings.sinks.rerun_sink._room", lambda file: RESERVED_BYTES)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = RerunSink()

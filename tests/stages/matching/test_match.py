@@ -118,7 +118,7 @@ def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
     assert nearer.sum() > 1000
     assert np.isnan(bare.pixels[known & (truth > 26.5)]).all()
     np.testing.assert_array_equal(joined.pixels[known & (truth > 26.5)], prior.pixels[known & (truth > 26.5)])
-    assert np.isfinite(joined.pixels[nearer]).all()  # the end of the range, where the search loses some, too
+    assert np.isfinite(joined.pixels[nearer]).all()  # the end of the range, where the search also loses some
     assert np.abs(joined.pixels - truth)[nearer].max() < 1
     taken = nearer & np.isnan(bare.pixels)
     assert (joined.source[taken] == PixelOrigin.MEASURED).all()

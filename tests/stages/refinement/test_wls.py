@@ -18,7 +18,7 @@ def test_equals_a_sparse_solve_of_every_line(height, width, strength, heaviest, 
     values = rng.uniform(0, 100, (height, width)).astype(np.float32)
     weights = np.where(rng.random((height, width)) < 0.3, 0, rng.random((height, width))).astype(np.float32)
     weights[0, 0] = 1
-    weights *= np.float32(heaviest)  # the lighter ones arrive as about the least that tells anything
+    weights *= np.float32(heaviest)  # the lighter ones are close to the smallest that has an effect
     guide = rng.integers(100, 110, (height, width), dtype=np.uint8)
     smoothed = smooth(values, weights, guide, strength, 3.0)
     expected, mass = smooth_reference(values, weights, guide, strength, 3.0)
