@@ -211,7 +211,7 @@ def test_a_setting_stands_wherever_it_is_named(tmp_path):
     (SETTINGS, ["twice=1 m"], r"--set twice=1 m: name the parameter of 'twice', as in twice.parameter=value"),
     (SETTINGS, ["twice.optional=maybe"], r"--set twice.optional=maybe: 'optional' must be true or false, not maybe"),
     (SETTINGS.replace("settings", "setings"), [], r"toy.yaml:1: a pipeline has no 'setings'; did you mean 'settings'"),
-    (SETTINGS.replace("{stretch: 25 cm}", "{stretch: $other, other: 1 m}"), [], r"toy.yaml:1: .*'stretch' refers to an"),
+    (SETTINGS.replace("{stretch: 25 cm}", "{stretch: $other, other: 1 m}"), [], r"toy.yaml:1: .*'stretch' refers"),
     ("settings: 3\n" + GOOD, [], r"toy.yaml:1: 'settings' must be a mapping"),
 ])  # fmt: skip
 def test_a_setting_that_cannot_be_is_named(tmp_path, text, overrides, message):
