@@ -19,8 +19,6 @@ from flow.cli import (
     demo,
     export,
     graph,
-    import_images,
-    import_middlebury,
     info,
     pipeline,
     run,
@@ -28,6 +26,7 @@ from flow.cli import (
     simulate,
     stages,
 )
+from flow.cli.importers import images, middlebury
 from flow.cli.replay import product_version
 from flow.errors import FAILED, INTERRUPTED, UNUSABLE, RoverflowError
 from recordings.errors import LogError, UnwritableError
@@ -43,7 +42,7 @@ COMMANDS: dict[str, ModuleType] = {
     "score": score,
     "export": export,
 }
-IMPORTERS: dict[str, ModuleType] = {"images": import_images, "middlebury": import_middlebury}
+IMPORTERS: dict[str, ModuleType] = {"images": images, "middlebury": middlebury}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

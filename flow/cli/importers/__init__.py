@@ -1,0 +1,1 @@
+"""`roverflow import KIND`: one module a kind of recording."""
