@@ -31,7 +31,7 @@ class Stop:
 
 @contextmanager
 def interrupts(stop: Stop, report: Callable[[str], None]) -> Iterator[None]:
-    """Turn SIGINT, SIGTERM and SIGHUP into requests to `stop`, and report each by `report`.
+    """Turn SIGINT, SIGTERM and SIGHUP into requests to `stop`, and pass a sentence about each to `report`.
 
     SIGHUP stays ignored where it is, as under nohup. The handlers from before are restored at the end.
     """
