@@ -22,8 +22,8 @@ def joint_bilateral(
 ) -> Array:
     """Average each known disparity with its known neighbours; an unknown one (NaN) stays unknown.
 
-    disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: px, > 0, the standard deviation of the
-    spatial Gaussian, too; gray: scale of the difference in the guide, levels; range_scale: scale of the difference in
+    disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: px, > 0, also the standard deviation of
+    the spatial Gaussian; gray: scale of the difference in the guide, levels; range_scale: scale of the difference in
     disparity, px; threads: 2 share the work. Returns (H, W) float32.
     """
     height, filtered = disparity.shape[0], np.empty(disparity.shape, np.float32)

@@ -2,8 +2,8 @@
 
 As by Hirschmüller (2008, section 2.5.3), eight rays from each pixel find what is known about it. Here a find counts by
 how near it is and how like the pixel's its colour is; behind an edge of the image it does not count at all. The pixel
-takes a low quantile, so that an object has to be in the majority to be taken for what lies beside it. What comes of it
-tells occlusions from mismatches: with that disparity the right camera would see the pixel, or something hides it.
+takes a low quantile, so that an object has to be in the majority to be taken for what lies beside it. The
+result separates occlusions from mismatches: with that disparity the right camera sees the pixel, or something hides it.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from stages.data import Array
 F32 = np.float32
 ALIKE = F32(1.5)  # px, by which disparities in a window differ at most
 LEAST = F32(1 / 3)  # of the square's pixels that count, which a window must have
-NOISE = F32(4)  # gray levels, of a contrast that tells little
+NOISE = F32(4)  # gray levels, of a contrast that carries little information
 FARTHEST = F32(0.3)  # px, that a match is moved
 LANES = 64  # pixels of a row that are worked on at once
 
@@ -90,7 +90,7 @@ def _move(framed, disparity, radius, moved, first, end):
 def _add(own, disparity, error, gradient, sums):
     """Add a pixel of each of `LANES` windows to its sums, if it belongs there: of 1, g, e, g g, g e.
 
-    They stand in one array, with constant distances: so the compiler can tell that they are apart, and adds vectors.
+    They stand in one array, with constant distances: so the compiler knows that they do not overlap, and adds vectors.
     """
     for j in range(LANES):
         inside = abs(disparity[j] - own[j]) <= ALIKE

@@ -16,7 +16,7 @@ from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by, with_margin
 from stages.data import Array
 
-SIDE = 15  # px, of the square about a pixel that tells evidence from a speck
+SIDE = 15  # px, of the square around a pixel that separates evidence from a speck
 SHARE = 0.5  # of what such a square knows in the mean; what stands in one that knows less is a speck
 
 
