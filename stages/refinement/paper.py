@@ -1,7 +1,7 @@
 """RefinePaper: the paper's refinement as it stands (sections 3.2 and 3.3): SLIC, RANSAC planes, WLS, bilateral.
 
-`stages.Refine` is the better stage. This one exists so that anyone can hold the paper beside it on the same log.
-Where the text gives no value, the parameters are those of the authors' released code.
+`stages.Refine` is more accurate; this stage is for comparison on the same log. Where the paper gives no value, the
+parameters are those of the authors' released code.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PLANE_CONFIDENCE, FILLED_CONFIDENCE = 0.8, 0.6  # not calibrated: the paper stat
 
 @dataclass(frozen=True)
 class RefinePaper(Stage):
-    """Every superpixel's matches become its RANSAC plane, WLS fills the holes, a bilateral filter smooths the result.
+    """RANSAC planes replace the matches of each superpixel, WLS fills the holes, and a bilateral filter smooths.
 
     A match is MEASURED where its plane is within `measured_within`, else PLANE. A filled hole is FILLED.
 

@@ -1,8 +1,8 @@
 """Joint bilateral filter of a disparity image (paper, section 3.3): near in space, in gray level and in disparity.
 
 Both range weights are Cauchy functions 1 / (1 + (difference / scale)^2) instead of Gaussians: no exponential in the
-inner loop, which runs over whole rows with the tap's offset fixed. An unknown disparity stands there as one so far away
-that it weighs nothing: 1e-30 of a neighbour's.
+inner loop, which runs over whole rows with the tap's offset fixed. An unknown disparity is set to a value so distant
+that its weight is negligible: 1e-30 of a neighbour's.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
 F32 = np.float32
-FAR = F32(1e15)  # in scales of the difference in disparity; its square is still far from the largest float32
+UNKNOWN_VALUE = F32(1e15)  # scales of disparity; its square is within float32
 
 
 def joint_bilateral(
@@ -24,7 +24,7 @@ def joint_bilateral(
 
     disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: px, > 0, also the standard deviation of
     the spatial Gaussian; gray: scale of the difference in the guide, levels; range_scale: scale of the difference in
-    disparity, px; threads: 2 share the work. Returns (H, W) float32.
+    disparity, px. Returns (H, W) float32.
     """
     height, filtered = disparity.shape[0], np.empty(disparity.shape, np.float32)
     values, levels = np.empty((2, *disparity.shape), np.float32)
@@ -44,10 +44,10 @@ def _spatial(radius: int) -> Array:
 
 @kernel
 def _prepare(disparity, guide, per_pixel, per_gray, first, end, values, levels):
-    """values: the disparities, levels: the guide, in their scales."""
+    """values becomes the disparities, levels the guide, each divided by its scale."""
     for y in range(first, end):
         for x in range(disparity.shape[1]):
-            values[y, x] = disparity[y, x] * per_pixel if np.isfinite(disparity[y, x]) else FAR
+            values[y, x] = disparity[y, x] * per_pixel if np.isfinite(disparity[y, x]) else UNKNOWN_VALUE
             levels[y, x] = F32(guide[y, x]) * per_gray
 
 

@@ -1,11 +1,10 @@
-"""Depth edges put where the image has them: a weighted median of what lies about them (Ma et al., 2013).
+"""Moves depth edges onto image edges by a weighted median (Ma et al., 2013).
 
-A match at the edge of a rock is one pixel off as often as not, or between rock and ground, where there is nothing. The
-median of a window, each pixel weighing by how much it looks like the one in the middle, is a disparity of the side it
-belongs to, and never one between. Where two fifths of the weight are on a pixel's own side of the jump, it stays. Only
-pixels next to a jump are looked at, and of their windows every other pixel, as on a chessboard. The median is found by
-halving a range of values: nothing is sorted, each step is one sum over the window, and the sums are of whole numbers,
-exact in any order.
+A match at the edge of a rock is often one pixel off, or between rock and ground, where there is nothing. The median of
+a window, weighted by similarity to the pixel in the middle, is a disparity of the side that the pixel belongs to. A
+pixel stays if two fifths of the weight are on its own side of the jump. Only pixels next to a jump are handled, with
+every other pixel of their windows, as on a chessboard. The median is found by bisection: each step is one sum of whole
+numbers over the window, exact in any order.
 """
 
 from __future__ import annotations
@@ -18,21 +17,20 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
 F32 = np.float32
-FINE = 16  # parts of a pixel, to which a median is found
-UNIT = 1000  # weight of a pixel as bright as the one in the middle
-COMPANY = F32(0.4)  # share of the weight on a pixel's own side with which it stays there
+STEPS_PER_PX = 16  # steps per pixel, resolution of the median
+MAX_WEIGHT = 1000  # weight of a pixel of equal brightness
+MIN_OWN_SHARE = F32(0.4)  # share of the weight on a pixel's own side; with less it changes sides
 LANES = 32
 
 
 def sharpen_edges(
     disparity: Array, guessed: Array, guide: Array, radius: int, jump: float, brightness: float, threads: int = 1
 ) -> Array:
-    """Each known disparity that jumps against a neighbour becomes the weighted median of its window, unless `COMPANY`
-    of the weight is within a jump of it; all others stay.
+    """Each disparity beside a jump becomes its window's weighted median, unless enough weight is on its own side.
 
-    disparity: (H, W) float32, px, NaN = unknown; guessed: (H, W) bool, disparities that are no evidence and count for
-    none that is; guide: (H, W) uint8; radius: of the window, px; jump: difference, px; brightness: difference, gray
-    levels, at which a weight falls to 1/e; threads: 2 share the work, to the same result. Returns (H, W) float32.
+    disparity: (H, W) float32, px, NaN = unknown; guessed: (H, W) bool, guesses, which do not move matches; guide:
+    (H, W) uint8; radius: of the window, px; jump: px between neighbours; brightness: gray levels over which a weight
+    falls to 1/e. Returns (H, W) float32.
     """
     sharp = np.empty_like(disparity)
     border = radius, radius, radius, radius, cv2.BORDER_CONSTANT
@@ -45,22 +43,22 @@ def sharpen_edges(
 
 
 def _taps(radius: int) -> Array:
-    """Rows and columns, (n, 2), from the middle of a window to every other pixel of it."""
+    """Offsets of every other pixel of a window from its middle: rows and columns, (n, 2)."""
     taps = np.indices((2 * radius + 1,) * 2).reshape(2, -1).T - radius
     return np.asarray(taps[taps.sum(axis=1) % 2 == 0])
 
 
 def _weights(brightness: float) -> Array:
-    """Weight of each difference of brightness, (256,) float32, whole numbers."""
-    return np.round(UNIT * np.exp(-np.arange(256) / brightness)).astype(np.float32)
+    """Weight by difference of brightness, (256,) float32, whole numbers."""
+    return np.round(MAX_WEIGHT * np.exp(-np.arange(256) / brightness)).astype(np.float32)
 
 
 @kernel
 def _sharpen(disparity, guessed, guide, taps, radius, jump, table, sharp, first, end):
-    """Rows first to end; disparity, guessed and guide are framed by `radius` pixels, taps are steps in memory."""
+    """Sharpen rows first to end; inputs are padded by `radius` pixels, taps are offsets in memory."""
     width, stride = sharp.shape[1], disparity.shape[1]
     flat, doubt, levels = disparity.reshape(-1), guessed.reshape(-1), guide.reshape(-1)
-    size = (taps.size + LANES - 1) // LANES * LANES  # whole vectors; what is over has no weight
+    size = (taps.size + LANES - 1) // LANES * LANES  # whole vectors; the surplus has no weight
     values, weights = np.zeros(size, np.float32), np.zeros(size, np.float32)
     jumps = np.empty(width, np.bool_)
     for y in range(first, end):
@@ -71,13 +69,13 @@ def _sharpen(disparity, guessed, guide, taps, radius, jump, table, sharp, first,
                 at = np.uint64((y + radius) * stride + x + radius)
                 near, low, high = _compare(flat, doubt, levels, taps, table, at, jump, values, weights)
                 total = _weight_up_to(values, weights, high)
-                if near < COMPANY * total:
-                    sharp[y, x] = _median(values, weights, total, low, high) / F32(FINE)
+                if near < MIN_OWN_SHARE * total:
+                    sharp[y, x] = _median(values, weights, total, low, high) / F32(STEPS_PER_PX)
 
 
 @part
 def _find_jumps(disparity, y, column, jump, jumps):
-    """Where in row y, from `column` on, one of the eight neighbours is a jump away."""
+    """Mark the pixels of row y, from `column`, with a jump to one of their eight neighbours."""
     above, row, below = disparity[y - 1, column - 1 :], disparity[y, column - 1 :], disparity[y + 1, column - 1 :]
     for x in range(jumps.size):
         d = row[x + 1]
@@ -88,14 +86,16 @@ def _find_jumps(disparity, y, column, jump, jumps):
 
 @part
 def _compare(flat, doubt, levels, taps, table, at, jump, values, weights):
-    """Disparities at the taps, in parts of a pixel, and their weights, 0 where none counts; returns the weight of
-    those within `jump` of the one in the middle, and the extremes."""
+    """Disparities at the taps, in steps of 1 / STEPS_PER_PX px, and their weights, 0 = does not count.
+
+    Returns the weight of those within `jump` of the middle pixel, and the smallest and largest.
+    """
     near, low, high = F32(0), F32(np.inf), F32(-np.inf)
     for i in range(taps.size):
         place = np.uint64(np.int64(at) + taps[i])
         value, step = flat[place], np.int32(levels[place]) - np.int32(levels[at])
         known = value == value and doubt[place] <= doubt[at]
-        fine = np.floor(value * F32(FINE) + F32(0.5))
+        fine = np.floor(value * F32(STEPS_PER_PX) + F32(0.5))
         values[i], weights[i] = (fine, table[abs(step)]) if known else (F32(0), F32(0))
         near += weights[i] if abs(value - flat[at]) <= jump else F32(0)
         if known:
@@ -105,7 +105,7 @@ def _compare(flat, doubt, levels, taps, table, at, jump, values, weights):
 
 @fast_part
 def _median(values, weights, total, low, high):
-    """The smallest whole number within low and high that, with all below it, has half of the weight."""
+    """The weighted median, between low and high."""
     below = low - F32(1)
     while high - below > F32(1):
         half = np.floor(F32(0.5) * (below + high))
@@ -136,11 +136,11 @@ def sharpen_edges_reference(
         inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
         rows, cols = rows[inside], cols[inside]
         known = np.isfinite(disparity[rows, cols]) & (guessed[rows, cols] <= guessed[y, x])
-        values = np.floor(disparity[rows, cols][known] * FINE + 0.5)
+        values = np.floor(disparity[rows, cols][known] * STEPS_PER_PX + 0.5)
         weights = table[np.abs(guide[rows, cols].astype(int) - int(guide[y, x]))][known]
         near = np.abs(disparity[rows, cols][known] - disparity[y, x]) <= np.float32(jump)
-        if weights[near].sum() >= COMPANY * weights.sum():
+        if weights[near].sum() >= MIN_OWN_SHARE * weights.sum():
             continue
         order = np.argsort(values, kind="stable")
-        sharp[y, x] = values[order][np.argmax(2 * np.cumsum(weights[order]) >= weights.sum())] / FINE
+        sharp[y, x] = values[order][np.argmax(2 * np.cumsum(weights[order]) >= weights.sum())] / STEPS_PER_PX
     return sharp

@@ -1,9 +1,9 @@
-"""Holes of a disparity image, filled from around as far as evidence reaches: from the far side, guided by the image.
+"""Fills holes of a disparity image from the background, guided by the image (Hirschmüller, 2008, section 2.5.3).
 
-As by Hirschmüller (2008, section 2.5.3), eight rays from each pixel find what is known about it. Here a find counts by
-how near it is and how like the pixel's its colour is; behind an edge of the image it does not count at all. The pixel
-takes a low quantile, so that an object has to be in the majority to be taken for what lies beside it. The
-result separates occlusions from mismatches: with that disparity the right camera sees the pixel, or something hides it.
+Eight rays from each hole find the nearest known disparities. Each is weighted by its distance and by its colour's
+similarity to the hole's. A disparity behind an image edge does not count. The hole takes a low weighted quantile, so
+the farther surface wins unless most of the weight is on the nearer one. A hole is an occlusion if, at its new
+disparity, a nearer surface in its row hides it from the right camera. Otherwise it is a mismatch.
 """
 
 from __future__ import annotations
@@ -17,60 +17,59 @@ from stages.data import Array
 from stages.refinement.kernels.valid_extent import Extent
 
 F32 = np.float32
-APART = 2.0  # px of disparity that make two surfaces
-KEPT, MISMATCH, OCCLUSION, OPEN = range(4)  # kinds of pixels: not a hole, filled as either, not filled
-HIDDEN = 1.0  # px by which what hides a pixel is nearer at the least
-QUANTILE = 0.3  # by weight, of the disparities found
-NEARBY = 32.0  # px: a find at this distance counts half of one at none
-ROW = 3.0  # what a find in the row counts: what hides a pixel and what goes on behind it meet there
-ALIKE = 20.0  # levels of a colour by which a find differs that counts half
-UNLIKE = 60  # and beyond which it lies behind an edge
-BEYOND = 2  # px behind the edge of what was found, where its colour is looked up: at the edge two mix
+MIN_SURFACE_STEP = 2.0  # px of disparity between two surfaces
+KEPT, MISMATCH, OCCLUSION, OPEN = range(4)  # kinds of pixels: no hole, filled as either, not filled
+MIN_OCCLUDER_STEP = 1.0  # px of disparity by which an occluder is nearer
+FILL_QUANTILE = 0.3  # share of the weight at or below the disparity that a hole takes
+HALF_WEIGHT_DISTANCE = 32.0  # px at which a weight is half of that at distance 0
+ROW_WEIGHT = 3.0  # of rays along the row, where an occluder and the surface behind it meet
+HALF_WEIGHT_COLOUR = 20.0  # levels of colour difference at which a weight is halved
+MAX_COLOUR_DIFFERENCE = 60  # levels; a larger difference means an image edge in between
+COLOUR_OFFSET = 2  # px behind the found pixel, where its colour is read; at its edge two colours mix
 RAYS = np.array([(0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1)])  # rows down, columns right
 LEFT, RIGHT = 0, 4
-LENGTHS = np.hypot(*RAYS.T).astype(np.float32)
-WORTH = np.where(RAYS[:, 0] == 0, F32(ROW), F32(1))
-NOTHING = F32(np.inf)
-BYTE, EIGHT, SIXTEEN = np.uint32(255), np.uint32(8), np.uint32(16)
+STEP_LENGTHS = np.hypot(*RAYS.T).astype(np.float32)
+RAY_WEIGHTS = np.where(RAYS[:, 0] == 0, F32(ROW_WEIGHT), F32(1))
+NO_VALUE = F32(np.inf)
+BYTE_MASK, GREEN_SHIFT, BLUE_SHIFT = np.uint32(255), np.uint32(8), np.uint32(16)
 
 
 def fill_holes(
-    disparity: Array, image: Array, within: Extent, reach: float, margin: int, threads: int = 1
+    disparity: Array, image: Array, within: Extent, max_distance: float, margin: int, threads: int = 1
 ) -> tuple[Array, Array]:
-    """Fill the holes that evidence explains.
+    """Fill holes up to `margin` px outside the valid extent `within`.
 
-    disparity: (H, W) float32, px, NaN = unknown; image: (H, W) or (H, W, 3) uint8; within: how far the evidence
-    reaches; reach: px within which a find counts, unless it is hidden here, and so may lie as far as what hides it;
-    margin: px beyond the evidence, at the border and above, that are filled. Returns the filled image, (H, W) float32,
-    and the kind of each pixel, (H, W) uint8: `KEPT`, `MISMATCH`, `OCCLUSION` or `OPEN`.
+    disparity: (H, W) float32, px, NaN = hole; image: (H, W) or (H, W, 3) uint8; max_distance: px, of the known
+    disparities that count; an occluded surface counts from any distance. Returns the filled image, (H, W) float32, and
+    the kind of each pixel, (H, W) uint8: `KEPT`, `MISMATCH`, `OCCLUSION` or `OPEN`.
     """
     height, width = disparity.shape
     both = shared_by(threads)
     filled, colour = both(disparity.copy, lambda: _packed(cv2.blur(image, (3, 3))))
     kinds, first = np.zeros((height, width), np.uint8), np.zeros(height + 1, np.int64)
-    by_bands(both, height, lambda top, end: _count(disparity, top, end, first))
+    by_bands(both, height, lambda top, end: _count_holes(disparity, top, end, first))
     np.cumsum(first, out=first)
     holes, steps = np.empty(first[-1], np.int32), np.empty((8, first[-1]), np.int16)
-    by_bands(both, height, lambda top, end: _list(disparity, top, end, first, holes))
+    by_bands(both, height, lambda top, end: _list_holes(disparity, top, end, first, holes))
     both(
-        lambda: _trace(disparity, first, holes, 1, steps[:4]),
-        lambda: _trace(disparity, first, holes, -1, steps[4:]),
+        lambda: _count_steps(disparity, first, holes, 1, steps[:4]),
+        lambda: _count_steps(disparity, first, holes, -1, steps[4:]),
     )
-    given = disparity, colour, within, F32(reach), margin, first, holes, steps
+    given = disparity, colour, within, F32(max_distance), margin, first, holes, steps
     by_bands(both, height, lambda top, end: _fill(*given, top, end, filled, kinds))
     return filled, kinds
 
 
 def _packed(image: Array) -> Array:
-    """The colours of a gray or RGB image, (H, W) uint32: a byte each."""
+    """The colours of a gray or RGB image, (H, W) uint32: one byte a channel."""
     form = cv2.COLOR_GRAY2RGBA if image.ndim == 2 else cv2.COLOR_RGB2RGBA
     packed: Array = cv2.cvtColor(image, form).view(np.uint32)[..., 0]
     return packed
 
 
 @kernel
-def _count(disparity, begin, end, first):
-    """first[y + 1]: how many holes row y has."""
+def _count_holes(disparity, begin, end, first):
+    """first[y + 1] becomes the number of holes in row y."""
     for y in range(begin, end):
         count = np.int64(0)
         for x in range(disparity.shape[1]):
@@ -79,8 +78,8 @@ def _count(disparity, begin, end, first):
 
 
 @kernel
-def _list(disparity, begin, end, first, holes):
-    """holes: the columns of the holes, row by row; those of row y from first[y]."""
+def _list_holes(disparity, begin, end, first, holes):
+    """holes becomes the columns of the holes; row y starts at first[y]."""
     for y in range(begin, end):
         n = first[y]
         if first[y + 1] == n:
@@ -92,10 +91,11 @@ def _list(disparity, begin, end, first, holes):
 
 
 @kernel
-def _trace(disparity, first, holes, sign, steps):
-    """How many steps along four of the `RAYS` each hole is from the first known pixel, 0 = there is none.
+def _count_steps(disparity, first, holes, sign, steps):
+    """Steps along four of the `RAYS` from each hole to the first known pixel, 0 = none.
 
-    sign: 1 for the rays left and up, -1 for those right and down. The next pixel is known, or has been asked before.
+    sign: 1 for the rays left and up, -1 for those right and down. The next pixel on a ray is known or a hole whose
+    steps are already counted.
     """
     height, width = disparity.shape
     numbers = np.empty((2, width), np.int32)  # of the holes of this row and of the one before
@@ -120,9 +120,9 @@ def _trace(disparity, first, holes, sign, steps):
 
 
 @kernel
-def _bound(row, bound):
-    """bound: below which disparity each pixel of a row is hidden from the right camera by what lies right of it."""
-    hidden = -NOTHING
+def _occlusion_limit(row, bound):
+    """bound becomes, per pixel of a row, the disparity below which the right camera does not see it."""
+    hidden = -NO_VALUE
     for back in range(row.size):
         x = row.size - 1 - back
         hidden -= F32(1)
@@ -131,45 +131,49 @@ def _bound(row, bound):
 
 
 @kernel
-def _look(disparity, colour, y, columns, down, across, steps, values, colours):
-    """What lies on one ray from each hole of a row: disparities, inf = none, and the colours beyond."""
+def _read_ray(disparity, colour, y, columns, down, across, steps, values, colours):
+    """First disparity on one ray from each hole of a row, inf = none, and the colour behind it."""
     height, width = disparity.shape
     for i in range(columns.size):
         x, n = columns[i], np.int64(steps[i])
-        values[i] = disparity[y + n * down, x + n * across] if n > 0 else NOTHING
-        place_y = min(max(y + (n + BEYOND) * down, 0), height - 1)
-        place_x = min(max(x + (n + BEYOND) * across, 0), width - 1)
+        values[i] = disparity[y + n * down, x + n * across] if n > 0 else NO_VALUE
+        place_y = min(max(y + (n + COLOUR_OFFSET) * down, 0), height - 1)
+        place_x = min(max(x + (n + COLOUR_OFFSET) * across, 0), width - 1)
         colours[i] = colour[place_y, place_x]
 
 
 @kernel
-def _weigh(own, hidden, reach, worth, length, steps, colours, values, weights):
-    """What the finds on one ray count, for holes of colours `own`; what does not count becomes inf."""
+def _weigh_ray(own, hidden, max_distance, ray_weight, length, steps, colours, values, weights):
+    """Weights of the disparities on one ray for holes of colours `own`; a value without weight becomes inf."""
     for i in range(own.size):
         one, other = own[i], colours[i]
-        first = abs(np.int32(one & BYTE) - np.int32(other & BYTE))
-        second = abs(np.int32((one >> EIGHT) & BYTE) - np.int32((other >> EIGHT) & BYTE))
-        third = abs(np.int32((one >> SIXTEEN) & BYTE) - np.int32((other >> SIXTEEN) & BYTE))
-        unlike = F32(max(first, max(second, third)))
-        distance, ratio, value = length * F32(steps[i]), unlike * F32(1 / ALIKE), values[i]
-        weight = worth / ((F32(1) + ratio * ratio) * (distance + F32(NEARBY)))
-        counts = (unlike <= F32(UNLIKE)) & ((distance <= reach) | (value < hidden[i])) & (value < NOTHING)
+        first = abs(np.int32(one & BYTE_MASK) - np.int32(other & BYTE_MASK))
+        second = abs(np.int32((one >> GREEN_SHIFT) & BYTE_MASK) - np.int32((other >> GREEN_SHIFT) & BYTE_MASK))
+        third = abs(np.int32((one >> BLUE_SHIFT) & BYTE_MASK) - np.int32((other >> BLUE_SHIFT) & BYTE_MASK))
+        colour_difference = F32(max(first, max(second, third)))
+        distance, ratio, value = length * F32(steps[i]), colour_difference * F32(1 / HALF_WEIGHT_COLOUR), values[i]
+        weight = ray_weight / ((F32(1) + ratio * ratio) * (distance + F32(HALF_WEIGHT_DISTANCE)))
+        counts = (
+            (colour_difference <= F32(MAX_COLOUR_DIFFERENCE))
+            & ((distance <= max_distance) | (value < hidden[i]))
+            & (value < NO_VALUE)
+        )
         weights[i] = weight if counts else F32(0)
-        values[i] = value if counts else NOTHING
+        values[i] = value if counts else NO_VALUE
 
 
 @kernel
 def _quantile(values, weights, total, share, least):
-    """Of eight values each the least that, with all below it, has `QUANTILE` of their weight; without any weight, inf.
+    """The weighted quantile `FILL_QUANTILE` of eight values per hole, inf where all weights are 0.
 
-    values, weights: (8, >= n); total, share: (n,), to work in; least: (n,). Without sorting: each value adds up the
-    weights of those not above it.
+    values, weights: (8, >= n); total, share: (n,) scratch; least: (n,) result. Nothing is sorted: each value sums the
+    weights of the values not above it.
     """
     n = least.size
     total[:] = F32(0)
     for ray in range(8):
         total += weights[ray, :n]
-    least[:] = NOTHING
+    least[:] = NO_VALUE
     for ray in range(8):
         limit = values[ray, :n]
         share[:] = F32(0)
@@ -178,19 +182,19 @@ def _quantile(values, weights, total, share, least):
             for i in range(n):
                 share[i] += weight[i] if value[i] <= limit[i] else F32(0)
         for i in range(n):
-            enough = share[i] >= F32(QUANTILE) * total[i]
+            enough = share[i] >= F32(FILL_QUANTILE) * total[i]
             least[i] = min(least[i], limit[i]) if enough else least[i]
 
 
 @kernel
-def _fill(disparity, colour, within, reach, margin, first, holes, steps, begin, end, filled, kinds):
+def _fill(disparity, colour, within, max_distance, margin, first, holes, steps, begin, end, filled, kinds):
     width = disparity.shape[1]
     bound = np.empty(width, np.float32)
     values, weights = np.empty((8, width), np.float32), np.empty((8, width), np.float32)
     colours, room = np.empty((2, width), np.uint32), np.empty((4, width), np.float32)
     for y in range(begin, end):
         start, stop = first[y], first[y + 1]
-        while start < stop and holes[start] < within.first[y] - margin:  # evidence does not reach so far
+        while start < stop and holes[start] < within.first[y] - margin:  # outside the valid extent
             kinds[y, holes[start]] = OPEN
             start += 1
         while start < stop and holes[stop - 1] > within.last[y] + margin:
@@ -199,82 +203,95 @@ def _fill(disparity, colour, within, reach, margin, first, holes, steps, begin, 
         n = stop - start
         if n == 0:
             continue
-        columns, own, beyond = holes[start:stop], colours[0, :n], colours[1, :n]
+        columns, own, colour_beyond = holes[start:stop], colours[0, :n], colours[1, :n]
         hidden, least = room[0, :n], room[1, :n]
-        _bound(disparity[y], bound)
+        _occlusion_limit(disparity[y], bound)
         for i in range(n):
             own[i] = colour[y, columns[i]]
-            hidden[i] = bound[columns[i]] - F32(HIDDEN)
+            hidden[i] = bound[columns[i]] - F32(MIN_OCCLUDER_STEP)
         for ray in range(8):
             taken, value, weight = steps[ray, start:stop], values[ray, :n], weights[ray, :n]
-            _look(disparity, colour, y, columns, RAYS[ray, 0], RAYS[ray, 1], taken, value, beyond)
-            _weigh(own, hidden, reach, WORTH[ray], LENGTHS[ray], taken, beyond, value, weight)
+            _read_ray(disparity, colour, y, columns, RAYS[ray, 0], RAYS[ray, 1], taken, value, colour_beyond)
+            _weigh_ray(
+                own, hidden, max_distance, RAY_WEIGHTS[ray], STEP_LENGTHS[ray], taken, colour_beyond, value, weight
+            )
         _quantile(values, weights, room[2, :n], room[3, :n], least)
         for i in range(n):
             x = columns[i]
-            if y < within.top[x] - margin or least[i] == NOTHING:
+            if y < within.top[x] - margin or least[i] == NO_VALUE:
                 kinds[y, x] = OPEN
                 continue
             before, after = steps[LEFT, start + i], steps[RIGHT, start + i]
-            value = _along_row(values[LEFT, i], values[RIGHT, i], before, after, least[i])
+            value = _row_value(values[LEFT, i], values[RIGHT, i], before, after, least[i])
             filled[y, x] = value
             kinds[y, x] = OCCLUSION if value < hidden[i] else MISMATCH
 
 
 @kernel
-def _along_row(left, right, before, after, value):
-    """What the row says, where that is the same surface: the line between two ends, or one of them; else the value."""
-    if abs(right - left) < F32(APART):
+def _row_value(left, right, before, after, value):
+    """`value`, or the row's end on the same surface, interpolated where both ends are."""
+    if abs(right - left) < F32(MIN_SURFACE_STEP):
         left += (right - left) * F32(before) / F32(before + after)
-    if abs(left - value) < F32(APART):
+    if abs(left - value) < F32(MIN_SURFACE_STEP):
         return left
-    return right if abs(right - value) < F32(APART) else value
+    return right if abs(right - value) < F32(MIN_SURFACE_STEP) else value
 
 
 def fill_holes_reference(
-    disparity: Array, image: Array, within: Extent, reach: float, margin: int
+    disparity: Array, image: Array, within: Extent, max_distance: float, margin: int
 ) -> tuple[Array, Array]:
     """`fill_holes` in plain numpy."""
     height, width = disparity.shape
     colour = cv2.blur(image, (3, 3)).reshape(height, width, -1).astype(int)
-    hidden = np.full(disparity.shape, -NOTHING)
+    hidden = np.full(disparity.shape, -NO_VALUE)
     for x in range(width - 2, -1, -1):
         hidden[:, x] = np.fmax(hidden[:, x + 1], disparity[:, x + 1]) - F32(1)
-    hidden -= F32(HIDDEN)
+    hidden -= F32(MIN_OCCLUDER_STEP)
     values, weights, taken = [], [], []
-    for (down, across), length, worth in zip(RAYS, LENGTHS, WORTH, strict=True):
-        value, steps, beyond = _look_reference(disparity, colour, down, across)
-        unlike, distance = abs(beyond - colour).max(axis=2).astype(F32), length * steps.astype(F32)
-        ratio = unlike * F32(1 / ALIKE)
-        counts = (value < NOTHING) & (unlike <= UNLIKE) & ((distance <= F32(reach)) | (value < hidden))
-        weights.append(np.where(counts, worth / ((F32(1) + ratio * ratio) * (distance + F32(NEARBY))), F32(0)))
-        values.append(np.where(counts, value, NOTHING))
+    for (down, across), length, ray_weight in zip(RAYS, STEP_LENGTHS, RAY_WEIGHTS, strict=True):
+        value, steps, colour_beyond = _read_ray_reference(disparity, colour, down, across)
+        colour_difference, distance = abs(colour_beyond - colour).max(axis=2).astype(F32), length * steps.astype(F32)
+        ratio = colour_difference * F32(1 / HALF_WEIGHT_COLOUR)
+        counts = (
+            (value < NO_VALUE)
+            & (colour_difference <= MAX_COLOUR_DIFFERENCE)
+            & ((distance <= F32(max_distance)) | (value < hidden))
+        )
+        weights.append(
+            np.where(counts, ray_weight / ((F32(1) + ratio * ratio) * (distance + F32(HALF_WEIGHT_DISTANCE))), F32(0))
+        )
+        values.append(np.where(counts, value, NO_VALUE))
         taken.append(steps.astype(F32))
     shares = [sum(w * (v <= limit) for v, w in zip(values, weights, strict=True)) for limit in values]
-    enough = np.stack(shares) >= F32(QUANTILE) * sum(weights)
-    least = np.where(enough, values, NOTHING).min(axis=0)
+    enough = np.stack(shares) >= F32(FILL_QUANTILE) * sum(weights)
+    least = np.where(enough, values, NO_VALUE).min(axis=0)
     left, right = values[LEFT], values[RIGHT]
     with np.errstate(invalid="ignore"):
         line = left + (right - left) * taken[LEFT] / (taken[LEFT] + taken[RIGHT])
-        left = np.where(abs(right - left) < APART, line, left)
-        guess = np.where(abs(left - least) < APART, left, np.where(abs(right - least) < APART, right, least))
+        left = np.where(abs(right - left) < MIN_SURFACE_STEP, line, left)
+        guess = np.where(
+            abs(left - least) < MIN_SURFACE_STEP, left, np.where(abs(right - least) < MIN_SURFACE_STEP, right, least)
+        )
     row, column = np.mgrid[:height, :width]
     reached = (row >= within.top - margin) & (column >= within.first[:, np.newaxis] - margin)
-    fill = np.isnan(disparity) & reached & (column <= within.last[:, np.newaxis] + margin) & (least < NOTHING)
+    fill = np.isnan(disparity) & reached & (column <= within.last[:, np.newaxis] + margin) & (least < NO_VALUE)
     kinds = np.where(fill, np.where(guess < hidden, OCCLUSION, MISMATCH), np.where(np.isnan(disparity), OPEN, KEPT))
     return np.where(fill, guess, disparity).astype(F32), kinds.astype(np.uint8)
 
 
-def _look_reference(disparity: Array, colour: Array, down: int, across: int) -> tuple[Array, Array, Array]:
-    """The first disparity on a ray from each pixel, inf = none; the steps to it; the colours beyond it."""
+def _read_ray_reference(disparity: Array, colour: Array, down: int, across: int) -> tuple[Array, Array, Array]:
+    """The first disparity on a ray from each pixel, inf = none; the steps to it; the colour behind it."""
     height, width = disparity.shape
     y, x = np.mgrid[:height, :width]
-    value, steps = np.full(disparity.shape, NOTHING), np.zeros(disparity.shape, int)
+    value, steps = np.full(disparity.shape, NO_VALUE), np.zeros(disparity.shape, int)
     for n in range(1, max(height, width)):
         there_y, there_x = y + n * down, x + n * across
         inside = (there_y >= 0) & (there_y < height) & (there_x >= 0) & (there_x < width)
         there = disparity[np.where(inside, there_y, 0), np.where(inside, there_x, 0)]
         new = inside & (steps == 0) & ~np.isnan(there)
         value[new], steps[new] = there[new], n
-    beyond = np.clip(y + (steps + BEYOND) * down, 0, height - 1), np.clip(x + (steps + BEYOND) * across, 0, width - 1)
-    return value, steps, colour[beyond]
+    colour_beyond = (
+        np.clip(y + (steps + COLOUR_OFFSET) * down, 0, height - 1),
+        np.clip(x + (steps + COLOUR_OFFSET) * across, 0, width - 1),
+    )
+    return value, steps, colour[colour_beyond]

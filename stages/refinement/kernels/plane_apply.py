@@ -1,6 +1,6 @@
-"""Matches and planes brought together: which matches count, and where a plane moves one or stands in for it.
+"""Selects the trusted matches, moves them to their median, and applies accepted planes.
 
-One pass over the image for each step, in bands of rows, where numpy would make a dozen.
+Each step is one pass over the image in bands of rows, where numpy would need a dozen.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from stages.compiled.jit import kernel, part
 from stages.compiled.parallel import by_bands, shared_by, with_margin
 from stages.data import Array, PixelOrigin, known
-from stages.refinement.kernels.holes import APART
+from stages.refinement.kernels.holes import MIN_SURFACE_STEP
 from stages.refinement.kernels.valid_extent import Extent
 
 F32 = np.float32
@@ -42,9 +42,9 @@ def trusted_matches(
 
 
 def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Array:
-    """The matches, each moved to the median of the side x side px about it where that is at most `near` px away.
+    """Each match moved to the median of its side x side px window where that is at most `near` px away.
 
-    A match with fewer neighbours than holes about it has no median and stays. matches: (H, W) float32, NaN = unknown.
+    A match in a window of mostly holes has no median and stays. matches: (H, W) float32, NaN = unknown.
     """
     moved = np.empty(matches.shape, np.float32)
 
@@ -61,20 +61,19 @@ def pull_to_planes(
     pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: int,
     threads: int = 1,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Disparities near their segment's plane drawn towards it, and holes filled from it.
+    """Disparities within `near` px of their region's plane move towards it, and holes take its value.
 
     pixels: (H, W) float32, px, NaN = hole; coefficients: (n, 3) float64 of the accepted planes, NaN for the others;
-    labels: (H, W) int32; within: how far the evidence reaches; near: px up to which a disparity is drawn; weight: of
-    the plane; margin: px beyond the evidence that are filled, negative: no hole is. A plane fills as long as it stays
-    within the range of all pixels: beyond, it is extrapolated too far. A hole whose left end lies behind its right one
-    is hidden by that: it takes no plane nearer to that than to the other. Returns the disparities (H, W) float32 and
-    where a plane had its say, (H, W) bool.
+    labels: (H, W) int32; weight: of the plane; margin: px outside the valid extent `within` that are filled, negative:
+    no hole is. A plane fills only values within the range of all pixels: others are extrapolated too far. If the left
+    end of a hole is farther than the right one, the hole is occluded: a plane nearer to the right end does not fill it.
+    Returns the disparities, (H, W) float32, and the pixels that a plane moved or filled, (H, W) bool.
     """
-    pulled, spoke = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
+    pulled, applied = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     given = pixels, coefficients, labels, within, F32(near), F32(weight), margin
     low, high = (extreme.reduce(pixels.ravel(), keepdims=True)[0] for extreme in (np.fmin, np.fmax))
-    by_bands(shared_by(threads), len(pixels), lambda first, end: _pull(*given, low, high, first, end, pulled, spoke))
-    return pulled, spoke
+    by_bands(shared_by(threads), len(pixels), lambda first, end: _pull(*given, low, high, first, end, pulled, applied))
+    return pulled, applied
 
 
 def trusted_matches_reference(
@@ -126,30 +125,30 @@ def _move_near(matches, median, near, moved):
 
 
 @kernel
-def _pull(pixels, coefficients, labels, within, near, weight, margin, low, high, first, end, pulled, spoke):
+def _pull(pixels, coefficients, labels, within, near, weight, margin, low, high, first, end, pulled, applied):
     width = pixels.shape[1]
     for y in range(first, end):
         row = pixels[y]
-        last, after, ceiling = -1, -1, high  # where the known pixels before and after x are; see above
+        last, after, ceiling = -1, -1, high  # columns of the known pixels before and after x; bound of a plane
         for x in range(width):
             a, b, c = coefficients[labels[y, x]]
             d, plane = row[x], F32(a * x + b * y + c)
             if d == d:
                 close = abs(plane - d) <= near
                 pulled[y, x] = d + weight * (plane - d) if close else d
-                spoke[y, x] = close
+                applied[y, x] = close
                 last = x
                 continue
             if after < x:
                 after = x + 1
                 while after < width and row[after] != row[after]:
                     after += 1
-                hidden = last >= 0 and after < width and row[after] - row[last] >= APART
+                hidden = last >= 0 and after < width and row[after] - row[last] >= MIN_SURFACE_STEP
                 ceiling = F32(0.5) * (row[last] + row[after]) if hidden else high
             reached = y >= within.top[x] - margin and x >= within.first[y] - margin and x <= within.last[y] + margin
             sane = margin >= 0 and reached and plane >= low and plane <= ceiling
             pulled[y, x] = plane if sane else d
-            spoke[y, x] = sane
+            applied[y, x] = sane
 
 
 def pull_to_planes_reference(
@@ -170,7 +169,7 @@ def pull_to_planes_reference(
     right = np.flip(np.minimum.accumulate(np.flip(np.where(hole, len(column), column), axis=1), axis=1), axis=1)
     padded = np.pad(pixels, ((0, 0), (1, 1)), constant_values=np.nan)
     before, after = np.take_along_axis(padded, left + 1, axis=1), np.take_along_axis(padded, right + 1, axis=1)
-    apart = after - before >= F32(APART)
+    apart = after - before >= F32(MIN_SURFACE_STEP)
     ceiling = np.where(apart, F32(0.5) * (before + after), np.nanmax(pixels))
     reached = (y >= within.top - margin) & (x >= within.first[:, None] - margin) & (x <= within.last[:, None] + margin)
     sane = hole & reached & (plane >= np.nanmin(pixels)) & (plane <= ceiling)

@@ -1,9 +1,8 @@
-"""A plane per superpixel (section 3.2 of the paper) by MSAC (Torr & Zisserman, 2000) and two least-squares refits,
-weighted by confidence.
+"""One plane per region (section 3.2 of the paper) by MSAC (Torr & Zisserman, 2000) and two weighted refits.
 
-The known pixels are gathered once, segment by segment, so that every hypothesis is scored over contiguous float32.
-Each segment draws from its own counter-based random numbers (splitmix64 of seed and segment): the result depends
-neither on the other segments nor on the order in which they are fitted.
+The known pixels are gathered region by region once, so that every hypothesis is scored over contiguous float32. Each
+region has its own counter-based random numbers (splitmix64 of seed and region): the result depends neither on other
+regions nor on their order.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ from stages.data import Array
 
 F32 = np.float32
 U64 = np.uint64
-LEAST_SUPPORT = 6  # twice the parameters of a plane: below that, agreement says nothing
-LEAST_TRIANGLE = 4.0  # twice the area, px^2, of the triangle of a hypothesis: below that, slopes are noise
+MIN_POINTS = 6  # matches; twice the parameters of a plane, so that agreement is no coincidence
+MIN_TRIANGLE = 4.0  # px^2, twice the area of a hypothesis's triangle; slopes of smaller ones are noise
 
 
 class Planes(NamedTuple):
-    """Planes d = a x + b y + c of n segments, pixel coordinates of the whole image.
+    """Planes d = a x + b y + c of n regions, in pixel coordinates of the whole image.
 
-    coefficients: (n, 3) float64 a, b, c, NaN where no plane was found; inlier_share: (n,) float32, inliers among the
-    known pixels; valid_share: (n,) float32, known pixels among all.
+    coefficients: (n, 3) float64 a, b, c, NaN = no plane; inlier_share: (n,) float32, inliers among the known pixels;
+    valid_share: (n,) float32, known pixels among all.
     """
 
     coefficients: Array
@@ -44,11 +43,11 @@ def fit_planes(
     seed: int = 0,
     threads: int = 1,
 ) -> Planes:
-    """Fit one plane to the known disparities of each segment.
+    """Fit one plane to the known disparities of each region.
 
-    disparity: (H, W) float32, px, NaN = unknown; labels: (H, W) int32 in 0..count-1; weights: (H, W) float32 > 0, what
-    each pixel counts in the least squares; hypotheses: planes tried per segment; threshold: px, beyond which a pixel is
-    an outlier; threads: 2 share the work, to the same result. The same seed gives the same planes.
+    disparity: (H, W) float32, px, NaN = unknown; labels: (H, W) int32 in 0..count-1; weights: (H, W) float32 > 0, of
+    the least squares; hypotheses: planes tried per region; threshold: px, largest deviation of an inlier. The same seed
+    gives the same planes, with any number of threads.
     """
     assert weights.shape == labels.shape, "a weight for each pixel"
     planes = Planes(np.empty((count, 3)), np.empty(count, np.float32), np.empty(count, np.float32))
@@ -62,11 +61,10 @@ def fit_planes(
 def known_points(
     disparity: Array, labels: Array, count: int, weights: Array, both: Fork = in_turn
 ) -> tuple[Array, Array, Array]:
-    """The known pixels, segment by segment, in scan order each.
+    """The known pixels, region by region, each in scan order.
 
-    The parameters are those of `fit_planes`. Returns (4, n) float32, column, row, disparity and weight; (count + 1,)
-    int64, those of segment s are start[s] to start[s + 1]; and (count,) int64, how many pixels a segment has, known or
-    not.
+    Parameters as in `fit_planes`. Returns (4, n) float32: column, row, disparity and weight; (count + 1,) int64: region
+    s has the points start[s] to start[s + 1]; and (count,) int64: the size of each region, with its unknown pixels.
     """
     middle = labels.shape[0] // 2
     parts = slice(middle), slice(middle, labels.shape[0])
@@ -90,13 +88,13 @@ def _count_points(disparity, labels, known, sizes):
     width = labels.shape[1]
     for y in range(labels.shape[0]):
         x = 0
-        while x < width:  # run by run of one segment
-            segment, begin, n = labels[y, x], x, 0
-            while x < width and labels[y, x] == segment:
+        while x < width:  # one run of a region after the other
+            region, begin, n = labels[y, x], x, 0
+            while x < width and labels[y, x] == region:
                 n += 1 if disparity[y, x] == disparity[y, x] else 0
                 x += 1
-            known[segment] += n
-            sizes[segment] += x - begin
+            known[region] += n
+            sizes[region] += x - begin
 
 
 @kernel
@@ -105,21 +103,21 @@ def _gather(disparity, labels, weights, first, end, place, points):
     for y in range(first, end):
         x = 0
         while x < width:
-            segment = labels[y, x]
-            n = place[segment]
-            while x < width and labels[y, x] == segment:
+            region = labels[y, x]
+            n = place[region]
+            while x < width and labels[y, x] == region:
                 d = disparity[y, x]
                 if d == d:
                     points[0, n], points[1, n], points[2, n], points[3, n] = x, y, d, weights[y, x]
                     n += 1
                 x += 1
-            place[segment] = n
+            place[region] = n
 
 
 @kernel
-def _draw(seed, segment, counter, n):
+def _random_index(seed, region, counter, n):
     """A number below n: splitmix64 of (seed, segment, counter)."""
-    z = seed + U64(segment) * U64(0xD1B54A32D192ED03) + U64(counter) * U64(0x9E3779B97F4A7C15)
+    z = seed + U64(region) * U64(0xD1B54A32D192ED03) + U64(counter) * U64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> U64(30))) * U64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> U64(27))) * U64(0x94D049BB133111EB)
     return np.int64((z ^ (z >> U64(31))) >> U64(33)) % n
@@ -127,7 +125,7 @@ def _draw(seed, segment, counter, n):
 
 @kernel
 def _fit(points, start, sizes, threshold, hypotheses, seed, first, end, coefficients, inlier_share, valid_share):
-    """Planes of the segments first to end."""
+    """Fit the planes of regions first to end."""
     for s in range(first, end):
         own = slice(start[s], start[s + 1])
         x, y, d, w = points[0, own], points[1, own], points[2, own], points[3, own]
@@ -135,9 +133,9 @@ def _fit(points, start, sizes, threshold, hypotheses, seed, first, end, coeffici
         inlier_share[s] = valid_share[s] = F32(0)
         if x.size > 0:
             valid_share[s] = F32(x.size / sizes[s])
-        if x.size < LEAST_SUPPORT:
+        if x.size < MIN_POINTS:
             continue
-        # Coordinates from the segment's first point keep float32 sums exact enough.
+        # Coordinates relative to the region's first point keep float32 sums exact enough.
         origin_x, origin_y = x[0], y[0]
         x -= origin_x
         y -= origin_y
@@ -152,18 +150,18 @@ def _fit(points, start, sizes, threshold, hypotheses, seed, first, end, coeffici
 
 
 @fast_part
-def _best_hypothesis(x, y, d, limit, hypotheses, seed, segment):
-    """The plane through three drawn pixels with the least truncated squared error: (cost, a, b, c)."""
+def _best_hypothesis(x, y, d, limit, hypotheses, seed, region):
+    """The plane through three random pixels with the smallest truncated squared error: (cost, a, b, c)."""
     n = x.size
     best, best_a, best_b, best_c = F32(1e30), F32(0), F32(0), F32(0)
     for h in range(hypotheses):
-        i = _draw(seed, segment, 3 * h, n)
-        j = _draw(seed, segment, 3 * h + 1, n)
-        k = _draw(seed, segment, 3 * h + 2, n)
+        i = _random_index(seed, region, 3 * h, n)
+        j = _random_index(seed, region, 3 * h + 1, n)
+        k = _random_index(seed, region, 3 * h + 2, n)
         x1, y1, d1 = x[j] - x[i], y[j] - y[i], d[j] - d[i]
         x2, y2, d2 = x[k] - x[i], y[k] - y[i], d[k] - d[i]
         area = x1 * y2 - x2 * y1
-        if abs(area) < F32(LEAST_TRIANGLE):
+        if abs(area) < F32(MIN_TRIANGLE):
             continue
         a, b = (d1 * y2 - d2 * y1) / area, (x1 * d2 - x2 * d1) / area
         c = d[i] - a * x[i] - b * y[i]
@@ -178,7 +176,7 @@ def _best_hypothesis(x, y, d, limit, hypotheses, seed, segment):
 
 @fast_part
 def _least_squares(x, y, d, weights, a, b, c, limit):
-    """The weighted least-squares plane of the inliers of (a, b, c), solved for the correction, about their centroid."""
+    """The weighted least-squares plane of the inliers of (a, b, c), relative to their centroid."""
     s = sx = sy = se = F32(0)
     inliers = 0
     for q in range(x.size):
@@ -189,7 +187,7 @@ def _least_squares(x, y, d, weights, a, b, c, limit):
         sx += w * x[q]
         sy += w * y[q]
         se += w * e
-    if inliers < LEAST_SUPPORT or not s > F32(0):
+    if inliers < MIN_POINTS or not s > F32(0):
         return a, b, c
     mx, my, me = sx / s, sy / s, se / s
     xx = xy = yy = xe = ye = F32(0)
@@ -227,21 +225,21 @@ def fit_planes_reference(
     threshold: float = 0.5,
     seed: int = 0,
 ) -> Planes:
-    """`fit_planes` in plain numpy and float64, one segment after the other, drawing the same hypotheses."""
+    """`fit_planes` in plain numpy and float64, one region after the other, with the same hypotheses."""
     planes = Planes(np.full((count, 3), np.nan), np.zeros(count, np.float32), np.zeros(count, np.float32))
     for s in range(count):
         y, x = np.nonzero(labels == s)
         known = np.isfinite(disparity[y, x])
         planes.valid_share[s] = known.mean() if known.size else 0
-        if known.sum() < LEAST_SUPPORT:
+        if known.sum() < MIN_POINTS:
             continue
         points = np.stack([x[known], y[known], np.ones(known.sum())], axis=1).astype(np.float64)
         d = disparity[y, x][known].astype(np.float64)
         root = np.sqrt(weights[y, x][known].astype(np.float64))
         best, plane = np.inf, None
         for h in range(hypotheses):
-            corners = [_draw_reference(seed, s, 3 * h + i, len(d)) for i in range(3)]
-            if abs(np.linalg.det(points[corners])) < LEAST_TRIANGLE:
+            corners = [_random_index_reference(seed, s, 3 * h + i, len(d)) for i in range(3)]
+            if abs(np.linalg.det(points[corners])) < MIN_TRIANGLE:
                 continue
             candidate = np.linalg.solve(points[corners], d[corners])
             cost = float(np.minimum((points @ candidate - d) ** 2, threshold**2).sum())
@@ -251,16 +249,16 @@ def fit_planes_reference(
             continue
         for _ in range(2):
             inlier = (points @ plane - d) ** 2 < threshold**2
-            if inlier.sum() >= LEAST_SUPPORT:
+            if inlier.sum() >= MIN_POINTS:
                 plane = np.linalg.lstsq(points[inlier] * root[inlier, None], d[inlier] * root[inlier], rcond=None)[0]
         planes.coefficients[s] = plane
         planes.inlier_share[s] = ((points @ plane - d) ** 2 < threshold**2).mean()
     return planes
 
 
-def _draw_reference(seed: int, segment: int, counter: int, n: int) -> int:
+def _random_index_reference(seed: int, region: int, counter: int, n: int) -> int:
     mask = 2**64 - 1
-    z = (seed + segment * 0xD1B54A32D192ED03 + counter * 0x9E3779B97F4A7C15) & mask
+    z = (seed + region * 0xD1B54A32D192ED03 + counter * 0x9E3779B97F4A7C15) & mask
     z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
     z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
     return ((z ^ (z >> 31)) >> 33) % n

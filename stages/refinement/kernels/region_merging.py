@@ -1,7 +1,7 @@
-"""Surfaces: superpixels grouped into regions of even colour, for planes that need more room.
+"""Merges superpixels into regions of even colour, a larger support for planes.
 
-SLIC once more, of superpixels instead of pixels: each is one point, its mean colour and place, that counts as often as
-it has pixels. A region may be in pieces: what is asked of it is to keep to edges, and superpixels have done that.
+It is SLIC of superpixels instead of pixels: each is one point, its mean colour and position, weighted by its size. A
+region may be in pieces, but it follows image edges because its superpixels do.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from stages.compiled.parallel import shared_by
 from stages.data import Array
 
 ITERATIONS = 3
-AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])
+NEIGHBOUR_CELLS = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])
 
 
 def merge_regions(
     image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, threads: int = 1
 ) -> tuple[Array, int]:
-    """Group superpixels into about `groups` surfaces.
+    """Merge superpixels into about `groups` regions.
 
     image: (H, W) gray or (H, W, 3) RGB, uint8; labels: (H, W) int32 in 0..count-1; compactness: weight of position
-    against colour, in CIELAB units at one grid step. Returns the surface of each superpixel, (count,) int32 in 0..n-1,
-    and n.
+    against colour, CIELAB units at one grid step. Returns the region of each superpixel, (count,) int32 in 0..n-1, and
+    n.
     """
     height, width = image.shape[:2]
     step = math.sqrt(height * width / min(groups, count))
     rows, cols = max(1, round(height / step)), max(1, round(width / step))
     points, size = _superpixel_points(image, labels, count, compactness / step, threads)
     home = np.floor(points[:, 3:] / (compactness / step) * [rows / height, cols / width]).astype(int)
-    nearest = _settle(points, size, np.minimum(home, [rows - 1, cols - 1]), rows, cols)
-    used, surface = np.unique(nearest, return_inverse=True)
-    return surface.astype(np.int32), len(used)
+    nearest = _nearest_cells(points, size, np.minimum(home, [rows - 1, cols - 1]), rows, cols)
+    used, region = np.unique(nearest, return_inverse=True)
+    return region.astype(np.int32), len(used)
 
 
 def _superpixel_points(image: Array, labels: Array, count: int, scale: float, threads: int) -> tuple[Array, Array]:
-    """Mean colour (CIELAB, L in 0..100) and place (y, x times `scale`) of each, (count, 5), and its size (count,)."""
+    """Mean colour (CIELAB, L in 0..100), y and x times `scale`, (count, 5), and size, (count,), of each superpixel."""
     middle = image.shape[0] // 2
     halves = np.zeros((2, count, 6), np.int64)
     shared_by(threads)(
-        lambda: _sum_up(image[:middle], labels[:middle], 0, halves[0]),
-        lambda: _sum_up(image[middle:], labels[middle:], middle, halves[1]),
+        lambda: _add_pixels(image[:middle], labels[:middle], 0, halves[0]),
+        lambda: _add_pixels(image[middle:], labels[middle:], middle, halves[1]),
     )
     sums = halves[0] + halves[1]
     means = sums[:, :5] / sums[:, 5:]
@@ -54,8 +54,8 @@ def _superpixel_points(image: Array, labels: Array, count: int, scale: float, th
 
 
 @kernel
-def _settle(points, size, home, rows, cols):
-    """The grid cell (n,) whose centre each of the points (n, 5) settles for, of the nine about its home (n, 2)."""
+def _nearest_cells(points, size, home, rows, cols):
+    """The nearest grid cell (n,) of each point (n, 5), among the nine around its own cell (n, 2)."""
     count = len(points)
     nearest = home[:, 0] * cols + home[:, 1]
     centres, mass = np.empty((rows * cols, 5)), np.empty(rows * cols)
@@ -83,8 +83,8 @@ def _settle(points, size, home, rows, cols):
 
 
 @kernel
-def _sum_up(image, labels, first, sums):
-    """Add R, G, B, y, x and 1 of every pixel to the sums of its label; the image begins at row `first`."""
+def _add_pixels(image, labels, first, sums):
+    """Add R, G, B, y, x and 1 of each pixel to the sums of its label; row 0 is row `first` of the image."""
     gray = image.ndim == 2
     for y in range(labels.shape[0]):
         for x in range(labels.shape[1]):
@@ -99,7 +99,7 @@ def _sum_up(image, labels, first, sums):
 def merge_regions_reference(
     image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0
 ) -> tuple[Array, int]:
-    """`surfaces` in plain numpy, superpixel after superpixel."""
+    """`merge_regions` in plain numpy, superpixel after superpixel."""
     height, width = image.shape[:2]
     step = math.sqrt(height * width / min(groups, count))
     rows, cols = max(1, round(height / step)), max(1, round(width / step))
@@ -118,9 +118,9 @@ def merge_regions_reference(
         members = [nearest == k for k in range(rows * cols)]
         centres = [(points[m] * sizes[m, None]).sum(axis=0) / sizes[m].sum() if m.any() else None for m in members]
         for s in range(count):
-            around = [tuple(home[s] + step) for step in AROUND]
+            around = [tuple(home[s] + step) for step in NEIGHBOUR_CELLS]
             inside = [r * cols + c for r, c in around if 0 <= r < rows and 0 <= c < cols]
             reached = [k for k in inside if centres[k] is not None]
             nearest[s] = min(reached, key=lambda k: ((points[s] - centres[k]) ** 2).sum())
-    used, surface = np.unique(nearest, return_inverse=True)
-    return surface.astype(np.int32), len(used)
+    used, region = np.unique(nearest, return_inverse=True)
+    return region.astype(np.int32), len(used)

@@ -1,9 +1,9 @@
 """SLIC superpixels (Achanta et al., 2012; section 3.2 of the paper): k-means over colour and position.
 
-Each pixel looks only at the nine centres around its own grid cell. Those of a grid row are laid out as rows of pixels
-once, so that the inner loop runs over whole rows of the image without a branch. The centres settle at half resolution,
-at a quarter of the work; the last assignment is of the full image. What is not connected then is found by runs of
-pixels in a row, not pixel by pixel.
+Each pixel is compared with the nine centres around its grid cell. The centres of a grid row are expanded to rows of
+pixels once, so that the inner loop runs over whole image rows without a branch. The centres move at half resolution,
+for a quarter of the work; the last assignment uses the full image. Connected components are found by runs of pixels in
+a row, not pixel by pixel.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from stages.matching.kernels.resample import halved
 
 F32 = np.float32
 _workspaces = Workspaces()
-LIGHTNESS = F32(100 / 255)  # of L in 0..100, to what 8 bits hold of it
-FAR = F32(1e30)
-MOVES = 2  # of the centres, before the last assignment
-LEAST_CELL = 8  # px; where grid cells are smaller, the centres settle at full resolution
+LIGHTNESS_SCALE = F32(100 / 255)  # from 8 bits to L in 0..100
+NO_CENTRE = F32(1e30)
+ITERATIONS = 2  # of the centres, before the last assignment
+MIN_HALVED_CELL = 8  # px; with smaller grid cells the centres move at full resolution
 
 
 def superpixels(image: Array, count: int, compactness: float = 10.0, threads: int = 1) -> tuple[Array, int]:
     """Segment an image into about `count` connected superpixels.
 
     image: (H, W) gray or (H, W, 3) RGB, uint8; compactness: weight of position against colour, in CIELAB units at one
-    grid step; threads: 2 share the work, to the same result. Returns the labels, (H, W) int32 in 0..n-1, and n.
+    grid step. Returns the labels, (H, W) int32 in 0..n-1, and n.
     """
     height, width = image.shape[:2]
     count = min(count, height * width)
     step = math.sqrt(height * width / count)
     grid = max(1, round(height / step)), max(1, round(width / step))
-    smallest = int(0.25 * height * width / count)
+    min_size = int(0.25 * height * width / count)
     both = shared_by(threads)
     with _workspaces.one() as space:
         space.reserve(12 * height * width + 64)
         colour = _colours(image, both)
-        scale = 2 if min(height // grid[0], width // grid[1]) >= LEAST_CELL and min(height, width) > 1 else 1
+        scale = 2 if min(height // grid[0], width // grid[1]) >= MIN_HALVED_CELL and min(height, width) > 1 else 1
         small = colour if scale == 1 else _colours(halved(image[: height // 2 * 2, : width // 2 * 2]), both)
         centres = _grid_centres(small, *grid)
-        for _ in range(MOVES):
-            _move(small, centres, grid, compactness / step * scale, both)
+        for _ in range(ITERATIONS):
+            _move_centres(small, centres, grid, compactness / step * scale, both)
         if scale == 2:
             centres[:, 3:] = centres[:, 3:] * 2 + F32(0.5)
-        labels = _assigned(colour, centres, grid, compactness / step, both)
-        total = connect(labels, smallest, space.array((3, height * width), np.int32), both)
+        labels = _labels(colour, centres, grid, compactness / step, both)
+        total = connect(labels, min_size, space.array((3, height * width), np.int32), both)
     return labels, total
 
 
@@ -74,26 +74,26 @@ def _grid_centres(colour: Array, rows: int, cols: int) -> Array:
     y, x = np.meshgrid((np.arange(rows) + 0.5) * height / rows, (np.arange(cols) + 0.5) * width / cols, indexing="ij")
     centres = np.zeros((rows * cols, 5), np.float32)
     centres[:, :channels] = colour[y.astype(int).ravel(), x.astype(int).ravel()]
-    centres[:, 0] *= LIGHTNESS
+    centres[:, 0] *= LIGHTNESS_SCALE
     centres[:, 3], centres[:, 4] = y.ravel(), x.ravel()
     return centres
 
 
-def _move(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Fork) -> None:
-    """One k-means step: `centres` becomes the means of what is nearest to each."""
-    labels = _assigned(colour, centres, grid, weight, both)
+def _move_centres(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Fork) -> None:
+    """One k-means step: each centre becomes the mean of its pixels."""
+    labels = _labels(colour, centres, grid, weight, both)
     upper, lower = np.zeros((2, len(centres), 6))
     middle = len(colour) // 2
     both(
-        lambda: _add_up(colour, labels, 0, middle, upper),
-        lambda: _add_up(colour, labels, middle, len(colour), lower),
+        lambda: _add_pixels(colour, labels, 0, middle, upper),
+        lambda: _add_pixels(colour, labels, middle, len(colour), lower),
     )
     sums = upper + lower
     seen = sums[:, 5] > 0
     centres[seen] = sums[seen, :5] / sums[seen, 5:]
 
 
-def _assigned(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Fork = in_turn) -> Array:
+def _labels(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Fork = in_turn) -> Array:
     """The nearest centre of each pixel, (H, W) int32."""
     rows, cols = grid
     labels = np.empty(colour.shape[:2], np.int32)
@@ -109,7 +109,7 @@ def _assigned(colour: Array, centres: Array, grid: tuple[int, int], weight: floa
 def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, labels):
     """Find the nearest of nine centres for the pixels of grid rows first_row to end_row."""
     height, width, channels = colour.shape
-    # Arrays of their own, not rows of one: so the compiler sees that they do not overlap.
+    # Separate arrays, not rows of one: so the compiler knows that they do not overlap.
     first, second, third = np.zeros(width, np.float32), np.zeros(width, np.float32), np.zeros(width, np.float32)
     least, nearest, col = np.empty(width, np.float32), np.empty(width, np.int32), np.empty(width, np.int32)
     for k in range(cols):
@@ -117,15 +117,15 @@ def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, la
     candidates = np.empty((9, 5, width), np.float32)
     for row in range(first_row, end_row):
         for place in range(9):
-            _lay_out(centres, rows, cols, row + place // 3 - 1, place % 3 - 1, position_weight, candidates[place])
+            _expand_row(centres, rows, cols, row + place // 3 - 1, place % 3 - 1, position_weight, candidates[place])
         for y in range(row * height // rows, (row + 1) * height // rows):
             for x in range(width):
-                first[x] = F32(colour[y, x, 0]) * LIGHTNESS
+                first[x] = F32(colour[y, x, 0]) * LIGHTNESS_SCALE
             if channels == 3:
                 for x in range(width):
                     second[x] = colour[y, x, 1]
                     third[x] = colour[y, x, 2]
-            least[:] = FAR
+            least[:] = NO_CENTRE
             for place in range(9):
                 beside = np.int32((place // 3 - 1) * cols + place % 3 - 1)
                 for x in range(width):
@@ -140,13 +140,13 @@ def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, la
 
 
 @kernel
-def _add_up(colour, labels, first, end, sums):
+def _add_pixels(colour, labels, first, end, sums):
     """Add colour, y, x and 1 of the pixels of rows first to end to the `sums` of their labels, (n, 6) float64."""
     channels = colour.shape[2]
     for y in range(first, end):
         for x in range(colour.shape[1]):
             total = sums[labels[y, x]]
-            total[0] += F32(colour[y, x, 0]) * LIGHTNESS
+            total[0] += F32(colour[y, x, 0]) * LIGHTNESS_SCALE
             if channels == 3:
                 total[1] += colour[y, x, 1]
                 total[2] += colour[y, x, 2]
@@ -156,9 +156,11 @@ def _add_up(colour, labels, first, end, sums):
 
 
 @fast_part
-def _lay_out(centres, rows, cols, row, beside, position_weight, laid):
-    """Each pixel's candidate in grid row `row`, `beside` its own column: laid, (5, W), becomes three colours, y, and
-    the weighted square of the distance along x; `FAR` where there is no such centre."""
+def _expand_row(centres, rows, cols, row, beside, position_weight, laid):
+    """laid, (5, W), becomes colour, y and weighted squared x distance of each pixel's candidate centre.
+
+    The candidate is in grid row `row`, `beside` the pixel's own grid column; `NO_CENTRE` without such a centre.
+    """
     width = laid.shape[1]
     for col in range(cols):
         start, stop = col * width // cols, (col + 1) * width // cols
@@ -171,25 +173,25 @@ def _lay_out(centres, rows, cols, row, beside, position_weight, laid):
                 laid[4, x] = dx * dx * position_weight
         else:
             laid[:4, start:stop] = 0
-            laid[4, start:stop] = FAR
+            laid[4, start:stop] = NO_CENTRE
 
 
-def connect(labels: Array, smallest: int, scratch: Array, both: Fork = in_turn) -> int:
+def connect(labels: Array, min_size: int, scratch: Array, both: Fork = in_turn) -> int:
     """Number the 4-connected components of `labels` (H, W) int32 in scan order, in place; returns how many.
 
-    scratch: (3, H * W) int32, to work in. One of fewer than `smallest` pixels joins the component left of its first
-    pixel, or above it at the left border.
+    scratch: (3, H * W) int32. A component of fewer than `min_size` pixels joins the one left of its first pixel, or
+    above it at the left border.
     """
     height = labels.shape[0]
-    # Of each run of equal labels in a row: where it ends, a run of its component before it, and its component's number.
+    # For each run of equal labels in a row: its end, an earlier run of its component, and its component's number.
     ends, parent, number = scratch
-    rows = np.empty((height, 2), np.int64)  # the first run of each row, and the first beyond
+    rows = np.empty((height, 2), np.int64)  # first run of each row, and one past the last
     middle = height // 2
     both(
         lambda: _join_runs(labels, 0, middle, rows, ends, parent),
         lambda: _join_runs(labels, middle, height, rows, ends, parent),
     )
-    total = int(_number(labels, middle, smallest, rows, ends, parent, number))
+    total = int(_number(labels, middle, min_size, rows, ends, parent, number))
     by_bands(both, height, lambda first, end: _write(labels, first, end, rows, ends, parent, number))
     return total
 
@@ -230,8 +232,8 @@ def _join_runs(labels, first, end, rows, ends, parent):
 
 
 @kernel
-def _number(labels, middle, smallest, rows, ends, parent, number):
-    """The parent of every run becomes its root, which gets the number of its component; returns how many."""
+def _number(labels, middle, min_size, rows, ends, parent, number):
+    """Set each run's parent to its root and number the components; returns their count."""
     height = labels.shape[0]
     if 0 < middle < height:
         _join(labels, middle, rows, ends, parent)
@@ -242,14 +244,14 @@ def _number(labels, middle, smallest, rows, ends, parent, number):
             parent[run] = first
             if first == run:
                 number[run] = 0
-            number[first] += ends[run] - start  # its size, at first
+            number[first] += ends[run] - start  # first the size
             start = ends[run]
     total = np.int32(0)
-    for y in range(height):  # a root is the first run of its component: what lies before it has its number already
+    for y in range(height):  # a root is the first run of its component: earlier runs have their numbers
         for run in range(rows[y, 0], rows[y, 1]):
             if parent[run] != run:
                 continue
-            if number[run] < smallest and run > 0:
+            if number[run] < min_size and run > 0:
                 before = run - 1 if run > rows[y, 0] else rows[y - 1, 0]
                 number[run] = number[parent[before]]
             else:
@@ -270,11 +272,11 @@ def _write(labels, first, end, rows, ends, parent, number):
 
 
 def assign_reference(colour: Array, centres: Array, rows: int, cols: int, position_weight: float) -> Array:
-    """What `_assign` finds, in plain numpy: the nearest of the nine centres around each pixel's grid cell."""
+    """`_assign` in plain numpy: the nearest of the nine centres around each pixel's grid cell."""
     height, width, channels = colour.shape
     values = np.zeros((height, width, 3))
     values[..., :channels] = colour
-    values[..., 0] = colour[..., 0] * LIGHTNESS
+    values[..., 0] = colour[..., 0] * LIGHTNESS_SCALE
     y, x = np.mgrid[:height, :width]
     row_edges = np.arange(1, rows) * height // rows
     col_edges = np.arange(1, cols) * width // cols
@@ -293,8 +295,8 @@ def assign_reference(colour: Array, centres: Array, rows: int, cols: int, positi
     return labels
 
 
-def connect_reference(labels: Array, smallest: int) -> tuple[Array, int]:
-    """`connect` by scipy's components, label after label: the numbers, (H, W) int32, and how many."""
+def connect_reference(labels: Array, min_size: int) -> tuple[Array, int]:
+    """`connect` by scipy, label after label: the numbers, (H, W) int32, and their count."""
     from scipy import ndimage
 
     height, width = labels.shape
@@ -307,7 +309,7 @@ def connect_reference(labels: Array, smallest: int) -> tuple[Array, int]:
         if numbers[y, x] >= 0:
             continue
         same = component == component[y, x]
-        if same.sum() < smallest and (y, x) != (0, 0):
+        if same.sum() < min_size and (y, x) != (0, 0):
             numbers[same] = numbers[y, x - 1] if x > 0 else numbers[y - 1, x]
         else:
             numbers[same], total = total, total + 1

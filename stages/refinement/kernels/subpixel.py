@@ -1,14 +1,14 @@
-"""Matches to a fraction of a pixel, from brightness (Lucas and Kanade, 1981).
+"""Subpixel refinement of matches from brightness (Lucas and Kanade, 1981).
 
-Where neighbours have the same whole disparity, as on a surface that faces the camera, semi-global matching makes both
-steps away from it dearer, and so draws the fraction to 0, by up to a quarter of a pixel. Brightness knows of no whole
-pixels: a match is moved by the shift d that makes the left window most like the right one, up to a constant,
+Semi-global matching penalises both steps away from the neighbours' whole disparity, as on a surface that faces the
+camera. So it pulls fractions of a pixel towards 0, by up to a quarter of a pixel. Brightness has no such bias. A match
+moves by the shift d that makes the left window most similar to the right one, up to a constant,
 
-    d = -sum (g - mean g) (e - mean e) / sum ((g - mean g)^2 + NOISE^2)    with e(p) = L(p) - R(p - disparity(p))
+    d = -sum (g - mean g) (e - mean e) / sum ((g - mean g)^2 + IMAGE_NOISE^2)    with e(p) = L(p) - R(p - disparity(p))
 
-and g the mean of both images' gradients along the row; in between, the right image is a Catmull-Rom spline. The window
-is what of the square about a pixel has about its disparity, so that no edge of depth is in it, and of that every other
-pixel, as on a chessboard. Where there is little contrast, or little of a window, the match stays about where it was.
+where g is the mean of both images' gradients along the row. A Catmull-Rom spline interpolates the right image. The
+window contains the pixels of similar disparity, so that no depth edge is in it, and of those every other one, as on a
+chessboard. With little contrast or few pixels in the window, the match hardly moves.
 """
 
 from __future__ import annotations
@@ -20,18 +20,17 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
 F32 = np.float32
-ALIKE = F32(1.5)  # px, by which disparities in a window differ at most
-LEAST = F32(1 / 3)  # of the square's pixels that count, which a window must have
-NOISE = F32(4)  # gray levels, of a contrast that carries little information
-FARTHEST = F32(0.3)  # px, that a match is moved
-LANES = 64  # pixels of a row that are worked on at once
+MAX_WINDOW_STEP = F32(1.5)  # px between disparities of a window
+MIN_WINDOW_SHARE = F32(1 / 3)  # of the pixels on the chessboard
+IMAGE_NOISE = F32(4)  # gray levels, standard deviation of the images
+MAX_SHIFT = F32(0.3)  # px
+LANES = 64  # pixels of a row handled together
 
 
 def fit_brightness(left: Array, right: Array, disparity: Array, radius: int, threads: int = 1) -> Array:
-    """The disparities moved to where both images are most alike, (H, W) float32.
+    """Disparities moved to where both images are most similar, (H, W) float32.
 
-    left, right: (H, W) uint8; disparity: (H, W) float32, px, NaN = unknown; radius: of the square, px; threads: 2 share
-    the work, to the same result.
+    left, right: (H, W) uint8; disparity: (H, W) float32, px, NaN = unknown; radius: of the window, px.
     """
     both, (height, width) = shared_by(threads), disparity.shape
     framed = np.empty((3, height, -(-width // LANES) * LANES + 2 * radius), F32)  # disparity, error, gradient
@@ -43,8 +42,10 @@ def fit_brightness(left: Array, right: Array, disparity: Array, radius: int, thr
 
 @kernel
 def _compare(left, right, disparity, radius, framed, first, end):
-    """Of rows first to end the disparity, what the right image differs by, and the mean gradient; NaN where there is no
-    partner, and `radius` columns and more about the image."""
+    """Disparity, difference of the images and mean gradient of rows first to end.
+
+    NaN without a partner, and in a frame of `radius` columns.
+    """
     width = disparity.shape[1]
     framed[:, first:end] = np.nan
     for y in range(first, end):
@@ -64,10 +65,10 @@ def _compare(left, right, disparity, radius, framed, first, end):
 
 @kernel
 def _move(framed, disparity, radius, moved, first, end):
-    """Rows first to end of disparities, each moved by what its window says."""
+    """Move the disparities of rows first to end."""
     height, width = disparity.shape
     sums = np.empty(5 * LANES, np.float32)
-    least = LEAST * F32((2 * radius + 1) ** 2 // 2)
+    least = MIN_WINDOW_SHARE * F32((2 * radius + 1) ** 2 // 2)
     for y in range(first, end):
         for start in range(0, width, LANES):
             sums[:] = 0
@@ -81,19 +82,19 @@ def _move(framed, disparity, radius, moved, first, end):
                 count, g, e = sums[j], sums[LANES + j], sums[2 * LANES + j]
                 moved[y, x] = disparity[y, x]
                 if count >= least:
-                    contrast = sums[3 * LANES + j] - g * g / count + count * NOISE * NOISE
+                    contrast = sums[3 * LANES + j] - g * g / count + count * IMAGE_NOISE * IMAGE_NOISE
                     step = (sums[4 * LANES + j] - g * e / count) / contrast
-                    moved[y, x] -= min(max(step, -FARTHEST), FARTHEST)
+                    moved[y, x] -= min(max(step, -MAX_SHIFT), MAX_SHIFT)
 
 
 @part
 def _add(own, disparity, error, gradient, sums):
-    """Add a pixel of each of `LANES` windows to its sums, if it belongs there: of 1, g, e, g g, g e.
+    """Add one pixel of each of `LANES` windows to its sums of 1, g, e, g g, g e, if its disparity is similar.
 
-    They stand in one array, with constant distances: so the compiler knows that they do not overlap, and adds vectors.
+    All sums are in one array at constant distances: so the compiler knows that they do not overlap and vectorises.
     """
     for j in range(LANES):
-        inside = abs(disparity[j] - own[j]) <= ALIKE
+        inside = abs(disparity[j] - own[j]) <= MAX_WINDOW_STEP
         g, e = gradient[j] if inside else F32(0), error[j] if inside else F32(0)
         sums[j] += F32(1) if inside else F32(0)
         sums[LANES + j] += g
@@ -119,10 +120,10 @@ def fit_brightness_reference(left: Array, right: Array, disparity: Array, radius
     for y, x in np.argwhere(np.isfinite(error)):
         window = tuple(slice(max(0, place - radius), place + radius + 1) for place in (y, x))
         with np.errstate(invalid="ignore"):
-            inside = (abs(disparity[window] - disparity[y, x]) <= ALIKE) & np.isfinite(error[window])
+            inside = (abs(disparity[window] - disparity[y, x]) <= MAX_WINDOW_STEP) & np.isfinite(error[window])
         inside &= chessboard[window] == chessboard[y, x]
-        if np.count_nonzero(inside) >= LEAST * ((2 * radius + 1) ** 2 // 2):
+        if np.count_nonzero(inside) >= MIN_WINDOW_SHARE * ((2 * radius + 1) ** 2 // 2):
             g, e = (layer[window][inside] - layer[window][inside].mean() for layer in (gradient, error))
-            step = (g @ e) / (g @ g + len(g) * float(NOISE) ** 2)
-            moved[y, x] -= np.clip(step, -FARTHEST, FARTHEST)
+            step = (g @ e) / (g @ g + len(g) * float(IMAGE_NOISE) ** 2)
+            moved[y, x] -= np.clip(step, -MAX_SHIFT, MAX_SHIFT)
     return moved

@@ -1,7 +1,7 @@
-"""How far the evidence of a disparity image reaches, and which unknown pixels are within it.
+"""The valid extent of a disparity image: the first and last known pixel of each row, the first of each column.
 
-What lies above all that is known in a column is the sky, and what lies beyond the known ends of a row was not seen by
-both cameras: there a guess may reach a little farther, not more. Specks do not count: the sky is full of them.
+Above the extent is the sky. Left and right of it is ground that one camera does not see. Small isolated patches are
+ignored, because mismatches in the sky make many.
 """
 
 from __future__ import annotations
@@ -16,35 +16,34 @@ from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by, with_margin
 from stages.data import Array
 
-SIDE = 15  # px, of the square around a pixel that separates evidence from a speck
-SHARE = 0.5  # of what such a square knows in the mean; what stands in one that knows less is a speck
+SPECK_WINDOW = 15  # px, side of the window in which known pixels are counted
+MIN_RELATIVE_DENSITY = 0.5  # of the image's density; a pixel in a window of less is ignored
 
 
 class Extent(NamedTuple):
-    """How far the evidence reaches, of a disparity image (H, W). Where there is none, first > last, top = H."""
+    """First and last known pixels of a disparity image (H, W). Without any, first > last and top = H."""
 
-    top: Array  # (W,) int64, the uppermost row in which a column is known
-    first: Array  # (H,) int64, the first column in which a row is known
-    last: Array  # (H,) int64, the last one
+    top: Array  # (W,) int64, uppermost known row of each column
+    first: Array  # (H,) int64, first known column of each row
+    last: Array  # (H,) int64, last known column of each row
 
 
 def extent(disparity: Array, threads: int = 1) -> Extent:
-    """How far what is known reaches, but for specks.
-
-    disparity: (H, W) float32, NaN = unknown; threads: 2 share the work, to the same result.
-    """
+    """The valid extent of a disparity image, (H, W) float32, NaN = unknown."""
     height, width = disparity.shape
     known, evidence = ~np.isnan(disparity), np.empty(disparity.shape, bool)
-    least = int(SHARE * SIDE**2 * (np.count_nonzero(known) / known.size))
+    least = int(MIN_RELATIVE_DENSITY * SPECK_WINDOW**2 * (np.count_nonzero(known) / known.size))
     found = Extent(np.full(width, height, np.int64), np.full(height, 2 * width, np.int64), np.full(height, -width))
 
-    def weed(first: int, end: int) -> None:
-        about, own = with_margin(known.view(np.uint8), first, end, SIDE // 2)
-        around = cv2.boxFilter(about, cv2.CV_16U, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_REPLICATE)
+    def ignore_specks(first: int, end: int) -> None:
+        about, own = with_margin(known.view(np.uint8), first, end, SPECK_WINDOW // 2)
+        around = cv2.boxFilter(
+            about, cv2.CV_16U, (SPECK_WINDOW, SPECK_WINDOW), normalize=False, borderType=cv2.BORDER_REPLICATE
+        )
         np.logical_and(known[first:end], around[own] > least, out=evidence[first:end])
         _find_ends(evidence[first:end], found.first[first:end], found.last[first:end])
 
-    by_bands(shared_by(threads), height, weed)
+    by_bands(shared_by(threads), height, ignore_specks)
     _find_top(evidence, found.top)
     return found
 
@@ -82,8 +81,10 @@ def extent_reference(disparity: Array) -> Extent:
     """`extent` in plain numpy."""
     known = np.isfinite(disparity)
     height, width = known.shape
-    around = sliding_window_view(np.pad(known, SIDE // 2, mode="edge"), (SIDE, SIDE)).sum(axis=(2, 3))
-    known &= around > np.floor(SHARE * SIDE**2 * known.mean())
+    around = sliding_window_view(np.pad(known, SPECK_WINDOW // 2, mode="edge"), (SPECK_WINDOW, SPECK_WINDOW)).sum(
+        axis=(2, 3)
+    )
+    known &= around > np.floor(MIN_RELATIVE_DENSITY * SPECK_WINDOW**2 * known.mean())
     rows, columns = known.any(axis=1), known.any(axis=0)
     last = width - 1 - known[:, ::-1].argmax(axis=1)
     return Extent(

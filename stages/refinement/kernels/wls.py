@@ -1,8 +1,8 @@
 """Confidence-weighted least squares by the fast global smoother (Min et al., IEEE TIP 2014; section 3.3 of the paper).
 
-The two-dimensional weighted least-squares problem is replaced by alternating one-dimensional ones, each a tridiagonal
-system solved exactly in linear time. All columns are solved together, so the recursion down a column runs in vector
-lanes; rows are solved as the columns of the transposed image.
+Alternating one-dimensional problems replace the two-dimensional one. Each is a tridiagonal system, solved exactly in
+linear time. All columns are solved together, so that the recursion down a column runs in vector lanes. Rows are solved
+as columns of the transposed image.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from stages.compiled.jit import fast_kernel, kernel
 from stages.data import Array
 
 F32 = np.float32
-BLOCK = 320  # columns solved together: their working set stays in the second-level cache
+COLUMN_BLOCK = 320  # columns solved together; they fit the second-level cache
 PASSES = 3
-LEAST = F32(1e-6)  # smoothed weight, below which nothing is known
+MIN_WEIGHT = F32(1e-6)  # smoothed weight; with less a pixel stays unknown
 
 
 def smooth(values: Array, weights: Array, guide: Array, strength: float, sigma: float) -> Array:
-    """Smooth values along the image, across edges of the guide as little as possible.
+    """Smooth values within the edges of the guide.
 
     values: (H, W) float32, finite where weights > 0; weights: (H, W) float32 >= 0, 0 = unknown; guide: (H, W) uint8;
     strength: the lambda of the first pass (each later one has a quarter); sigma: gray levels of the guide over which
-    the coupling of two pixels falls to 1/e. Returns the smoothed values, (H, W) float32, NaN where less than `LEAST` of
-    weight arrives.
+    the coupling of two pixels falls to 1/e. Returns the smoothed values, (H, W) float32, NaN where the smoothed weight
+    is below `MIN_WEIGHT`.
     """
     coupling = np.exp(-np.arange(256) / sigma).astype(np.float32)
     height, width = values.shape
@@ -40,13 +40,13 @@ def smooth(values: Array, weights: Array, guide: Array, strength: float, sigma: 
         _solve_in_blocks(moment, mass, across, step)
         moment, mass = cv2.transpose(moment), cv2.transpose(mass)
         _solve_in_blocks(moment, mass, down, step)
-    return np.where(mass > LEAST, moment / np.maximum(mass, LEAST), F32(np.nan))
+    return np.where(mass > MIN_WEIGHT, moment / np.maximum(mass, MIN_WEIGHT), F32(np.nan))
 
 
 def _solve_in_blocks(moment: Array, mass: Array, coupling: Array, strength: np.float32) -> None:
-    upper = np.empty((moment.shape[0], min(BLOCK, moment.shape[1])), np.float32)
-    for start in range(0, moment.shape[1], BLOCK):
-        stop = min(start + BLOCK, moment.shape[1])
+    upper = np.empty((moment.shape[0], min(COLUMN_BLOCK, moment.shape[1])), np.float32)
+    for start in range(0, moment.shape[1], COLUMN_BLOCK):
+        stop = min(start + COLUMN_BLOCK, moment.shape[1])
         _solve(moment, mass, coupling, strength, upper, start, stop)
 
 
@@ -93,7 +93,7 @@ def _solve(moment, mass, coupling, strength, upper, start, stop):
 
 
 def smooth_reference(values: Array, weights: Array, guide: Array, strength: float, sigma: float) -> tuple[Array, Array]:
-    """`smooth` in float64, every line a sparse system handed to scipy; and the smoothed weights."""
+    """`smooth` in float64 by scipy's sparse solver, and the smoothed weights."""
     mass = weights.astype(np.float64)
     moment = np.where(mass > 0, values, 0.0) * mass
     for index in range(PASSES):
@@ -102,7 +102,7 @@ def smooth_reference(values: Array, weights: Array, guide: Array, strength: floa
             for array in (moment, mass):
                 turn(array)[:] = _solve_reference(turn(array), lines, strength * 0.25**index, sigma)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(mass > LEAST, moment / mass, np.nan), mass
+        return np.where(mass > MIN_WEIGHT, moment / mass, np.nan), mass
 
 
 def _solve_reference(right_side: Array, guide: Array, strength: float, sigma: float) -> Array:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from stages.data import PixelOrigin
 from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN
-from stages.refinement.kernels.pixel_origin import Trust, label_origin, name_sources_reference
+from stages.refinement.kernels.pixel_origin import Trust, label_origin, label_origin_reference
 
 TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.83, 0.84, 0.58, 0.56)
 
@@ -24,7 +24,7 @@ def test_names_are_those_of_the_reference(height, width, seed, threads):
     reasons = rng.choice(np.array([0, 4, 6, 10], np.uint8), shape)
     given = matches, confidence, rng.random(shape) < 0.5, kinds, refined, rng.random(shape) < 0.8, reasons, 0.5, TRUST
     source, worth = label_origin(*given, threads)
-    expected, expected_worth = name_sources_reference(*given)
+    expected, expected_worth = label_origin_reference(*given)
     assert np.array_equal(source, expected)
     assert np.array_equal(worth, expected_worth)
 
@@ -35,10 +35,10 @@ def test_every_origin_has_its_own_worth():
     refined = np.array([[8.5, 8, 8, 8.6, 8, 8, 8, nan]], np.float32)
     kinds = np.array([[KEPT, KEPT, KEPT, KEPT, KEPT, MISMATCH, OCCLUSION, OPEN]], np.uint8)
     agreed = np.array([[True, False, False, True, True, False, False, False]])
-    borne_out = np.array([[True, True, False, True, True, True, True, True]])
+    correlated = np.array([[True, True, False, True, True, True, True, True]])
     reasons = np.full((1, 8), PixelOrigin.LEFT_RIGHT, np.uint8)
     own = np.full((1, 8), 0.75, np.float32)
-    source, worth = label_origin(matches, own, agreed, kinds, refined, borne_out, reasons, 0.5, TRUST)
+    source, worth = label_origin(matches, own, agreed, kinds, refined, correlated, reasons, 0.5, TRUST)
     names = [PixelOrigin(code).name for code in source[0]]
     assert names == ["MEASURED", "MEASURED", "FILLED", "PLANE", "PLANE", "FILLED", "FILLED", "LEFT_RIGHT"]
     assert np.allclose(worth[0], [0.98, 0.86, 0.58, 0.83, 0.84, 0.58, 0.56, 0], atol=1e-3)

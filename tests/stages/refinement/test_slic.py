@@ -85,11 +85,11 @@ def test_assignment_is_the_nearest_of_nine_centres(photo, channels):
     image = photo[:90, :131] if channels == 3 else photo[:90, :131, 1]
     colour, rows, cols = slic._colours(image), 6, 9
     centres = slic._grid_centres(colour, rows, cols)
-    labels = slic._assigned(colour, centres, (rows, cols), 0.4**0.5)
+    labels = slic._labels(colour, centres, (rows, cols), 0.4**0.5)
     expected = slic.assign_reference(colour, centres, rows, cols, 0.4)
     assert (labels == expected).mean() > 0.999  # float32 may break a tie differently
     sums = np.zeros((rows * cols, 6))
-    slic._add_up(colour, labels, 0, len(labels), sums)
+    slic._add_pixels(colour, labels, 0, len(labels), sums)
     assert np.array_equal(sums[:, 5], np.bincount(labels.ravel(), minlength=rows * cols))
 
 
@@ -108,14 +108,14 @@ def test_a_step_moves_each_centre_to_the_mean_of_what_is_nearest_to_it(photo):
     values = [*lab, *np.mgrid[:90, :131].reshape(2, -1)]
     means = np.stack([np.bincount(labels, v, rows * cols) for v in values], axis=1)
     means /= np.bincount(labels, minlength=rows * cols)[:, None]
-    slic._move(colour, centres, (rows, cols), 0.4**0.5, in_turn)
+    slic._move_centres(colour, centres, (rows, cols), 0.4**0.5, in_turn)
     assert centres == pytest.approx(means, abs=0.05)
 
 
 def test_settled_centres_explain_the_image_better_than_a_grid(photo, monkeypatch):
     found = []
     for moves in (4, 0):
-        monkeypatch.setattr(slic, "MOVES", moves)
+        monkeypatch.setattr(slic, "ITERATIONS", moves)
         found.append(explained_variance(photo, slic.superpixels(photo, 600)[0]))
     settled, grid = found
     assert settled > grid + 0.002

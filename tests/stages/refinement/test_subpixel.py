@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages import Match, Refine, StereoCamera, StereoFrame
-from stages.refinement.kernels.subpixel import FARTHEST, fit_brightness, fit_brightness_reference
+from stages.refinement.kernels.subpixel import MAX_SHIFT, fit_brightness, fit_brightness_reference
 
 HEIGHT, WIDTH = 120, 260
 
@@ -69,5 +69,5 @@ def test_where_there_is_no_contrast_or_no_partner_a_match_stays():
     left, right = shifted(7.0)
     moved = fit_brightness(left, right, disparity, 2)
     np.testing.assert_array_equal(moved[:, :8], disparity[:, :8])
-    assert np.abs(moved - disparity).max() <= FARTHEST + 1e-5
+    assert np.abs(moved - disparity).max() <= MAX_SHIFT + 1e-5
     assert np.isnan(fit_brightness(left, right, np.full(even.shape, np.nan, np.float32), 2)).all()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.refinement.kernels.wls import LEAST, smooth, smooth_reference
+from stages.refinement.kernels.wls import MIN_WEIGHT, smooth, smooth_reference
 
 
 @settings(max_examples=15, deadline=None)
@@ -22,9 +22,9 @@ def test_equals_a_sparse_solve_of_every_line(height, width, strength, heaviest, 
     guide = rng.integers(100, 110, (height, width), dtype=np.uint8)
     smoothed = smooth(values, weights, guide, strength, 3.0)
     expected, mass = smooth_reference(values, weights, guide, strength, 3.0)
-    reached = mass > 1.001 * LEAST
+    reached = mass > 1.001 * MIN_WEIGHT
     assert smoothed[reached] == pytest.approx(expected[reached], rel=1e-4, abs=1e-4)
-    assert np.isnan(smoothed[mass < 0.999 * LEAST]).all()
+    assert np.isnan(smoothed[mass < 0.999 * MIN_WEIGHT]).all()
 
 
 def test_wide_images_are_solved_in_blocks_without_seams():
