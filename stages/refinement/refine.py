@@ -52,7 +52,9 @@ class Refine(Stage):
 
     A match that moves by at most 0.5 px stays MEASURED if left and right image correlate there, else it becomes FILLED.
     A match that moves farther becomes PLANE, as does a hole that a plane fills. Other filled holes are FILLED. The
-    confidence is the calibrated fraction of such pixels that are right within 1 px. See docs/refinement.md.
+    confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that stays unknown keeps
+    its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or OUT_OF_VIEW. See
+    docs/refinement.md.
 
     References
     ----------

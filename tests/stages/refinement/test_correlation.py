@@ -1,4 +1,4 @@
-"""Correlation: high where two images show the same, about none where noise matches noise; as the plain reference."""
+"""Correlation: high where both images show the same, low where noise matches noise; equal to the plain reference."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -9,7 +9,7 @@ from stages.refinement.kernels.correlation import correlation, correlation_refer
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 2**31), st.sampled_from([1, 2]))
-def test_it_is_that_of_the_reference(height, width, seed, threads):
+def test_the_correlation_equals_its_reference(height, width, seed, threads):
     rng = np.random.default_rng(seed)
     disparity = rng.uniform(-3, 12, (height, width)).astype(np.float32)
     disparity[rng.random(disparity.shape) < 0.3] = np.nan
@@ -20,7 +20,7 @@ def test_it_is_that_of_the_reference(height, width, seed, threads):
     assert np.abs(found).max() <= 1.000001
 
 
-def test_sums_of_a_wide_row_of_full_contrast_hold():
+def test_sums_over_a_wide_row_of_full_contrast_are_exact():
     rng = np.random.default_rng(2)
     left = rng.choice(np.array([0, 255], np.uint8), (3, 4000))
     disparity, none = np.full(left.shape, 1.5, np.float32), np.zeros(left.shape, bool)
@@ -29,7 +29,7 @@ def test_sums_of_a_wide_row_of_full_contrast_hold():
     )
 
 
-def test_what_both_see_correlates_and_noise_does_not_whatever_was_matched():
+def test_common_texture_correlates_and_noise_does_not():
     rng = np.random.default_rng(3)
     texture = rng.normal(0, 8, (120, 220))
     noise = rng.normal(0, 2, (2, 120, 200))
@@ -41,7 +41,7 @@ def test_what_both_see_correlates_and_noise_does_not_whatever_was_matched():
     assert np.abs(found[:52]).max() < 0.5
 
 
-def test_an_edge_along_the_row_says_nothing():
+def test_an_edge_along_the_row_does_not_correlate():
     rng = np.random.default_rng(4)
     left, right = rng.normal(0, 1, (2, 60, 100))
     for image in (left, right):
@@ -51,7 +51,7 @@ def test_an_edge_along_the_row_says_nothing():
     assert np.abs(found).max() < 0.6
 
 
-def test_where_nothing_varies_or_nothing_is_known_there_is_none():
+def test_without_texture_or_disparity_the_correlation_is_zero():
     flat = np.full((40, 60), 90, np.uint8)
     none = np.zeros(flat.shape, bool)
     assert not correlation(np.zeros((40, 60), np.float32), none, flat, flat).any()

@@ -1,4 +1,4 @@
-"""Depth edges: the weighted median is that of the plain reference, and puts an edge where the image has it."""
+"""Depth edges: the weighted median equals the plain reference and moves an edge onto the image edge."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def sharpened(disparity, image):
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 14), st.integers(1, 14), st.integers(1, 5), st.integers(0, 2**31))
-def test_the_median_is_that_of_the_reference(height, width, radius, seed):
+def test_the_median_equals_its_reference(height, width, radius, seed):
     random = np.random.default_rng(seed)
     disparity = np.float32(random.choice([-900.0, 3.0, 40.0], (height, width)) + random.normal(0, 0.2, (height, width)))
     disparity[random.random(disparity.shape) < 0.2] = np.nan
@@ -26,7 +26,7 @@ def test_the_median_is_that_of_the_reference(height, width, radius, seed):
     np.testing.assert_array_equal(sharp, sharpen_edges(*everything, threads=2))
 
 
-def test_an_edge_that_is_off_moves_to_that_of_the_image():
+def test_a_misplaced_depth_edge_moves_onto_the_image_edge():
     image = np.full((40, 60), 80, np.uint8)
     image[:, 30:] = 140
     truth = np.where(image > 100, np.float32(30), np.float32(10))
@@ -46,7 +46,7 @@ def test_ground_without_a_jump_and_unknown_pixels_stay():
     assert np.array_equal(sharp[:, :18], ground[:, :18], equal_nan=True)
 
 
-def test_guesses_do_not_outvote_a_match_but_follow_it():
+def test_guesses_do_not_move_matches_but_follow_them():
     disparity, image = np.full((20, 20), 10, np.float32), np.full((20, 20), 90, np.uint8)
     disparity[9:11, 9:11] = 30
     guessed = disparity == 10

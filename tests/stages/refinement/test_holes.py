@@ -1,4 +1,4 @@
-"""Holes: filled from the far side and from what looks alike, never across an edge, and open where nothing explains."""
+"""Holes: filled from the background and from similar colours, never across an edge, and open without evidence."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def filled(disparity, image, reach=64, margin=100):
 @settings(max_examples=80, deadline=None)
 @given(st.integers(1, 24), st.integers(1, 40), st.sampled_from([0.0, 4.0, 64.0]), st.sampled_from([0.0, 3.0, 16.0]),
        st.integers(0, 2**31), st.sampled_from([1, 2]))  # fmt: skip
-def test_the_fill_is_that_of_its_reference_to_the_bit(height, width, reach, margin, seed, threads):
+def test_the_fill_equals_its_reference_bit_by_bit(height, width, reach, margin, seed, threads):
     disparity, image = random_disparity(height, width, seed)
     within = extent(disparity)
     ours, kinds = fill_holes(disparity, image, within, reach, margin, threads)
@@ -44,7 +44,7 @@ def box():
     return disparity, image
 
 
-def test_what_an_object_hides_goes_on_behind_it(box):
+def test_occluded_holes_take_the_background(box):
     disparity, image = box
     hidden = np.s_[20:60, 20:40]  # as wide as the step, on the side that the right camera does not see
     disparity[hidden] = np.nan
@@ -56,7 +56,7 @@ def test_what_an_object_hides_goes_on_behind_it(box):
 
 
 @pytest.mark.parametrize("bright", [BRIGHT, DARK + 45])  # behind an edge, or only less like
-def test_a_hole_that_both_cameras_see_is_a_mismatch_and_parts_where_the_image_does(box, bright):
+def test_a_mismatch_is_filled_up_to_the_image_edge(box, bright):
     disparity, image = box
     image[image == BRIGHT] = bright
     truth = disparity.copy()
@@ -69,7 +69,7 @@ def test_a_hole_that_both_cameras_see_is_a_mismatch_and_parts_where_the_image_do
     assert (kinds[30:50, sure] == MISMATCH).all()
 
 
-def test_between_two_near_objects_the_ground_is_seen_and_not_the_objects():
+def test_a_gap_between_two_near_objects_takes_the_ground():
     disparity, image = np.full((60, 80), NEAR, np.float32), np.full((60, 80), BRIGHT, np.uint8)
     gap = np.s_[:, 30:50]
     disparity[gap], image[gap] = FAR, DARK
@@ -79,7 +79,7 @@ def test_between_two_near_objects_the_ground_is_seen_and_not_the_objects():
 
 
 @pytest.mark.parametrize("flip", [1, -1])
-def test_ground_beside_an_object_at_the_border_is_not_given_the_object(flip):
+def test_ground_at_the_border_does_not_take_an_objects_disparity(flip):
     disparity, image = np.full((40, 60), NEAR, np.float32), np.full((40, 60), BRIGHT, np.uint8)
     disparity[:, 45:], image[:, 45:] = np.nan, DARK
     result, kinds = filled(disparity[:, ::flip].copy(), image[:, ::flip].copy())
@@ -90,7 +90,7 @@ def test_ground_beside_an_object_at_the_border_is_not_given_the_object(flip):
     assert (same[:, ::flip][:, 46:] == NEAR).all()
 
 
-def test_on_one_surface_the_line_is_drawn():
+def test_a_hole_in_one_surface_is_interpolated():
     disparity = np.full((1, 100), np.nan, np.float32)
     disparity[0, :30], disparity[0, 39:] = 10, 11
     result, kinds = filled(disparity, np.full((1, 100), 90, np.uint8))
@@ -98,7 +98,7 @@ def test_on_one_surface_the_line_is_drawn():
     assert (kinds[0, 30:39] == MISMATCH).all()
 
 
-def test_nothing_is_fetched_from_farther_than_the_reach_but_what_is_hidden():
+def test_only_occluded_holes_are_filled_from_beyond_max_distance():
     disparity, image = np.full((1, 200), np.nan, np.float32), np.full((1, 200), DARK, np.uint8)
     disparity[0, :50], disparity[0, 150:] = FAR, FAR
     result, _ = filled(disparity, image, reach=20)
@@ -118,14 +118,14 @@ def bay():
     return disparity
 
 
-def test_nothing_is_filled_beyond_the_margin_nor_in_a_column_without_any_match(bay):
+def test_nothing_is_filled_beyond_the_margin(bay):
     result, _ = filled(bay, np.full((30, 50), 90, np.uint8), margin=4)
     known = np.zeros((30, 50), bool)
     known[12:, 6:44] = known[0, :45] = True
     assert np.array_equal(np.isfinite(result), known)
 
 
-def test_nothing_is_filled_above_the_margin_over_what_a_column_knows(bay):
+def test_nothing_is_filled_above_the_margin_of_a_column(bay):
     bay[0, 1:45] = np.nan
     bay[1:12, 0] = bay[1:12, 49] = FAR
     result, _ = filled(bay, np.full((30, 50), 90, np.uint8), margin=4)

@@ -1,4 +1,4 @@
-"""Source and confidence: what each pixel is called, and what it is worth, as the plain reference says."""
+"""Source and confidence of each pixel equal the plain reference."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -13,7 +13,7 @@ TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.83, 0.84, 0.58, 0.56)
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1, 2]))
-def test_names_are_those_of_the_reference(height, width, seed, threads):
+def test_origin_and_confidence_equal_the_reference(height, width, seed, threads):
     rng = np.random.default_rng(seed)
     shape = height, width
     matches = np.where(rng.random(shape) < 0.4, np.nan, rng.uniform(2, 9, shape)).astype(np.float32)
@@ -29,7 +29,7 @@ def test_names_are_those_of_the_reference(height, width, seed, threads):
     assert np.array_equal(worth, expected_worth)
 
 
-def test_every_origin_has_its_own_worth():
+def test_every_origin_has_its_own_confidence():
     nan = np.nan
     matches = np.array([[8, 8, 8, 8, nan, nan, nan, nan]], np.float32)
     refined = np.array([[8.5, 8, 8, 8.6, 8, 8, 8, nan]], np.float32)

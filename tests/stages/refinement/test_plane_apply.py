@@ -1,4 +1,4 @@
-"""Planes and matches brought together: equal to plain references, on one thread or two."""
+"""Trusted matches, medians and applied planes equal plain references, on one thread or two."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -29,19 +29,19 @@ def scene(height, width, seed):
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 20), st.integers(1, 30), st.sampled_from([-1.0, 0.0, 3.0]), st.integers(0, 2**31),
        st.sampled_from([1, 2]))  # fmt: skip
-def test_planes_pull_and_fill_as_the_reference_does(height, width, margin, seed, threads):
+def test_planes_pull_and_fill_as_in_the_reference(height, width, margin, seed, threads):
     pixels, coefficients, labels = scene(height, width, seed)
     within = extent(pixels)
-    pulled, spoke = pull_to_planes(pixels, coefficients, labels, within, 2.0, 0.7, margin, threads)
-    expected, expected_spoke = pull_to_planes_reference(pixels, coefficients, labels, within, 2.0, 0.7, margin)
+    pulled, applied = pull_to_planes(pixels, coefficients, labels, within, 2.0, 0.7, margin, threads)
+    expected, expected_applied = pull_to_planes_reference(pixels, coefficients, labels, within, 2.0, 0.7, margin)
     assert np.allclose(pulled, expected, atol=1e-5, equal_nan=True)
-    assert np.array_equal(spoke, expected_spoke)
+    assert np.array_equal(applied, expected_applied)
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 24), st.integers(1, 30), st.sampled_from([3, 5]), st.sampled_from([0.0, 1.5, 1000.0]),
        st.integers(0, 2**31), st.sampled_from([1, 2]))  # fmt: skip
-def test_the_median_is_that_of_sorted_windows(height, width, side, near, seed, threads):
+def test_the_median_equals_that_of_sorted_windows(height, width, side, near, seed, threads):
     pixels, *_ = scene(height, width, seed)
     moved = near_median(pixels, side, near, threads)
     assert np.array_equal(moved, near_median_reference(pixels, side, near), equal_nan=True)
@@ -49,7 +49,7 @@ def test_the_median_is_that_of_sorted_windows(height, width, side, near, seed, t
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1, 2]))
-def test_trusted_matches_are_those_of_the_reference(height, width, seed, threads):
+def test_trusted_matches_equal_the_reference(height, width, seed, threads):
     pixels, *_ = scene(height, width, seed)
     rng = np.random.default_rng(seed)
     source = rng.integers(0, len(PixelOrigin), pixels.shape, dtype=np.uint8)
@@ -60,7 +60,7 @@ def test_trusted_matches_are_those_of_the_reference(height, width, seed, threads
         np.testing.assert_array_equal(made, plain)
 
 
-def test_only_measured_finite_and_trusted_pixels_are_matches():
+def test_only_measured_finite_confident_pixels_are_matches():
     pixels = np.array([[1, 2, np.inf, 4, np.nan], [1, 2, 3, 4, 5]], np.float32)
     source = np.array([[1, 2, 1, 1, 1], [0, 1, 3, 1, 1]], np.uint8)
     confidence = np.array([[0.9, 0.9, 0.9, 0.4, 0.9], [0.9, 0.5, 0.9, 0.9, 0.49]], np.float32)

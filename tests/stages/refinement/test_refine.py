@@ -1,4 +1,4 @@
-"""Refinement: better than the matches it is given, honest about what it filled, and silent where nothing is known."""
+"""Refine: less noise than its matches, fills marked as such, unknown where there is no evidence."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,8 +12,7 @@ from stages.data import known as known_origin
 from stages.refinement import refine as module
 from stages.refinement.refine import MAX_EVEN_CONTRAST, Refine, _saturated
 from tests.bench.stereo_scores import paper_stages
-
-SHAPE = HEIGHT, WIDTH = 120, 160
+from tests.stages.refinement.flat_scene import HEIGHT, SHAPE, WIDTH, flat_scene
 
 
 @pytest.fixture
@@ -47,7 +46,7 @@ def test_noise_falls_and_holes_close_on_the_right_side_of_edges(box):
     assert (error[occluded] > 2).mean() < 0.02  # never the box's disparity
 
 
-def test_every_pixel_says_where_it_comes_from(box):
+def test_source_is_the_origin_of_every_pixel(box):
     frame, matches, _ = box
     refined = Refine(superpixels=200, min_superpixel_size=1, subpixel_radius=0, min_correlation=0)(frame, matches)
     known, matched = np.isfinite(refined.pixels), np.isfinite(matches.pixels)
@@ -66,7 +65,7 @@ def test_every_pixel_says_where_it_comes_from(box):
 
 
 @pytest.mark.parametrize("code", [PixelOrigin.UNKNOWN, PixelOrigin.PLANE, PixelOrigin.FILLED])
-def test_what_was_not_measured_is_no_match_whatever_its_pixels_say(box, code):
+def test_only_measured_pixels_are_matches(box, code):
     frame, matches, _ = box
     nowhere = Refine()(frame, replace(matches, source=np.full(SHAPE, code, np.uint8)))
     assert (nowhere.source == PixelOrigin.UNKNOWN).all()
@@ -79,15 +78,8 @@ def test_what_was_not_measured_is_no_match_whatever_its_pixels_say(box, code):
     assert np.array_equal(given.source, wanted.source)
 
 
-def flat_scene(level=8.0):
-    """A frame of one gray, all of it matched at `level` with full confidence: (frame, pixels, source, confidence)."""
-    image = np.full(SHAPE, 100, np.uint8)
-    frame = StereoFrame(5, image, image, StereoCamera(300, 300, 80, 60, 0.1, WIDTH, HEIGHT))
-    return frame, np.full(SHAPE, level, np.float32), np.ones(SHAPE, np.uint8), np.ones(SHAPE, np.float32)
-
-
 @pytest.mark.parametrize("median", [0, 5])
-def test_a_match_that_is_replaced_is_called_plane_and_loses_its_confidence(median, monkeypatch):
+def test_a_replaced_match_becomes_plane_with_less_confidence(median, monkeypatch):
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80] = 30
     matches = Disparity(5, pixels, source, confidence)
@@ -123,32 +115,6 @@ def test_a_match_of_little_confidence_counts_as_unknown():
     doubted = Refine(min_confidence=0.31, **bare)(frame, matches)
     assert np.array_equal(np.isnan(doubted.pixels), confidence < 0.31)
     assert np.isfinite(Refine(min_confidence=0.3, **bare)(frame, matches).pixels).all()
-
-
-def test_a_plane_steeper_than_allowed_fills_nothing(monkeypatch):
-    frame, pixels, source, confidence = flat_scene()
-    pixels += 0.4 * np.arange(WIDTH, dtype=np.float32)
-    hole = np.s_[50:55, 70:75]
-    pixels[hole], source[hole] = np.nan, 0
-    matches = Disparity(5, pixels, source, confidence)
-    refine = Refine(superpixels=60, min_superpixel_size=1, fill=False)
-    filled = refine(frame, matches)
-    assert (filled.source[hole] == PixelOrigin.PLANE).all()
-    assert np.abs(filled.pixels[hole] - (8 + 0.4 * np.arange(70, 75))).max() < 0.1
-    monkeypatch.setattr(module, "MAX_GRADIENT", 0.35)
-    assert np.isnan(refine(frame, matches).pixels[hole]).all()
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-def test_a_plane_is_not_followed_beyond_the_range_of_all_matches(side):
-    frame, pixels, source, confidence = flat_scene(100.0)
-    pixels += side * 0.4 * np.arange(WIDTH, dtype=np.float32)
-    pixels[:, 150:], source[:, 150:] = np.nan, 0
-    matches = Disparity(5, pixels, source, confidence)
-    # One superpixel: its plane would go on to the image's right border.
-    filled = Refine(superpixels=1, min_superpixel_size=1, fill=False, median_size=0)(frame, matches)
-    assert np.isfinite(filled.pixels[:, :149]).all()
-    assert np.isnan(filled.pixels[:, 151:]).all()
 
 
 @pytest.mark.filterwarnings("error")
@@ -221,21 +187,7 @@ def test_a_disparity_of_another_time_is_refused(box):
         Refine()(frame, replace(matches, stamp=6))
 
 
-def test_planes_of_surfaces_reach_where_superpixels_have_no_match():
-    frame, pixels, source, confidence = flat_scene()
-    pixels += 0.03 * np.arange(WIDTH, dtype=np.float32)
-    hole = np.s_[45:75, 60:100]  # larger than a superpixel, smaller than a surface
-    truth = pixels[hole].copy()
-    pixels[hole], source[hole] = np.nan, 0
-    matches = Disparity(5, pixels, source, confidence)
-    bare = Refine(superpixels=200, min_superpixel_size=1, fill=False, surface_size=0)(frame, matches)
-    assert np.isnan(bare.pixels[hole]).mean() > 0.5
-    wide = Refine(superpixels=200, min_superpixel_size=1, fill=False, surface_size=50)(frame, matches)
-    assert (wide.source[hole] == PixelOrigin.PLANE).all()
-    assert np.abs(wide.pixels[hole] - truth).max() < 0.05
-
-
-# No fit, no median and no plane: nothing else smooths.
+# Without subpixel fit, median and planes nothing else smooths.
 BARE = {
     "superpixels": 200,
     "min_superpixel_size": 1,
@@ -247,7 +199,7 @@ BARE = {
 }
 
 
-def test_the_bilateral_filter_takes_noise_and_leaves_the_step(box):
+def test_the_bilateral_filter_removes_noise_and_keeps_the_step(box):
     frame, matches, truth = box
     raw, smooth = (Refine(bilateral_radius=radius, edge_radius=0, **BARE)(frame, matches) for radius in (0, 3))
     known = np.isfinite(matches.pixels)
@@ -258,7 +210,7 @@ def test_the_bilateral_filter_takes_noise_and_leaves_the_step(box):
     assert error.max() < 1
 
 
-def test_edges_of_depth_go_where_the_image_has_them(box):
+def test_depth_edges_move_onto_image_edges(box):
     frame, matches, truth = box
     known = np.isfinite(matches.pixels)
     moved = replace(matches, pixels=np.where(known, np.roll(truth, 1, axis=1), np.nan).astype(np.float32))
@@ -274,53 +226,6 @@ def test_edges_of_depth_go_where_the_image_has_them(box):
     assert wrong[1] < 0.1 * wrong[0]
 
 
-# No superpixel with a hole has a plane then, a surface may have: half of it is to be matched.
-SURFACES_ONLY = {"superpixels": 1, "min_superpixel_size": 1, "surface_size": 1}
-
-
-@pytest.mark.parametrize(("surface_size", "min_valid"), [(0, 0.6), (1, 1.0)])
-def test_a_plane_counts_matches_by_their_confidence(surface_size, min_valid, monkeypatch):
-    monkeypatch.setattr(module, "MIN_VALID_SHARE", min_valid)
-    parameters = SURFACES_ONLY | {"surface_size": surface_size}
-    frame, pixels, source, confidence = flat_scene()
-    doubted = np.random.default_rng(4).random(SHAPE) < 0.5
-    pixels[doubted], confidence[doubted] = 8.4, 0.5
-    hole = np.s_[50:55, 70:75]
-    pixels[hole], source[hole], confidence[hole] = np.nan, 0, 0
-    refine = Refine(median_size=0, bilateral_radius=0, edge_radius=0, **parameters)
-    filled = refine(frame, Disparity(5, pixels, source, confidence))
-    half = doubted[np.isfinite(pixels)].mean()
-    mean = (8 * (1 - half) + 8.4 * half * 0.5) / (1 - half + half * 0.5)
-    assert filled.pixels[hole] == pytest.approx(mean, abs=0.01)
-
-
-def test_a_surface_draws_half_as_far_and_agreement_is_worth_more(monkeypatch):
-    monkeypatch.setattr(module, "MIN_VALID_SHARE", 1.0)
-    frame, pixels, source, confidence = flat_scene()
-    pixels[60, 80], pixels[60, 90] = 8.4, 8.7
-    pixels[30, 30], source[30, 30] = np.nan, 0
-    matches = Disparity(5, pixels, source, confidence)
-    steps = {"median_size": 0, "bilateral_radius": 0, "edge_radius": 0, "min_correlation": 0}
-    drawn = Refine(plane_weight=1, **steps, **SURFACES_ONLY)(frame, matches)
-    assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
-    assert drawn.pixels[60, 90] == np.float32(8.7)
-    assert drawn.confidence[60, 70] > drawn.confidence[60, 90] > 0.9
-    assert (drawn.source[60, 70], drawn.source[60, 90]) == (PixelOrigin.MEASURED, PixelOrigin.MEASURED)
-
-
-def test_what_a_superpixel_filled_is_no_evidence_for_a_surface():
-    frame, pixels, source, confidence = flat_scene()
-    holes = np.random.default_rng(6).random(SHAPE) < 0.3
-    holes[:, 60:] = True  # the rest is three eighths of the image, and matched by seven tenths
-    pixels[holes], source[holes] = np.nan, 0
-    refine = Refine(
-        superpixels=48, min_superpixel_size=1, surface_size=48, fill=False, bilateral_radius=0, edge_radius=0
-    )
-    filled = refine(frame, Disparity(5, pixels, source, confidence))
-    assert np.isfinite(filled.pixels[:, :59]).mean() > 0.95
-    assert np.isnan(filled.pixels[:, 62:]).all()
-
-
 def test_a_match_moves_to_its_median_where_that_is_near():
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80], pixels[60, 100] = 8.9, 11
@@ -332,7 +237,7 @@ def test_a_match_moves_to_its_median_where_that_is_near():
 @pytest.mark.parametrize(
     "refine", [Refine(), paper_stages()[1], Refine(fill=False, bilateral_radius=0, edge_radius=0, median_size=0)]
 )
-def test_no_match_at_all_stays_no_disparity(box, refine):
+def test_a_frame_without_matches_stays_unknown(box, refine):
     frame, matches, _ = box
     empty = np.full(SHAPE, np.nan, np.float32)
     nothing = replace(matches, pixels=empty, source=np.zeros(SHAPE, np.uint8), confidence=np.zeros(SHAPE, np.float32))
@@ -373,7 +278,7 @@ def test_without_planes_no_superpixels_are_made(box):
         assert Refine(superpixels=200, min_superpixel_size=1, **parameters)(frame, matches).segments.max() > 100
 
 
-def test_what_an_object_hides_is_never_given_the_object(box, monkeypatch):
+def test_occluded_pixels_never_get_the_occluders_disparity(box, monkeypatch):
     monkeypatch.setattr(module, "MIN_INLIER_SHARE", 0)
     monkeypatch.setattr(module, "MIN_VALID_SHARE", 0)
     frame, matches, truth = box
@@ -383,7 +288,7 @@ def test_what_an_object_hides_is_never_given_the_object(box, monkeypatch):
     assert (refined.pixels[hidden] < 0.5 * (40 + truth[hidden])).all()
 
 
-def test_nothing_is_filled_above_all_that_is_known():
+def test_nothing_is_filled_above_the_uppermost_matches():
     frame, pixels, source, confidence = flat_scene()
     pixels[:60, 30:130], source[:60, 30:130] = np.nan, 0  # a sky between two hills
     refined = Refine(max_extrapolation=5)(frame, Disparity(5, pixels, source, confidence))
@@ -391,7 +296,7 @@ def test_nothing_is_filled_above_all_that_is_known():
     assert np.isfinite(refined.pixels[56:, 30:130]).all()
 
 
-def test_matches_of_a_burnt_out_sky_do_not_count(monkeypatch):
+def test_matches_of_a_saturated_sky_do_not_count(monkeypatch):
     frame, pixels, source, confidence = flat_scene()
     image = np.dstack([frame.left] * 3)
     image[:50] = (130, 235, 252)
@@ -408,7 +313,7 @@ def test_matches_of_a_burnt_out_sky_do_not_count(monkeypatch):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_what_is_burnt_out_does_not_depend_on_bands(threads):
+def test_saturated_patches_do_not_depend_on_bands(threads):
     image = cv2.blur(np.random.default_rng(3).integers(0, 256, (97, 60, 3), dtype=np.uint8), (9, 9))
     image[24:72, 10:] = 253  # bands begin where it begins and ends
     guide = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -416,8 +321,8 @@ def test_what_is_burnt_out_does_not_depend_on_bands(threads):
     np.testing.assert_array_equal(_saturated(image, guide, 250, threads), even & (image >= 250).any(axis=2))
 
 
-def test_a_match_that_the_images_do_not_bear_out_is_a_guess():
-    """Noise over texture: the same disparity everywhere, of which the upper half of the images knows nothing."""
+def test_a_match_without_correlation_becomes_filled():
+    """Texture below, noise above: only the lower half of the images correlates at the common disparity."""
     rng = np.random.default_rng(11)
     texture = rng.integers(60, 140, (HEIGHT, WIDTH + 8)).astype(np.uint8)
     left, right = texture[:, :WIDTH].copy(), texture[:, 8:].copy()

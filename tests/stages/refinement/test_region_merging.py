@@ -1,4 +1,4 @@
-"""Surfaces: superpixels of one colour together, those of another apart, as the plain reference groups them."""
+"""Merged regions equal the plain reference and do not cross image edges."""
 
 import numpy as np
 import pytest
@@ -13,32 +13,32 @@ from stages.refinement.kernels.slic import superpixels
 @settings(max_examples=30, deadline=None)
 @given(st.integers(4, 60), st.integers(4, 60), st.integers(1, 40), st.integers(1, 12), st.integers(0, 2**31),
        st.sampled_from([1, 2]))  # fmt: skip
-def test_groups_are_those_of_the_reference(height, width, aimed, groups, seed, threads):
+def test_regions_equal_the_reference(height, width, aimed, groups, seed, threads):
     rng = np.random.default_rng(seed)
     shape = (height, width, 3) if seed % 2 else (height, width)
     image = rng.integers(0, 256, shape, dtype=np.uint8)
     labels, count = superpixels(image, aimed)
-    surface, total = merge_regions(image, labels, count, groups, threads=threads)
+    region, total = merge_regions(image, labels, count, groups, threads=threads)
     expected, expected_total = merge_regions_reference(image, labels, count, groups)
-    assert np.array_equal(surface, expected)
+    assert np.array_equal(region, expected)
     assert total == expected_total
 
 
-def test_groups_of_a_photo_are_those_of_the_reference():
+def test_regions_of_a_photo_equal_the_reference():
     image = np.ascontiguousarray(data.astronaut()[:200, 100:340])
     labels, count = superpixels(image, 300)
     for compactness in (2.0, 10.0):
-        surface, total = merge_regions(image, labels, count, 20, compactness)
-        assert np.array_equal(surface, merge_regions_reference(image, labels, count, 20, compactness)[0])
+        region, total = merge_regions(image, labels, count, 20, compactness)
+        assert np.array_equal(region, merge_regions_reference(image, labels, count, 20, compactness)[0])
         assert 10 <= total <= 30
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_surface_does_not_cross_an_edge_that_its_superpixels_keep(threads):
+def test_a_region_does_not_cross_an_edge_between_superpixels(threads):
     image = np.full((120, 160), 60, np.uint8)
     image[:, 83:] = 180
     labels, count = superpixels(image, 120)
-    surface, total = merge_regions(image, labels, count, 8, threads=threads)
-    regions = surface[labels]
+    region, total = merge_regions(image, labels, count, 8, threads=threads)
+    regions = region[labels]
     assert set(regions[:, :83].ravel()) & set(regions[:, 83:].ravel()) == set()
     assert 4 <= total <= 12

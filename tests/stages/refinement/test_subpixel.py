@@ -1,4 +1,4 @@
-"""The fraction of a pixel from brightness: as the plain reference, and right where matching alone is drawn to 0."""
+"""Subpixel fractions from brightness: equal to the plain reference, and without the bias of matching."""
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ def shifted(disparity, seed=0, noise=1.0):
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 30), st.integers(1, 150), st.integers(1, 4), st.sampled_from([1, 2]), st.integers(0, 2**31))
-def test_it_is_the_reference(height, width, radius, threads, seed):
+def test_the_fit_equals_its_reference(height, width, radius, threads, seed):
     rng = np.random.default_rng(seed)
     left = cv2.blur(rng.integers(0, 256, (height, width), np.uint8), (3, 3))
     right = np.roll(left, -4, axis=1)
@@ -36,7 +36,7 @@ def test_it_is_the_reference(height, width, radius, threads, seed):
 
 
 @pytest.mark.parametrize("fraction", [0.2, 0.4, 0.6, 0.8])
-def test_a_surface_that_faces_the_camera_is_not_drawn_to_whole_pixels(fraction):
+def test_a_surface_facing_the_camera_is_not_biased_to_whole_pixels(fraction):
     true = 20 + fraction
     left, right = shifted(true)
     frame = StereoFrame(0, left, right, StereoCamera(500, 500, WIDTH / 2, HEIGHT / 2, 0.2, WIDTH, HEIGHT))
@@ -48,21 +48,21 @@ def test_a_surface_that_faces_the_camera_is_not_drawn_to_whole_pixels(fraction):
     assert abs(off[1]) > 0.1
 
 
-def test_what_neighbours_are_off_by_together_is_taken_back_on_a_slope_too():
+def test_a_common_offset_on_a_slope_is_corrected():
     true = 20 + 0.2 * np.arange(HEIGHT)[:, None] + np.zeros((1, WIDTH))
     left, right = shifted(true)
     moved = fit_brightness(left, right, (true + 0.2).astype(np.float32), 2)
     assert np.abs(moved - true)[10:-10, 60:-10].mean() < 0.05
 
 
-def test_what_lies_behind_an_edge_of_depth_does_not_move_what_is_in_front():
+def test_pixels_behind_a_depth_edge_do_not_move_those_in_front():
     true = np.where(np.arange(WIDTH) < 140, 12.0, 30.0) + np.zeros((HEIGHT, 1))
     left, right = shifted(true, noise=0)
     moved = fit_brightness(left, right, true.astype(np.float32), 2)
     np.testing.assert_allclose(moved[:, 141:-10], 30, atol=0.05)
 
 
-def test_where_there_is_no_contrast_or_no_partner_a_match_stays():
+def test_a_match_without_contrast_or_partner_stays():
     even = np.full((HEIGHT, WIDTH), 90, np.uint8)
     disparity = np.full(even.shape, 7.25, np.float32)
     np.testing.assert_array_equal(fit_brightness(even, even, disparity, 2), disparity)

@@ -1,4 +1,4 @@
-"""How far evidence reaches: as the plain reference says, and a little farther, not more."""
+"""The valid extent equals its plain reference and ignores specks."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -9,7 +9,7 @@ from stages.refinement.kernels.valid_extent import extent, extent_reference
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 70), st.integers(1, 40), st.sampled_from([1, 2]), st.integers(0, 2**31))
-def test_the_extent_is_that_of_its_reference(height, width, threads, seed):
+def test_the_extent_equals_its_reference(height, width, threads, seed):
     rng = np.random.default_rng(seed)
     known = rng.random((height, width)) < rng.uniform(0.02, 0.7)
     disparity = np.where(known, 5, np.nan).astype(np.float32)
@@ -17,7 +17,7 @@ def test_the_extent_is_that_of_its_reference(height, width, threads, seed):
         assert np.array_equal(ours, expected)
 
 
-def test_specks_in_the_sky_are_no_evidence_of_how_far_the_ground_reaches():
+def test_specks_in_the_sky_do_not_widen_the_extent():
     scene = np.full((60, 80), np.nan, np.float32)
     scene[40:] = 5
     scene[3:6, 10:14] = 1

@@ -1,4 +1,4 @@
-"""The weighted smoother: equal to the sparse solve, kept by constants, and stopped by edges of the guide."""
+"""WLS: equal to the sparse solve, keeps constants, stops at edges of the guide."""
 
 import numpy as np
 import pytest
