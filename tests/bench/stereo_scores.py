@@ -20,10 +20,11 @@ from recordings.scoring.stereo_metrics import StereoErrors
 from stages.data import Array, Disparity, StereoFrame
 from stages.matching.match import Match
 from stages.matching.match_opencv import MatchOpenCV
+from stages.refinement.paper import RefinePaper
 from stages.refinement.refine import Refine
 
 
-def paper_stages() -> tuple[MatchOpenCV, Refine]:
+def paper_stages() -> tuple[MatchOpenCV, RefinePaper]:
     """Matching and refinement as the pipeline `paper` sets them."""
     actors = {node.name: node.actor for node in load("paper").nodes}
     return actors["matched"], actors["disparity"]
