@@ -77,7 +77,7 @@ CASES: dict[str, tuple[Callable[[int, Path], Change], tuple[str, ...]]] = {
         images(lambda h, w: np.full((h, w), 255)),
         ("1 failed", "the frame has no measured point within range"),
     ),
-    "tilt gap": (no_tilt, ("1 unaligned", "inclinometer has a gap of 650.0 ms, more than 200.0 ms")),
+    "tilt gap": (no_tilt, ("1 unaligned", "inclinometer has a gap of 650 ms, more than 200 ms")),
     "NaN tilt": (senseless_tilt, ("12 unreadable", "the quaternion of the inclinometer is not a rotation", "a gap of")),
 }
 

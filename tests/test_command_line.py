@@ -302,7 +302,7 @@ def test_what_a_full_disk_took_is_kept_and_so_is_the_result_before(traverse, tmp
     with McapFile(kept) as log:
         held = [item for item in log.messages(set(log.index.channels)) if isinstance(item, RawMessage)]
         topics = {log.channel(item.channel).topic for item in held}
-    assert f"File too large (the {len(held)} messages that it took are in {kept}); " in said.err
+    assert f"File too large (its first {len(held)} messages are in {kept}); " in said.err
     assert said.err.count("\n") == 1
     assert topics >= {"/nav/disparity", "/nav/points", "/nav/elevation_map"}
     assert out.read_bytes() == before

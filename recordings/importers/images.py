@@ -223,7 +223,7 @@ def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
     try:
         ImageCalibration(**loaded)
     except ValueError as error:
-        raise LogError(f"{where}: {error}") from error
+        raise LogError(f"{where}: {str(error).removeprefix('ImageCalibration.')}") from error
     return {"fy": loaded["fx"], "cx_right": loaded["cx"], **loaded}
 
 
