@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.segmentation import slic
 
-from stages.data import Array, Disparity, PixelOrigin, StereoFrame
+from stages.data import Array, Disparity, PixelOrigin, StereoFrame, known
 from stages.matching.intensity import eight_bit, gray
 from stages.refinement.kernels.bilateral import joint_bilateral
 from stages.refinement.kernels.plane_apply import near_median
@@ -144,6 +144,7 @@ class RefinePaper(Stage):
         plane = np.isfinite(matches) & ~near
         origin = np.select([near, plane], [PixelOrigin.MEASURED, PixelOrigin.PLANE], PixelOrigin.FILLED)
         trust = np.select([near, plane], [disparity.confidence, F32(PLANE_CONFIDENCE)], F32(FILLED_CONFIDENCE))
-        known = np.isfinite(refined)
-        source = np.where(known, origin, disparity.source).astype(np.uint8)
-        return source, np.where(known, trust, 0).astype(np.float32)
+        finite = np.isfinite(refined)
+        reasons = np.where(known(disparity.source), PixelOrigin.UNKNOWN, disparity.source)
+        source = np.where(finite, origin, reasons).astype(np.uint8)
+        return source, np.where(finite, trust, 0).astype(np.float32)

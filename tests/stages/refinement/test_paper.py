@@ -83,6 +83,14 @@ def test_a_frame_without_matches_keeps_its_reasons() -> None:
     assert (refined.source == PixelOrigin.SPECKLE).all()
 
 
+def test_an_unfilled_pixel_has_no_code_of_a_known_one() -> None:
+    frame, matches = scene()
+    planes_only = replace(matches, source=np.full(SHAPE, PixelOrigin.PLANE, np.uint8))
+    refined = RefinePaper()(frame, planes_only)
+    assert np.isnan(refined.pixels).all()
+    assert (refined.source == PixelOrigin.UNKNOWN).all()
+
+
 def test_the_stamp_decides_every_bit_also_of_two_frames_at_once() -> None:
     refine = RefinePaper(superpixels=30, trials=2)
     jobs = [scene(5), scene(6)] * 3
