@@ -1,6 +1,7 @@
 """Rules of the code base: which folder may import which, and the words that each may use."""
 
 import ast
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,22 @@ def test_imports_run_one_way(room):
         names = [name for name in imported(file) if name.split(".")[0] in ROOMS - {room}]
         strangers = [name for name in names if not name.startswith(shared)]
         assert strangers == [], f"{file.relative_to(ROOT)} must not import {strangers}"
+
+
+def test_a_public_class_name_occurs_once():
+    names = Counter(
+        node.name
+        for room in ROOMS
+        for file in (ROOT / room).rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    assert [name for name, times in names.items() if times > 1] == []
+
+
+def test_no_folder_has_more_than_15_modules():
+    folders = Counter(file.parent for room in ROOMS for file in (ROOT / room).rglob("*.py") if file.stem != "__init__")
+    assert {str(folder.relative_to(ROOT)): n for folder, n in folders.items() if n > 15} == {}
 
 
 def test_the_rule_would_notice_a_stranger(tmp_path):

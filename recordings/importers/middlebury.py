@@ -32,7 +32,7 @@ _POSITIVE = ("fx", "fy", "baseline", "width", "height", "ndisp")
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class MiddleburyScene:
     """A scene.
 
     frame: left and right image with their camera; ndisp: the search range of its authors, px; truth: (H, W) float32,
@@ -106,7 +106,7 @@ def logs_of(source: Path, out: Path) -> list[tuple[Path, Path]]:
     return [(folder, out / f"{folder.name}.mcap") for folder in scenes]
 
 
-def read_scene(folder: Path, stamp: int = FIRST_STAMP) -> Scene:
+def read_scene(folder: Path, stamp: int = FIRST_STAMP) -> MiddleburyScene:
     """The scene of a folder, with its frame at `stamp`, ns. Raises LogError if a file is missing (the truth may be) or
     cannot be used."""
     text, numbers = _calibration(folder / CALIBRATION)
@@ -117,7 +117,7 @@ def read_scene(folder: Path, stamp: int = FIRST_STAMP) -> Scene:
     truth = _same_size(read_pfm(path), frame, path) if path is not None else None
     mask = folder / MASK
     occlusion = _same_size(_codes(mask), frame, mask) if truth is not None and mask.exists() else None
-    return Scene(folder.resolve().name, frame, ndisp, truth, occlusion, text)
+    return MiddleburyScene(folder.resolve().name, frame, ndisp, truth, occlusion, text)
 
 
 def read_pfm(path: Path) -> Array:
@@ -197,7 +197,7 @@ def _same_size(truth: Array, frame: StereoFrame, path: Path) -> Array:
     return truth
 
 
-def _write_truth(writer: Ros2Writer, scene: Scene) -> None:
+def _write_truth(writer: Ros2Writer, scene: MiddleburyScene) -> None:
     stamp, truth = scene.frame.stamp, scene.truth
     writer.metadata("middlebury", {"scene": scene.name, **scene.calibration})
     if truth is not None:
