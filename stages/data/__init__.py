@@ -12,9 +12,10 @@ from __future__ import annotations
 from stages.data.arrays import Array
 from stages.data.camera import CameraImage, CameraModel, StereoCamera, StereoFrame
 from stages.data.cloud import PointCloud, VoxelMap
-from stages.data.disparity import Disparity, MatchHealth, PixelOrigin, known
+from stages.data.disparity import Disparity, MatchHealth
 from stages.data.maps import LEVEL_FRAME, Cell, CellReason, ElevationMap, NavigationMap
 from stages.data.motion import CameraMotion, Mount, Pose, Tilt, TiltHealth, Transform
+from stages.data.pixel_validity import PixelOrigin, known
 from stages.data.rover import Rover
 from stages.data.tiles import Tiles
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stages.data.arrays import Array, check_resolution, publish, publish_stamp
-from stages.data.disparity import PixelOrigin
 from stages.data.motion import Transform
+from stages.data.pixel_validity import PixelOrigin
 
 
 @dataclass(frozen=True, eq=False)

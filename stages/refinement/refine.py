@@ -20,7 +20,7 @@ from stages.refinement.kernels.bilateral import joint_bilateral
 from stages.refinement.kernels.correlation import correlation
 from stages.refinement.kernels.depth_edges import sharpen_edges
 from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
-from stages.refinement.kernels.pixel_origin import Trust, label_origin
+from stages.refinement.kernels.label_origin import Trust, label_origin
 from stages.refinement.kernels.plane_apply import near_median, pull_to_planes, trusted_matches
 from stages.refinement.kernels.plane_fit import Planes, fit_planes
 from stages.refinement.kernels.region_merging import merge_regions

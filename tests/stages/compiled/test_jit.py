@@ -67,7 +67,7 @@ def test_kernels_are_announced_once_kept_and_made_again_after_a_change_anywhere(
     after, said = run()
     assert after != first
     assert "compiling kernels" in said
-    codes = tmp_path / "stages" / "data" / "disparity.py"  # the values of its enumerations are compiled in
+    codes = tmp_path / "stages" / "data" / "pixel_validity.py"  # the values of its enumerations are compiled in
     codes.write_text(f"{codes.read_text()}\n# changed\n")
     assert "compiling kernels" in run()[1]
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from stages.data import PixelOrigin
 from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN
-from stages.refinement.kernels.pixel_origin import Trust, label_origin, label_origin_reference
+from stages.refinement.kernels.label_origin import Trust, label_origin, label_origin_reference
 
 TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.83, 0.84, 0.58, 0.56)
 
