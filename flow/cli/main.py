@@ -47,7 +47,8 @@ IMPORTERS: dict[str, ModuleType] = {"images": images, "middlebury": middlebury}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code. An error is one sentence on stderr."""
-    options = parser().parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    options = parser().parse_args(given or ["--help"])
     logging.basicConfig(level=logging.DEBUG if options.debug else logging.ERROR, format="%(message)s")
     logging.getLogger("numba").setLevel(logging.WARNING)
     try:
@@ -92,7 +93,7 @@ def parser() -> argparse.ArgumentParser:
     """The parser of the command line; every command declares its own arguments."""
     top = argparse.ArgumentParser(
         prog="roverflow",
-        description="Replay rover traverses into terrain one can trust.",
+        description="Turn the log of a rover into disparity, point clouds, elevation and navigation maps.",
         epilog="Exit codes: 0 complete; 1 an output or the program failed; 2 wrong usage, or an unusable log; "
         "3 finished but incomplete; 130 interrupted (the outputs of a run are closed and readable).",
     )

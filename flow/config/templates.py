@@ -248,7 +248,10 @@ def resolved(port: str, given: Value, scope: Scope | None) -> str:
     stream = scope.stream(given.value)
     if stream is None:
         meant = nearest(given.value, [*scope.inputs, *scope.streams])
-        raise given.place.error(f"the template has no stream or input '{given.value}'{meant}")
+        if given.value.removeprefix("$") in scope.inputs:
+            raise given.place.error(f"'{given.value[1:]}' is an input of the template; write it without $")
+        remedy = meant or "; declare it under inputs, and pass it where the template is used"
+        raise given.place.error(f"the template has no stream or input '{given.value}'{remedy}")
     return stream
 
 

@@ -7,10 +7,14 @@ and a test fails when a page is not current.
 from __future__ import annotations
 
 import argparse
+import inspect
+import re
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
 
 import stages
+import stages.data
 from flow.cli.main import parser
 from flow.config.reference import NodeReference, stage_reference
 
@@ -36,8 +40,8 @@ STAGES_INTRO = """# Stages and their parameters
 
 This page is generated from the code by `make docs`. `roverflow stages [NAME]` prints the same on a terminal.
 
-Inputs and outputs name the types of `stages.data`. In a pipeline file, write times, lengths and angles with a unit:
-`5 ms`, `20 cm`, `20 deg`. [pipelines.md](pipelines.md) shows how to use a stage.
+Inputs and outputs name the types of `stages.data`, whose fields are [below](#data-types). In a pipeline file, write
+times, lengths and angles with a unit: `5 ms`, `20 cm`, `20 deg`. [pipelines.md](pipelines.md) shows how to use a stage.
 """
 COMMANDS_INTRO = """# Command line
 
@@ -72,7 +76,24 @@ def _stages() -> str:
         for node in nodes:
             if node.use.startswith(module):
                 parts += _section(node)
+    parts.append(
+        "## Data types\n\nTypes of streams. Arrays are read-only; `NaN` is unknown; `stamp` is in nanoseconds.\n"
+    )
+    for name in stages.data.__all__:
+        kind = getattr(stages.data, name)
+        if isinstance(kind, type) and is_dataclass(kind) and (fields := _documented_fields(kind)):
+            summary = inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
+            parts.append(f"### {name}\n\n{_escaped(summary)}\n\n| field | content |\n|---|---|")
+            parts.append("\n".join(_row(f"`{field}`", text) for field, text in fields) + "\n")
     return "\n".join(parts)
+
+
+def _documented_fields(kind: type) -> list[tuple[str, str]]:
+    """(fields, content) of the section Parameters of a numpydoc docstring."""
+    doc = inspect.cleandoc(kind.__doc__ or "")
+    section = re.search(r"(?:Parameters|Attributes)\n-+\n(.*?)(?=\n\n\w+\n-+\n|\Z)", doc, re.S)
+    rows = re.findall(r"^(\S.*)\n((?:[ ]+.*\n?)+)", section[1], re.M) if section else []
+    return [(name.partition(" : ")[0], " ".join(text.split())) for name, text in rows]
 
 
 def _folder(node: NodeReference) -> str:
