@@ -60,13 +60,13 @@ def terrain_picture() -> Array:
         stamp = given["stereo"].stamp
         streams, _ = through("rover", given | {"tilt": measured_tilt("rover", simulation, stamp)})
         terrain, navigation = streams["elevation_map"], streams["navigation_map"]
-        told = colormaps.legend_colors(navigation.reason, colormaps.REASON_LEGEND)
+        detected = colormaps.legend_colors(navigation.reason, colormaps.REASON_LEGEND)
         true = colormaps.legend_colors(
             np.select([~ground.seen, ground.rock >= 0.2, ground.hazard],
                       [CellReason.UNOBSERVED, CellReason.STEP, CellReason.SLOPE], CellReason.CLEAR),
             colormaps.REASON_LEGEND,
         )  # fmt: skip
-        maps = [_ahead(grid, terrain) for grid in (colormaps.elevation_colors(terrain), told, true)]
+        maps = [_ahead(grid, terrain) for grid in (colormaps.elevation_colors(terrain), detected, true)]
         rows.append(np.hstack([cv2.resize(given["stereo"].left, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), *maps]))
     return np.vstack([*rows, _legend(rows[0].shape[1])])
 

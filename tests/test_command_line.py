@@ -1,4 +1,4 @@
-"""The command line on real files: what a user types, what comes out, and what is said when it cannot be done."""
+"""The command line on real files: arguments, outputs, and messages about what cannot be done."""
 
 from __future__ import annotations
 
@@ -54,18 +54,18 @@ def test_every_frame_leaves_every_result(result):
     assert not list(result.parent.glob("*.partial"))
 
 
-def test_a_run_notes_once_which_streams_go_by_the_time_of_the_log(traverse, tmp_path, capsys):
+def test_a_run_notes_once_which_streams_use_log_times(traverse, tmp_path, capsys):
     def unstamped(topic, index, data):
         return data[:4] + bytes(8) + data[12:] if topic == "/odometry" else data
 
     log, summary = rewrite(traverse, tmp_path / "log.mcap", unstamped), tmp_path / "out.json"
     assert roverflow("run", log, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--summary", summary) == 0
-    said = {"severity": "note", "sentence": "the header stamps are 0, so log times are used"}
-    assert json.loads(summary.read_text())["findings"]["odometry"] == said
+    finding = {"severity": "note", "sentence": "the header stamps are 0, so log times are used"}
+    assert json.loads(summary.read_text())["findings"]["odometry"] == finding
     assert capsys.readouterr().out.count("odometry: the header stamps are 0, so log times are used") == 1
 
 
-def test_every_known_disparity_says_whether_it_was_measured_or_guessed(result):
+def test_every_known_disparity_has_its_origin(result):
     disparities, sources = (
         [message for _, _, message in iter_decoded(result, [topic])]
         for topic in ("/nav/disparity", "/nav/disparity/source")
@@ -79,7 +79,7 @@ def test_every_known_disparity_says_whether_it_was_measured_or_guessed(result):
         assert set(np.unique(codes)) >= {PixelOrigin.MEASURED, PixelOrigin.PLANE, PixelOrigin.FILLED}
 
 
-def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
+def test_the_summary_contains_frame_counts_losses_and_seconds_per_stage(result):
     summary = json.loads(result.with_suffix(".json").read_text())
     assert (summary["verdict"], summary["frames_in"], summary["frames_out"]) == ("COMPLETE", FRAMES, FRAMES)
     assert summary["drops"] == {}
@@ -88,7 +88,7 @@ def test_the_summary_says_what_went_in_and_out_and_how_long_it_took(result):
     assert set(summary["seconds"]) >= {"rectified", "disparity", "points", "elevation_map", "navigation_map"}
 
 
-def test_a_log_without_a_pose_gets_one_that_says_it_is_visual(traverse, tmp_path, capsys):
+def test_a_log_without_a_pose_gets_a_visual_one_named_as_such(traverse, tmp_path, capsys):
     poses = ("/odometry", "/tf")
     log = rewrite(traverse, tmp_path / "log.mcap", lambda topic, _, data: None if topic in poses else data)
     out, summary = tmp_path / "out.mcap", tmp_path / "out.json"
@@ -102,8 +102,8 @@ def test_a_log_without_a_pose_gets_one_that_says_it_is_visual(traverse, tmp_path
         place = pose.pose.pose.position
         assert np.linalg.norm([place.x - true[0], place.y - true[1], place.z - true[2]]) < 0.03
     findings = json.loads(summary.read_text())["findings"]
-    said = f"The log contains no pose. Visual odometry supplies it ({FRAMES} poses, frame visual_odom)."
-    assert findings["pose"]["sentence"] == said
+    sentence = f"The log contains no pose. Visual odometry supplies it ({FRAMES} poses, frame visual_odom)."
+    assert findings["pose"]["sentence"] == sentence
     assert f"pose: {findings['pose']['sentence']}" in capsys.readouterr().out
 
 
@@ -215,7 +215,7 @@ def test_part_of_a_log(traverse, tmp_path):
     assert len([topic for topic, _, _ in raw_messages(out) if topic == "/nav/points"]) == 1
 
 
-def test_the_pose_comes_from_tf_where_told(traverse, tmp_path):
+def test_the_pose_comes_from_tf_if_so_configured(traverse, tmp_path):
     """The simulator's /odometry is left out; its pose is written as /tf among another transform."""
     from recordings.mcap.writer import Ros2Writer
     from recordings.ros2.to_msg import transform_message
@@ -285,7 +285,7 @@ def test_a_score_never_overwrites_what_it_reads(traverse, result, capsys):
     assert traverse.stat() == before
 
 
-def test_what_a_full_disk_took_is_kept_and_so_is_the_result_before(traverse, tmp_path, capsys):
+def test_a_full_disk_keeps_the_partial_and_the_previous_result(traverse, tmp_path, capsys):
     out = tmp_path / "out.mcap"
     command = ("run", traverse, *SMALL, "-o", out, "--no-rrd", "--workers", 1)
     assert roverflow(*command) == 0
@@ -296,19 +296,19 @@ def test_what_a_full_disk_took_is_kept_and_so_is_the_result_before(traverse, tmp
         assert roverflow(*command) == 1
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    said = capsys.readouterr()
-    assert said.out.startswith("INCOMPLETE: ")
+    captured = capsys.readouterr()
+    assert captured.out.startswith("INCOMPLETE: ")
     (kept,) = set(tmp_path.iterdir()) - {out}
     with McapFile(kept) as log:
         held = [item for item in log.messages(set(log.index.channels)) if isinstance(item, RawMessage)]
         topics = {log.channel(item.channel).topic for item in held}
-    assert f"File too large (its first {len(held)} messages are in {kept}); " in said.err
-    assert said.err.count("\n") == 1
+    assert f"File too large (its first {len(held)} messages are in {kept}); " in captured.err
+    assert captured.err.count("\n") == 1
     assert topics >= {"/nav/disparity", "/nav/points", "/nav/elevation_map"}
     assert out.read_bytes() == before
 
 
-def test_a_reader_that_leaves_does_not_change_the_exit_code(traverse):
+def test_a_closed_pipe_does_not_change_the_exit_code(traverse):
     command = f"{sys.executable} -m flow info {traverse} | true; exit ${{PIPESTATUS[0]}}"
     assert subprocess.run(["bash", "-c", command], cwd=ROOT, stderr=subprocess.PIPE).returncode == 0
 
@@ -334,14 +334,14 @@ def test_an_interrupt_leaves_a_readable_result_and_exits_130(traverse, tmp_path)
         time.sleep(0.05)
     time.sleep(0.5)
     child.send_signal(signal.SIGINT)
-    _, said = child.communicate(timeout=60)
-    assert child.returncode == 130, said
-    assert b"Traceback" not in said
+    _, stderr = child.communicate(timeout=60)
+    assert child.returncode == 130, stderr
+    assert b"Traceback" not in stderr
     assert 1 <= len(raw_messages(out)) < 3 * FRAMES + 1
     assert not list(tmp_path.glob("*.partial"))
 
 
-def test_an_interrupted_demo_reports_what_there_is_and_goes_on_to_nothing_else(traverse, tmp_path, capsys, monkeypatch):
+def test_an_interrupted_demo_reports_its_files_and_stops(traverse, tmp_path, capsys, monkeypatch):
     written = McapSink.write
 
     def interrupted(sink, record):
@@ -374,7 +374,7 @@ AT_EXIT = "atexit.register(os.kill, os.getpid(), signal.SIGINT)"
 
 
 @pytest.mark.parametrize("moment", [ON_IMPORT.format("flow.cli.report"), ON_IMPORT.format("rerun"), AT_EXIT])
-def test_an_interrupt_while_the_program_begins_or_ends_is_no_traceback(moment):
+def test_an_interrupt_at_start_or_exit_prints_no_traceback(moment):
     heard = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # what runs in the background may ignore it
     code = f"import atexit, os, signal, sys\n{heard}\n{moment}\nimport flow.__main__"
     done = subprocess.run([sys.executable, "-c", code, "graph"], cwd=ROOT, capture_output=True, text=True)
@@ -382,7 +382,7 @@ def test_an_interrupt_while_the_program_begins_or_ends_is_no_traceback(moment):
     assert done.stderr == ("" if moment == AT_EXIT else "roverflow: interrupted\n")
 
 
-def test_a_stage_that_still_works_when_its_frame_is_abandoned_does_not_hold_or_break_the_exit():
+def test_an_abandoned_stage_at_work_neither_delays_nor_breaks_the_exit():
     code = """
 import atexit, sys, threading, time
 from flow.cli import __main__ as program, main as cli

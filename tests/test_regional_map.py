@@ -38,16 +38,16 @@ def test_a_result_log_contains_the_reason_of_every_cell(result, stream):
         for topic in (f"/nav/{stream}", f"/nav/{stream}/reason")
     )
     assert len(grids) == len(reasons) == FRAMES
-    told = {
+    expected = {
         Cell.FREE: {CellReason.CLEAR},
         Cell.UNKNOWN: {CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNSURE},
     }
-    told[Cell.HAZARD] = set(CellReason) - told[Cell.FREE] - told[Cell.UNKNOWN] - {CellReason.ELEVATION}
+    expected[Cell.HAZARD] = set(CellReason) - expected[Cell.FREE] - expected[Cell.UNKNOWN] - {CellReason.ELEVATION}
     for grid, reason in zip(grids, reasons, strict=True):
         navigation = ros2.read_occupancy_grid(grid, reason)
         assert reason.info.pose.position.x == pytest.approx(navigation.origin[0] + reason.info.length_x / 2)
-        for state, why in told.items():
-            assert set(np.unique(navigation.reason[navigation.cells == state]).tolist()) <= {*why}
+        for state, reasons_of_state in expected.items():
+            assert set(np.unique(navigation.reason[navigation.cells == state]).tolist()) <= {*reasons_of_state}
         assert CellReason.STEP in navigation.reason
 
 
@@ -66,10 +66,10 @@ def test_export_without_a_regional_map_exports_the_frames(traverse, tmp_path, ca
     counts = Counter(topic for topic, _, _ in iter_decoded(out))
     assert not REGIONAL & set(counts)
     assert roverflow("export", out, tmp_path / "maps") == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "contains no /nav/regional_map, only " in said
-    assert "--frames" in said
+    stderr = capsys.readouterr().err
+    assert stderr.count("\n") == 1
+    assert "contains no /nav/regional_map, only " in stderr
+    assert "--frames" in stderr
     assert roverflow("export", out, tmp_path / "maps", "--frames") == 0
     assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == FRAMES
 

@@ -117,7 +117,7 @@ def test_interpolation_is_exact_at_and_between_samples():
     assert values(answers) == [(0, 0.0), (25, 2.5), (100, 10.0)]
 
 
-def test_interpolation_refuses_a_gap_and_says_how_long_it_is():
+def test_interpolation_refuses_a_gap_and_reports_its_length():
     answers = sampling(Interpolate(max_gap=50 * MS), ("stream", 0, 0.0), ("at", MS, 0.0), ("stream", 80 * MS, 1.0))
     assert reasons(answers) == [LossReason.UNALIGNED]
     assert "80 ms" in answers[0].value.cause.detail

@@ -99,7 +99,7 @@ sinks: [{use: tests.flow.toys.Keep}]
     (["source.pitch.sign=-1"], -1, 1),
     (["source.pitch.sign=1", "angle.sign=-1"], 1, -1),
 ])  # fmt: skip
-def test_a_key_of_a_setting_is_replaced_wherever_it_is_named_or_in_one_place_alone(tmp_path, overrides, pitch, roll):
+def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, overrides, pitch, roll):
     source = loaded(tmp_path, SHARED_ANGLE, overrides).source
     assert vars(source.pitch) == {"field": "vector.x", "unit": "deg", "sign": pitch}
     assert vars(source.roll) == {"field": "vector.x", "unit": "deg", "sign": roll}
@@ -254,24 +254,24 @@ def test_a_module_that_does_not_import_is_named_with_its_line(tmp_path):
         loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", "broken.Stage"))
 
 
-def test_a_module_that_ends_the_program_as_it_is_imported_does_not_end_this_one(tmp_path):
+def test_a_module_that_exits_on_import_is_an_error_in_the_pipeline_file(tmp_path):
     (tmp_path / "script.py").write_text("import sys\nsys.exit(3)\n")
     with pytest.raises(PipelineError, match=r"toy.yaml:5: cannot import 'script': SystemExit: 3"):
         loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", "script.Stage"))
 
 
-@pytest.mark.parametrize(("field", "takes", "returns", "said"), [
+@pytest.mark.parametrize(("field", "takes", "returns", "message"), [
     ("list[Nix]", "couple: Couple", "Couple", "the annotations of Own cannot be read: name 'Nix' is not defined"),
     ("int", "couple: Nix", "Couple", "the annotations of Own.__call__ cannot be read: name 'Nix' is not defined"),
     ("int", "*couple: Couple", "Couple", "Own.__call__ must take each input by its name"),
     ("int", "couple: Couple", "Couple | None", "Own.__call__ does not say which one type it returns"),
 ])  # fmt: skip
-def test_annotations_that_do_not_tell_are_named_with_their_line(tmp_path, field, takes, returns, said):
+def test_unclear_annotations_are_named_with_their_line(tmp_path, field, takes, returns, message):
     source = "from __future__ import annotations\nfrom tests.flow.toys import *\n@dataclass(frozen=True)\nclass Own:\n"
     source += f"    a: {field} = 0\n    def __call__(self, {takes}) -> {returns}: ...\n"
     module = tmp_path.name
     (tmp_path / f"{module}.py").write_text(source)
-    with pytest.raises(PipelineError, match=rf"toy.yaml:5: {re.escape(said)}"):
+    with pytest.raises(PipelineError, match=rf"toy.yaml:5: {re.escape(message)}"):
         loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale, couple: both, factor: 25 cm, bad: [1, 2.5]",
                                       f"{module}.Own, couple: both"))  # fmt: skip
 
@@ -283,7 +283,7 @@ def test_a_stage_without_an_input_is_refused(tmp_path):
         loaded(tmp_path, GOOD.replace("tests.flow.toys.Add, a: twice, b: height", "idle.Idle"))
 
 
-def test_what_is_no_dataclass_is_not_told_to_be_itself(tmp_path):
+def test_a_hint_never_suggests_the_refused_name_itself(tmp_path):
     (tmp_path / "plain.py").write_text("class Stage:\n    def __call__(self): ...\ndef function(): ...\n")
     for name in ("Stage", "function"):
         with pytest.raises(PipelineError, match=rf"toy.yaml:5: plain.{name} is no dataclass") as caught:
@@ -291,14 +291,14 @@ def test_what_is_no_dataclass_is_not_told_to_be_itself(tmp_path):
         assert "did you mean" not in str(caught.value)
 
 
-def test_a_stage_that_breaks_down_as_it_is_made_is_named_with_its_line(tmp_path):
+def test_a_stage_whose_constructor_raises_is_named_with_its_line(tmp_path):
     source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Odd(Add):\n    __call__ = Add.__call__\n"
     (tmp_path / "odd.py").write_text(source + "    def __post_init__(self):\n        {}['nix']\n")
     with pytest.raises(PipelineError, match=r"toy.yaml:6: KeyError: 'nix' \(odd.py, line 6; --debug"):
         loaded(tmp_path, GOOD.replace("tests.flow.toys.Add", "odd.Odd"))
 
 
-def test_an_anchor_that_holds_itself_is_refused(tmp_path):
+def test_a_recursive_anchor_is_refused(tmp_path):
     with pytest.raises(PipelineError, match="anchor"):
         loaded(tmp_path, "a: &a [*a]\n")
 
@@ -308,19 +308,19 @@ def test_an_anchor_that_holds_itself_is_refused(tmp_path):
     (math.radians(20), "rad", "20 deg"), (math.radians(60), "rad", "60 deg"), (0, "ns", "0"), (128, "px", "128"),
     (12.0, "m", "12 m"), (0.25, "", "0.25"),
 ])  # fmt: skip
-def test_a_number_is_shown_as_one_would_write_it(value, unit, text):
+def test_numbers_are_written_in_the_unit_that_a_user_would_choose(value, unit, text):
     assert as_written(value, unit) == text
     assert quantity(text, unit) == pytest.approx(value)
 
 
-def test_a_file_that_is_no_text_is_refused_with_what_may_be_given(tmp_path):
+def test_a_binary_pipeline_file_is_refused_with_the_valid_names(tmp_path):
     (tmp_path / "t.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(UsageError, match=r"t.mcap is no text; give fast, paper, rover or a YAML file"):
         load(str(tmp_path / "t.mcap"))
 
 
 @pytest.mark.parametrize("text", ["", "source: {use: a.B}"])
-def test_what_lacks_a_part_says_what_to_begin_with(tmp_path, text):
+def test_an_incomplete_pipeline_file_names_a_file_to_start_from(tmp_path, text):
     with pytest.raises(PipelineError, match=r"toy.yaml:1: .*; begin with a copy of .*/flow/pipelines/rover.yaml"):
         loaded(tmp_path, text)
 

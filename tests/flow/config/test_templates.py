@@ -81,7 +81,7 @@ def test_the_command_line_sets_parameters_and_inner_streams(tmp_path, override, 
     assert factors(loaded(tmp_path, overrides=[override])) == expected
 
 
-def test_a_parameter_that_only_the_output_has_is_set_by_the_name_of_the_use(tmp_path):
+def test_a_parameter_of_the_output_is_set_by_the_name_of_the_use(tmp_path):
     graph = loaded(tmp_path, overrides=["out.bad=[1, 2]"])
     assert {node.name: node for node in graph.nodes}["out"].actor.bad == (1.0, 2.0)
 

@@ -152,13 +152,13 @@ sinks: [{use: tests.flow.toys.Keep}]
     assert max(most) == 2
 
 
-def test_a_frame_that_has_nothing_to_work_on_is_through_at_once(tmp_path):
-    told, ledger = [], Ledger()
-    engine = Engine(graph(tmp_path).stages, {}, ledger, on_frame=told.append)
+def test_a_frame_without_inputs_is_through_at_once(tmp_path):
+    completeness, ledger = [], Ledger()
+    engine = Engine(graph(tmp_path).stages, {}, ledger, on_frame=completeness.append)
     lost = Absent(ledger.add(Loss("both", 0, "both", LossReason.FAILED, "lost")))
     assert engine.admit(0, {"both": lost, "height": Number(0, 0.0)}, [])
     engine.finish()
-    assert told == [False]
+    assert completeness == [False]
 
 
 def frame(index):
@@ -184,7 +184,8 @@ def test_a_stopped_engine_waits_for_a_sink_at_work(tmp_path):
 
 
 def test_an_abandoned_frame_reports_only_its_losses_so_far(tmp_path, monkeypatch):
-    inside, gate, told, ledger, stages = threading.Event(), threading.Event(), [], Ledger(), graph(tmp_path).stages
+    inside, gate, ledger = threading.Event(), threading.Event(), Ledger()
+    completeness, stages = [], graph(tmp_path).stages
 
     def hang(self, couple):
         inside.set()
@@ -192,7 +193,7 @@ def test_an_abandoned_frame_reports_only_its_losses_so_far(tmp_path, monkeypatch
         raise ValueError("too late")
 
     monkeypatch.setattr("tests.flow.toys.Scale.__call__", hang)
-    engine = Engine(stages, {}, ledger, workers=1, on_frame=told.append)
+    engine = Engine(stages, {}, ledger, workers=1, on_frame=completeness.append)
     lost = ledger.add(Loss("level", 0, "source", LossReason.UNREADABLE, "chunk 7 is damaged"))
     engine.admit(0, frame(0), [lost])
     inside.wait(5)
@@ -204,7 +205,7 @@ def test_an_abandoned_frame_reports_only_its_losses_so_far(tmp_path, monkeypatch
     abandoned = Loss("frame", 0, "engine", LossReason.ABANDONED, "the run ended before the frame was through")
     assert engine.late_entries == [lost, abandoned]
     assert set(ledger.entries) == {lost, abandoned}
-    assert (told, engine.through) == ([], 0)
+    assert (completeness, engine.through) == ([], 0)
 
 
 class Sum:

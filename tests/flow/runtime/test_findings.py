@@ -1,4 +1,4 @@
-"""What stages find in a run is said to the user and to the sinks, a warning last, where it is not missed."""
+"""Findings of the stages reach the user and the sinks, warnings last."""
 
 from pathlib import Path
 
@@ -27,40 +27,41 @@ def test_a_note_is_one_of_the_lines_and_a_warning_the_last(tmp_path, capsys):
     assert more == ["WARNING: total: the sum is 30.0"]
 
 
-def said_of(**changes):
+def verdict_line(**changes):
     summary = {"verdict": "INCOMPLETE", "interrupted": False, "frames_in": 18, "frames_out": 18, "drops": {}}
     return headline({**summary, "frames_per_second": 2.5, **changes}).removesuffix("; 2.50 frames/s")
 
 
-def test_the_verdict_says_what_was_lost_in_the_same_line():
-    assert said_of(verdict="COMPLETE") == "COMPLETE: 18 of 18 frames complete"
-    assert said_of(drops={"unmatched": 2}) == "INCOMPLETE: 18 frames complete, 2 losses: 2 unmatched"
+def test_the_verdict_line_counts_the_losses_by_reason():
+    assert verdict_line(verdict="COMPLETE") == "COMPLETE: 18 of 18 frames complete"
+    assert verdict_line(drops={"unmatched": 2}) == "INCOMPLETE: 18 frames complete, 2 losses: 2 unmatched"
     lost = {"failed": 1, "unreadable": 2}
     assert (
-        said_of(frames_out=17, drops=lost) == "INCOMPLETE: 17 of 18 frames complete, 3 losses: 1 failed, 2 unreadable"
+        verdict_line(frames_out=17, drops=lost)
+        == "INCOMPLETE: 17 of 18 frames complete, 3 losses: 1 failed, 2 unreadable"
     )
-    assert said_of(interrupted=True, frames_in=1, frames_out=1) == "INCOMPLETE: interrupted after 1 frame"
+    assert verdict_line(interrupted=True, frames_in=1, frames_out=1) == "INCOMPLETE: interrupted after 1 frame"
 
 
-def test_frames_that_the_user_gave_up_are_no_losses_of_the_log():
-    stopped = said_of(interrupted=True, frames_out=15, drops={"abandoned": 3})
+def test_abandoned_frames_are_not_counted_as_losses():
+    stopped = verdict_line(interrupted=True, frames_out=15, drops={"abandoned": 3})
     assert stopped == "INCOMPLETE: interrupted after 15 of 18 frames, 3 abandoned"
-    stopped = said_of(interrupted=True, frames_out=14, drops={"abandoned": 3, "failed": 1})
+    stopped = verdict_line(interrupted=True, frames_out=14, drops={"abandoned": 3, "failed": 1})
     assert stopped == "INCOMPLETE: interrupted after 14 of 18 frames, 3 abandoned, 1 loss: 1 failed"
-    assert said_of(interrupted=True, verdict="COMPLETE") == "COMPLETE: 18 of 18 frames complete"
+    assert verdict_line(interrupted=True, verdict="COMPLETE") == "COMPLETE: 18 of 18 frames complete"
 
 
 def test_findings_reach_the_summary_and_the_sinks(tmp_path):
     sink, summary = replayed(graph(tmp_path), traverse(5))
-    said = {"total": {"severity": "note", "sentence": "the sum is 20.0"}}
-    assert summary["findings"] == sink.summary["findings"] == said
+    findings = {"total": {"severity": "note", "sentence": "the sum is 20.0"}}
+    assert summary["findings"] == sink.summary["findings"] == findings
     warned = replayed(graph(tmp_path), traverse(6))[1]
     assert warned["findings"] == {"total": {"severity": "warning", "sentence": "the sum is 30.0"}}
     assert warned["verdict"] == "COMPLETE"  # for nothing was lost
     assert replayed(graph(tmp_path), [])[1]["findings"] == {}
 
 
-def test_a_finding_that_breaks_down_costs_the_run_nothing(tmp_path):
+def test_a_failing_finding_becomes_a_warning_and_the_run_is_complete(tmp_path):
     _, summary = replayed(graph(tmp_path), traverse(4))
     found = summary["findings"]["total"]
     assert (summary["verdict"], found["severity"]) == ("COMPLETE", "warning")

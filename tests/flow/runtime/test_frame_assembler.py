@@ -36,7 +36,7 @@ def test_a_clock_set_forward_costs_one_frame(tmp_path):
     assert summary["drops"] == {"unaligned": 1}
 
 
-def test_a_clock_set_back_costs_the_rest_and_entries_say_what_to_do(tmp_path):
+def test_a_clock_set_back_loses_the_rest_and_the_ledger_names_the_option(tmp_path):
     sink, summary = replayed(graph(tmp_path), shifted(traverse(10), -3_600_000 * MS, since=451 * MS))
     assert len(sink.values("sum")) == 5
     lost = [entry for entry in summary["ledger"] if entry["reason"] == "out of order"]
@@ -77,7 +77,7 @@ def test_a_suspect_stamp_does_not_hold_up_the_log(tmp_path):
             yield at, stream, item
 
     alone = [(0, "words", Text(3_600_000 * MS, "alone"))]
-    text = PIPELINE.replace("sinks:", "  said: {use: flow.align.latest, stream: words, at: both}\nsinks:")
+    text = PIPELINE.replace("sinks:", "  last_words: {use: flow.align.latest, stream: words, at: both}\nsinks:")
     assembler = FrameAssembler(graph(tmp_path, text=text), Ledger())
     next(assembler.frames(counted(alone + traverse(1000)[1:])))
     assert read["left"] < 110
@@ -86,7 +86,7 @@ def test_a_suspect_stamp_does_not_hold_up_the_log(tmp_path):
 def test_reading_ahead_of_a_suspect_stamp_is_bounded(tmp_path):
     alone = [(0, "words", Text(3_600_000 * MS, "alone"))]
     often = [(at, "level", Number(at, at / 1e9)) for at in range(MS, 5000 * MS, MS)]
-    text = PIPELINE.replace("sinks:", "  said: {use: flow.align.latest, stream: words, at: both}\nsinks:")
+    text = PIPELINE.replace("sinks:", "  last_words: {use: flow.align.latest, stream: words, at: both}\nsinks:")
     read = iter(alone + traverse(1)[:3] + often)
     next(FrameAssembler(graph(tmp_path, text=text), Ledger()).frames(read))
     assert len(often) - len(list(read)) < 130

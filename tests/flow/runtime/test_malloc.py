@@ -32,7 +32,9 @@ PROGRAM = "import sys; sys.argv = ['roverflow', 'graph']; from flow.cli.__main__
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left alone")
 @pytest.mark.parametrize(("before", "several"), [("", True), (PROGRAM, False)])
 def test_the_threads_of_the_program_share_one_heap(before, several):
-    untold = {name: value for name, value in os.environ.items() if name not in ("MALLOC_ARENA_MAX", "GLIBC_TUNABLES")}
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ("MALLOC_ARENA_MAX", "GLIBC_TUNABLES")
+    }
     command = [sys.executable, "-c", before + THREADS]
-    said = subprocess.run(command, check=True, capture_output=True, text=True, env=untold).stderr
-    assert (said.count("Arena ") > 1) == several
+    stderr = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stderr
+    assert (stderr.count("Arena ") > 1) == several

@@ -149,7 +149,7 @@ def test_a_run_stopped_before_its_first_frame_leaves_no_output(tmp_path, monkeyp
     assert (sink.summary is None) == discards
 
 
-def test_a_run_of_which_no_frame_gets_through_leaves_no_output(tmp_path, monkeypatch):
+def test_a_run_without_a_complete_frame_leaves_no_output(tmp_path, monkeypatch):
     given_up = []
     monkeypatch.setattr(Keep, "discard", lambda self: given_up.append(self), raising=False)
     events = [event for event in traverse(3) if event[1] != "right"]
@@ -205,7 +205,7 @@ def test_items_that_break_an_aligner_lose_their_frame_not_the_verdict(tmp_path, 
     assert summary["verdict"] == "INCOMPLETE"
     assert summary["frames_out"] == 0
     details = [entry["detail"] for entry in lost_frames(summary)]
-    assert all(said.startswith("TypeError: no such pair (test_run.py, line ") for said in details)
+    assert all(detail.startswith("TypeError: no such pair (test_run.py, line ") for detail in details)
 
 
 def test_a_sample_that_cannot_be_made_is_in_the_ledger_and_the_verdict(tmp_path, monkeypatch):
@@ -320,7 +320,7 @@ def test_a_log_that_fails_at_its_notes_costs_no_output(tmp_path):
     assert "input/output error" in summary["findings"]["log"]["sentence"]
 
 
-def test_a_pipeline_of_which_nothing_is_left_is_refused(tmp_path):
+def test_a_pipeline_whose_streams_are_all_missing_is_refused(tmp_path):
     text = re.sub(r"^(  \w+: +{.*)}$", r"\1, optional: true}", PIPELINE, flags=re.MULTILINE)
     with pytest.raises(UsageError, match="no right camera"):
         run(graph(tmp_path, text=text), Log([], missing={"right": "no right camera"}), {})

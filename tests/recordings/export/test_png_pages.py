@@ -184,9 +184,9 @@ def test_unknown_ground_behind_the_rover_is_not_drawn():
     assert colormaps.terrain_ahead(ElevationMap(0, {"elevation": behind}, 0.05, (-2.0, 0.0), "level")).shape == (4, 80)
 
 
-@pytest.mark.parametrize(("value", "said"), [(-0.0, "0"), (-5.55e-17, "0"), (-0.25, "-0.25"), (112.0, "112")])
-def test_scale_values_have_few_digits_and_no_minus_zero(value, said):
-    assert colormaps.format_value(value) == said
+@pytest.mark.parametrize(("value", "text"), [(-0.0, "0"), (-5.55e-17, "0"), (-0.25, "-0.25"), (112.0, "112")])
+def test_scale_values_have_few_digits_and_no_minus_zero(value, text):
+    assert colormaps.format_value(value) == text
 
 
 def test_a_sampled_colour_range_covers_the_whole_layer():

@@ -181,7 +181,7 @@ def test_a_map_is_not_scored_if_the_other_map_does_not_fit(tmp_path, truth, fram
     }
 
 
-def test_a_run_of_which_nothing_fits_is_no_score(tmp_path, truth, frames):
+def test_a_result_with_no_comparable_message_is_not_scored(tmp_path, truth, frames):
     only = ("/nav/elevation_map", "/nav/navigation_map")
     with pytest.raises(LogError, match=r"no result fits the truth in .*: /nav/elevation_map: its cells"):
         scored(tmp_path, truth, frames, only=only, resolution=0.1)
@@ -283,7 +283,7 @@ def test_a_missing_frame_scores_as_one_of_unknown_cells(tmp_path, truth, frames)
     assert honest.missing == {}
 
 
-def test_a_tilt_that_cannot_be_scored_says_why(tmp_path, truth, frames):
+def test_an_unscored_tilt_has_a_reason(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, only=scoring.RESULTS)
     assert found.tilt is None
     assert found.untilted == {"the result has no /tf from 'level' at that stamp": 2}
@@ -335,7 +335,7 @@ def test_one_stamp_far_ahead_does_not_separate_the_logs(tmp_path, truth, frames)
 
 
 def without(truth: Path, path: Path, *topics: str) -> Path:
-    """The truth with topics of which it has the channels, but no messages, as recorders leave them."""
+    """The truth without the messages of some topics, but with their channels, as recorders write it."""
     with truth.open("rb") as source, path.open("wb") as target:
         writer, channels = Writer(target), {}
         writer.start(profile="ros2")
@@ -359,11 +359,11 @@ def test_a_truth_topic_without_messages_is_ignored(tmp_path, truth, frames):
 def test_an_incomplete_truth_names_the_missing_topic(tmp_path, truth, frames):
     found = scored(tmp_path, without(truth, tmp_path / "bare.mcap", "/truth/navigation_map"), frames)
     assert found.terrain is None
-    said = "not scored   /truth/elevation_map: 2 frames: the truth has no /truth/navigation_map there"
-    assert said in format_score(found).splitlines()
+    line = "not scored   /truth/elevation_map: 2 frames: the truth has no /truth/navigation_map there"
+    assert line in format_score(found).splitlines()
 
 
-def test_logs_that_cannot_be_compared_say_why(tmp_path, truth, frames):
+def test_logs_that_cannot_be_compared_are_refused_with_the_reason(tmp_path, truth, frames):
     run = Run().write(tmp_path / "run.mcap", frames)
     with pytest.raises(LogError, match="no ground truth"):
         scoring.score(run, run)

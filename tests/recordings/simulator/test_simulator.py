@@ -163,7 +163,7 @@ def test_strewn_rocks_have_the_size_frequency_and_cover_of_the_law():
     assert ratio.max() <= 0.6
 
 
-def test_a_rock_stands_as_high_and_as_wide_as_the_truth_says():
+def test_rocks_have_the_height_and_width_of_the_truth():
     rocks = SMALL.terrain.rocks
     large = np.flatnonzero(rocks.diameter > 0.3)[:40]
     shapes = SMALL.terrain.facets

@@ -136,7 +136,7 @@ def test_curves_of_one_plot_differ_in_colour(rrd: Path) -> None:
     ]
     escaped = ["/".join(map(rr.escape_entity_path_part, name.split("/"))) for name in names]
     colours = [rows(rrd, name, "SeriesLines:colors") for name in escaped]
-    assert [len(found) for found in colours] == [1] * 4  # said once, for all frames
+    assert [len(found) for found in colours] == [1] * 4  # once, for all frames
     assert len({found[0][2][0] for found in colours}) == 4
 
 

@@ -140,15 +140,15 @@ def test_the_diagnostics_contain_the_epoch_of_a_regional_map(tmp_path: Path) -> 
         pose = replace(pose, frame_id="odom" if frame == 0 else "odom/2")  # the map starts again
         sink.write(Record(cloud.stamp, {"regional_map": fuse(cloud, pose, MOUNT)}))
     sink.close({})
-    told = {}
+    epochs_by_stamp = {}
     for topic, stamp, message in iter_decoded(tmp_path / "out.mcap"):
         if topic == "/nav/diagnostics":
             epochs = [v.value for s in message.status if s.name == "regional_map" for v in s.values if v.key == "epoch"]
-            told[stamp] = int(epochs[0])
-    assert list(told.values()) == [DRIVE, DRIVE + SECOND, DRIVE + SECOND]
+            epochs_by_stamp[stamp] = int(epochs[0])
+    assert list(epochs_by_stamp.values()) == [DRIVE, DRIVE + SECOND, DRIVE + SECOND]
     for topic, stamp, message in iter_decoded(tmp_path / "out.mcap"):
         if topic == "/nav/regional_map":
-            assert told[stamp] + np.nanmax(read_grid_map(message).layers["last"]) * SECOND == stamp
+            assert epochs_by_stamp[stamp] + np.nanmax(read_grid_map(message).layers["last"]) * SECOND == stamp
 
 
 def test_the_metadata_contain_the_inputs_and_the_verdict_of_the_run(tmp_path: Path) -> None:

@@ -54,27 +54,27 @@ def run(tmp_path):
     return call
 
 
-def test_kernels_are_announced_once_kept_and_made_again_after_a_change_anywhere(run, tmp_path):
-    first, said = run()
-    assert "compiling kernels" in said
-    again, said = run()
-    assert (again, said) == (first, "")
+def test_kernels_are_cached_and_recompiled_after_a_change_in_any_file(run, tmp_path):
+    first, stderr = run()
+    assert "compiling kernels" in stderr
+    again, stderr = run()
+    assert (again, stderr) == (first, "")
     # what is changed is called by the kernel, but is in another file
     layer = tmp_path / "stages" / "compiled" / "simd.py"
     changed = re.sub(r'icmp_unsigned\("<"', 'icmp_unsigned("<="', layer.read_text())
     assert changed != layer.read_text()
     layer.write_text(changed)
-    after, said = run()
+    after, stderr = run()
     assert after != first
-    assert "compiling kernels" in said
+    assert "compiling kernels" in stderr
     codes = tmp_path / "stages" / "data" / "pixel_validity.py"  # the values of its enumerations are compiled in
     codes.write_text(f"{codes.read_text()}\n# changed\n")
     assert "compiling kernels" in run()[1]
 
 
-def test_what_was_compiled_just_now_gives_the_same_bits_as_what_is_loaded(run):
-    first, said = run(PLANES)
-    assert "compiling kernels" in said
+def test_compiled_and_loaded_kernels_give_the_same_bits(run):
+    first, stderr = run(PLANES)
+    assert "compiling kernels" in stderr
     assert run(PLANES) == (first, "")
 
 

@@ -132,7 +132,7 @@ LARGE = (640, 480)
 
 
 @pytest.mark.parametrize("terms", [(1.3,), (-0.7, 0.5, 0.8), TURNED])
-def test_the_row_offset_is_measured_to_a_tenth_of_a_pixel_anywhere_in_the_image(terms):
+def test_the_row_offset_is_within_0_1_px_everywhere_in_the_image(terms):
     measured = measure([a_pair(terms, size=LARGE)])
     assert measured.clear
     field, truth = offset_field(measured.terms, *LARGE), offset_field(terms, *LARGE)
@@ -208,7 +208,7 @@ def test_without_evidence_there_is_no_offset(pair):
     assert (stage.row_offset, "not clear" in found.sentence, found.severity) == (0.0, True, "note")
 
 
-def test_features_in_a_corner_claim_no_more_about_the_whole_image_than_they_know():
+def test_features_in_a_corner_give_an_honest_error_of_the_whole_field():
     left, right = (image.copy() for image in a_pair((1.0,), size=LARGE))
     for image in (left, right):
         image[150:], image[:, 200:] = 90, 90
@@ -241,7 +241,7 @@ def test_a_survey_measures_what_its_frames_have_in_common(rectified):
     (20.0, True, "100% of the features that both images show look farther than infinity: left and right are swapped"),
     (20.0, False, "so much is unusual: are the images rectified"),
 ])  # fmt: skip
-def test_a_survey_tells_of_images_that_cannot_be_a_rectified_pair(rows, swapped, words):
+def test_a_survey_warns_of_swapped_and_of_unrectified_images(rows, swapped, words):
     left, right = a_pair((rows,), size=LARGE)
     pair = (right, left) if swapped else (left, right)
     _, found = Rectify().survey([StereoFrame(1, *pair, StereoCamera(500, 500, 320, 240, 0.1, *LARGE))])
@@ -250,7 +250,7 @@ def test_a_survey_tells_of_images_that_cannot_be_a_rectified_pair(rows, swapped,
     assert found.severity == "warning"
 
 
-def test_images_that_are_infinitely_far_at_another_disparity_are_not_called_swapped():
+def test_a_principal_point_offset_is_not_reported_as_swapped_images():
     left, right = a_pair((0.0,), size=LARGE)
     camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE, cx_right=380)
     _, found = Rectify().survey([StereoFrame(1, right, left, camera)])
@@ -258,7 +258,7 @@ def test_images_that_are_infinitely_far_at_another_disparity_are_not_called_swap
 
 
 @pytest.mark.parametrize("row_offset", [None, 0.0])
-def test_a_pair_whose_far_field_lies_below_disparity_0_is_moved_until_it_does_not(row_offset):
+def test_a_pair_with_negative_disparities_is_shifted_above_zero(row_offset):
     left, right = a_pair((0.0,), size=LARGE)
     moved = np.roll(right, 60, axis=1)
     camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE)
@@ -313,18 +313,18 @@ def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "message"),
     [
         ({"k": np.zeros((3, 3))}, "no focal length in K"),
         ({"r": np.zeros((3, 3))}, "R of the calibration is not a rotation"),
         ({"r": np.diag([1.0, 1, 0.5])}, "R of the calibration is not a rotation"),
     ],
 )
-def test_an_empty_calibration_makes_no_black_image(entry, said):
+def test_an_empty_calibration_makes_no_black_image(entry, message):
     models = [CameraModel(WIDTH, HEIGHT, K, np.zeros(5), np.eye(3), projection) for projection in (P_LEFT, P_RIGHT)]
     camera = StereoCamera.from_models(models[0], replace(models[1], **entry), "cam", rectified=False)
     image = np.zeros((HEIGHT, WIDTH), np.uint8)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         Rectify()(StereoFrame(1, image, image, camera))
 
 
