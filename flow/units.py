@@ -67,7 +67,7 @@ def check_bare(number: float, unit: str) -> None:
 
 
 def as_written(value: float, unit: str) -> str:
-    """A number of `unit` as one would write it by hand.
+    """A number of `unit` in the most readable unit.
 
     >>> as_written(5_000_000, "ns")
     '5 ms'

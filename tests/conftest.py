@@ -1,4 +1,4 @@
-"""What several test files share: a short simulated traverse, and logs cut out of it."""
+"""Fixtures of several test files: a short simulated traverse, and logs cut out of it."""
 
 from __future__ import annotations
 

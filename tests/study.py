@@ -1,4 +1,4 @@
-"""What each step of refinement is worth: `make study` prints the errors after every step, and of variants.
+"""The effect of each step of refinement: `make study` prints the errors after every step, and of variants.
 
 On real scenes with truth where ROVERFLOW_DATA names the data, and on simulated rover frames, where errors within 3 px
 of a depth edge count separately. Pictures of image, disparity, source and confidence go to the folder named on the

@@ -107,7 +107,7 @@ def test_a_log_without_a_pose_gets_a_visual_one_named_as_such(traverse, tmp_path
     assert f"pose: {findings['pose']['sentence']}" in capsys.readouterr().out
 
 
-def test_the_logs_own_pose_is_kept_and_the_tilt_judged_all_the_same(result):
+def test_a_logged_pose_is_kept_and_the_tilt_is_still_checked(result):
     poses = [message for topic, _, message in iter_decoded(result) if topic == "/nav/pose"]
     assert {pose.header.frame_id for pose in poses} == {"odom"}
     findings = json.loads(result.with_suffix(".json").read_text())["findings"]
@@ -172,7 +172,7 @@ def test_the_result_reads_back_with_reruns_own_loader(result, tmp_path):
     assert paths >= RESULTS
 
 
-def test_the_recording_verifies_and_holds_every_intermediate(result):
+def test_the_recording_verifies_and_contains_every_intermediate(result):
     rrd = result.with_suffix(".rrd")
     check = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(rrd)], capture_output=True, text=True)
     assert check.returncode == 0, check.stderr
@@ -203,7 +203,7 @@ def test_results_do_not_depend_on_the_number_of_workers(traverse, tmp_path, pipe
     assert logs[0] == logs[1]
 
 
-def test_the_score_is_that_of_a_working_chain(traverse, result, tmp_path, capsys):
+def test_a_score_is_printed_and_written_as_json(traverse, result, tmp_path, capsys):
     assert roverflow("score", result, "--truth", traverse, "--json", tmp_path / "score.json") == 0
     assert "disparity" in capsys.readouterr().out
     assert json.loads((tmp_path / "score.json").read_text())["frames"] == FRAMES
@@ -279,7 +279,7 @@ def test_a_run_without_any_result_replaces_none(tmp_path, capsys):
     assert out.with_suffix(".rrd").exists()  # which shows why
 
 
-def test_a_score_never_overwrites_what_it_reads(traverse, result, capsys):
+def test_a_score_never_overwrites_its_inputs(traverse, result, capsys):
     before = traverse.stat()
     assert roverflow("score", result, "--truth", traverse, "--json", traverse) == 2
     assert traverse.stat() == before
@@ -399,7 +399,7 @@ sys.exit(program.program())
 
 
 @pytest.mark.parametrize("closed", ["stdout", "stderr"])
-def test_a_program_that_is_started_without_a_stream_works_all_the_same(traverse, tmp_path, closed):
+def test_the_program_works_without_stdout_or_stderr(traverse, tmp_path, closed):
     arguments = ["run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--end", "0.8"]
     command = ["bash", "-c", f'"$@" {"" if closed == "stdout" else "2"}>&-', "bash"]
     command += [sys.executable, "-m", "flow", *map(str, arguments)]

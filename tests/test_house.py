@@ -53,7 +53,7 @@ def test_no_folder_has_more_than_15_modules():
     assert {str(folder.relative_to(ROOT)): n for folder, n in folders.items() if n > 15} == {}
 
 
-def test_the_rule_would_notice_a_stranger(tmp_path):
+def test_the_import_rule_finds_a_forbidden_import(tmp_path):
     file = tmp_path / "wrong.py"
     file.write_text("from stages import Match\nimport recordings.ros2.to_msg\n")
     assert list(imported(file)) == ["stages.Match", "recordings.ros2.to_msg"]

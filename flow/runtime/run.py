@@ -1,4 +1,4 @@
-"""One run: a log through a graph into sinks, with its summary and verdict, whatever fails on the way."""
+"""One run: a log through a graph into sinks. A failure still leaves a summary and a verdict."""
 
 from __future__ import annotations
 

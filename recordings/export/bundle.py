@@ -252,7 +252,7 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
 def _check_damage(result: Path, lost: Counter[str] | None) -> None:
     """Raise LogError if damage left nothing to export."""
     for why in lost or ():
-        raise LogError(f"{result}: {why}; nothing that is left of it can be exported, run the traverse again")
+        raise LogError(f"{result}: {why}; the rest cannot be exported; run the traverse again")
 
 
 def _fields_of(cloud: Any) -> dict[str, Array]:

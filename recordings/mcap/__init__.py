@@ -1,1 +1,1 @@
-"""The MCAP container: read whatever its state, and written."""
+"""Reads and writes MCAP files; reads damaged ones as far as possible."""

@@ -1,4 +1,4 @@
-"""Where loggers put their entities: one recording, whose timelines stand at one frame.
+"""Where loggers put their entities: one recording at the time of one frame.
 
 Its one trick: the canvas remembers which entities the last frame had, and clears those that this frame lacks, so the
 viewer never shows an old picture as this frame's.

@@ -197,7 +197,7 @@ def elevation_colors(terrain: ElevationMap, limits: tuple[float, float] | None =
 def surface(terrain: ElevationMap) -> tuple[Array, Array]:
     """The terrain as a mesh: vertices (n, 3) float32, one a known cell in grid order, and triangles (m, 3) uint32.
 
-    A triangle stands only where its three cells are known: holes stay holes.
+    A triangle exists only if its three cells are known, so holes stay holes.
     """
     elevation, (rows, cols) = terrain.layers["elevation"], terrain.shape
     x, y = cell_centres(terrain)

@@ -152,7 +152,7 @@ class McapLog:
         return self._between(*self._range(), streams)
 
     def excerpts(self, count: int, streams: Collection[str]) -> Iterator[Iterator[tuple[int, str, Any]]]:
-        """The events of a few frames at `count` places of the whole log, whatever range is read."""
+        """The events of a few frames at `count` places of the whole log, independent of the range that is read."""
         times = self.file.times(self.channels("left")).tolist() if "left" in self.topics else []
         for first in sorted({int((part + 0.5) * len(times) / count) for part in range(count)}) if times else ():
             last = min(first + EXCERPT_FRAMES, len(times)) - 1

@@ -53,7 +53,7 @@ class McapSource(LogSettings):
         Raises
         ------
         LogError
-            If the file cannot be read at all, or the range contains nothing.
+            If the file cannot be read at all, or the range is empty.
         """
         for name, seconds in (("start", start), ("end", end)):
             if seconds is not None and not math.isfinite(seconds):

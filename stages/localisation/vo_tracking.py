@@ -110,7 +110,7 @@ def step_between(earlier: VoFrame, later: VoFrame, min_features: int) -> Step | 
 
 
 def _pairs(earlier: VoFrame, later: VoFrame) -> tuple[Array, Array]:
-    """Indices of matching features, of which the earlier ones have a point."""
+    """Indices of matching features; each earlier feature has a point."""
     known = np.flatnonzero(np.isfinite(earlier.points[:, 2]))
     here, there = clear_partners(
         earlier.descriptors[known], later.descriptors, MAX_HAMMING_BITS, MAX_DISTANCE_RATIO

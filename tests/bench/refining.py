@@ -1,4 +1,4 @@
-"""Refinement beside what one would use instead: time of its parts and of the whole chain, accuracy of the pipelines.
+"""Refinement beside its alternatives: time of its parts and of the whole chain, accuracy of the pipelines.
 
 Run as `python -m tests.bench.refining`. Times are medians of interleaved rounds in one process, on two threads, of a
 1280x960 colour frame with 192 disparities. Accuracy is that of the pipelines as they ship, over what the code that
@@ -96,7 +96,7 @@ def segment_points(disparity: Array, labels: Array) -> list[Array]:
 
 
 def ransac_loop(segments: list[Array]) -> None:
-    """The planes of segments as one would fit them with scikit-image, their points at hand."""
+    """The planes of segments by scikit-image, from their listed points."""
     from skimage.measure import ransac
 
     for points in segments:
@@ -105,7 +105,7 @@ def ransac_loop(segments: list[Array]) -> None:
 
 
 class _Plane:
-    """d = a x + b y + c, as `skimage.measure.ransac` wants its models."""
+    """d = a x + b y + c, a model for `skimage.measure.ransac`."""
 
     def estimate(self, points: Array) -> bool:
         system = np.column_stack([points[:, :2], np.ones(len(points))])
@@ -131,7 +131,9 @@ def speed() -> None:
     matcher = cv2.StereoSGBM.create(0, DISPARITIES, 5, 4 * 25, 38 * 25, 1, 0, 1, 100, 2, cv2.STEREO_SGBM_MODE_HH)
     matched = Match(disparities=DISPARITIES, threads=2)(frame)
     labels, count = superpixels(frame.left, SUPERPIXELS)
-    points = segment_points(matched.pixels, labels)  # sorted out beforehand: we do that within the time
+    points = segment_points(
+        matched.pixels, labels
+    )  # sorted before the timing starts; our own time includes the sorting
     sample = [points[segment] for segment in np.random.default_rng(0).choice(count, SAMPLE, replace=False)]
     contestants: dict[str, Callable[[], object]] = {
         "OpenCV MODE_HH, gray": lambda: matcher.compute(*gray),

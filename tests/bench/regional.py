@@ -39,7 +39,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Region:
-    """What the regional map of a traverse is like. seams: (frames - 1, 2) m, placed and fused; errors: (n,) m, of cells
+    """Figures of the regional map of a traverse. seams: (frames - 1, 2) m, placed and fused; errors: (n,) m, of cells
     that frames changed; sigmas: (n,) m, stated for them; contradicted: share of cells; seconds: by stream."""
 
     seams: Array
@@ -59,7 +59,7 @@ class Region:
 
 
 def main() -> None:
-    """Print a row per traverse, and how well the stated sigmas hold over all."""
+    """Print a row per traverse, and how well the stated sigmas fit over all."""
     print(f"\nregional map: {FRAMES} frames of 1280x960, inclinometer noise 0.3 degrees, slopes of 8 degrees (RMS)")
     print(" ".join(f"{name:>{width}}" for name, width in COLUMNS))
     regions = []
@@ -101,7 +101,7 @@ def within(regions: list[Region]) -> str:
 
 
 def _frames(out: Path) -> dict[int, dict[str, object]]:
-    """Stamp -> what a frame left: the points (N, 3), the map, and `level` in the map's frame."""
+    """Stamp -> results of a frame: the points (N, 3), the map, and `level` in the map's frame."""
     frames: dict[int, dict[str, object]] = {}
     for topic, stamp, message in iter_decoded(out, ["/nav/points", "/nav/regional_map", "/tf"]):
         frame = frames.setdefault(stamp, {})
@@ -140,7 +140,7 @@ def _upright(poses: Sequence[Pose], stamp: int) -> Transform:
 
 
 def _heights(points: Array, placed: Transform) -> tuple[Array, Array]:
-    """Numbers of the cells that hold points, and the mean heights in them."""
+    """Numbers of the cells that contain points, and the mean heights in them."""
     moved = placed(points[np.hypot(points[:, 0], points[:, 1]) <= REACH])
     places = np.floor(moved[:, :2] / CELL).astype(np.int64) + 1_000_000
     cells, which = np.unique(places[:, 1] * 2_000_000 + places[:, 0], return_inverse=True)

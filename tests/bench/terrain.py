@@ -49,7 +49,7 @@ class Run:
 
 
 def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any], dict[str, Any], TrueGround]]:
-    """What the pipelines take of each frame but its tilt, what is true of it in its place, and its true map."""
+    """A frame's inputs of the pipelines except its tilt, the true values of the same streams, and its true map."""
     left, _, inclinometer = simulation.mounts
     camera_from_inclinometer = left.rotation.T @ inclinometer.rotation
     for index in range(0, simulation.frames, stride):
@@ -117,7 +117,7 @@ def nodes(pipeline: str) -> list[Any]:
 
 
 def through(pipeline: str, streams: dict[str, Any]) -> tuple[dict[str, Any], float]:
-    """What a frame's navigation map takes beyond the streams given, and the processor seconds of terrain stages."""
+    """The further streams up to a frame's navigation map, and the processor seconds of terrain stages."""
     wanted, steps = {"navigation_map"}, []
     for node in reversed(nodes(pipeline)):
         if node.name in wanted and node.name not in streams:

@@ -42,7 +42,7 @@ def texts(file: Path) -> Iterator[tuple[int, str]]:
 
 
 def lines(file: Path) -> Iterator[tuple[int, str]]:
-    """(line, text) of a page or a pipeline file, without what CONTRIBUTING shows as it should not be."""
+    """(line, text) of a page or a pipeline file, without the bad examples in CONTRIBUTING."""
     for number, line in enumerate(file.read_text().splitlines(), 1):
         yield number, line.rpartition(" | ")[2] if file.name == "CONTRIBUTING.md" else line
 

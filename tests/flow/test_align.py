@@ -1,4 +1,4 @@
-"""Alignment joins clocks as the stamps say, gives up in bounded time, and accounts for every message."""
+"""Alignment joins clocks by stamps, gives up in bounded time, and accounts for every message."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -50,7 +50,7 @@ def test_partners_further_apart_than_the_slop_are_both_unmatched():
     assert {(a.stream, a.reason) for a in answers} == {("left", LossReason.UNMATCHED), ("right", LossReason.UNMATCHED)}
 
 
-def test_a_missing_right_costs_one_left_and_nothing_else():
+def test_a_missing_right_image_loses_only_its_left_image():
     answers = pairing(
         ("left", 0, 1.0), ("right", 0, 1.0), ("left", 100, 2.0), ("left", 200, 3.0), ("right", 200, 3.0), slop=5
     )
@@ -89,7 +89,7 @@ def test_a_partner_logged_too_late_reports_the_delay_and_the_setting():
     assert len(values(pairing(*frames, patience=1500 * MS))) == 6
 
 
-def test_items_that_do_not_fit_make_a_frame_that_is_lost_with_its_reason():
+def test_items_that_cannot_be_paired_lose_their_frame_with_the_reason():
     (answer,) = pairing(("left", 10, -1.0), ("right", 10, 2.0))
     assert answer.stamp == 10
     assert answer.value.cause.reason is LossReason.FAILED
@@ -156,7 +156,7 @@ def test_clocks_that_are_far_apart_report_the_distance(config):
         assert "3600 s " in late.value.cause.detail
 
 
-def test_what_a_sample_falls_short_of_is_named():
+def test_an_unaligned_sample_names_the_limit_it_exceeds():
     def detail(config, *messages):
         return sampling(config, *messages)[0].value.cause.detail
 
@@ -185,7 +185,7 @@ def test_nearest_takes_the_nearer_neighbour_within_the_slop():
     assert reasons(answers) == [LossReason.UNALIGNED]
 
 
-def test_latest_takes_what_the_log_has_brought_by_then():
+def test_latest_takes_the_last_sample_logged_by_then():
     messages = [("stream", 0, 1.0), ("at", 60, 0.0), ("stream", 100, 2.0), ("at", 400, 0.0)]
     assert values(sampling(Latest(), *messages)) == [(60, 1.0), (400, 2.0)]
     assert reasons(sampling(Latest(max_age=100), *messages)) == [LossReason.UNALIGNED]
@@ -222,7 +222,7 @@ def test_images_logged_later_than_their_stamp_still_find_their_sample(config, la
     assert len(aligner.samples) < 100 + 2 * latency / (10 * MS)
 
 
-def test_old_samples_are_forgotten_even_if_nobody_asks():
+def test_old_samples_are_dropped_even_without_requests():
     aligner, _ = fed_at_100_hz(Interpolate(), 0, images_every=10**18)
     assert len(aligner.samples) < 1100
 
@@ -280,13 +280,13 @@ def test_smoothing_does_not_lag_at_the_ends_of_a_stream():
     assert reasons(smoothing([(0, 0.0), (10, 1.0), (90, 9.0), (100, 10.0)], [50], 50)) == [LossReason.UNALIGNED]
 
 
-def test_a_sample_at_the_very_stamp_counts_though_a_gap_follows_it():
+def test_a_sample_exactly_at_the_stamp_is_used_before_a_gap():
     for smooth in (0, 50):
         samples = [(30, 3.0), (40, 4.0), (50, 5.0), (120, 12.0), (130, 13.0)]
         assert values(smoothing(samples, [50], smooth)) == [(50, 5.0)]
 
 
-def test_what_cannot_be_smoothed_is_refused_before_anything_runs():
+def test_smoothing_of_an_unsuitable_type_is_refused_before_the_run():
     with pytest.raises(TypeError, match="a Number cannot be smoothed"):
         Interpolate(smooth=10).output({"stream": Number, "at": Number})
     assert Interpolate(smooth=10).output({"stream": Reading, "at": Number}) is Reading

@@ -1,4 +1,4 @@
-"""A small world for the runtime's tests: numbers instead of images, so that nothing but the dataflow is at work."""
+"""Toy stages for the runtime's tests: they compute numbers instead of images, so tests see only the dataflow."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ class Kept:
 
 @dataclass
 class Keep:
-    """A sink that keeps what it is given; the copies that runs make of it share `kept`."""
+    """A sink that keeps its records; the copies that runs make of it share `kept`."""
 
     suffix: ClassVar[str] = ".txt"
     names_streams: ClassVar[tuple[str, ...]] = ("only",)

@@ -1,4 +1,4 @@
-"""The sample log, and what is read of it while it is whole; a rerun recording."""
+"""The sample log, the items of the undamaged log, and a rerun recording."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def test_times_of_whole_nanoseconds_are_exact(nanoseconds, unit):
 
 
 @pytest.mark.parametrize("text", ["1e-400 s", "0 s", "1e400 s"])
-def test_numbers_beyond_all_measure_are_no_trap(text):
+def test_numbers_beyond_float_range_become_zero_or_infinite(text):
     assert quantity(text, "ns") in (0.0, math.inf)
 
 
@@ -169,7 +169,7 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
         ("toys.Keep", "toys.Scale", 8, ["tests.flow.toys.Scale is no sink: it has no 'suffix'"]),
     ],
 )
-def test_what_is_wrong_is_named_with_its_line(tmp_path, old, new, line, words):
+def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, words):
     assert old in GOOD
     with pytest.raises(PipelineError) as caught:
         loaded(tmp_path, GOOD.replace(old, new, 1))
@@ -188,7 +188,7 @@ def test_a_file_that_is_no_pipeline_is_refused(tmp_path, text):
 SETTINGS = "settings: {stretch: 25 cm}\n" + GOOD.replace("factor: 25 cm", "factor: $stretch")
 
 
-def test_a_setting_stands_wherever_it_is_named(tmp_path):
+def test_a_setting_is_filled_in_wherever_it_is_named(tmp_path):
     def factor(**options):
         return next(node.actor.factor for node in loaded(tmp_path, SETTINGS, **options).nodes if node.name == "twice")
 
@@ -214,7 +214,7 @@ def test_a_setting_stands_wherever_it_is_named(tmp_path):
     (SETTINGS.replace("{stretch: 25 cm}", "{stretch: $other, other: 1 m}"), [], r"toy.yaml:1: .*'stretch' refers"),
     ("settings: 3\n" + GOOD, [], r"toy.yaml:1: 'settings' must be a mapping"),
 ])  # fmt: skip
-def test_a_setting_that_cannot_be_is_named(tmp_path, text, overrides, message):
+def test_an_invalid_setting_is_named(tmp_path, text, overrides, message):
     with pytest.raises((PipelineError, UsageError), match=message):
         loaded(tmp_path, text, overrides=overrides)
 
@@ -227,12 +227,12 @@ def test_a_setting_that_cannot_be_is_named(tmp_path, text, overrides, message):
         "twice.bad=" + "[" * 3000, "twice.bad=&a [*a]",
     ],
 )  # fmt: skip
-def test_a_bad_setting_is_named(tmp_path, setting):
+def test_an_invalid_set_option_is_named(tmp_path, setting):
     with pytest.raises((PipelineError, UsageError), match="--set"):
         loaded(tmp_path, overrides=[setting])
 
 
-def test_of_several_settings_the_one_at_fault_is_named(tmp_path):
+def test_the_invalid_one_of_several_settings_is_named(tmp_path):
     source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Odd(Scale):\n"
     source += "    __call__ = Scale.__call__\n    def __post_init__(self):\n        raise ValueError('Odd.nap: no')\n"
     (tmp_path / "strict.py").write_text(source)
@@ -241,7 +241,7 @@ def test_of_several_settings_the_one_at_fault_is_named(tmp_path):
         loaded(tmp_path, text, overrides=["twice.nap=1 s", "twice.factor=2 m"])
 
 
-def test_stages_may_stand_beside_the_file_that_uses_them(tmp_path):
+def test_stages_may_be_in_the_folder_of_the_pipeline_file(tmp_path):
     source = "from tests.flow.toys import Scale\nclass Near(Scale):\n    pass\n"
     (tmp_path / "beside.py").write_text(source)
     text = GOOD.replace("tests.flow.toys.Scale", "beside.Near")

@@ -1,4 +1,4 @@
-"""The engine delivers every frame once, in order, to every sink, whatever fails or how many workers there are."""
+"""The engine delivers every frame once, in order, to every sink, despite failures and with any number of workers."""
 
 import threading
 import time

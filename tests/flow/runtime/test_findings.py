@@ -68,7 +68,7 @@ def test_a_failing_finding_becomes_a_warning_and_the_run_is_complete(tmp_path):
     assert found["sentence"].startswith("RuntimeError: unlucky (toys.py, line ")
 
 
-def test_what_is_no_finding_becomes_a_warning():
+def test_a_finding_of_another_type_becomes_a_warning():
     wrong = "the stage must return a flow.contracts.Finding or None, not 'the mount is loose'"
     assert checked("the mount is loose") == Finding(wrong, Severity.WARNING)
     assert checked(None) is None

@@ -55,7 +55,7 @@ def test_a_clock_years_from_that_of_the_log_costs_nothing(tmp_path, frames):
 @settings(max_examples=50, deadline=None)
 @given(stalls=st.lists(st.tuples(st.integers(0, 9_000), st.integers(1, 9_000)), max_size=4))
 def test_a_log_that_was_written_in_bursts_loses_nothing(tmp_path_factory, stalls):
-    """A recorder that stalls for up to nine seconds logs what came meanwhile all at once."""
+    """A recorder that stalls for up to nine seconds then logs all waiting messages at once."""
 
     def logged(at):
         ends = [(begin + length) * MS for begin, length in stalls if begin * MS <= at < (begin + length) * MS]
@@ -68,7 +68,7 @@ def test_a_log_that_was_written_in_bursts_loses_nothing(tmp_path_factory, stalls
 
 
 def test_a_suspect_stamp_does_not_hold_up_the_log(tmp_path):
-    """A stream that may have a single message shall not make the log wait in memory for another."""
+    """The assembler does not read the whole log to wait for a second message of a stream."""
     read = Counter()
 
     def counted(events):

@@ -24,7 +24,7 @@ def test_a_stage_error_is_shown_as_it_is():
     assert sentence_of(refuse) == "the image is too dark; take another"
 
 
-def test_so_is_the_stage_error_of_a_library_that_a_stage_calls():
+def test_a_stage_error_of_a_called_library_is_shown_as_it_is():
     assert sentence_of(lambda: StereoFrame(0, np.zeros((2, 2), np.uint8), np.zeros((2, 3), np.uint8), None)) == (
         "StereoFrame: left is (2, 2), right is (2, 3)"
     )

@@ -1,4 +1,4 @@
-"""Whether the program's threads share one heap, as glibc reports its heaps."""
+"""The program's threads share one heap, by glibc's own statistics."""
 
 from __future__ import annotations
 

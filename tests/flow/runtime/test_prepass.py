@@ -1,4 +1,4 @@
-"""The survey: a stage sees frames of the whole log before the run, whatever part is run and in whatever order."""
+"""The survey: before the run, a stage sees frames of the whole log, even if only a part is run."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ sinks:
 
 @dataclass(frozen=True)
 class Centre:
-    """Takes off the mean of the frames of its survey."""
+    """Subtracts the mean of the frames of its survey."""
 
     mean: float | None = None
 

@@ -1,4 +1,4 @@
-"""A run ends with a verdict and a ledger that hold, whatever the log lacks, whatever fails, whoever interrupts it."""
+"""A run ends with a correct verdict and ledger, despite missing streams, failures and interrupts."""
 
 import re
 import signal
@@ -59,7 +59,7 @@ def test_a_failing_sink_stops_the_run_and_is_still_closed(tmp_path):
     assert sink.summary["verdict"] == "INCOMPLETE"
 
 
-def test_a_log_that_breaks_off_keeps_what_was_read(tmp_path):
+def test_a_log_that_fails_midway_keeps_the_frames_read_before(tmp_path):
     class Broken(Log):
         def events(self, streams):
             yield from super().events(streams)
@@ -85,7 +85,7 @@ def test_an_interrupt_finishes_frames_in_flight_and_closes_sinks(tmp_path):
     assert summary["interrupted"]
     assert summary["verdict"] == "INCOMPLETE"
     assert 10 <= summary["frames_out"] == len(sink.records) < 100
-    assert (summary["drops"], summary["ledger"]) == ({}, [])  # what was not read on is not lost
+    assert (summary["drops"], summary["ledger"]) == ({}, [])  # unread messages are not lost
     assert sink.summary["frames_out"] == summary["frames_out"]
 
 
@@ -117,7 +117,7 @@ def test_a_run_under_nohup_outlives_its_terminal():
         signal.signal(signal.SIGHUP, before)
 
 
-def test_an_interrupt_that_comes_after_the_end_of_the_log_costs_nothing(tmp_path):
+def test_an_interrupt_after_the_end_of_the_log_loses_no_frame(tmp_path):
     stop, pipeline = Stop(), graph(tmp_path)
     ((_, sink),) = pipeline.sinks
 
@@ -224,7 +224,7 @@ def test_a_sample_that_cannot_be_made_is_in_the_ledger_and_the_verdict(tmp_path,
     assert [r.index for r in sink.records if r.entries] == [2]
 
 
-def test_samplers_of_samplers_are_whole_to_the_end_of_the_log(tmp_path):
+def test_chained_samplers_answer_to_the_end_of_the_log(tmp_path):
     text = PIPELINE.replace("height: {use: flow.align.interpolate, stream: level, at: both}",
                             "held: {use: flow.align.nearest, stream: level, at: right, slop: 60 ms}\n"
                             "  height: {use: flow.align.nearest, stream: held, at: both, slop: 60 ms}")  # fmt: skip
@@ -232,7 +232,7 @@ def test_samplers_of_samplers_are_whole_to_the_end_of_the_log(tmp_path):
     assert (summary["verdict"], summary["frames_out"]) == ("COMPLETE", 9)
 
 
-def test_a_run_that_is_torn_down_is_never_sealed_as_complete(tmp_path):
+def test_a_run_that_raises_is_never_marked_complete(tmp_path):
     class Torn(Log):
         def events(self, streams):
             yield from super().events(streams)
@@ -267,7 +267,7 @@ def test_a_log_without_a_needed_stream_is_refused_with_its_reason(tmp_path):
         run(pipeline, Log([], missing={"level": "no level in it"}), {})
 
 
-def test_what_is_optional_is_left_out_where_the_log_lacks_it(tmp_path):
+def test_an_optional_stage_is_left_out_if_the_log_lacks_its_input(tmp_path):
     text = PIPELINE
     for line in ("at: both", "b: height"):
         text = text.replace(line, f"{line}, optional: true")
@@ -302,14 +302,14 @@ def test_a_stage_without_a_needed_input_is_refused_or_left_out(tmp_path, optiona
             replayed_log(pipeline, log)
 
 
-def test_a_message_that_no_stage_would_have_got_is_no_loss(tmp_path):
+def test_a_message_that_no_stage_reads_is_no_loss(tmp_path):
     text = "\n".join(line for line in PIPELINE.splitlines() if not re.search("height|raised", line))
     broken = [(50 * MS, "level", OSError("damaged")), (60 * MS, "words", OSError("damaged"))]
     _, summary = replayed(graph(tmp_path, text=text), [*traverse(1), *broken])
     assert (summary["verdict"], summary["ledger"]) == ("COMPLETE", [])
 
 
-def test_a_log_that_fails_at_its_notes_costs_no_output(tmp_path):
+def test_failing_notes_of_a_log_lose_no_output(tmp_path):
     class Mute(Log):
         def notes(self):
             raise OSError("input/output error")
@@ -336,7 +336,7 @@ def test_an_output_that_fails_at_its_end_makes_the_run_incomplete(tmp_path, monk
     assert caught.value.summary["verdict"] == "INCOMPLETE"
 
 
-def test_an_unprintable_exception_is_not_blamed_on_an_output(tmp_path, monkeypatch):
+def test_an_unprintable_exception_is_not_reported_as_a_sink_error(tmp_path, monkeypatch):
     class UnprintableError(Exception):
         def __str__(self):
             raise RuntimeError("no words for it")

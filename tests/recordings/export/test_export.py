@@ -26,7 +26,7 @@ LEVEL = Transform("odom", "level", TURN, np.array([2.0, -1.0, 0.5]))
 
 
 def ground(x: Array, y: Array) -> Array:
-    """Heights that no flip, turn or transposition leaves alone."""
+    """Heights that change with any flip, turn or transposition."""
     return np.float32(0.2 * x - 0.05 * y + 0.01 * x * y)
 
 
@@ -244,7 +244,7 @@ def test_the_readable_part_of_a_cut_log_is_exported(tmp_path: Path) -> None:
     assert [why.partition(" at byte")[0] for why in lost] == ["the log is cut or damaged"]
     with rasterio.open(tmp_path / "out" / "elevation.tif") as file:
         assert (file.width, file.height) == (40, 30)
-    with pytest.raises(LogError, match=r"cut or damaged .*; nothing that is left of it can be exported"):
+    with pytest.raises(LogError, match=r"cut or damaged .*; the rest cannot be exported"):
         export(path, tmp_path / "nothing", frames=True, lost=Counter())
 
 

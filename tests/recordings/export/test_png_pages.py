@@ -97,7 +97,7 @@ def test_the_first_middle_and_last_frame_are_drawn(result: Path, tmp_path: Path)
 
 
 def test_a_picture_from_the_log_is_the_picture_of_the_data(result: Path, tmp_path: Path) -> None:
-    """Through GridMap and OccupancyGrid, whose cells run in other directions, nothing is turned round."""
+    """GridMap and OccupancyGrid order their cells differently; both keep the orientation."""
     files = {path.name: cv2.imread(str(path)) for path in draw(result, tmp_path)}
     pictures = {
         "disparity": disparity_page(disparity().pixels), "elevation": elevation_page(terrain()),

@@ -79,7 +79,7 @@ def test_without_its_plane_a_tilted_and_shifted_map_has_no_error(east, north, up
     assert np.nanmax(np.abs(left)) < 1e-9
 
 
-def test_a_plane_through_three_cells_proves_nothing():
+def test_residuals_of_a_plane_through_three_cells_are_unknown():
     error = np.full((3, 3), NAN)
     error[0, 0] = error[1, 1] = error[0, 2] = 1.0
     assert np.isnan(metrics.without_plane(np.arange(3.0), np.arange(3.0), error)).all()
@@ -103,5 +103,5 @@ def test_grids_half_a_cell_apart_do_not_compare():
         metrics.aligned(np.zeros((2, 2)), (0.25, 0.0), (2, 2), (0.0, 0.0), 0.5, NAN)
 
 
-def test_grids_that_do_not_overlap_have_nothing_in_common():
+def test_grids_without_overlap_share_no_cell():
     assert np.isnan(metrics.aligned(np.zeros((2, 2)), (9.0, 9.0), (2, 2), (0.0, 0.0), 0.5, NAN)).all()

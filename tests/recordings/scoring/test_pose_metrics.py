@@ -39,7 +39,7 @@ def test_poses_in_another_frame_of_reference_have_no_error():
     assert found["distance"] == pytest.approx(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
 
 
-def test_the_drift_is_the_last_error_over_the_way_there_and_back():
+def test_the_drift_is_the_last_error_over_the_distance_driven():
     found = tallied([
         (pose([0, 0, 0]), pose([0, 0, 0])),
         (pose([4, 0, 0]), pose([4.5, 0, 0], 0.2)),
@@ -64,7 +64,7 @@ def test_each_part_is_aligned_again_and_adds_its_error_and_distance():
     assert "not scored in 1 frame: the result has no pose" in second
 
 
-def test_a_pose_of_something_else_is_not_scored():
+def test_a_pose_of_another_frame_is_not_scored():
     assert tallied([(pose([0, 0, 0]), None)]) is None
     found = tallied([(pose([0, 0, 0]), pose([0, 0, 0], child="camera"))])
     assert math.isnan(found["drift"])

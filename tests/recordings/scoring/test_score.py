@@ -1,4 +1,4 @@
-"""Scores of results whose errors are known, because the results are the truth with a known change."""
+"""Scores of results with known errors: the truth with a known change."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def frames():
 
 @dataclass
 class Run:
-    """A result log made from the truth; each field changes one thing about it."""
+    """A result log made from the truth; each field changes one property."""
 
     disparity: Callable[[np.ndarray], np.ndarray] = lambda pixels: pixels
     elevation: Callable[[np.ndarray], np.ndarray] = lambda layer: layer

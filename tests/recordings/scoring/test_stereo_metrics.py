@@ -104,7 +104,7 @@ def test_an_error_of_exactly_the_threshold_is_not_bad():
     assert found["bad_0.5"] == 1
 
 
-def test_an_estimate_that_knows_nothing_is_all_bad_and_has_no_error():
+def test_an_empty_estimate_is_all_bad_and_has_no_error():
     found = measured(np.full((2, 2), NAN), np.ones((2, 2)), np.full((2, 2), 255))
     assert found["bad_2"] == found["bad_4"] == 1
     assert found["density"] == found["values"] == 0

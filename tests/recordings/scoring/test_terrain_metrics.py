@@ -1,4 +1,4 @@
-"""The scores of maps count what they say: an error here, a made-up value there, a rock behind a rise."""
+"""The scores of maps count errors, hallucinated values and hidden rocks correctly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulator's truth, held against itself and against plain references."""
+"""The simulator's truth, compared with its own images and with plain references."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_true_disparity_reprojects_to_a_mm_of_the_true_surface(seen):
         assert np.abs(excess).max() * SMALL.terrain.rocks.semi_axes[rock].max() < 1e-3
 
 
-def test_nothing_stands_between_the_camera_and_what_it_sees(seen):
+def test_no_surface_lies_before_the_hits_of_the_rays(seen):
     ground, rocks = SMALL.terrain, SMALL.terrain.rocks
     points, _, _ = world_points(seen)
     eye = seen.base.after(SMALL.mounts[0]).translation
@@ -179,7 +179,7 @@ def test_rocks_have_the_height_and_width_of_the_truth():
 
 
 @pytest.mark.parametrize("slope", [2.0, 15.0])
-def test_relief_has_the_slope_asked_for_and_no_seam(slope):
+def test_relief_has_the_set_slope_and_no_seam(slope):
     ground = terrain.relief(np.random.default_rng(1), 512, 0.05, np.radians(slope)).astype(np.float64)
     rise = [np.roll(ground, 20, axis=axis) - ground for axis in (0, 1)]
     assert np.degrees(np.arctan(np.sqrt(np.mean(np.square(rise))))) == pytest.approx(slope, rel=1e-3)
@@ -200,7 +200,7 @@ def test_the_ground_repeats_without_end():
 
 
 @pytest.mark.parametrize(("elevation", "azimuth"), [(38, 140), (20, -100), (9, 45), (55, 0), (30, 270), (90, 0)])
-def test_what_is_surely_lit_has_nothing_before_the_sun(elevation, azimuth):
+def test_certainly_lit_points_have_a_free_ray_to_the_sun(elevation, azimuth):
     here = replace(
         SMALL, slope=float(np.radians(12)), sun_elevation=float(np.radians(elevation)),
         sun_azimuth=float(np.radians(azimuth)),
@@ -304,7 +304,7 @@ def test_high_rocks_are_hazards_and_open_ground_is_free(seen):
     assert (hazards.cells != Cell.UNKNOWN).all()
 
 
-def test_no_rock_stands_in_the_rovers_way():
+def test_no_high_rock_is_in_the_path_of_the_rover():
     rocks = SMALL.terrain.rocks
     for way in np.arange(0, 1.0, 0.1):
         base = traverse.base_pose(SMALL.terrain, SMALL.route, way)
@@ -352,7 +352,7 @@ def test_odometry_without_errors_is_exact():
 
 
 def test_odometry_has_the_scale_error_and_heading_drift_of_its_settings():
-    """Over many drives; the heading's error, and that of the place across the way, grow with the way as they should."""
+    """Over many drives, the errors of heading and of lateral position grow with the distance as the model states."""
     long, scale, turn = 16.0, 0.02, np.radians(0.5)
     ways = np.linspace(0, long, 161)
     bases = [Transform("world", "base_link", np.eye(3), np.array([way, 0.0, 0.0])) for way in ways]

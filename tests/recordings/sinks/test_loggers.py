@@ -1,4 +1,4 @@
-"""Every picture of a recording shows what the frame held, where it was, in its own numbers."""
+"""Every picture of a recording shows the frame's data at their places, with their values."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_maps_are_seen_from_above_with_forward_up_and_left_left(rrd: Path) -> No
     assert np.argwhere(picture == Cell.HAZARD).tolist() == [[40 - 1 - 3, 30 - 1 - 2]]
 
 
-def test_hazards_stand_on_the_ground_where_they_are(rrd: Path) -> None:
+def test_hazards_are_drawn_on_the_ground_at_their_cells(rrd: Path) -> None:
     position = rows(rrd, "/navigation_map/hazards", "Points3D:positions")[0][2]
     ground = scene()["elevation_map"].layers["elevation"][2, 3]
     np.testing.assert_allclose(position, [[0.35, -1.25, ground + 0.03]], atol=1e-6)
@@ -164,7 +164,7 @@ def test_the_logs_own_pose_is_drawn_once(tmp_path: Path) -> None:
     assert [path for path in entities(tmp_path / "run.rrd") if "trajectory" in path] == ["/pose/trajectory"]
 
 
-def test_a_pair_is_seen_alike_though_the_right_image_was_moved():
+def test_a_pair_is_drawn_alike_with_a_moved_right_image():
     camera = StereoCamera(500, 500, 320, 240, 0.1, 640, 480)
     assert same_view(camera, replace(camera, cx_right=260.0))
     assert not same_view(camera, replace(camera, width=320, height=240, cx=160.0, cx_right=160.0))

@@ -1,4 +1,4 @@
-"""Writing results: what a frame made is in the log, under its stamp, whole or not at all."""
+"""Result logs: the results of a frame are in the log under its stamp, complete or not at all."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def test_a_run_without_frames_leaves_a_readable_log(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["out.mcap"]
 
 
-def test_only_the_named_streams_are_wanted() -> None:
+def test_only_the_named_streams_are_written() -> None:
     sink = McapSink(results=("disparity",))
     assert sink.wants("disparity", Disparity)
     assert not sink.wants("points", PointCloud)

@@ -1,4 +1,4 @@
-"""The rerun recording holds every intermediate at its own time, and shows nothing that a frame did not have."""
+"""The rerun recording contains every intermediate at its own time, and clears those that a frame lacks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from stages.data import Mount
 from tests.recordings.sinks.recorded_scene import START, STEP, STREAMS, Loss, Record, entities, record_of, rows, scene
 
 
-def test_every_intermediate_is_there(rrd: Path) -> None:
+def test_every_intermediate_is_recorded(rrd: Path) -> None:
     assert entities(rrd) >= {
         "/rectified/left", "/rectified/right", "/matched/pixels", "/matched/source/labels", "/disparity/pixels",
         "/disparity/source/labels", "/disparity/superpixels", "/points/points", "/elevation_map/relief",
@@ -50,7 +50,7 @@ def test_legends_that_do_not_change_are_stored_once(rrd: Path) -> None:
 
 
 def test_entities_that_a_frame_lacks_are_cleared_at_that_frame(tmp_path: Path) -> None:
-    """Else the viewer would show the picture before it as this frame's."""
+    """Otherwise the viewer shows the earlier picture at this frame."""
     lost = ("stereo", "rectified", "disparity", "points", "elevation_map")
     second = {name: item for name, item in scene(START + STEP).items() if name not in lost}
     frames = [scene(), second, scene(START + 2 * STEP)]
@@ -63,7 +63,7 @@ def test_entities_that_a_frame_lacks_are_cleared_at_that_frame(tmp_path: Path) -
         shown = [(frame, bool(value)) for _, frame, value in rows(path, legend, "Points2D:positions")]
         assert shown == [(0, True), (2, True)], legend  # and once more when it hangs again
         assert [frame for _, frame, value in rows(path, legend, "Clear:is_recursive") if value is not None] == [1]
-    # An encoded image is emptied instead, for the viewer ignores its clearing.
+    # An encoded image is emptied instead, because the viewer ignores its clearing.
     for entity, kind in (
         ("/rectified/left", "EncodedImage"), ("/rectified/camera/image", "EncodedImage"),
         ("/disparity/superpixels", "EncodedImage"), ("/disparity/pixels", "EncodedDepthImage"),
@@ -117,7 +117,7 @@ def test_losses_are_logged_at_their_own_stamps(tmp_path: Path) -> None:
 
 
 def test_frames_may_come_from_different_threads(tmp_path: Path) -> None:
-    """rerun's clocks are a thread's own: a thread that did not set them would log for all times."""
+    """rerun sets its clocks per thread; a thread without them logs for all times."""
     sink = RerunSink()
     sink.open(tmp_path / "threads.rrd", STREAMS, {})
     for n in range(4):
@@ -194,7 +194,7 @@ def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path: Path, monkeypatch:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_recording_ends_before_the_disk_is_full(tmp_path: Path) -> None:
-    """rerun's writer does not return from a disk that is full, or a file that may grow no more."""
+    """rerun's writer never returns if the disk is full or the file cannot grow."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = RerunSink()
     sink.open(tmp_path / "run.rrd", STREAMS, {})

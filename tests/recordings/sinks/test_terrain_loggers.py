@@ -1,4 +1,4 @@
-"""On the timeline: a map with layers added hangs once, and voxels are boxes where they are."""
+"""Terrain in a recording: a map with more layers replaces the earlier one, and voxels are boxes."""
 
 from __future__ import annotations
 

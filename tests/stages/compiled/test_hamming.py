@@ -13,7 +13,7 @@ from stages.data import Array
 
 
 def descriptors(count: int, seed: int, flips: int = 128) -> Array:
-    """Random descriptors that differ from one common one by about so many bits: fewer bits, more ties."""
+    """Random descriptors that differ from a common one by about `bits` bits; fewer bits give more ties."""
     random = np.random.default_rng(seed)
     bits = random.random((count, 256)) < flips / 256
     return np.packbits(bits, axis=1)
@@ -52,5 +52,5 @@ def test_too_few_have_no_clear_partner_and_too_many_are_refused() -> None:
     with pytest.raises(ValueError, match="2 to 16320 descriptors, not 16321"):
         nearest_two(descriptors(1, 1), np.zeros((MAX_OTHERS + 1, 32), np.uint8))
     codes = descriptors(50, 1)
-    many = np.concatenate([codes, descriptors(MAX_OTHERS, 2)])  # as of a pattern of dots; none is lost for that
+    many = np.concatenate([codes, descriptors(MAX_OTHERS, 2)])  # as in a pattern of dots
     np.testing.assert_array_equal(clear_partners(codes, many, 64, 0.8)[1], np.arange(50))

@@ -59,7 +59,7 @@ def test_kernels_are_cached_and_recompiled_after_a_change_in_any_file(run, tmp_p
     assert "compiling kernels" in stderr
     again, stderr = run()
     assert (again, stderr) == (first, "")
-    # what is changed is called by the kernel, but is in another file
+    # the kernel calls the changed function, which is in another file
     layer = tmp_path / "stages" / "compiled" / "simd.py"
     changed = re.sub(r'icmp_unsigned\("<"', 'icmp_unsigned("<="', layer.read_text())
     assert changed != layer.read_text()

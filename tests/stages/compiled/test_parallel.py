@@ -29,7 +29,7 @@ def test_a_failure_of_either_is_raised(both):
             both(*halves)
 
 
-def test_after_a_failure_of_one_the_other_does_not_run_any_more():
+def test_after_a_failure_no_other_function_is_left_running():
     ended = []
 
     def fail():
@@ -52,14 +52,14 @@ def test_many_threads_may_ask_at_once():
 
 @pytest.mark.parametrize("both", [in_turn, at_once])
 @pytest.mark.parametrize("rows", [1, BANDS - 1, BANDS, 1000])
-def test_bands_hold_every_row_once_and_none_is_empty(both, rows):
+def test_bands_contain_every_row_once_and_none_is_empty(both, rows):
     taken = []
     by_bands(both, rows, lambda first, end: taken.append(range(first, end)))
     assert sorted(row for band in taken for row in band) == list(range(rows))
     assert len(taken) == (1 if both is in_turn else min(rows, BANDS))
 
 
-def test_bands_that_one_thread_has_no_time_for_the_other_takes():
+def test_the_other_thread_takes_the_bands_of_a_busy_one():
     slow, done = threading.Event(), []
 
     def work(first, end):

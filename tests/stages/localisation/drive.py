@@ -50,7 +50,7 @@ class Drive:
         return self.truth.mounts[0].rotation.T @ self.truth.mounts[2].rotation  # type: ignore[no-any-return]
 
     def ups(self, frames: int = FRAMES, late: float = 0.0) -> Array:
-        """Readings of the inclinometer at the frames, with stamps `late` by so many seconds."""
+        """Readings of the inclinometer at the frames, with stamps too late by `late` seconds."""
         rng, spread = np.random.default_rng([self.seed, 1]), np.radians(self.noise) * SMOOTHED
         found = []
         for stamp in self.stamps(frames):

@@ -150,7 +150,7 @@ def test_a_large_offset_is_measured_as_well(rows):
 
 
 @pytest.mark.parametrize(("gain", "bias"), [(0.6, 0), (1.0, -40), (0.5, 60)])
-def test_the_cameras_need_not_expose_alike(gain, bias):
+def test_the_cameras_may_differ_in_exposure(gain, bias):
     left, right = a_pair(TURNED, size=LARGE)
     measured = measure([(left, cv2.convertScaleAbs(right, alpha=gain, beta=bias))])
     assert np.abs(offset_field(measured.terms, *LARGE) - offset_field(TURNED, *LARGE)).max() < 0.2
@@ -170,7 +170,7 @@ def test_aligned_images_with_little_texture_are_left_alone():
     assert corrected <= 1
 
 
-def test_the_same_view_again_and_again_proves_no_more():
+def test_repeated_views_do_not_reduce_the_stated_error():
     left, right = (image.copy() for image in a_pair((1.0,), size=LARGE))
     for image in (left, right):
         image[150:], image[:, 200:] = 90, 90
@@ -281,7 +281,7 @@ def test_a_pair_with_negative_disparities_is_shifted_above_zero(row_offset):
     ({"cy": 400.0}, "cy of 400 px lies in the outer fifth of 640x480 images: check that"),
     ({"baseline": 12.0}, "the baseline is 12 m: check that it is given in metres; "),
 ])  # fmt: skip
-def test_a_calibration_that_hardly_any_camera_has_is_a_warning(changes, words):
+def test_an_implausible_calibration_is_a_warning(changes, words):
     camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE)
     frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), camera)
     plain, sound = Rectify().survey([frame])
@@ -291,7 +291,7 @@ def test_a_calibration_that_hardly_any_camera_has_is_a_warning(changes, words):
     assert stage == plain
 
 
-def test_of_a_raw_image_nothing_is_lost_that_it_shows():
+def test_shifted_columns_of_a_raw_image_keep_all_its_pixels():
     image = np.random.default_rng(0).integers(0, 256, (LARGE[1], LARGE[0], 3), np.uint8)
     k = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     p_left, p_right = np.c_[k, [0, 0, 0]], np.c_[k, [-100.0, 0, 0]]
@@ -328,12 +328,12 @@ def test_an_empty_calibration_makes_no_black_image(entry, message):
         Rectify()(StereoFrame(1, image, image, camera))
 
 
-def test_a_list_of_terms_is_taken_as_the_survey_prints_it():
+def test_the_terms_that_a_survey_prints_are_a_valid_setting():
     assert Rectify(row_offset=[0.5, 0.1]) == Rectify(row_offset=(0.5, 0.1))
 
 
 @pytest.mark.parametrize("row_offset", [(), (1, 2, 3, 4, 5, 6), 65.0, (0.5, float("nan")), "0.5", True])
-def test_a_row_offset_that_is_none_is_refused(row_offset):
+def test_an_invalid_row_offset_is_refused(row_offset):
     with pytest.raises(ValueError, match=r"Rectify\.row_offset must be"):
         Rectify(row_offset=row_offset)
 

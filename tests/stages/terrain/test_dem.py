@@ -94,7 +94,7 @@ def test_the_layers_of_one_cell_are_those_of_its_points() -> None:
 
 
 def test_tilt_uncertainty_is_the_common_variance_not_the_random_one() -> None:
-    """A cloud turned by the tilt's sigma is off by its common standard deviation, wherever it lies across the turn."""
+    """A cloud rotated by the tilt's sigma has an error of its common standard deviation at every point."""
     cloud = cloud_of(scattered(5, 20000) * [1, 1, 0])
     sure, unsure = Voxelise()(cloud), Voxelise()(replace(cloud, tilt_sigma=0.01))
     np.testing.assert_array_equal(sure.layers["variance"], unsure.layers["variance"])

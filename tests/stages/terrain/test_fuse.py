@@ -31,7 +31,7 @@ def test_frames_at_any_heading_make_one_map_of_the_ground():
     assert np.median(terrain.layers["count"][known]) > 16  # more than any frame alone has
 
 
-def test_a_rock_seen_from_two_headings_stands_where_it_is():
+def test_a_rock_seen_from_two_headings_keeps_its_place():
     def with_rock(x, y):
         return np.where(np.hypot(x - 1.0, y - 2.0) < 0.3, 0.25, 0.0)
 
