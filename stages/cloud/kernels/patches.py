@@ -43,7 +43,7 @@ def connected_patches(inverse: Array, tolerance: Array, slope: float) -> Array:
     """Labels of the patches, (H, W) int32: the flat index of a patch's first pixel, -1 without a point.
 
     inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; tolerance: (H, W) float32, difference explained by
-    noise, 1/m, of which the larger of two counts; slope: further difference allowed per pixel of distance, 1/m.
+    noise, 1/m (of two points the larger one applies); slope: further difference allowed per pixel of distance, 1/m.
     """
     return _connected_patches(  # type: ignore[no-any-return]
         np.ascontiguousarray(inverse), np.ascontiguousarray(tolerance), float(slope)
