@@ -48,7 +48,7 @@ COLUMNS = "bad-0.5  bad-1  bad-2 | all -0.5     -1     -2 |   RMS"
 def stereo_part(
     pipeline: str, frame: StereoFrame, disparities: int, threads: int = 1, entry: str = "stereo", **given: Disparity
 ) -> dict[str, Any]:
-    """What a pipeline's disparity of one frame, which enters as stream `entry`, is made of, by name of the stream.
+    """The streams that a pipeline's disparity of one frame depends on, by name; the frame enters as stream `entry`.
 
     disparities: the range at full size; a coarser one keeps its share of it; given: streams that are not made but
     taken as they are.

@@ -1,10 +1,10 @@
 """The regional map of simulated traverses: seams between neighbouring frames, errors against the truth, cost.
 
-A seam is what is left between two neighbouring frames where they overlap, cell by cell, once each is placed: by pose
-and tilt alone, and as `stages.Fuse` placed it (the transform odom <- level of the result log). The truth is the exact
-surface, its mean over each cell that a frame changed, carried into the pose's frame with that frame's own pose, so
-that what odometry loses on the way does not count; a plane per frame is the tilt's, and is taken off. The last line is
-of the cells of all traverses.
+A seam is the height difference of two neighbouring frames in the cells where they overlap. It is printed for frames
+placed by pose and tilt alone, and for frames placed by `stages.Fuse` (the transform odom <- level of the result log).
+The truth is the mean height of the exact surface over each cell that a frame changed. It is moved into the pose's frame
+with that frame's own pose, so errors of odometry do not count. A plane per frame, the error of the tilt, is removed.
+The last line covers the cells of all traverses.
 """
 
 from __future__ import annotations
