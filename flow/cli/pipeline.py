@@ -7,17 +7,19 @@ import argparse
 from flow.cli.report import say
 from flow.errors import COMPLETE
 
-HELP = "print the file of a pipeline: roverflow pipeline rover > mine.yaml"
+HELP = "print the file of a pipeline or of one of its templates: roverflow pipeline rover > mine.yaml"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    sub.add_argument("name", metavar="NAME", help="rover, fast, paper, or the path of a YAML file")
+    sub.add_argument("name", metavar="NAME", help="rover, fast, paper, a template such as rover_disparity, or a file")
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the file."""
-    from flow.config.loader import pipeline_file
+    from flow.config.loader import SHIPPED, pipeline_file
 
-    say(pipeline_file(options.name).read_text(encoding="utf-8").rstrip("\n"))
+    part = SHIPPED / "parts" / f"{options.name}.yaml"
+    file = part if part.is_file() else pipeline_file(options.name)
+    say(file.read_text(encoding="utf-8").rstrip("\n"))
     return COMPLETE

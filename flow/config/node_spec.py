@@ -115,6 +115,10 @@ def _class(use: str, place: YamlLocation) -> type:
     module_name, _, name = use.rpartition(".")
     try:
         module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name != module_name.partition(".")[0]:
+            raise place.error(f"cannot import '{module_name}': {error}") from error
+        raise place.error(f"there is no module '{error.name}' beside {place.file} or on the Python path") from error
     except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise place.error(f"cannot import '{module_name}': {type(error).__name__}: {error}") from error
     kind = getattr(module, name, None)
