@@ -6,7 +6,10 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Any, ClassVar, Protocol
+from functools import reduce
+from operator import or_
+from types import UnionType
+from typing import Any, ClassVar, Protocol, Union, get_args, get_origin
 
 
 class LossReason(StrEnum):
@@ -166,6 +169,20 @@ class Sink(Protocol):
 
     def close(self, summary: Mapping[str, Any]) -> None:
         """Finish the output and give it its name."""
+
+
+def unaliased(kind: Any) -> Any:
+    """A type with its type aliases expanded: `NDArray[...]` is an alias from numpy 2.5 on."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if hasattr(origin, "__value__"):
+        return unaliased(origin.__value__[arguments])
+    if hasattr(kind, "__value__"):
+        return unaliased(kind.__value__)
+    if origin in (Union, UnionType):
+        return reduce(or_, map(unaliased, arguments))
+    if origin in (dict, list, tuple):
+        return origin[tuple(map(unaliased, arguments))]
+    return kind
 
 
 def counted(number: int, what: str, many: str = "") -> str:

@@ -14,7 +14,7 @@ from numbers import Real
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from flow.contracts import Sink
+from flow.contracts import Sink, unaliased
 from flow.errors import PipelineError
 from flow.runtime.ledger import failure
 
@@ -208,7 +208,7 @@ def ports_of(kind: type) -> tuple[dict[str, Any], set[str]]:
 def hints_of(annotated: Any) -> dict[str, Any]:
     """The annotated types of a class or function; raises TypeError where they cannot be resolved."""
     try:
-        return get_type_hints(annotated)
+        return {name: unaliased(kind) for name, kind in get_type_hints(annotated).items()}
     except Exception as error:  # an annotation may be any expression
         raise TypeError(f"the annotations of {annotated.__qualname__} cannot be read: {error}") from error
 
@@ -237,7 +237,7 @@ def output_of(actor: Any, kinds: dict[str, type], place: YamlLocation) -> type:
             return actor.output(kinds)  # type: ignore[no-any-return]
         except TypeError as error:
             raise place.error(f"{error}") from error
-    returned: Any = get_type_hints(type(actor).__call__).get("return")
+    returned: Any = hints_of(type(actor).__call__).get("return")
     origin = get_origin(returned) or returned  # of `NDArray[...]` and `dict[str, float]` the class
     if not isinstance(origin, type) or origin is UnionType:
         raise place.error(f"{type(actor).__name__}.__call__ does not say which one type it returns")

@@ -15,6 +15,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from flow.contracts import unaliased
+
 NUMBERS = (numbers.Real, np.bool_)  # of Python and numpy; bool is one of them
 _HEADER_FIELDS = ("stamp", "frame_id")  # fields that go into the header of a message
 
@@ -66,7 +68,7 @@ def _number(value: Any, kind: Any) -> bool | int | float:
 @lru_cache(maxsize=256)
 def field_types(kind: type) -> dict[str, Any]:
     """The public fields of a dataclass with their types, without those of a message header."""
-    hints = get_type_hints(kind)
+    hints = {name: unaliased(hint) for name, hint in get_type_hints(kind).items()}
     names = (item.name for item in fields(kind))
     return {name: hints[name] for name in names if name not in _HEADER_FIELDS and not name.startswith("_")}
 
@@ -81,6 +83,7 @@ def refusal(kind: Any, known: tuple[type, ...] = (), within: tuple[Any, ...] = (
 
 def _options(kind: Any) -> list[Any]:
     """The alternatives of a union without None, or the type itself."""
+    kind = unaliased(kind)
     options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
     return [option for option in options if option is not NoneType]
 
