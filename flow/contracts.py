@@ -124,7 +124,7 @@ class Log(Protocol):
     """An opened log.
 
     missing: stream -> why this log does not have it; refused: setting of the source -> why this log cannot be read with
-    it; frames: the number of frames, where it is known.
+    it; frames: the number of frames, where it is known. Optional: `begin`, the log time of its first message, ns.
     """
 
     missing: Mapping[str, str]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 from flow.config.loader import SHIPPED
 from tests.conftest import FRAMES, roverflow
@@ -23,6 +24,14 @@ def test_info_reports_why_a_run_would_refuse_the_log(traverse, capsys):
     assert output.startswith("run -p paper: would refuse this log: the source's 'left' is set to /nix")
     assert roverflow("run", traverse, "-p", "paper", "--set", "source.left=/nix") == 2
     assert output.partition("refused: ")[2] in capsys.readouterr().err
+
+
+def test_info_recognises_a_result_and_its_pipeline(result, capsys):
+    assert roverflow("info", result) == 0
+    output = capsys.readouterr().out
+    assert re.search(r"\nThis is a result of roverflow \S+: pipeline rover, run on traverse\.mcap\.\n", output)
+    assert "missing" not in output
+    assert output.endswith("would refuse this log: it contains results; run the log that they were made from\n")
 
 
 def test_info_of_a_cut_log_ends_incomplete(traverse, tmp_path, capsys):

@@ -42,7 +42,8 @@ def run(options: argparse.Namespace) -> int:
     say(json.dumps(description, indent=2) if options.json else format_description(description))
     if not options.json:
         if why := description["refused"]:
-            answer = f"would refuse this log: {why}"
+            results = "it contains results; run the log that they were made from"
+            answer = f"would refuse this log: {results if description['result'] else why}"
         else:
             answer = f"can run on this log{_caveat(graph, description['frames'])}"
         say(f"run -p {options.pipeline}: {answer}")

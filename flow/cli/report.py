@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Any
 from flow.contracts import LossReason, Severity, Verdict, counted
 from flow.errors import COMPLETE, INCOMPLETE, INTERRUPTED
 from flow.runtime.findings import lines
+
+MAX_OFFSET = 1e6  # s; stamps farther from the log's beginning are of another clock
 
 
 def say(text: str) -> None:
@@ -54,10 +57,17 @@ def report(summary: dict[str, Any]) -> None:
         say(f"  {line}")
     for reason, number in summary["drops"].items():
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
-        say(f"  {number} {reason}, first: {first['stream']} at {first['stamp']} ns: {first['detail']}")
+        place = f"{first['stream']} at {_moment(first['stamp'], summary.get('log_begin'))}"
+        say(f"  {number} {reason}, first: {place}: {first['detail']}")
     for path in summary["withheld"]:
         say(f"  {path} was not written because the run produced no results. --summary FILE lists the losses.")
     for path in map(Path, summary["outputs"]):
         say(f"  wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
     for line in [line for part in found for line in lines(part, Severity.WARNING)]:
         say(f"WARNING: {line}")
+
+
+def _moment(stamp: int, begin: int | None) -> str:
+    """A stamp as seconds after the log's first message, as --start takes them, and in ns."""
+    seconds = math.inf if begin is None else (stamp - begin) / 1e9
+    return f"{seconds:+.1f} s ({stamp} ns)" if abs(seconds) < MAX_OFFSET else f"{stamp} ns"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import textwrap
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flow.cli.report import say
@@ -12,18 +14,19 @@ from flow.errors import COMPLETE
 if TYPE_CHECKING:
     from flow.config.reference import NodeReference
 
-HELP = "list stages, aligners, source and sinks; with a name, its inputs and parameters"
+HELP = "list stages, aligners, source and sinks; with a name, its inputs and parameters, or the fields of a data type"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    sub.add_argument("name", nargs="?", metavar="NAME", help="a stage, such as Match or stages.Match")
+    sub.add_argument("name", nargs="?", metavar="NAME", help="such as Match, my_module.Stage or Disparity")
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the list, or the parameters of one stage."""
     from flow.config.reference import stage_reference
 
+    sys.path.append(str(Path.cwd()))  # so that stages can be in this folder
     found = stage_reference(options.name)
     say("\n".join(map(details, found)) if options.name else overview(found))
     return COMPLETE
@@ -41,10 +44,12 @@ def overview(nodes: list[NodeReference]) -> str:
 
 
 def details(node: NodeReference) -> str:
-    """Inputs, output and parameters of one class."""
+    """Inputs, output and parameters of one class; the fields of a data type."""
     optional = dict.fromkeys(node.optional_inputs, " (optional)")
     ports = [f"  {port}: {kind}{optional.get(port, '')}" for port, kind in node.inputs.items()]
     lines = [f"{node.use} ({node.role}): {node.summary}"]
+    if node.role == "data type":
+        return "\n".join([*lines, "fields:", *ports])
     lines += ["inputs:", *ports] if ports else []
     lines += [f"output: {node.output}"] if node.output else []
     lines += ["parameters:"] if node.parameters else ["no parameters"]

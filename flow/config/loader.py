@@ -139,9 +139,11 @@ def _nodes(expansion: Expansion, kinds: dict[str, type]) -> tuple[list[Node], di
     entries = {name: NodeSpec.read(spec.item, f"stream '{name}'", "stage") for name, spec in streams.items()}
     wiring = {name: _inputs(name, entry, known, streams[name].scope) for name, entry in entries.items()}
     places = {name: spec.item.place for name, spec in streams.items()}
+    ports = [kind for entry in entries.values() for kind in ports_of(entry.kind)[0].values()]
+    types = {name for kind in ports for name in type_name(kind).split(" | ")}
     nodes = []
     for name in in_order({name: ports.values() for name, ports in wiring.items()}, places):
-        _check_declared(streams[name].scope, kinds)
+        _check_declared(streams[name].scope, kinds, types)
         node = _node(name, entries[name], wiring[name], kinds, clocks)
         kinds[name], clocks[name] = node.output, node.clock
         nodes.append(node)
@@ -153,14 +155,23 @@ def _check_known(stream: str, known: Collection[str], place: YamlLocation) -> No
         raise place.error(f"there is no stream '{stream}'{nearest(stream, known)}")
 
 
-def _check_declared(scope: Scope | None, kinds: Mapping[str, type]) -> None:
-    """Check the types of the streams given to a template, as far as they are known."""
+def _check_declared(scope: Scope | None, kinds: Mapping[str, type], types: Collection[str]) -> None:
+    """Check the types of the streams given to a template, as far as they are known. types: names of other types."""
     for name, given in (scope.inputs if scope else {}).items():
-        kind = kinds.get(given.stream)
-        if kind is not None and given.kind not in [base.__name__ for base in getattr(kind, "__mro__", (kind,))]:
-            raise given.place.error(
-                f"template '{given.template}' takes {given.kind} as '{name}', but '{given.stream}' is {type_name(kind)}"
-            )
+        kind, wanted = kinds.get(given.stream), str(given.kind.plain())
+        if kind is None or wanted in _names(kind):
+            continue
+        known = {*types, *(name for kind in kinds.values() for name in _names(kind))}
+        if wanted not in known:
+            raise given.kind.place.error(f"'{name}' has an unknown type, '{wanted}'{nearest(wanted, known)}")
+        raise given.place.error(
+            f"template '{given.template}' takes {wanted} as '{name}', but '{given.stream}' is {type_name(kind)}"
+        )
+
+
+def _names(kind: type) -> list[str]:
+    """The names of a type and its bases."""
+    return [base.__name__ for base in getattr(kind, "__mro__", (kind,))]
 
 
 def _inputs(name: str, entry: NodeSpec, known: list[str], scope: Scope | None) -> dict[str, str]:

@@ -36,7 +36,7 @@ class NodeSpec:
             raise item.place.error(f"{what} lacks 'use', its class, such as stages.Match")
         if not isinstance(use.value, str) or not all(use.value.split(".")) or "." not in use.value:
             raise use.place.error(f"'use: {use.plain()}' must be a module and a class, such as stages.Match")
-        kind = _class(use.value, use.place)
+        kind = class_at(use.value, use.place)
         if not (role == "stage" and is_aligner(kind)) and (needed := lacking(kind, role)):
             raise use.place.error(f"{use.value} is no {role}: it has no '{needed[0]}'")
         return cls(item, use.value, kind)
@@ -110,15 +110,16 @@ def place_at_fault(values: Iterable[Value], place: YamlLocation) -> YamlLocation
     return by_hand[-1] if by_hand else place
 
 
-def _class(use: str, place: YamlLocation) -> type:
-    """The dataclass that an entry names."""
+def class_at(use: str, place: YamlLocation) -> type:
+    """The dataclass that an entry at this place names."""
     module_name, _, name = use.rpartition(".")
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name != module_name.partition(".")[0]:
             raise place.error(f"cannot import '{module_name}': {error}") from error
-        raise place.error(f"there is no module '{error.name}' beside {place.file} or on the Python path") from error
+        where = f"beside {place.file}" if place.line else "in the folder"
+        raise place.error(f"there is no module '{error.name}' {where} or on the Python path") from error
     except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise place.error(f"cannot import '{module_name}': {type(error).__name__}: {error}") from error
     kind = getattr(module, name, None)

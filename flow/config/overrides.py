@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from flow.config.node_spec import mapping
 from flow.config.yaml_tree import Value, nearest, read
 from flow.errors import UsageError
 from flow.runtime.graph import YamlLocation
@@ -42,9 +43,10 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
     The changes of settings come first, then the settings are filled in, then the source and the sinks are changed. The
     changes of streams are left.
     """
-    settings, left = dict(_settings(tree)), []
-    sinks = {_class_name(item): number for number, item in enumerate(_items(tree, "sinks"))}
-    entries = {*_streams(tree), *({"source"} & tree.value.keys()), *sinks}
+    given = mapping(tree.value.get("settings", Value({}, tree.place)), "'settings'")
+    settings, left, streams = dict(given), [], _part(tree, "streams", dict)
+    sinks = {_class_name(item): number for number, item in enumerate(_part(tree, "sinks", list))}
+    entries = {*streams, *({"source"} & tree.value.keys()), *sinks}
     for change in changes:
         if change.keys and (change.target in entries or "/" in change.target):
             left.append(change)
@@ -53,21 +55,20 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
         else:
             raise change.value.place.error(_unknown(change, entries, settings))
     parts = {
-        key: item if key in ("templates", "settings") else filled_in(item, settings, "there is no setting '{}'")
-        for key, item in tree.value.items()
+        key: item if key in ("templates", "settings") else filled_in(item, settings) for key, item in tree.value.items()
     }
-    used = set(_texts(tree, leave_out="templates"))
-    for name, given in _settings(tree).items():
-        if any(isinstance(text, str) and text.startswith("$") for text in _texts(settings[name])):
+    used = {leaf.value for key, item in tree.value.items() if key != "templates" for leaf in item.leaves()}
+    for name, item in given.items():
+        if any(str(leaf.value).startswith("$") for leaf in settings[name].leaves()):
             raise settings[name].place.error(f"the setting '{name}' refers to another setting; give it a value")
         if f"${name}" not in used:
-            raise given.place.error(f"the setting '{name}' is used nowhere; write ${name} where it belongs")
+            raise item.place.error(f"the setting '{name}' is used nowhere; write ${name} where it belongs")
     of_streams = []
     for change in left:
-        filled = Change(change.target, change.keys, filled_in(change.value, settings, "there is no setting '{}'"))
+        filled = replace(change, value=filled_in(change.value, settings))
         if change.target == "source":
             parts["source"] = filled.applied(parts["source"])
-        elif change.target in sinks and change.target not in _streams(tree):
+        elif change.target in sinks and change.target not in streams:
             listed = list(parts["sinks"].value)
             listed[sinks[change.target]] = filled.applied(listed[sinks[change.target]])
             parts["sinks"] = Value(listed, parts["sinks"].place)
@@ -76,17 +77,17 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
     return Value(parts, tree.place), of_streams
 
 
-def filled_in(item: Value, values: Mapping[str, Value], missing: str) -> Value:
-    """The tree `item` with a value where its `$name` stands; missing: the sentence about a name without a value."""
+def filled_in(item: Value, values: Mapping[str, Value]) -> Value:
+    """The tree `item` with a value where its `$name` stands. Raises PipelineError for a name without a value."""
     if isinstance(item.value, dict):
-        return Value({key: filled_in(value, values, missing) for key, value in item.value.items()}, item.place)
+        return Value({key: filled_in(value, values) for key, value in item.value.items()}, item.place)
     if isinstance(item.value, list):
-        return Value([filled_in(value, values, missing) for value in item.value], item.place)
+        return Value([filled_in(value, values) for value in item.value], item.place)
     if not isinstance(item.value, str) or not item.value.startswith("$"):
         return item
     name = item.value[1:]
     if name not in values:
-        raise item.place.error(missing.format(name) + nearest(name, values))
+        raise item.place.error(f"there is no setting '{name}'{nearest(name, values)}")
     return replace(values[name], filled_at=item.place)
 
 
@@ -102,24 +103,10 @@ def _unknown(change: Change, entries: Iterable[str], settings: Mapping[str, Valu
     return f"the pipeline has no setting '{target}'{nearest(target, settings)}"
 
 
-def _settings(tree: Value) -> dict[str, Value]:
-    """The values that a pipeline file names once, to use them in several places."""
-    given = tree.value.get("settings")
-    if given is None:
-        return {}
-    if not isinstance(given.value, dict):
-        raise given.place.error("'settings' must be a mapping of names to values")
-    return given.value
-
-
-def _streams(tree: Value) -> dict[str, Value]:
-    streams = tree.value["streams"].value if "streams" in tree.value else {}
-    return streams if isinstance(streams, dict) else {}
-
-
-def _items(tree: Value, key: str) -> list[Value]:
-    given = tree.value[key].value if key in tree.value else []
-    return given if isinstance(given, list) else []
+def _part(tree: Value, key: str, kind: type) -> Any:
+    """A part of the pipeline file, empty where it is missing or of another kind; the loader reports that."""
+    value = tree.value[key].value if key in tree.value else None
+    return value if isinstance(value, kind) else kind()
 
 
 def _class_name(item: Value) -> str:
@@ -137,12 +124,3 @@ def _with_value(item: Value, what: str, keys: Sequence[str], value: Value) -> Va
     inner = item.value.get(keys[0], Value({}, value.place))
     changed = _with_value(inner, f"{what}.{keys[0]}", keys[1:], value)
     return Value({**item.value, keys[0]: changed}, value.place)
-
-
-def _texts(item: Value, leave_out: str = "") -> list[Any]:
-    """All values in `item` that contain no others, without those under one key."""
-    if not isinstance(item.value, dict | list):
-        return [item.value]
-    if isinstance(item.value, list):
-        return [text for part in item.value for text in _texts(part)]
-    return [text for key, part in item.value.items() if key != leave_out for text in _texts(part)]

@@ -1,19 +1,20 @@
-"""What a pipeline can use: stages, aligners, the source and the sinks, with their inputs and parameters."""
+"""What a pipeline can use: stages, aligners, source and sinks with inputs and parameters, data types with fields."""
 
 from __future__ import annotations
 
 import inspect
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import Field, dataclass, fields, is_dataclass
 from importlib import import_module
 from typing import Any
 
-from flow.config.node_spec import ROLES, dataclass_of, lacking, type_name
+from flow.config.node_spec import ROLES, class_at, dataclass_of, lacking, type_name
 from flow.config.yaml_tree import nearest
 from flow.errors import UsageError
 from flow.parameters import is_required
-from flow.runtime.graph import hints_of, is_aligner, ports_of
+from flow.runtime.graph import YamlLocation, hints_of, is_aligner, ports_of
 from flow.units import as_written
 
 MODULES = ("flow.align", "stages", "recordings")  # whose classes a pipeline file names without a path of its own
@@ -45,7 +46,10 @@ class ParameterReference:
 
 @dataclass(frozen=True)
 class NodeReference:
-    """A class that a pipeline can use. role: "stage", "aligner", "source" or "sink"; inputs: port -> type."""
+    """A class that a pipeline can use, or a type of its streams.
+
+    role: "stage", "aligner", "source", "sink" or "data type"; inputs: port -> type; of a data type, field -> content.
+    """
 
     use: str
     role: str
@@ -62,7 +66,8 @@ def stage_reference(name: str | None = None) -> list[NodeReference]:
     Parameters
     ----------
     name
-        As in a pipeline file, "stages.Match", or without its module, "Match".
+        As in a pipeline file, "stages.Match", or without its module, "Match"; also a class of the user's own,
+        "my_module.Stage", or a data type, "Disparity".
 
     Raises
     ------
@@ -70,13 +75,28 @@ def stage_reference(name: str | None = None) -> list[NodeReference]:
         If nothing has that name; the sentence contains the nearest one.
     """
     found = {use: kind for module in MODULES for use, kind in _usable(module)}
-    if name is not None:
-        matching = {use: kind for use, kind in found.items() if name in (use, use.rpartition(".")[2])}
-        if not matching:
-            meant = nearest(name, [*found, *(use.rpartition(".")[2] for use in found)])
-            raise UsageError(f"no stage, aligner, source or sink is called '{name}'{meant}")
-        found = matching
-    return [_reference(use, kind) for use, kind in found.items()]
+    if name is None:
+        return [_reference(use, kind) for use, kind in found.items()]
+    types = {node.use: node for node in data_types()}
+    matching = [_reference(use, kind) for use, kind in found.items() if name in (use, use.rpartition(".")[2])]
+    if matching or name.removeprefix("stages.") in types:
+        return matching or [types[name.removeprefix("stages.")]]
+    module = name.rpartition(".")[0]
+    if not module or module in MODULES:
+        meant = nearest(name, [*found, *(use.rpartition(".")[2] for use in found), *types])
+        raise UsageError(f"no stage, aligner, source, sink or data type is called '{name}'{meant}")
+    try:
+        return [_reference(name, class_at(name, YamlLocation(name, None)))]
+    except TypeError as error:
+        raise UsageError(str(error)) from error
+
+
+def data_types() -> list[NodeReference]:
+    """The types of streams that document their fields."""
+    module = import_module("stages.data")
+    kinds = [getattr(module, name) for name in module.__all__]
+    nodes = [_reference(kind.__name__, kind, "data type") for kind in kinds if isinstance(kind, type)]
+    return [node for node in nodes if node.inputs]
 
 
 def _usable(module_name: str) -> Iterator[tuple[str, type]]:
@@ -100,13 +120,22 @@ def _role(kind: type) -> str:
     return next((role for role in ROLES if not lacking(kind, role)), "")
 
 
-def _reference(use: str, kind: type) -> NodeReference:
-    role = _role(kind)
+def _reference(use: str, kind: type, role: str = "") -> NodeReference:
+    doc, role = inspect.cleandoc(kind.__doc__ or ""), role or _role(kind) or "data type"
+    summary = doc.partition("\n\n")[0].replace("\n", " ")
+    if role == "data type":
+        return NodeReference(use, "data type", summary, _documented_fields(doc), (), "", ())
     ports, optional = ports_of(kind) if role in ("stage", "aligner") else ({}, set())
     inputs = {port: "any stream" if role == "aligner" else type_name(hint) for port, hint in ports.items()}
-    output = type_name(hints_of(kind.__call__)["return"]) if role == "stage" else ""
-    summary = inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
+    output = type_name(hints_of(kind.__call__).get("return")) if role == "stage" else ""
     return NodeReference(use, role, summary, inputs, tuple(sorted(optional)), output, tuple(_parameters(kind)))
+
+
+def _documented_fields(doc: str) -> dict[str, str]:
+    """Field -> content, from the section Parameters of a numpydoc docstring."""
+    section = re.search(r"(?:Parameters|Attributes)\n-+\n(.*?)(?=\n\n\w+\n-+\n|\Z)", doc, re.S)
+    rows = re.findall(r"^(\S.*)\n((?:[ ]+.*\n?)+)", section[1], re.M) if section else []
+    return {name.partition(" : ")[0]: " ".join(text.split()) for name, text in rows}
 
 
 def _parameters(kind: type, prefix: str = "") -> Iterator[ParameterReference]:

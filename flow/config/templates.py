@@ -20,11 +20,10 @@ _KEYS = ("inputs", "parameters", "output", "streams")
 
 @dataclass(frozen=True)
 class Template:
-    """A checked template. inputs: name -> type; parameters: name -> default."""
+    """A checked template. inputs: name -> name of a type; parameters: name -> default."""
 
     name: str
-    place: YamlLocation
-    inputs: Mapping[str, str]
+    inputs: Mapping[str, Value]
     parameters: Mapping[str, Value]
     output: str
     streams: Mapping[str, Value]
@@ -41,12 +40,7 @@ class Template:
                 raise item.place.error(f"template '{name}' lacks '{key}'")
         parts = {key: mapping(given[key], f"'{key}'") for key in ("inputs", "parameters", "streams") if key in given}
         template = cls(
-            name,
-            item.place,
-            {key: str(kind.plain()) for key, kind in parts.get("inputs", {}).items()},
-            parts.get("parameters", {}),
-            str(given["output"].plain()),
-            parts["streams"],
+            name, parts.get("inputs", {}), parts.get("parameters", {}), str(given["output"].plain()), parts["streams"]
         )
         if template.output not in template.streams:
             meant = nearest(template.output, template.streams)
@@ -55,25 +49,31 @@ class Template:
         return template
 
     def _check_names(self) -> None:
-        """Refuse a name that is used twice, and a parameter that is not used."""
+        """Refuse a name that is used twice, a `$name` that is no parameter, and a parameter that is not used."""
         for key, item in self.streams.items():
             check_name(key, item.place)
             if key in self.inputs:
                 raise item.place.error(f"'{key}' is already an input of template '{self.name}'; choose another name")
-        used = set(_texts(self.streams.values()))
+        leaves = [leaf for item in self.streams.values() for leaf in item.leaves() if str(leaf.value).startswith("$")]
+        uses = {leaf.value[1:]: leaf.place for leaf in leaves}
+        for key, place in uses.items():
+            if key in self.inputs:
+                raise place.error(f"'{key}' is an input of template '{self.name}'; write it without $")
+            if key not in self.parameters:
+                raise place.error(f"template '{self.name}' has no parameter '{key}'{nearest(key, self.parameters)}")
         for key, item in self.parameters.items():
             if key in (*self.inputs, "use", "template", "optional"):
                 raise item.place.error(f"'{key}' is no name of a parameter of '{self.name}'; choose another name")
-            if f"${key}" not in used:
+            if key not in uses:
                 raise item.place.error(f"the parameter '{key}' of '{self.name}' is used nowhere; write ${key} for it")
 
 
 @dataclass(frozen=True)
 class TemplateInput:
-    """What a use of a template gives to one of its inputs. kind: the name of the declared type."""
+    """What a use of a template gives to one of its inputs. kind: the name of the declared type, in the template."""
 
     stream: str
-    kind: str
+    kind: Value
     template: str
     place: YamlLocation
 
@@ -233,7 +233,7 @@ class _Expander:
         names = {key: name if key == template.output else f"{path}/{key}" for key in template.streams}
         inner = Scope(names, inputs)
         for key, item in template.streams.items():
-            moved = filled_in(_moved(item, use.place), values, f"template '{template.name}' has no parameter '{{}}'")
+            moved = filled_in(_moved(item, use.place), values)
             if "optional" in use.value and isinstance(moved.value, dict):
                 moved = Value({**moved.value, "optional": use.value["optional"]}, moved.place)
             self.add(names[key], f"{path}/{key}", moved, inner, within)
@@ -248,8 +248,6 @@ def resolved(port: str, given: Value, scope: Scope | None) -> str:
     stream = scope.stream(given.value)
     if stream is None:
         meant = nearest(given.value, [*scope.inputs, *scope.streams])
-        if given.value.removeprefix("$") in scope.inputs:
-            raise given.place.error(f"'{given.value[1:]}' is an input of the template; write it without $")
         remedy = meant or "; declare it under inputs, and pass it where the template is used"
         raise given.place.error(f"the template has no stream or input '{given.value}'{remedy}")
     return stream
@@ -286,12 +284,3 @@ def _moved(item: Value, use: YamlLocation) -> Value:
     if isinstance(item.value, list):
         return Value([_moved(value, use) for value in item.value], place)
     return Value(item.value, place)
-
-
-def _texts(items: Iterable[Value]) -> Iterable[object]:
-    """All values in the items that contain no others."""
-    for item in items:
-        if isinstance(item.value, dict | list):
-            yield from _texts(item.value.values() if isinstance(item.value, dict) else item.value)
-        else:
-            yield item.value

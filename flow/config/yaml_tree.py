@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -30,6 +30,14 @@ class Value:
     def key_place(self) -> YamlLocation:
         """The place of the key with this value."""
         return self.filled_at or self.place
+
+    def leaves(self) -> Iterator[Value]:
+        """The values in it that contain no others."""
+        parts = self.value.values() if isinstance(self.value, dict) else self.value
+        if isinstance(self.value, dict | list):
+            yield from (leaf for part in parts for leaf in part.leaves())
+        else:
+            yield self
 
     def plain(self) -> Any:
         """The value without places."""

@@ -152,6 +152,7 @@ def run(
             "verdict": str(Verdict.COMPLETE if complete else Verdict.INCOMPLETE),
             "interrupted": stop.finishing(),
             "pipeline": graph.name,
+            "log_begin": getattr(log, "begin", None),
             **_counts(assembler, engine, ledger, times),
             "surveys": as_dicts(prepared.findings),
             "fixed": prepared.fixed,

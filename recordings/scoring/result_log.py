@@ -9,6 +9,7 @@ from itertools import islice
 from pathlib import Path
 
 from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
 
@@ -16,17 +17,31 @@ from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 
 
+def about_run(result: Path) -> dict[str, str]:
+    """The facts of the run that wrote a result log; empty for another log."""
+    with suppress(McapError, OSError, ValueError, struct.error), result.open("rb") as file:
+        *_, record = islice(StreamReader(file, emit_chunks=True).records, 2)  # the header and the first metadata record
+        if isinstance(record, Metadata) and record.name == "roverflow":
+            return dict(record.metadata)
+    return {}
+
+
+def pipeline_of(result: Path) -> str:
+    """The name of the pipeline that wrote a complete result log."""
+    with suppress(McapError, OSError, ValueError, struct.error), result.open("rb") as file:
+        for record in make_reader(file).iter_metadata():
+            if record.name == "roverflow.run":
+                return record.metadata["pipeline"]
+    return "unknown"
+
+
 def part_run(result: Path, log: Path) -> tuple[float | None, float | None]:
     """Start and end of the run in its input `log`, s after the first message; None for no limit or if unknown."""
-    about: dict[str, str] = {}
-    with suppress(McapError, OSError, ValueError, struct.error), result.open("rb") as file:
-        # The header and the first metadata record.
-        for record in islice(StreamReader(file, emit_chunks=True).records, 2):
-            about = record.metadata if isinstance(record, Metadata) else {}
-        if about.get("log") == log.name.encode("utf-8", "replace").decode():
-            first, end = (about.get(name) for name in ("start", "end"))
-            return float(first) if first else None, float(end) if end else None
-    return None, None
+    about = about_run(result)
+    if about.get("log") != log.name.encode("utf-8", "replace").decode():
+        return None, None
+    start, end = (float(about[name]) if about.get(name) else None for name in ("start", "end"))
+    return start, end
 
 
 def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:

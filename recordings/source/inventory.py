@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flow.contracts import counted
 from recordings.mcap.index import LostMessage
+from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.source.cameras import CAMERAS
 from recordings.source.log import McapLog
 from recordings.source.topics import peek_stamp
@@ -39,6 +40,7 @@ def describe(log: McapLog, slop: int = 5_000_000, max_gap: int | None = 200_000_
     left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
     return {
         "path": str(log.path),
+        "result": _run(log),
         "size_bytes": log.file.size,
         "profile": log.file.index.profile,
         "indexed": not log.file.index.walked,
@@ -70,6 +72,7 @@ def format_description(description: dict[str, Any]) -> str:
     d = description
     how = "indexed (chunk CRCs not verified yet)" if d["indexed"] else "no valid index (read through)"
     lines = [f"{d['path']}: {d['duration_s']:.3f} s, {d['size_bytes'] / 1e6:.1f} MB, {how}", ""]
+    lines += [f"This is a result of {d['result']}.", ""] if d["result"] else []
     lines += [*_table(d["topics"], d["streams"]), ""]
     if camera := d["calibration"]:
         state = "rectified" if camera["rectified"] else "not rectified"
@@ -84,7 +87,7 @@ def format_description(description: dict[str, Any]) -> str:
         base, position = d["mount"]["base"], d["mount"]["position"]
         lines.append("mount: camera position unknown" if base is None else f"mount: camera at {position} m in '{base}'")
     lines += [f"transform: {transform}" for transform in d["transforms"]]
-    reasons = dict.fromkeys(d["missing"].values())
+    reasons = dict.fromkeys(() if d["result"] else d["missing"].values())
     for why in reasons:
         streams = ", ".join(stream for stream in d["missing"] if d["missing"][stream] == why)
         known = next((other for other in reasons if why.endswith(f": {other}")), "")  # it has a line of its own
@@ -93,6 +96,13 @@ def format_description(description: dict[str, Any]) -> str:
     lines += [d["undecodable"]] if d["undecodable"] else []
     lines += [f"damaged: {damage}" for damage in _grouped(d["damage"])]
     return "\n".join(lines)
+
+
+def _run(log: McapLog) -> str:
+    """The run that wrote a result log, in words; empty for another log."""
+    about = about_run(log.path)
+    pipeline = "unknown" if log.file.index.walked else pipeline_of(log.path)
+    return f"roverflow {about['roverflow']}: pipeline {pipeline}, run on {about['log']}" if about else ""
 
 
 def _table(topics: list[dict[str, Any]], streams: dict[str, str]) -> list[str]:

@@ -137,6 +137,11 @@ class McapLog:
             raise
 
     @property
+    def begin(self) -> int:
+        """The log time of the first message, ns."""
+        return self.file.start
+
+    @property
     def frames(self) -> int | None:
         """The number of left images in the range; None if the log has none."""
         if "left" not in self.topics:

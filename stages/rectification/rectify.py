@@ -132,11 +132,11 @@ class Rectify(Stage):
             return replace(self, row_offset=0.0), Finding(swapped, Severity.WARNING)
         terms = tuple(round(term, 4) for term in offset.terms)
         found = (
-            f"rows differ by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, +- {offset.error:.2f}"
-            f" ({offset.features} features of {counted(len(plain), 'frame')})"
+            f"left and right rows are offset by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, "
+            f"+- {offset.error:.2f} ({offset.features} features of {counted(len(plain), 'frame')})"
         )
         if not offset.clear:
-            return replace(self, row_offset=0.0), Finding(f"{found}: too little to correct")
+            return replace(self, row_offset=0.0), Finding(f"{found}: not corrected, too little")
         severity = Severity.NOTE
         if offset.largest > UNUSUAL_ROW_OFFSET:
             severity = Severity.WARNING

@@ -7,16 +7,12 @@ and a test fails when a page is not current.
 from __future__ import annotations
 
 import argparse
-import inspect
-import re
 from collections.abc import Iterator
-from dataclasses import is_dataclass
 from pathlib import Path
 
 import stages
-import stages.data
 from flow.cli.main import parser
-from flow.config.reference import NodeReference, stage_reference
+from flow.config.reference import NodeReference, data_types, stage_reference
 
 DOCS = Path(__file__).parent.parent.parent / "docs"
 STEPS = {
@@ -79,21 +75,10 @@ def _stages() -> str:
     parts.append(
         "## Data types\n\nTypes of streams. Arrays are read-only; `NaN` is unknown; `stamp` is in nanoseconds.\n"
     )
-    for name in stages.data.__all__:
-        kind = getattr(stages.data, name)
-        if isinstance(kind, type) and is_dataclass(kind) and (fields := _documented_fields(kind)):
-            summary = inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
-            parts.append(f"### {name}\n\n{_escaped(summary)}\n\n| field | content |\n|---|---|")
-            parts.append("\n".join(_row(f"`{field}`", text) for field, text in fields) + "\n")
+    for node in data_types():
+        parts.append(f"### {node.use}\n\n{_escaped(node.summary)}\n\n| field | content |\n|---|---|")
+        parts.append("\n".join(_row(f"`{field}`", text) for field, text in node.inputs.items()) + "\n")
     return "\n".join(parts)
-
-
-def _documented_fields(kind: type) -> list[tuple[str, str]]:
-    """(fields, content) of the section Parameters of a numpydoc docstring."""
-    doc = inspect.cleandoc(kind.__doc__ or "")
-    section = re.search(r"(?:Parameters|Attributes)\n-+\n(.*?)(?=\n\n\w+\n-+\n|\Z)", doc, re.S)
-    rows = re.findall(r"^(\S.*)\n((?:[ ]+.*\n?)+)", section[1], re.M) if section else []
-    return [(name.partition(" : ")[0], " ".join(text.split())) for name, text in rows]
 
 
 def _folder(node: NodeReference) -> str:

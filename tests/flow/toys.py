@@ -59,6 +59,7 @@ class Scale:
     factor: float = field(default=1.0, metadata={"unit": "m", "low": 0})
     bad: tuple[float, ...] = ()
     nap: float = field(default=0.0, metadata={"unit": "s"})
+    size: int = field(default=1, metadata={"unit": "px"})
 
     def __post_init__(self) -> None:
         if not self.factor >= 0:

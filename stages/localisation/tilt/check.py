@@ -82,7 +82,7 @@ class CheckTilt(Stage):
     >>> check(motion, Tilt(0, [0.0, -1.0, 0.0]), Mount(0, np.eye(3)), state=state).judgement
     'No frames to judge the tilt by.'
     >>> check.finding(state).sentence
-    'Too few frames to judge the tilt (1).'
+    'The tilt was not checked: too few frames in which the rover moved (1; it takes 8 in a row).'
     """
 
     window: int = parameter(50, "number of frames behind a judgement, at most", low=10)

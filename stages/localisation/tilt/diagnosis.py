@@ -83,7 +83,8 @@ def diagnose(evidence: Evidence) -> Diagnosis:
         return wrong_unit
     degrees_of_freedom = 2 * (n - len(np.unique(evidence.segments)))
     if n < MIN_FRAMES or degrees_of_freedom < MIN_FRAMES:
-        return Diagnosis("", f"Too few frames to judge the tilt ({n}).", False)
+        why = f"too few frames in which the rover moved ({n}; it takes {MIN_FRAMES} in a row)"
+        return Diagnosis("", f"The tilt was not checked: {why}.", False)
     found, noise = _judged(evidence, degrees_of_freedom, NOISE)
     if found.fault and noise < NOISE:  # the camera's drift weighs more than assumed; the fault must remain with it
         found, _ = _judged(evidence, degrees_of_freedom, noise)

@@ -115,6 +115,7 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
         ("5 ms", "5 m", 3, ["'5 m' is a length; expected a time in ms or s"]),
         ("25 cm", "25 rad", 5, ["'25 rad' is an angle; expected a length in m"]),
         ("25 cm", "25 px", 5, ["'25 px' is a number of pixels; expected a length in m"]),
+        ("bad: [1, 2.5]", "size: 3 cm", 5, ["'3 cm' is a length; expected a number of pixels, such as 3 px"]),
         ("25 cm", "-1 m", 5, ["at least 0 m"]),
         ("25 cm", "true", 5, ["expected a number in m"]),
         ("5 ms", "-5 ms", 3, ["must be at least 0 ns, not -5 ms"]),

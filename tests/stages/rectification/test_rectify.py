@@ -246,7 +246,7 @@ def test_a_survey_warns_of_swapped_and_of_unrectified_images(rows, swapped, word
     pair = (right, left) if swapped else (left, right)
     _, found = Rectify().survey([StereoFrame(1, *pair, StereoCamera(500, 500, 320, 240, 0.1, *LARGE))])
     assert words in found.sentence
-    assert ("swapped" in found.sentence, "rows differ" in found.sentence) == (swapped, not swapped)
+    assert ("swapped" in found.sentence, "are offset by" in found.sentence) == (swapped, not swapped)
     assert found.severity == "warning"
 
 
