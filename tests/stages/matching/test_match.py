@@ -58,7 +58,7 @@ def test_disparities_are_not_drawn_to_whole_numbers(slope, cost):
     assert np.abs(bias).max() < 0.06, bias
 
 
-def test_the_left_margin_is_matched_where_the_right_image_sees_it_and_only_there(slope):
+def test_the_left_margin_is_matched_only_where_the_right_image_sees_it(slope):
     frame, truth = slope
     pixels = Match(disparities=48)(frame).pixels
     margin = np.s_[:, :48]
@@ -86,7 +86,7 @@ def test_a_negative_range_finds_points_beyond_infinity(slope):
     assert np.median(np.abs(pixels + truth[:, ::-1])[known]) < 0.12
 
 
-def test_what_lies_beyond_the_farthest_of_interest_is_neither_searched_nor_made_up(slope):
+def test_what_lies_beyond_max_depth_is_neither_searched_nor_made_up(slope):
     frame, truth = slope
     match = Match(disparities=48, max_depth=1.5)  # 20 px: fx * baseline is 30 px m
     coarse = np.where(np.arange(320) >= truth, truth, np.nan).astype(np.float32)
@@ -183,7 +183,7 @@ def known(slope):
 
 @pytest.mark.parametrize("cost", COSTS)
 @pytest.mark.parametrize("paths", [4, 8])
-def test_around_a_prior_disparities_are_found_beyond_the_range_too_and_nowhere_else(slope, known, cost, paths):
+def test_near_a_prior_disparities_are_found_also_beyond_the_range(slope, known, cost, paths):
     frame, truth = slope
     near = Match(disparities=10, search_radius=4, cost=cost, paths=paths, prior_weight=0.0)
     found = near(frame, known)

@@ -51,7 +51,7 @@ def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(paths, color):
     assert (result.stamp, result.camera) == (frame.stamp, frame.camera)
 
 
-def test_the_left_margin_is_matched_where_the_right_image_sees_it_and_only_there():
+def test_the_left_margin_is_matched_only_where_the_right_image_sees_it():
     frame, truth = slanted_pair()
     pixels = MatchOpenCV(disparities=48)(frame).pixels
     margin = np.s_[:, :48]
@@ -96,7 +96,7 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
     st.integers(32, 90), st.integers(32, 90), st.sampled_from([3, 5, 8]), st.integers(16, 130), st.integers(-20, 20),
     st.integers(0, 99),
 )  # fmt: skip
-def test_any_size_gives_disparities_within_range_and_within_the_right_image(h, w, paths, disparities, minimum, seed):
+def test_any_size_gives_disparities_in_range_and_in_the_right_image(h, w, paths, disparities, minimum, seed):
     left = textured(h, w, seed).astype(np.uint8)
     right = np.roll(left, -5, axis=1)
     result = MatchOpenCV(disparities=disparities, min_disparity=minimum, paths=paths)(frame_of(left, right))

@@ -63,7 +63,7 @@ def test_every_row_is_in_one_band_whose_range_holds_its_prior(rows, columns, ban
     assert found == row_ranges(prior, band, minimum, disparities, threads=2)
 
 
-def test_specks_do_not_widen_a_range_and_a_band_that_knows_little_has_the_whole():
+def test_specks_do_not_widen_a_range_and_a_sparse_band_has_the_whole():
     prior = np.full((128, 1000), 40, np.float32)
     prior[3, :30], prior[5, :30] = 150, 2  # 60 of 64000 pixels
     prior[7, :3] = 1e30, -1e30, np.inf
@@ -96,7 +96,7 @@ def test_moved_paths_keep_what_both_ranges_have(lanes, other_lanes, later):
     st.booleans(), st.booleans(), st.sampled_from([0, -9, -60, 7]), st.sampled_from([65, 96, 100, 130, 192]),
     st.integers(0, 2**32 - 1),
 )  # fmt: skip
-def test_disparities_are_those_of_a_search_that_lacks_the_rest_of_the_range(
+def test_disparities_are_those_of_a_search_without_the_rest_of_the_range(
     gradient, diagonals, minimum, disparities, seed
 ):
     rng = np.random.default_rng(seed)
