@@ -40,7 +40,7 @@ def test_on_a_simulated_frame_rover_beats_paper_and_matching_alone():
 
 
 @pytest.mark.slow
-def test_on_real_scenes_rover_beats_paper_matching_alone_and_the_released_code():
+def test_rover_beats_paper_matching_and_the_released_code_on_real_scenes():
     cases = real_cases()
     scores = [[errors(p, c.truth, c.mask, c.disparities) for p in outcomes(c.frame, c.disparities)] for c in cases]
     released = np.array([RELEASED[case.name] for case in cases])
@@ -74,7 +74,7 @@ def test_ground_nearly_four_times_as_near_as_the_range_is_known(pipeline):
     assert (error > 0.5).mean() < (0.02 if pipeline == "rover" else 0.4)  # found at a quarter of the size, and no more
 
 
-def test_confidence_is_the_share_that_is_right_on_a_frame_it_was_not_fitted_to():
+def test_confidence_is_the_share_that_is_right_on_a_held_out_frame():
     stated, right = [], []
     for seed, abundance in ((21, 0.08), (22, 0.18)):
         simulation = Simulation(frames=2, width=480, height=360, seed=seed, abundance=abundance)
@@ -94,7 +94,7 @@ def test_confidence_is_the_share_that_is_right_on_a_frame_it_was_not_fitted_to()
 
 
 @pytest.mark.slow
-def test_confidence_is_the_share_that_is_right_of_real_and_simulated_pixels_alike():
+def test_confidence_is_the_share_right_of_real_and_of_simulated_pixels():
     pools = []
     for cases in (simulated(), real_cases()):
         stated, right = [], []
