@@ -17,14 +17,13 @@ from stages.stage import Stage, check_cells, parameter
 from stages.terrain.fused_map import FusedMap, Observation, layers_of, merged, variance_of, with_ceiling
 from stages.terrain.height_alignment import fit_plane, plane_height
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
+from stages.terrain.map_levelling import MapLevelling, StatedErrors
 from stages.terrain.map_registration import FrameGrid, frame_grid, register, with_plane
 
 WINDOW_MARGIN = 1.5  # m; the slope and step of a cell depend on cells this near
 MIN_OVERLAP_CELLS = 100  # of a frame and the map, for their heights to show a jump
 MAX_JUMP = 5.0  # standard deviations of the aligning plane from one frame to the next
 MAX_REJECTED = 3  # frames in succession that do not align; then the map is reset
-FOLLOW_TILT = 0.05  # share of a frame's own tilt that the map takes over, so that it follows gravity in the long run
-FOLLOW_HEIGHT = 0.003  # share of its own height; far less, because errors of height tilt the map
 MAX_LEAN_DEG = 5.0  # of the pose's frame; odometry without an inclinometer is off by less than such a mean slope
 MAX_GRADIENT = 3.0  # rise per run of a cell in the variance of misplaced frames; rock edges are steeper
 
@@ -57,6 +56,16 @@ class Fuse(Stage):
     window: float = parameter(20.0, "width of the map returned with each frame", unit="m", low=0.5, high=400.0)
     tilt_sigma: float = parameter(0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0)
     height_sigma: float = parameter(0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0)
+    attitude_sigma: float = parameter(
+        0.0009, "standard deviation of the pose's roll and pitch, if it has no covariance (0.05 degrees)", unit="rad",
+        low=0.0,
+    )  # fmt: skip
+    height_drift: float = parameter(
+        0.002, "error of the pose's height per metre of the drive, if it has no covariance", low=0.0
+    )
+    tilt_bias: float = parameter(
+        np.deg2rad(0.1), "standard deviation of the error common to all tilts", unit="rad", low=0.0, high=0.2
+    )
     position_sigma: float = parameter(
         0.012, "standard deviation of a frame's horizontal position against the map", unit="m", low=0.0
     )
@@ -89,7 +98,7 @@ class Fuse(Stage):
         if pose.frame_id != state.frame_id:
             state.reset(pose.frame_id, cloud.stamp)
         known, observed = frame.known, self._observation(frame)
-        cells, plane = self._aligned(frame, observed, state)
+        cells, plane = self._aligned(frame, observed, pose, up, cloud.tilt_sigma or self.tilt_sigma, state)
         state.up_sum += up
         cells[known] = merged(cells[known], observed.with_plane(plane), state.age(cloud.stamp))
         hidden = ~known & np.isfinite(frame.ceiling) & (cells["frames"] == 0)
@@ -134,46 +143,59 @@ class Fuse(Stage):
         variance += np.asarray(self.alignment_sigma**2 + self.position_sigma**2 * gradient)[known]
         return Observation(*frame.offsets(known), elevation, minimum, maximum, variance, points)
 
-    def _aligned(self, frame: FrameGrid, observed: Observation, state: FusedMap) -> tuple[Array, Array]:
+    def _aligned(
+        self, frame: FrameGrid, observed: Observation, pose: Pose, up: Array, tilt_sigma: float, state: FusedMap
+    ) -> tuple[Array, Array]:
         """The map's cells (rows, cols) below the frame, and the plane (3,) that aligns the frame to them."""
         cells = state.cells.read(frame.row, frame.col, *frame.terrain.shape)
-        plane = self._plane(cells[frame.known], observed, state.plane)
-        if self._jumped(plane, state):
-            state.reset(frame.terrain.frame_id, frame.terrain.stamp)
-            state.resets += 1
-            cells, plane = np.zeros_like(cells), np.zeros(3)
-        state.plane, state.rejected = plane, 0
-        return cells, plane
+        stated = StatedErrors(self.attitude_sigma, self.height_drift, self.tilt_bias)
+        if state.levelling is not None:
+            levelling = state.levelling.moved(pose, stated).tilted(up, tilt_sigma)
+            expected = levelling.plane(up)
+            plane, covariance, overlaps = self._fitted(cells[frame.known], observed, expected)
+            if self._jumped(plane - expected, state):
+                state.reset(frame.terrain.frame_id, frame.terrain.stamp)
+                state.resets += 1
+                cells = np.zeros_like(cells)
+            elif overlaps:
+                levelling = levelling.overlapped(plane, covariance, up)
+        if state.levelling is None:
+            levelling = MapLevelling.begin(pose, stated).tilted(up, tilt_sigma).placed()
+        levelling = levelling.corrected()
+        state.levelling, state.rejected = levelling, 0
+        return cells, levelling.plane(up)
 
     @property
     def _plane_sigma(self) -> Array:
         return np.array([self.height_sigma, self.tilt_sigma, self.tilt_sigma])
 
-    def _plane(self, cells: Array, observed: Observation, last: Array) -> Array:
-        """The plane (3,) to add to a frame: height at the rover, m, and slopes along x and y.
+    def _fitted(self, cells: Array, observed: Observation, expected: Array) -> tuple[Array, Array, bool]:
+        """The plane (3,) that fits a frame to the map, its covariance (3, 3), and whether they overlap.
 
-        cells, observed: (n,), the known cells of the frame; last: the plane of the frame before.
+        cells, observed: (n,), the known cells of the frame; expected: the plane where they do not overlap.
         """
         both = cells["frames"] > 0
         cells, observed = cells[both], observed.only(both)
         off = cells["height"].astype(np.float64) - observed.elevation
         variance = variance_of(cells) + observed.variance
-        # The height of a pose drifts slowly, so the last plane's height is the prior.
-        before = np.array([last[0], 0.0, 0.0])
-        plane = before + fit_plane(
-            observed.x, observed.y, off - before[0], variance, self._plane_sigma, self.resolution
+        x, y = observed.x, observed.y
+        change, covariance = fit_plane(
+            x, y, off - plane_height(expected, x, y), variance, self._plane_sigma, self.resolution
         )  # fmt: skip
+        plane = expected + change
         # After a large jump a robust fit takes all cells for outliers.
-        left = np.abs(off - plane_height(plane, observed.x, observed.y))
-        tilted = self.tilt_sigma * (np.abs(observed.x) + np.abs(observed.y))
-        explained = self.height_sigma + tilted + np.sqrt(variance)
+        left = np.abs(off - plane_height(plane, x, y))
+        explained = self.height_sigma + self.tilt_sigma * (np.abs(x) + np.abs(y)) + np.sqrt(variance)
         if len(off) >= MIN_OVERLAP_CELLS and self.height_sigma > 0 and np.median(left - MAX_JUMP * explained) > 0:
-            return np.array([np.median(off), 0.0, 0.0])
-        return np.asarray(plane * (1 - np.array([FOLLOW_HEIGHT, FOLLOW_TILT, FOLLOW_TILT])))
+            plane = np.array([np.median(off), 0.0, 0.0])
+        return plane, covariance, len(off) > 0
 
-    def _jumped(self, plane: Array, state: FusedMap) -> bool:
-        """Whether too many frames in succession do not align; raises StageError for the first of them."""
-        change = np.abs(plane - state.plane)
+    def _jumped(self, change: Array, state: FusedMap) -> bool:
+        """Whether too many frames in succession do not align; raises StageError for the first of them.
+
+        change: (3,), of the aligning plane from the expected one.
+        """
+        change = np.abs(change)
         if np.all(change <= MAX_JUMP * self._plane_sigma):
             return False
         state.rejected += 1

@@ -10,6 +10,7 @@ import numpy as np
 from stages.data import Array
 from stages.data.tiles import Tiles
 from stages.terrain.height_alignment import plane_height
+from stages.terrain.map_levelling import MapLevelling
 
 SHARED_SHARE = 0.5  # share of the smallest variance of a cell's frames that they have in common
 MAX_CONTRADICTION = 3.0  # standard deviations between two heights of a cell
@@ -36,7 +37,7 @@ class FusedMap:
     last: int = -1  # ns, stamp of the last frame
     has_ceiling: bool = False  # whether the frames contain occluded cells
     cells: Tiles = field(default_factory=lambda: Tiles(CELL))
-    plane: Array = field(default_factory=lambda: np.zeros(3))  # that aligned the last frame
+    levelling: MapLevelling | None = None  # None before the first frame
     up_sum: Array = field(default_factory=lambda: np.zeros(3))  # of the tilts, in the map's frame
     rejected: int = 0  # frames in succession that did not align
     resets: int = 0  # because of them
@@ -44,7 +45,7 @@ class FusedMap:
     def reset(self, frame_id: str, stamp: int) -> None:
         """Start an empty map."""
         self.frame_id, self.epoch, self.cells = frame_id, stamp, Tiles(CELL)
-        self.plane, self.up_sum = np.zeros(3), np.zeros(3)
+        self.levelling, self.up_sum = None, np.zeros(3)
 
     def age(self, stamp: int) -> int:
         """Time since the epoch, ms."""

@@ -16,17 +16,21 @@ _HUBER, _CAUCHY = 1.345, 2.385  # standard deviations; 95 % as efficient as leas
 _ROUNDS = 8  # of each
 
 
-def fit_plane(x: Array, y: Array, off: Array, variance: Array, expected: Array, resolution: float) -> Array:
-    """The most likely plane (3,): height at (0, 0), m, and slopes along x and y; zero without cells.
+def fit_plane(
+    x: Array, y: Array, off: Array, variance: Array, expected: Array, resolution: float
+) -> tuple[Array, Array]:
+    """The most likely plane (3,): height at (0, 0), m, and slopes along x and y; and its covariance (3, 3).
+
+    Without cells the plane is zero, and its covariance is the prior's.
 
     x, y: (n,) positions, m; off: (n,) height differences, m; variance: (n,) of each, m^2; expected: (3,) prior standard
     deviations of the plane's numbers; resolution: cell size, m.
     """
     known = np.flatnonzero(expected > 0)
-    plane = np.zeros(3)
+    plane, covariance = np.zeros(3), np.zeros((3, 3))
     design = np.stack([np.ones_like(x), x, y])[known]
     trust = 1 / (variance * max(1.0, (CORRELATION_LENGTH / resolution) ** 2))
-    prior = np.diag(1 / expected[known] ** 2)
+    normal = prior = np.diag(1 / expected[known] ** 2)
     sigma = np.sqrt(variance)
     for number in range(2 * _ROUNDS if len(x) else 0):
         residual = np.abs(off - plane[known] @ design) / sigma
@@ -35,8 +39,10 @@ def fit_plane(x: Array, y: Array, off: Array, variance: Array, expected: Array, 
         else:
             weight = 1 / (1 + (residual / _CAUCHY) ** 2)
         weighted = design * (weight * trust)
-        plane[known] = np.linalg.solve(weighted @ design.T + prior, weighted @ off)
-    return plane
+        normal = weighted @ design.T + prior
+        plane[known] = np.linalg.solve(normal, weighted @ off)
+    covariance[np.ix_(known, known)] = np.linalg.inv(normal)
+    return plane, covariance
 
 
 def plane_height(plane: Array, x: Array, y: Array) -> Array:

@@ -25,7 +25,7 @@ def flat(x, y):
 
 
 def drive(frame, ground=rolling, sigma=0.02, tilt=(0.0, 0.0), at=None, noise=0.0):
-    """Cloud and pose of one frame: 2 to 7 m ahead, 100 degrees wide, 6 points a cell. tilt: errors of the levelling."""
+    """Cloud and pose of one frame: 2 to 7 m ahead, 100 degrees wide, 6 points a cell. tilt: slopes by a wrong tilt."""
     rng = np.random.default_rng(frame)
     x, y, yaw = at or (0.4 * frame - 3.03, 0.1 * frame + 0.521, 0.4 + 0.1 * frame)
     base = np.array([x, y, float(ground(np.array(x), np.array(y)))])
@@ -33,7 +33,8 @@ def drive(frame, ground=rolling, sigma=0.02, tilt=(0.0, 0.0), at=None, noise=0.0
     ahead = np.column_stack([reach * np.cos(bearing), reach * np.sin(bearing)])
     world = ahead @ Rotation.from_euler("z", yaw).as_matrix()[:2, :2].T + base[:2]
     heights = ground(world[:, 0], world[:, 1]) - base[2] + ahead @ tilt + noise * rng.normal(size=len(ahead))
-    sensor = replace(MOUNT.base_from_camera, parent="level")
+    wrong = Rotation.from_rotvec([tilt[1], -tilt[0], 0.0]).as_matrix()
+    sensor = replace(MOUNT.base_from_camera, parent="level", rotation=wrong @ LOOKING)
     count = len(ahead)
     cloud = PointCloud(
         START + frame * SECOND, np.column_stack([ahead, heights]).astype(np.float32),

@@ -18,18 +18,20 @@ def test_a_plane_is_found_although_a_fifth_of_the_ground_has_changed():
     plane = np.array([0.02, 0.006, -0.004])
     x, y, off = differences(plane)
     off[x > 6.5] -= 0.3
-    found = fit_plane(x, y, off, np.full(len(x), 1e-4), EXPECTED, 0.05)
+    found, _ = fit_plane(x, y, off, np.full(len(x), 1e-4), EXPECTED, 0.05)
     np.testing.assert_allclose(np.column_stack([np.ones_like(x), x, y]) @ (found - plane), 0, atol=0.012)
 
 
 def test_without_an_overlap_there_is_no_plane():
     nothing = np.empty(0)
-    np.testing.assert_array_equal(fit_plane(nothing, nothing, nothing, nothing, EXPECTED, 0.05), 0)
+    plane, covariance = fit_plane(nothing, nothing, nothing, nothing, EXPECTED, 0.05)
+    np.testing.assert_array_equal(plane, 0)
+    np.testing.assert_allclose(covariance, np.diag(EXPECTED**2))
 
 
 def test_a_few_cells_do_not_tilt_a_frame():
     x, y, off = differences(np.array([0.0, 0.2, 0.0]), count=3)
-    found = fit_plane(x, y, off, np.full(3, 1e-2), EXPECTED, 0.05)
+    found, _ = fit_plane(x, y, off, np.full(3, 1e-2), EXPECTED, 0.05)
     assert np.abs(found[1:]).max() < 2e-4
 
 
@@ -38,6 +40,6 @@ def test_a_number_with_a_zero_sigma_stays_zero(fixed):
     expected = EXPECTED.copy()
     expected[fixed] = 0
     x, y, off = differences(np.array([0.02, 0.006, -0.004]))
-    found = fit_plane(x, y, off, np.full(len(x), 1e-4), expected, 0.05)
+    found, _ = fit_plane(x, y, off, np.full(len(x), 1e-4), expected, 0.05)
     assert found[fixed] == 0
     assert np.all(found[np.arange(3) != fixed] != 0)

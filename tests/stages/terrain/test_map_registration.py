@@ -38,17 +38,30 @@ def test_frames_with_tilt_errors_join_without_a_seam():
     assert np.max(seams, axis=0)[1] < 0.008
 
 
-def test_the_tilt_error_of_the_first_frame_fades_without_overshoot():
+def leans_of_the_map(covariance):
+    """Lean of the map that each frame is placed in, over the error of the first tilt; and the last map."""
     fuse, lean, found = Running(Fuse()), np.radians(0.6), []
     for frame in range(61):
-        cloud, pose = drive(frame, flat, tilt=(lean if frame == 0 else 0.0, 0.0), at=(0.25 * frame, 0.0, 0.0))
-        placed = fuse(part(cloud, np.s_[::10]), pose, MOUNT).level
-        found.append(np.arcsin(placed.rotation[2, 0]) / lean)
+        cloud, pose = drive(frame, flat, tilt=(0.0 if frame else lean, 0.0), at=(0.25 * frame, 0.0, 0.0))
+        terrain = fuse(part(cloud, np.s_[::10]), replace(pose, covariance=covariance), MOUNT)
+        found.append(np.arcsin(terrain.level.rotation[2, 0]) / lean)
+    return np.array(found), terrain
+
+
+def test_the_tilt_error_of_the_first_frame_fades_if_the_pose_is_uncertain():
+    found, terrain = leans_of_the_map(np.diag([1e-4] * 3 + [3e-3] * 2 + [1e-3]))
     assert 0.7 < found[1] < 1.0  # aligned to the map
     assert abs(found[40]) < 0.15
     assert abs(found[60]) < 0.1
     assert min(found) > -0.1
-    assert abs(placed.translation[2]) < 0.1
+    assert abs(terrain.level.translation[2]) < 0.1
+
+
+@pytest.mark.parametrize("covariance", [None, np.diag([1e-6] * 3 + [1e-7] * 3)])
+def test_the_tilt_error_of_a_frame_does_not_tilt_the_map_of_a_precise_pose(covariance):
+    found, terrain = leans_of_the_map(covariance)
+    assert np.abs(found[1:]).max() < 0.1
+    assert np.nanmax(np.abs(terrain.layers["elevation"])) < 0.01
 
 
 def test_a_pose_of_the_camera_gives_the_map_of_a_pose_of_the_rover():
