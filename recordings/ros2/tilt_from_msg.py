@@ -16,24 +16,37 @@ from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_of, rotation_of, stamp_or
 from stages.data import Array, Tilt
 
+MAX_STATED_SIGMA = np.radians(20.0)  # beyond it a covariance says only that the driver does not know
+
 
 def tilt_of(message: Any, log_time: int) -> Tilt:
     """The tilt of a sensor_msgs/Imu, geometry_msgs/QuaternionStamped or Quaternion.
 
     The quaternion turns the sensor's frame into a world with z up (REP 145), so up in the sensor's frame is the third
-    row of its matrix.
+    row of its matrix. The sigma is that of the Imu's orientation_covariance, without the heading's.
     """
-    if hasattr(message, "orientation_covariance") and message.orientation_covariance[0] == -1:
+    covariance = getattr(message, "orientation_covariance", None)
+    if covariance is not None and covariance[0] == -1:
         raise LogError("the Imu marks its orientation as absent (orientation_covariance[0] is -1)")
     quaternion = next((q for name in ("orientation", "quaternion") if (q := getattr(message, name, None))), message)
     up = rotation_of(quaternion, "the inclinometer").as_matrix()[2]
-    return _tilt(message, log_time, up)
+    return _tilt(message, log_time, up, None if covariance is None else _stated_sigma(covariance))
 
 
-def _tilt(message: Any, log_time: int, up: Array) -> Tilt:
+def _tilt(message: Any, log_time: int, up: Array, sigma: float | None = None) -> Tilt:
     header = getattr(message, "header", None)
     stamp = stamp_or(header, log_time) if header is not None else log_time
-    return Tilt(stamp, up / np.linalg.norm(up), frame_of(message) or "inclinometer")
+    return Tilt(stamp, up / np.linalg.norm(up), frame_of(message) or "inclinometer", sigma)
+
+
+def _stated_sigma(covariance: Array) -> float | None:
+    """Standard deviation, rad, about the two axes that are surer than the third, which is the heading's; None for zeros
+    (unknown) and for what is no covariance of a tilt."""
+    matrix = np.asarray(covariance, np.float64).reshape(3, 3)
+    if not np.isfinite(matrix).all():
+        return None
+    variance = float(np.mean(np.linalg.eigvalsh((matrix + matrix.T) / 2)[:2]))
+    return float(np.sqrt(variance)) if 0 < variance < MAX_STATED_SIGMA**2 else None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from recordings.source.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.source.mount import pose_of_base
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
+from recordings.source.tilt_noise import TiltNoise
 from recordings.source.topics import Decoder, peek_stamp
 from stages.data import CameraImage, CameraModel, Pose, Tilt
 
@@ -275,9 +276,9 @@ class McapLog:
     def _stream_readers(
         self, calibrations: dict[str, CalibrationHistory], streams: Collection[str]
     ) -> list[TopicReader]:
-        tilt, base_frame = self.source.angles() or tilt_of, self.source.base_frame
+        tilt, noise, base_frame = self.source.angles() or tilt_of, TiltNoise(), self.source.base_frame
         made: dict[str, Callable[[Any, int], Any]] = {
-            "inclinometer": lambda message, log_time: self._checked_tilt(tilt(message, log_time)),
+            "inclinometer": lambda message, log_time: noise(self._checked_tilt(tilt(message, log_time))),
             "odometry": lambda message, log_time: self._rover_pose(pose_of(message, log_time, base_frame)),
         }
         for side, camera in zip(CAMERAS, self.resolution.cameras or (), strict=False):

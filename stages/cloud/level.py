@@ -36,7 +36,7 @@ class Level(Stage):
         1.0, "height of the left camera above the origin, if base_link is not known", unit="m", low=0.0
     )
     tilt_sigma: float = parameter(
-        0.0042, "standard deviation of the tilt at the frame's time, about each horizontal axis, for the map's common "
+        0.0042, "standard deviation of a tilt of unknown sigma, about each horizontal axis, for the map's common "
         "variance (0.24 degrees: readings of 0.3 degrees, interpolated)",
         unit="rad", low=0.0, high=0.5,
     )  # fmt: skip
@@ -59,7 +59,8 @@ class Level(Stage):
             mount = Mount(tilt.stamp, np.eye(3))
         sensor = level_transform(tilt, mount, cloud.frame_id, self.camera_height)
         points = transform_points(cloud.points, sensor.rotation, sensor.translation)
-        return replace(cloud, points=points, frame_id=LEVEL_FRAME, sensor=sensor, tilt_sigma=self.tilt_sigma)
+        sigma = self.tilt_sigma if tilt.sigma is None else tilt.sigma
+        return replace(cloud, points=points, frame_id=LEVEL_FRAME, sensor=sensor, tilt_sigma=sigma)
 
 
 def level_transform(tilt: Tilt, mount: Mount, camera_frame: str, camera_height: float = 1.0) -> Transform:

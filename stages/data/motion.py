@@ -65,6 +65,8 @@ class Tilt:
     ----------
     up : (3,) float64
         Unit vector against gravity, in the inclinometer's frame `frame_id`.
+    sigma : float, optional
+        Standard deviation, rad, about each horizontal axis; None if unknown.
 
     Examples
     --------
@@ -76,27 +78,33 @@ class Tilt:
     stamp: int
     up: Array
     frame_id: str = "inclinometer"
+    sigma: float | None = None
 
     def __post_init__(self) -> None:
         publish_stamp(self)
         publish_vector(self, "up", (3,))
+        if self.sigma is not None and not 0 <= self.sigma < np.inf:
+            raise StageError(f"Tilt.sigma must be at least 0 and finite, not {self.sigma}")
         if not abs(float(np.linalg.norm(self.up)) - 1.0) < 1e-6:
             raise StageError(f"Tilt.up must be a unit vector, not {self.up.tolist()}")
 
     def interpolated(self, later: Tilt, stamp: int) -> Tilt:
         """The tilt at `stamp`, ns, between this one and a later one, along the great circle."""
-        return Tilt(stamp, _slerp(self.up, later.up, _fraction(self.stamp, later.stamp, stamp)), self.frame_id)
+        share = _fraction(self.stamp, later.stamp, stamp)
+        sigma = _sigma_of([self, later], np.array([1 - share, share]))
+        return Tilt(stamp, _slerp(self.up, later.up, share), self.frame_id, sigma)
 
     @staticmethod
     def smoothed(samples: Sequence[Tilt], stamp: int) -> Tilt:
         """The tilt at `stamp`, ns, on the line fitted over time to three or more samples around it."""
         seconds = (np.array([sample.stamp for sample in samples]) - stamp) / 1e9
         line = np.column_stack([np.ones_like(seconds), seconds])
-        up = np.linalg.lstsq(line, np.array([sample.up for sample in samples]), rcond=None)[0][0]
+        weights = np.linalg.pinv(line)[0]
+        up = weights @ np.array([sample.up for sample in samples])
         length = float(np.linalg.norm(up))
         if not length > 0.5:
             raise StageError("Tilt.smoothed: the samples have no common direction")
-        return Tilt(stamp, up / length, samples[0].frame_id)
+        return Tilt(stamp, up / length, samples[0].frame_id, _sigma_of(samples, weights))
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,6 +268,12 @@ def _fraction(first: int, last: int, stamp: int) -> float:
     if not first <= stamp <= last:
         raise StageError(f"stamp {stamp} is outside [{first}, {last}]")
     return (stamp - first) / (last - first) if last > first else 0.0
+
+
+def _sigma_of(tilts: Sequence[Tilt], weights: Array) -> float | None:
+    """Standard deviation, rad, of a weighted sum of tilts with independent errors; None if one of them is unknown."""
+    sigmas = [tilt.sigma for tilt in tilts]
+    return None if None in sigmas else float(np.linalg.norm(weights * np.array(sigmas, np.float64)))
 
 
 def _slerp(start: Array, end: Array, share: float) -> Array:

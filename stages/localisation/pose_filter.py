@@ -21,6 +21,7 @@ from stages.stage import Stage, parameter
 
 VISUAL_FRAME = "visual_odom"  # "visual_odom/2" after tracking was lost once
 SCALE_ERROR = 0.005  # relative error common to all steps' lengths; half of it sideways
+MIN_TILT_SIGMA = 1e-5  # rad
 TURN_ERROR = float(np.deg2rad(0.015))  # rad per metre, common to all steps
 
 
@@ -60,7 +61,11 @@ class PoseFilter(Stage):
     """
 
     tilt_noise: float = parameter(
-        np.deg2rad(0.3), "standard deviation of a tilt", unit="rad", low=1e-5, high=float(np.deg2rad(10))
+        np.deg2rad(0.3),
+        "standard deviation of a tilt of unknown sigma",
+        unit="rad",
+        low=1e-5,
+        high=float(np.deg2rad(10)),
     )
     tilt_bias: float = parameter(
         np.deg2rad(0.1), "standard deviation of the error common to all tilts", unit="rad", low=0.0, high=0.2
@@ -109,11 +114,16 @@ class PoseFilter(Stage):
         unaligned = f"{source}). It lost track {losses}: the poses are in {state.segment} unaligned frames, {frames}."
         return Finding(unaligned, Severity.WARNING)
 
+    def _variance(self, tilt: Tilt) -> float:
+        """Variance of a tilt about each horizontal axis, rad^2."""
+        return max(self.tilt_noise if tilt.sigma is None else tilt.sigma, MIN_TILT_SIGMA) ** 2
+
     def _first(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> _Estimate:
         """The first frame of a segment: at its origin, upright by the tilt."""
         world = level_transform(tilt, mount, camera.child, camera_height=0.0)
         # The origin is base_link if it is known; then the tilt's error moves the camera.
-        tilt_covariance = np.diag([0, 0, 0, self.tilt_noise**2, self.tilt_noise**2, 0])
+        variance = self._variance(tilt)
+        tilt_covariance = np.diag([0, 0, 0, variance, variance, 0])
         covariance = translated_covariance(tilt_covariance, world.translation)
         return _Estimate(motion.segment, camera, motion.covariance, world, covariance, 0.0)
 
@@ -121,7 +131,7 @@ class PoseFilter(Stage):
         """The estimate corrected by the tilt, which measures the rotation about the two level axes."""
         world, covariance = estimate.world, estimate.covariance
         up = world.rotation @ mount.camera_from_inclinometer @ tilt.up
-        gain = covariance[:, 3:5] @ np.linalg.inv(covariance[3:5, 3:5] + self.tilt_noise**2 * np.eye(2))
+        gain = covariance[:, 3:5] @ np.linalg.inv(covariance[3:5, 3:5] + self._variance(tilt) * np.eye(2))
         change = gain @ np.array([up[1], -up[0]])  # the rotation that brings up to z
         turn = np.asarray(Rotation.from_rotvec(change[3:]).as_matrix())
         corrected = Transform(world.parent, world.child, turn @ world.rotation, world.translation + change[:3])

@@ -15,7 +15,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -32,11 +32,12 @@ from recordings.scoring.table import ROWS, terrain_figures, terrain_lines
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
+from recordings.source.tilt_noise import WINDOW, TiltNoise
 from stages.data import Array, Cell, Disparity, Mount, PixelOrigin, StereoFrame, Tilt, Transform
 
 SLOPE, TILT_NOISE = np.radians(5.0), np.radians(0.3)
 RUNS = {"rover": "rover", "paper": "paper", "rover, true disparity and tilt": "rover"}
-TILT_SAMPLES = 10  # before and after a frame, from which a pipeline takes what it smooths over
+TILT_SAMPLES = 10  # after a frame, from which a pipeline takes what it smooths over
 TERRAIN_STREAMS = ("cloud", "cleaned", "points", "cells", "elevation_map", "navigation_map")
 
 
@@ -71,14 +72,14 @@ def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any]
 def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
     """The tilt as the pipeline's own aligner makes it of the inclinometer's samples about a frame."""
     number = int((stamp - simulation.begin) * 1e-9 * simulation.tilt_rate)
-    samples: deque[Token] = deque()
-    for sample in range(max(number - TILT_SAMPLES, 0), number + TILT_SAMPLES + 1):
+    samples, noise = deque[Token](), TiltNoise()
+    for sample in range(max(number - WINDOW, 0), number + TILT_SAMPLES + 1):
         at = simulation.begin + round(sample / simulation.tilt_rate * 1e9)
         random = np.random.default_rng([simulation.seed, 4, sample])
         base, mount = simulation.base_at(at), simulation.mounts[2]
         reading = traverse.inclinometer_reading(base, mount, simulation.tilt_noise, random)
         up = Rotation.from_quat(reading).as_matrix()[2]
-        samples.append(Token(at, Tilt(at, up / np.linalg.norm(up))))
+        samples.append(Token(at, noise(Tilt(at, up / np.linalg.norm(up)))))
     aligner = next(node.actor for node in nodes(pipeline) if node.name == "tilt")
     tilt = aligner.choose("tilt", "inclinometer", stamp, samples, " by the log's end")
     assert isinstance(tilt, Tilt), tilt
@@ -88,9 +89,14 @@ def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
 def tilt_errors(pipeline: str, simulation: Simulation) -> Array:
     """By how much the pipeline's tilt is off, (N, 2): slopes along x and y that it gives to level ground, at each frame
     of the traverse and three times between."""
+    return np.array([tilt_error(simulation, tilt) for tilt in measured_tilts(pipeline, simulation)])
+
+
+def measured_tilts(pipeline: str, simulation: Simulation) -> list[Tilt]:
+    """The pipeline's tilts at those times."""
     times = simulation.start + np.arange(4 * simulation.frames) * round(0.25e9 / simulation.rate)
     offset = simulation.stamp(0) - simulation.start
-    return np.array([tilt_error(simulation, measured_tilt(pipeline, simulation, int(at) + offset)) for at in times])
+    return [measured_tilt(pipeline, simulation, int(at) + offset) for at in times]
 
 
 def tilt_error(simulation: Simulation, tilt: Tilt) -> Array:
@@ -146,8 +152,9 @@ def score(simulations: Sequence[Simulation], stride: int, runs: dict[str, str]) 
     for simulation in simulations:
         for given, exact, ground in frames(simulation, stride):
             for name, pipeline in runs.items():
-                measured = {"tilt": measured_tilt(pipeline, simulation, given["stereo"].stamp)}
-                streams, seconds = through(pipeline, given | (exact if "true" in name else measured))
+                tilt = measured_tilt(pipeline, simulation, given["stereo"].stamp)
+                exact["tilt"] = replace(exact["tilt"], sigma=tilt.sigma)
+                streams, seconds = through(pipeline, given | (exact if "true" in name else {"tilt": tilt}))
                 layers: dict[str, Array] = dict(streams["elevation_map"].layers)
                 tilts = others[pipeline] - tilt_error(simulation, streams["tilt"])
                 found[name].tally.add(ground, layers, streams["navigation_map"].cells, tilts)

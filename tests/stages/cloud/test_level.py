@@ -141,6 +141,7 @@ def test_transform_kernel_equals_the_reference() -> None:
 def test_the_cloud_carries_the_sigma_of_the_tilt() -> None:
     cloud = cloud_of(scattered())
     assert Level(tilt_sigma=0.01)(cloud, Tilt(3, UP), BARE).tilt_sigma == 0.01
+    assert Level(tilt_sigma=0.01)(cloud, Tilt(3, UP, sigma=0.002), BARE).tilt_sigma == 0.002
     assert cloud.tilt_sigma == 0
     with pytest.raises(ValueError, match="tilt_sigma"):
         Level(tilt_sigma=-0.01)
