@@ -16,44 +16,65 @@ from flow.errors import COMPLETE, UsageError
 
 HELP = "write a synthetic traverse with ground truth topics under /truth"
 
-# option -> (field of recordings.simulator.Simulation, its unit)
-OPTIONS = {
-    "frames": ("frames", 1),
-    "seed": ("seed", 1),
-    "baseline": ("baseline", 1),
-    "camera_height": ("camera_height", 1),
-    "pitch_down": ("pitch_down", math.radians(1)),
-    "rocks": ("abundance", 1),
-    "slope": ("slope", math.radians(1)),
-    "tilt_noise": ("tilt_noise", math.radians(1)),
-    "odometry_scale": ("odometry_scale", 0.01),
-    "odometry_turn": ("odometry_turn", math.radians(1)),
-}
+DEGREE, PERCENT, MILLISECOND = math.radians(1), 0.01, 0.001
+
+# option -> (field of recordings.simulator.Simulation, its type, its unit, name of the value, help)
+OPTIONS: dict[str, tuple[str, type, float, str | None, str]] = {
+    "scene": ("scene", str, 1, "NAME", "defaults for gravel, mixed, dunes, dusk or bedrock (gravel)"),
+    "frames": ("frames", int, 1, None, "number of stereo frames (12)"),
+    "seed": ("seed", int, 1, None, "random seed of terrain and noise (1)"),
+    "baseline": ("baseline", float, 1, "M", "distance between the cameras (0.24)"),
+    "camera_height": ("camera_height", float, 1, "M", "height of the cameras above the ground (0.9)"),
+    "pitch_down": ("pitch_down", float, DEGREE, "DEG", "angle of the cameras below the horizon (15)"),
+    "rocks": ("abundance", float, 1, "K", "fraction of ground under rocks (Golombek's k; gravel: 0.1)"),
+    "slope": ("slope", float, DEGREE, "DEG", "RMS slope of the terrain (4)"),
+    "sand": ("sand", float, PERCENT, "PERCENT", "ground that is sand (mixed: 45)"),
+    "dust": ("dust", float, PERCENT, "PERCENT", "ground that is dust (mixed: 10)"),
+    "bedrock": ("bedrock", float, PERCENT, "PERCENT", "ground that is bedrock; the rest is gravel (mixed: 15)"),
+    "sand_contrast": ("sand_contrast", float, 1, "GRAY", "contrast of sand over a few pixels, RMS at mid-gray (2)"),
+    "gravel_contrast": ("gravel_contrast", float, 1, "GRAY", "the same of gravel (gravel: 18, others: 12)"),
+    "ripples": ("ripples", float, 1, "GRAY", "RMS contrast of the ripples of sand (1; dunes: 3)"),
+    "sun_elevation": ("sun_elevation", float, DEGREE, "DEG", "sun above the horizon (38; dusk: 6)"),
+    "sun_azimuth": ("sun_azimuth", float, DEGREE, "DEG", "direction of the sun, from the world's x towards y (140)"),
+    "skylight": ("skylight", float, 1, "LIGHT", "light in the shadows; the sun's is 0.86 (0.24; dusk: 0.1)"),
+    "brightness": ("brightness", float, 1, "FACTOR", "exposure; below 1, the images are darker (1; dusk: 0.75)"),
+    "noise": ("noise", float, 1, "GRAY", "noise of the gray image, one sigma at mid-gray (1.5; dusk: 3; gravel: 1.36)"),
+    "blur": ("blur", float, 1, "PX", "lens blur, one sigma (0.55)"),
+    "vignetting": ("vignetting", float, PERCENT, "PERCENT", "light that the corners lose (14)"),
+    "exposure_difference": (
+        "exposure_difference", float, PERCENT, "PERCENT", "light that the right image gets more, besides 1 %% (0)",
+    ),
+    "row_offset": ("row_offset", float, 1, "PX", "rows that the right image is too low (0)"),
+    "exposure_time": ("exposure_time", float, MILLISECOND, "MS", "time of an exposure, for motion blur (0)"),
+    "jpeg": ("jpeg", int, 1, "QUALITY", "write JPEG images of this quality, 1 to 100 (not compressed)"),
+    "tilt_noise": ("tilt_noise", float, DEGREE, "DEG", "inclinometer noise, one sigma (0.1)"),
+    "odometry_scale": (
+        "odometry_scale", float, PERCENT, "PERCENT", "scale error of odometry (1); 0, with --odometry-turn 0, is exact",
+    ),
+    "odometry_turn": (
+        "odometry_turn", float, DEGREE, "DEG",
+        "heading drift of odometry after 1 m, one sigma; grows with its root (0.2)",
+    ),
+}  # fmt: skip
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Declare the options."""
     sub.add_argument("out", type=Path, metavar="OUT.mcap")
-    sub.add_argument("--frames", type=int, help="number of stereo frames (12)")
-    sub.add_argument("--seed", type=int, help="random seed of terrain and noise (1)")
     sub.add_argument("--size", type=size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
-    sub.add_argument("--baseline", type=float, metavar="M", help="distance between the cameras (0.24)")
-    sub.add_argument("--camera-height", type=float, metavar="M", help="height of the cameras above the ground (0.9)")
-    sub.add_argument("--pitch-down", type=float, metavar="DEG", help="angle of the cameras below the horizon (15)")
-    sub.add_argument("--rocks", type=float, metavar="K", help="fraction of ground under rocks (Golombek's k, 0.1)")
-    sub.add_argument("--slope", type=float, metavar="DEG", help="RMS slope of the terrain (4)")
-    sub.add_argument("--tilt-noise", type=float, metavar="DEG", help="inclinometer noise, one sigma (0.1)")
-    scale = "scale error of odometry (1); 0, with --odometry-turn 0, is exact"
-    sub.add_argument("--odometry-scale", type=float, metavar="PERCENT", help=scale)
-    turn = "heading drift of odometry after 1 m, one sigma; grows with the square root of the distance (0.2)"
-    sub.add_argument("--odometry-turn", type=float, metavar="DEG", help=turn)
+    for option, (_, kind, _, metavar, text) in OPTIONS.items():
+        sub.add_argument(f"--{option.replace('_', '-')}", type=kind, metavar=metavar, help=text)
 
 
 def run(options: argparse.Namespace) -> int:
     """Write the traverse."""
     check_outputs({"input log": options.out})
     given = {option: getattr(options, option) for option in OPTIONS}
-    settings = {OPTIONS[o][0]: value * OPTIONS[o][1] for o, value in given.items() if value is not None}
+    settings = {}
+    for option, value in given.items():
+        field, kind, unit, *_ = OPTIONS[option]
+        if value is not None:
+            settings[field] = value * unit if kind is float else value
     width, height = options.size
     try:
         simulate(options.out, **settings, width=width, height=height)
@@ -64,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _with_options(sentence: str) -> str:
     """The sentence about a field of Simulation, with the name of the option instead."""
-    for option, (field, _) in OPTIONS.items():
+    for option, (field, *_) in OPTIONS.items():
         sentence = sentence.replace(f"Simulation.{field} ", f"--{option.replace('_', '-')} ")
     for side in ("width", "height"):
         sentence = sentence.replace(f"Simulation.{side} ", f"the {side} of --size ")

@@ -62,6 +62,11 @@ def image(stamp: int, frame_id: str, pixels: Array) -> Any:
     )  # fmt: skip
 
 
+def compressed_image(stamp: int, frame_id: str, content: Array, format: str) -> Any:
+    """sensor_msgs/CompressedImage of the bytes of an image file, (N,) uint8, of the format "jpeg" or "png"."""
+    return make("sensor_msgs/msg/CompressedImage", header=header(stamp, frame_id), format=format, data=content)
+
+
 def camera_info(stamp: int, frame_id: str, model: CameraModel) -> Any:
     """sensor_msgs/CameraInfo."""
     return make(

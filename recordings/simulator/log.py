@@ -99,7 +99,12 @@ def _camera_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> d
     for (side, frame_id), picture in zip(sides, truth.images, strict=True):
         model = pinhole(simulation.camera, side)
         messages[f"/stereo/{side}/camera_info"] = ros2.camera_info(stamp, frame_id, model)
-        messages[f"/stereo/{side}/{name}"] = ros2.image(stamp, frame_id, picture)
+        topic = f"/stereo/{side}/{name}"
+        if truth.jpegs is None:
+            messages[topic] = ros2.image(stamp, frame_id, picture)
+        else:
+            content = truth.jpegs[side == "right"]
+            messages[f"{topic}/compressed"] = ros2.compressed_image(stamp, frame_id, content, "jpeg")
     return messages
 
 
@@ -108,6 +113,7 @@ def _truth_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> di
     return {
         "/truth/disparity": ros2.disparity_image(ground_truth.true_disparity(simulation, stamp, truth)),
         "/truth/occlusion": ros2.image(stamp, traverse.LEFT_FRAME, truth.seen),
+        "/truth/terrain_class": ros2.image(stamp, traverse.LEFT_FRAME, truth.terrain_class),
         "/truth/elevation_map": ros2.grid_map(elevation),
         "/truth/navigation_map": ros2.occupancy_grid(hazards),
         "/truth/rocks": _rocks_message(simulation, stamp, truth),

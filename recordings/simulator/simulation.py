@@ -10,12 +10,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from flow.parameters import check_parameters, parameter
-from recordings.simulator import raycast, shading, sunlight, traverse
+from recordings.simulator import camera as cameras
+from recordings.simulator import raycast, shading, sunlight, texture, traverse
 from recordings.simulator.odometry import dead_reckoning
+from recordings.simulator.scenes import DEFAULT_SCENE, SCENES, defaults_of
 from recordings.simulator.terrain import Terrain, make_terrain
 from stages.data import Array, Pose, StereoCamera, Transform
 
@@ -38,7 +41,8 @@ class FrameTruth:
     """The exact geometry of one frame.
 
     depth: (H, W) float64 m, inf = sky; surface: (H, W) int32 codes of the ray caster; seen: (H, W) uint8, 255 by both
-    cameras, 128 hidden from the right one, 0 no surface; images: left and right.
+    cameras, 128 hidden from the right one, 0 no surface; images: left and right; terrain_class: (H, W) uint8, the
+    `TerrainClass` of each pixel; jpegs: the bytes of both images' files, if they are compressed.
     """
 
     base: Transform
@@ -47,11 +51,20 @@ class FrameTruth:
     surface: Array
     seen: Array
     images: tuple[Array, Array]
+    terrain_class: Array
+    jpegs: tuple[Array, Array] | None = None
+
+
+def _by_scene(help: str, **limits: Any) -> Any:
+    """A parameter whose default depends on the scene."""
+    return parameter(None, f"{help}; the default depends on the scene", **limits)
 
 
 @dataclass(frozen=True)
 class Simulation:
     """A synthetic traverse; equal simulations write equal bytes. Lengths in m, angles in rad, times in s.
+
+    The scene gives the parameters that are not set; `dataclasses.replace` keeps those of the first scene.
 
     Examples
     --------
@@ -61,6 +74,7 @@ class Simulation:
     (240, 320)
     """
 
+    scene: str = parameter(DEFAULT_SCENE, "named defaults of ground, light and noise", choices=SCENES)
     frames: int = parameter(12, "number of stereo frames", low=1, high=100_000)
     rate: float = parameter(2.0, "frames per second", unit="Hz", low=0.001, high=100)
     speed: float = parameter(0.5, "speed of the rover", unit="m/s", low=0, high=10)
@@ -72,13 +86,35 @@ class Simulation:
     slope: float = parameter(_rad(4), "RMS slope of the ground over 1 m", unit="rad", low=0, high=_rad(45))
     relief_cells: int = parameter(2048, "cells along a side of the repeating ground tile")
     relief_resolution: float = parameter(0.04, "size of a cell of the ground tile", unit="m", low=0.001, high=10)
-    abundance: float = parameter(0.10, "k of Golombek's law of rocks (0.05 sparse, 0.15 dense)", low=0, high=0.5)
+    abundance: float = _by_scene("k of Golombek's law of rocks (0.05 sparse, 0.15 dense)", low=0, high=0.5)
     smallest_rock: float = parameter(0.06, "diameter of the smallest rock", unit="m", low=0.01, high=10)
     largest_rock: float = parameter(1.5, "diameter of the largest rock", unit="m")
-    sun_elevation: float = parameter(_rad(38), "sun above the horizon", unit="rad", low=_rad(0.1), high=_rad(90))
+    sand: float = _by_scene("share of the ground that is sand", unit="share", low=0, high=1)
+    dust: float = _by_scene("share of the ground that is dust", unit="share", low=0, high=1)
+    bedrock: float = _by_scene("share of the ground that is bedrock; the rest is gravel", unit="share", low=0, high=1)
+    sand_contrast: float = _by_scene(
+        "contrast of sand without noise at the scale of a few pixels, RMS, gray levels at mid-gray", low=0, high=30
+    )  # fmt: skip
+    gravel_contrast: float = _by_scene("the same of gravel, for a sun at 38 degrees", low=0, high=60)
+    ripples: float = _by_scene("contrast of the ripples of sand, RMS, gray levels at mid-gray", low=0, high=30)
+    sun_elevation: float = _by_scene("sun above the horizon", unit="rad", low=_rad(0.1), high=_rad(90))
     sun_azimuth: float = parameter(_rad(140), "direction of the sun", unit="rad")
+    skylight: float = _by_scene("light of the sky, which fills shadows; the sun's is 0.86", low=0, high=1)
+    brightness: float = _by_scene("exposure, as a factor", low=0.01, high=10)
     color: bool = parameter(True, "images in rgb8, or else in mono8")
-    noise: float = parameter(0.008, "image noise at half scale, as a share of full scale", low=0, high=1)
+    noise: float = _by_scene(
+        "shot and read noise of the gray image (mono8, or the luma of rgb8), one sigma at mid-gray, gray levels",
+        low=0, high=100,
+    )  # fmt: skip
+    blur: float = parameter(0.55, "lens blur, one sigma", unit="px", low=0, high=20)
+    vignetting: float = parameter(0.14, "share of the light that the corners lose", unit="share", low=0, high=1)
+    exposure_difference: float = parameter(
+        0.0, "share by which the right image gets more light, besides the 0.5 to 1 % of every camera", unit="share",
+        low=-0.9, high=9,
+    )  # fmt: skip
+    row_offset: float = parameter(0.0, "rows that the right image is too low", unit="px", low=-20, high=20)
+    exposure_time: float = parameter(0.0, "time of an exposure, for motion blur", unit="s", low=0, high=1)
+    jpeg: int | None = parameter(None, "quality of compressed images; None: not compressed", low=1, high=100)
     tilt_noise: float = parameter(_rad(0.1), "one sigma of a tilt sample", unit="rad", low=0, high=_rad(45))
     tilt_rate: float = parameter(20.0, "tilt samples per second", unit="Hz", low=1, high=1000)
     odometry_rate: float = parameter(10.0, "poses per second", unit="Hz", low=1, high=1000)
@@ -99,7 +135,13 @@ class Simulation:
     threads: int = parameter(2, "threads of the computation; the result does not depend on it", low=1, high=1024)
 
     def __post_init__(self) -> None:
+        if self.scene in SCENES:
+            for name, value in defaults_of(self.scene).items():
+                if getattr(self, name) is None:
+                    object.__setattr__(self, name, value)
         check_parameters(self)
+        if (total := self.sand + self.dust + self.bedrock) > 1 + 1e-9:
+            raise ValueError(f"Simulation.sand must be at most 1 with dust and bedrock, not {total:g} together")
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
 
@@ -142,9 +184,12 @@ class Simulation:
         return sunlight.lit_above(self.terrain.scene, self.sun)
 
     @cached_property
-    def texture(self) -> shading.Texture:
+    def texture(self) -> texture.Texture:
         """The look of the ground under this sun."""
-        return shading.make_texture(self._rng(1), self.sun)
+        cover = texture.Cover(
+            self.sand, self.dust, self.bedrock, self.sand_contrast, self.gravel_contrast, self.ripples
+        )  # fmt: skip
+        return texture.make_texture(self._rng(1), self.sun, cover, self._rng(6))
 
     @cached_property
     def mounts(self) -> tuple[Transform, Transform, Transform]:
@@ -190,9 +235,9 @@ class Simulation:
         """Images and exact geometry of one frame."""
         base = self.base_at(self.stamp(index))
         left, right = (base.after(mount) for mount in self.mounts[:2])
-        gain = 1 + 0.01 * float(self._rng(2).uniform(0.5, 1.0))
+        gain = self.exposure_difference + 1 + 0.01 * float(self._rng(2).uniform(0.5, 1.0))
         with ThreadPoolExecutor(self.threads) as pool:
-            depth, surface, radiance = self._render(left, pool)
+            depth, surface, kind, radiance = self._render(left, pool)
             seen = np.empty(depth.shape, np.uint8)
             self._by_rows(
                 pool,
@@ -201,35 +246,51 @@ class Simulation:
                     rows.start, depth[rows], seen[rows],
                 ),
             )  # fmt: skip
-            _, _, other = self._render(right, pool)
-            pictures = pool.map(
-                lambda side, light, factor: shading.expose(
-                    light, factor, self.noise, self._rng(3, index, side), self.color
-                ),
-                (0, 1), (radiance, other), (1.0, gain),
+            other_depth, _, _, other = self._render(right, pool, self.row_offset)
+            views = (0, radiance, depth, 1.0), (1, other, other_depth, gain)
+            images, jpegs = zip(*pool.map(lambda view: self._picture(index, *view), views), strict=True)
+        compressed = jpegs if self.jpeg is not None else None
+        return FrameTruth(base, traverse.level_pose(base), depth, surface, seen, images, kind, compressed)
+
+    def _picture(self, index: int, side: int, light: Array, depth: Array, gain: float) -> tuple[Array, Array]:
+        """The image of one camera and, if it is compressed, the bytes of its file."""
+        if self.exposure_time > 0:
+            half, stamp = round(self.exposure_time / 2 * SECOND), self.stamp(index)
+            begin, middle, end = (
+                self.base_at(time).after(self.mounts[side]) for time in (stamp - half, stamp, stamp + half)
             )  # fmt: skip
-            images = next(pictures), next(pictures)
-        return FrameTruth(base, traverse.level_pose(base), depth, surface, seen, images)
+            light = cameras.moved(light, depth, self.camera, (begin, middle, end))
+        rng = self._rng(3, index, side)
+        picture = cameras.expose(
+            light, self.brightness * gain, self.blur, self.vignetting, self.noise, rng, self.color
+        )  # fmt: skip
+        if self.jpeg is None:
+            return picture, np.zeros(0, np.uint8)
+        content, decoded = cameras.jpeg(picture, self.jpeg)
+        return decoded, content
 
-    def _intrinsics(self) -> tuple[float, float, float, float]:
-        return self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy
+    def _intrinsics(self, row_offset: float = 0.0) -> tuple[float, float, float, float]:
+        return self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy + row_offset
 
-    def _render(self, pose: Transform, pool: ThreadPoolExecutor) -> tuple[Array, Array, Array]:
-        """Depth, surface and radiance of one camera's image."""
+    def _render(
+        self, pose: Transform, pool: ThreadPoolExecutor, row_offset: float = 0.0
+    ) -> tuple[Array, Array, Array, Array]:
+        """Depth, surface, terrain class and radiance of one camera's image."""
         shape = self.height, self.width
         depth, surface, facet = np.empty(shape), np.empty(shape, np.int32), np.empty(shape, np.int8)
-        radiance = np.empty((*shape, 3), np.float32)
+        kind, radiance = np.empty(shape, np.uint8), np.empty((*shape, 3), np.float32)
 
         def render(rows: slice) -> None:
-            view = pose.translation, pose.rotation, *self._intrinsics()
+            view = pose.translation, pose.rotation, *self._intrinsics(row_offset)
             hits = depth[rows], surface[rows], facet[rows]
             raycast.cast_rows(self.terrain.scene, *view, self.horizon, rows.start, *hits)
             shading.shade_rows(
-                self.terrain.scene, self.texture, self.lit_above, self.sun, *view, rows.start, *hits, radiance[rows]
+                self.terrain.scene, self.texture, self.lit_above, self.sun, self.skylight, *view, rows.start, *hits,
+                radiance[rows], kind[rows],
             )  # fmt: skip
 
         self._by_rows(pool, render)
-        return depth, surface, radiance
+        return depth, surface, kind, radiance
 
     def _by_rows(self, pool: ThreadPoolExecutor, work: Callable[[slice], None]) -> None:
         starts = range(0, self.height, ROW_BLOCK)

@@ -318,8 +318,8 @@ def test_a_log_has_everything_a_replay_needs_in_log_time_order(logged):
     per_frame = {topic for topic in messages if topic.startswith(("/stereo", "/truth"))}
     assert per_frame == {
         "/stereo/left/image_rect", "/stereo/left/camera_info", "/stereo/right/image_rect", "/stereo/right/camera_info",
-        "/truth/disparity", "/truth/occlusion", "/truth/elevation_map", "/truth/navigation_map", "/truth/rocks",
-        "/truth/tilt", "/truth/pose",
+        "/truth/disparity", "/truth/occlusion", "/truth/terrain_class", "/truth/elevation_map", "/truth/navigation_map",
+        "/truth/rocks", "/truth/tilt", "/truth/pose",
     }  # fmt: skip
     wanted = [SMALL.stamp(index) for index in range(SMALL.frames)]
     for topic in per_frame:
