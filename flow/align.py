@@ -11,8 +11,9 @@ A waiting message gives up when the stream of its partner has moved past it, or 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from statistics import median_low
 from typing import Any
 
 from flow.contracts import Absent, Loss, LossReason
@@ -33,6 +34,11 @@ class Token:
 
 SAMPLE_HISTORY = 10_000_000_000  # ns of log time; how long samples are kept for messages that are logged late
 MIN_SMOOTHING_SAMPLES = 3  # a line through two samples smooths nothing
+MAX_INTERVALS = 50  # of a sampled stream, whose median is its interval
+MIN_INTERVALS = 3  # with fewer the interval is unknown
+GAP_INTERVALS = 1.75  # a longer time between two samples is a gap: at least one sample is missing
+MIN_GAP = 200_000_000  # ns; shorter times are no gap, whatever the interval
+MIN_GAP_OF_UNKNOWN_INTERVAL = 1_200_000_000  # ns; streams of 1 Hz and more lose nothing at their start
 MAX_GIVEN_UP = 100  # unmatched messages remembered, to report by how much their partner came too late
 
 Answer = Token | Loss
@@ -167,12 +173,14 @@ class _Sampler:
         """A running aligner; `inputs` maps ports to stream names."""
         return SamplerState(self, name, inputs)
 
-    def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
+    def choose(
+        self, node: str, name: str, stamp: int, samples: deque[Token], final: str, intervals: Sequence[int] = ()
+    ) -> Any:
         """The value at `stamp`; or a sentence (str) why there is none; or None to wait for more samples.
 
         node: the aligner's stream, whose settings a sentence names; name: the sampled stream. final: empty while more
-        samples may come, else how long the aligner waited, in words; it must not wait then. May raise what the methods
-        of the samples raise.
+        samples may come, else how long the aligner waited, in words; it must not wait then. intervals: ns, the last
+        ones between samples. May raise what the methods of the samples raise.
         """
         raise NotImplementedError
 
@@ -185,7 +193,9 @@ class Interpolate(_Sampler):
     reach equally far to both sides of the stamp, so that the result does not lag.
     """
 
-    max_gap: int = _duration(200_000_000, "largest time between the two neighbours")
+    max_gap: int | None = _duration(
+        None, "largest time between the two neighbours; none: 1.75 times the stream's interval, at least 200 ms"
+    )
     patience: int = _duration(1_000_000_000, "log time to wait for the later neighbour")
     smooth: int = _duration(0, "samples so near to the stamp are smoothed; 0: interpolate between the two neighbours")
 
@@ -201,24 +211,35 @@ class Interpolate(_Sampler):
                 raise TypeError(f"a {kinds['stream'].__name__} cannot be {method}")
         return kinds["stream"]
 
-    def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
+    def choose(
+        self, node: str, name: str, stamp: int, samples: deque[Token], final: str, intervals: Sequence[int] = ()
+    ) -> Any:
         before, after = _neighbours(samples, stamp)
         exact = before is not None and before.stamp == stamp
         awaited = after is None or samples[-1].stamp < stamp + self.smooth
         if awaited and not final and (self.smooth or not exact):
             return None
-        wide = before is not None and after is not None and after.stamp - before.stamp > self.max_gap
+        max_gap = self.max_gap_of(intervals)
+        wide = before is not None and after is not None and after.stamp - before.stamp > max_gap
         if before is not None and exact and (after is None or wide or not self.smooth):
             return before.value
         if before is None or after is None:
             return _none(name, stamp, samples, final)
         if wide:
-            limit = f"{_time(self.max_gap)} ({node}.max_gap)"
+            limit = f"{_time(max_gap)} ({node}.max_gap)"
             return f"{name} has a gap of {_time(after.stamp - before.stamp)}, more than {limit}"
         near = self._near(samples, stamp)
         if len(near) >= MIN_SMOOTHING_SAMPLES:
             return before.value.smoothed(near, stamp)
         return before.value.interpolated(after.value, stamp)
+
+    def max_gap_of(self, intervals: Sequence[int]) -> int:
+        """The largest time between two neighbours, ns, in a stream whose last samples had these intervals, ns."""
+        if self.max_gap is not None:
+            return self.max_gap
+        if len(intervals) < MIN_INTERVALS:
+            return MIN_GAP_OF_UNKNOWN_INTERVAL
+        return max(MIN_GAP, round(GAP_INTERVALS * median_low(intervals)))
 
     def _near(self, samples: deque[Token], stamp: int) -> list[Any]:
         """The samples within `smooth` of the stamp, equally far to both sides."""
@@ -235,7 +256,9 @@ class Nearest(_Sampler):
     slop: int = _duration(50_000_000, "largest time between sample and stamp")
     patience: int = _duration(1_000_000_000, "log time to wait for a nearer sample")
 
-    def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
+    def choose(
+        self, node: str, name: str, stamp: int, samples: deque[Token], final: str, intervals: Sequence[int] = ()
+    ) -> Any:
         before, after = _neighbours(samples, stamp)
         if after is None and not final and not (before is not None and before.stamp == stamp):
             return None
@@ -257,7 +280,9 @@ class Latest(_Sampler):
     max_age: int | None = _duration(None, "largest age of a sample; none: any age")
     patience: int = _duration(0, "log time to wait for samples that are logged late")
 
-    def choose(self, node: str, name: str, stamp: int, samples: deque[Token], final: str) -> Any:
+    def choose(
+        self, node: str, name: str, stamp: int, samples: deque[Token], final: str, intervals: Sequence[int] = ()
+    ) -> Any:
         before, after = _neighbours(samples, stamp)
         if after is None and not final and self.patience:
             return None
@@ -277,6 +302,8 @@ class SamplerState:
         self.wanted: deque[tuple[int, Token]] = deque()
         self.samples: deque[Token] = deque()
         self.arrivals: deque[int] = deque()
+        self.intervals: deque[int] = deque(maxlen=MAX_INTERVALS)
+        self.newest: int | None = None  # stamp of the last sample
         self.answered: int | None = None  # the last stamp with an answer
 
     def push(self, port: str, log_time: int, token: Token) -> Answers:
@@ -285,6 +312,9 @@ class SamplerState:
             if not isinstance(token.value, Absent):
                 self.samples.append(token)
                 self.arrivals.append(log_time)
+                if self.newest is not None:
+                    self.intervals.append(token.stamp - self.newest)
+                self.newest = token.stamp
         else:
             self.wanted.append((log_time, token))
         yield from self._answer(log_time)
@@ -307,7 +337,9 @@ class SamplerState:
             elif arrived + self.config.patience < log_time:
                 final = f" within {_time(self.config.patience)} of log time ({self.name}.patience)"
             try:
-                value = self.config.choose(self.name, self.stream, token.stamp, self.samples, final)
+                value = self.config.choose(
+                    self.name, self.stream, token.stamp, self.samples, final, self.intervals
+                )  # fmt: skip
             except Exception as error:
                 value = Absent(Loss(self.name, token.stamp, self.name, LossReason.FAILED, failure(error)))
             if value is None:

@@ -18,7 +18,7 @@ PIPELINE = """
 source: {use: recordings.McapSource}
 streams:
   stereo:    {use: flow.align.pair, left: left, right: right, slop: 5 ms}
-  tilt:      {use: flow.align.interpolate, stream: inclinometer, at: stereo, max_gap: 200 ms, smooth: 100 ms}
+  tilt:      {use: flow.align.interpolate, stream: inclinometer, at: stereo, smooth: 100 ms}
   mounting:  {use: flow.align.latest, stream: mount, at: stereo}
   matched:   {use: stages.Match, frame: stereo, disparities: 64, max_speckle_size: 100}
   cloud:     {use: stages.Reproject, frame: stereo, disparity: matched}

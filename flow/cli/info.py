@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,14 +58,16 @@ def _caveat(graph: Graph, frames: dict[str, Any]) -> str:
     return ", but no frame has tilt readings near enough in time (see frames)" if frames["with_tilt"] == 0 else ""
 
 
-def _tolerances(graph: Graph) -> tuple[int, int | None]:
-    """The pipeline's slop between left and right, and its largest gap of the tilt (None: not interpolated), ns."""
+def _tolerances(graph: Graph) -> tuple[int, Callable[[Sequence[int]], int] | None]:
+    """The pipeline's slop between left and right, ns, and the function from the intervals of the tilt to its largest
+    gap, ns (None: not interpolated)."""
     from flow.align import Interpolate, Pair
 
-    slop, max_gap = Pair.slop, None
+    slop: int = Pair.slop
+    max_gap: Callable[[Sequence[int]], int] | None = None
     for node in graph.aligners:
         if isinstance(node.actor, Pair) and {*node.inputs.values()} == {"left", "right"}:
             slop = node.actor.slop
         if isinstance(node.actor, Interpolate) and node.inputs["stream"] == "inclinometer":
-            max_gap = node.actor.max_gap
+            max_gap = node.actor.max_gap_of
     return slop, max_gap

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,9 @@ from stages.data import StereoCamera, Tilt
 Stamps = NDArray[np.int64]
 
 
-def describe(log: McapLog, slop: int = 5_000_000, max_gap: int | None = 200_000_000) -> dict[str, Any]:
+def describe(
+    log: McapLog, slop: int = 5_000_000, max_gap_of: Callable[[Sequence[int]], int] | None = None
+) -> dict[str, Any]:
     """The inventory of a log as plain JSON values.
 
     Pairs and tilts are counted by their stamps alone; a run may also lose messages that were logged too late.
@@ -30,14 +33,15 @@ def describe(log: McapLog, slop: int = 5_000_000, max_gap: int | None = 200_000_
         An opened log.
     slop : int
         Largest difference between the stamps of the two images of a frame, ns.
-    max_gap : int or None
-        Largest distance between the two tilts around a frame, ns; None: do not count them.
+    max_gap_of : callable, optional
+        From the intervals of the tilts, ns, to the largest one around a frame; None: do not count frames with a tilt.
     """
     resolution, lost = log.resolution, log.file.index.lost
     damage = sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems})
     stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
     stamps["inclinometer"] = _tilts(log, damage)
     left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
+    max_gap = None if max_gap_of is None else max_gap_of(np.diff(tilts).tolist())
     return {
         "path": str(log.path),
         "result": _run(log),

@@ -1,5 +1,7 @@
 """Alignment joins clocks by stamps, gives up in bounded time, and accounts for every message."""
 
+import random
+import re
 from collections import Counter
 from dataclasses import dataclass, replace
 
@@ -130,9 +132,52 @@ def test_a_gap_longer_than_the_patience_is_a_gap_for_every_frame_in_it():
     details = [answer.value.cause.detail for answer in sampling(Interpolate(), *messages)]
     assert details == [
         "no level sample after it within 1 s of log time (tilt.patience); the last is 50 ms before it",
-        "level has a gap of 1.4 s, more than 200 ms (tilt.max_gap)",
+        "level has a gap of 1.4 s, more than 1.2 s (tilt.max_gap)",
         "no level sample after it by the log's end; the last is 50 ms before it",
     ]
+
+
+def jittered(rate, seconds=20, jitter=4):
+    """Stamps, ns, of a stream of so many Hz whose samples are early or late by up to `jitter` ms."""
+    rng = random.Random(1)
+    return [round(count / rate * 1000 * MS) + rng.randint(-jitter, jitter) * MS for count in range(1, seconds * rate)]
+
+
+def unaligned(stamps, smooth=0, **config):
+    """Of frames every 90 ms, those without a sample, by their reason; and the number of all frames."""
+    frames = range(stamps[0] + MS, stamps[-1] - 300 * MS, 90 * MS)
+    events = sorted([*((stamp, "stream") for stamp in stamps), *((stamp, "at") for stamp in frames)])
+    aligner = Interpolate(smooth=smooth, **config).start("tilt", {"stream": "level", "at": "stereo"})
+    answers = []
+    for stamp, port in events:
+        answers += [*aligner.tick(stamp), *aligner.push(port, stamp, Token(stamp, Reading(stamp, 0.0)))]
+    answers += aligner.end()
+    assert len(answers) == len(frames)
+    return {answer.stamp: answer.value.cause.detail for answer in answers if isinstance(answer.value, Absent)}
+
+
+@pytest.mark.parametrize("rate", [1, 2, 5, 20, 100])
+@pytest.mark.parametrize("smooth", [0, 100 * MS])
+def test_a_stream_of_any_rate_has_no_gaps_by_jitter(rate, smooth):
+    assert unaligned(jittered(rate), smooth, patience=1500 * MS) == {}
+
+
+@pytest.mark.parametrize(
+    ("rate", "lost", "limit"), [(2, 1, r"8[67][\d.]+ ms"), (5, 1, r"3[45][\d.]+ ms"), (20, 5, "200 ms")]
+)
+def test_lost_samples_are_a_gap_for_the_frames_in_it(rate, lost, limit):
+    stamps = jittered(rate)
+    first, last = stamps[8 * rate - 1], stamps[8 * rate + lost]
+    del stamps[8 * rate : 8 * rate + lost]
+    found = unaligned(stamps)
+    assert found
+    assert all(first < stamp < last for stamp in found)
+    sentence = rf"level has a gap of [\d.]+ m?s, more than {limit} \(tilt\.max_gap\)"
+    assert all(re.fullmatch(sentence, why) for why in found.values())
+
+
+def test_a_set_gap_does_not_depend_on_the_rate():
+    assert len(unaligned(jittered(5), max_gap=190 * MS)) > 100
 
 
 CONFIGS = [Interpolate(), Nearest(), Latest(patience=1000 * MS)]

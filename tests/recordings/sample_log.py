@@ -133,10 +133,10 @@ def items_of(path: Path, source: McapSource | None = None, **bounds: float) -> l
         return list(log.events())
 
 
-def inventory_of(path: Path, **tolerances: int) -> dict[str, Any]:
+def inventory_of(path: Path, slop: int = 5_000_000, max_gap: int = 200_000_000) -> dict[str, Any]:
     """The inventory of a log."""
     with McapSource().open(path) as log:
-        return describe(log, **tolerances)
+        return describe(log, slop, lambda intervals: max_gap)
 
 
 def essence(item: Any) -> Any:
