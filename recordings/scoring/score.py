@@ -32,8 +32,8 @@ from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")
 TRUTHS = (
-    "/truth/disparity", "/truth/occlusion", "/truth/elevation_map", "/truth/navigation_map", "/truth/rocks",
-    "/truth/tilt", "/truth/pose",
+    "/truth/disparity", "/truth/occlusion", "/truth/terrain_class", "/truth/elevation_map", "/truth/navigation_map",
+    "/truth/rocks", "/truth/tilt", "/truth/pose",
 )  # fmt: skip
 CAMERA_RTOL = 1e-3  # of focal length and baseline; cameras that differ by less are the same
 
@@ -59,7 +59,8 @@ class Score:
     lost
         Log -> reason -> number of unreadable messages. A true frame without one is scored as far as possible.
     disparity
-        `StereoErrors.metrics`, cropped by the truth's max_disparity rounded up to 16.
+        `StereoErrors.metrics`, cropped by the truth's max_disparity rounded up to 16; by_surface, if the truth has it:
+        the metrics of nonocc on sand, gravel, dust and rock.
     terrain
         `TerrainTally.metrics`.
     tilt
@@ -151,6 +152,7 @@ class _Tally:
         self.outside: set[int] = set()  # stamps of the truth outside the part that was run
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
+        self.surfaces: dict[str, StereoErrors] = {}
         self.terrain: TerrainTally | None = None
         self.tilts: list[float] = []
         self.untilted: dict[str, int] = {}
@@ -220,21 +222,34 @@ class _Tally:
             self._leave_out("/nav/disparity", f"{why}: they are not of the same image")
             return {}
         columns = cropped_columns(frame["/truth/disparity"].max_disparity)
-        errors = StereoErrors.of(estimate, true, self._occlusion(stamp, frame, true.shape), columns)
+        occlusion, codes = (
+            self._mask(f"/truth/{name}", stamp, frame, true.shape) for name in ("occlusion", "terrain_class")
+        )  # fmt: skip
+        errors = StereoErrors.of(estimate, true, occlusion, columns)
         self.disparity = self.disparity + errors if self.disparity else errors
+        if codes is not None:
+            for name, on_it in StereoErrors.by_surface(estimate, true, occlusion, codes).items():
+                self.surfaces[name] = self.surfaces.get(name, StereoErrors()) + on_it
         found = errors.metrics()
         return {f"disparity_{name}": found[name] for name in ("density", "bad_1", "rmse")}
 
-    def _occlusion(self, stamp: int, frame: dict[str, Any], shape: tuple[int, ...]) -> Array | None:
-        mask = frame.get("/truth/occlusion")
+    def _mask(self, topic: str, stamp: int, frame: dict[str, Any], shape: tuple[int, ...]) -> Array | None:
+        """The pixels of a mono8 image of the truth; None if the frame has none."""
+        mask = frame.get(topic)
         if mask is None:
             return None
         if (mask.height, mask.width) != shape:
             raise LogError(
-                f"{self.truth}: /truth/occlusion at {stamp} ns is {mask.width}x{mask.height}, /truth/disparity is "
+                f"{self.truth}: {topic} at {stamp} ns is {mask.width}x{mask.height}, /truth/disparity is "
                 f"{shape[1]}x{shape[0]}; make the truth again"
             )
         return np.asarray(mask.data).reshape(mask.height, mask.step)[:, : mask.width]
+
+    def _disparity_metrics(self) -> dict[str, Any] | None:
+        if self.disparity is None:
+            return None
+        surfaces = {name: errors.metrics()["whole_image"]["nonocc"] for name, errors in self.surfaces.items()}
+        return self.disparity.metrics() | ({"by_surface": surfaces} if surfaces else {})
 
     def _add_terrain(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
         true = ros2.read_grid_map(frame["/truth/elevation_map"])
@@ -300,7 +315,7 @@ class _Tally:
             beyond=self.beyond,
             unscored=self.unscored,
             lost={log: dict(why) for log, why in self.lost.items() if why},
-            disparity=self.disparity.metrics() if self.disparity else None,
+            disparity=self._disparity_metrics(),
             terrain=self.terrain.metrics() if self.terrain and not unfit else None,
             tilt={"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)} if tilts else None,
             untilted=self.untilted,

@@ -22,6 +22,7 @@ THRESHOLDS = (0.5, 1.0, 2.0, 4.0)  # px
 SEEN_BY_BOTH, SEEN_BY_ONE, SEEN_BY_NONE = 255, 128, 0  # the codes of an occlusion mask
 CROP_STEP = 16  # columns; the paper's code crops by its number of disparities, a multiple of 16
 REGIONS = {"nonocc": (0,), "all": (0, 1, 2), "occluded": (1,)}  # of the classes both, one, neither or unknown
+SURFACES = {"sand": 1, "gravel": 2, "dust": 3, "rock": 4}  # codes of /truth/terrain_class
 _KINDS, _SIDES = 3, 2  # classes: how many cameras see it, times left or right of the crop
 _SUMS = ("pixels", "known", "absolute", "squares", *(f"over_{limit:g}" for limit in THRESHOLDS))
 
@@ -68,6 +69,16 @@ class StereoErrors:
         } | {f"over_{limit:g}": _by_class(of_known[error > limit]) for limit in THRESHOLDS}
         values = int(np.count_nonzero(given))
         return cls(sums, values, values - int(sums["known"].sum()), frozenset({columns}))
+
+    @classmethod
+    def by_surface(
+        cls, estimate: Array, truth: Array, occlusion: Array | None, codes: Array
+    ) -> dict[str, StereoErrors]:
+        """The same for each of `SURFACES`, by the codes (H, W) of its pixels, without a crop."""
+        return {
+            name: cls.of(estimate, np.where(codes == code, truth, np.nan), occlusion, 0)
+            for name, code in SURFACES.items()
+        }
 
     def __add__(self, other: StereoErrors) -> StereoErrors:
         return StereoErrors(

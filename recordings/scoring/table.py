@@ -91,6 +91,7 @@ def _disparity_lines(d: dict[str, Any]) -> list[str]:
         "disparity    bad-T: share wrong by over T px, or unknown; mean and RMS error of the known, px",
         f"               whole image       pixels    known |{limits} |    mean     RMS",
         *(_region_line(name, d["whole_image"][name]) for name in REGIONS),
+        *(_region_line(name, m) for name, m in d.get("by_surface", {}).items() if m["pixels"]),
         *(_known_line(name, d["whole_image"][name]) for name in ("nonocc", "all")),
         *_cropped_lines(d["cropped_image"]),
         "             estimates where stereo cannot measure",
@@ -112,7 +113,8 @@ def _cropped_lines(cropped: dict[str, Any]) -> list[str]:
 def _region_line(name: str, m: dict[str, float]) -> str:
     bad = "".join(f"{_percent(m[f'bad_{limit:g}']):>8}" for limit in THRESHOLDS)
     errors = "".join(f"{_number(m[key], 3):>8}" for key in ("mae", "rmse"))
-    return f"               {REGION_NAMES[name]:<12} {m['pixels']:11.0f} {_percent(m['density']):>8} |{bad} |{errors}"
+    title = REGION_NAMES.get(name, f"both, {name}")
+    return f"               {title:<12} {m['pixels']:11.0f} {_percent(m['density']):>8} |{bad} |{errors}"
 
 
 def _known_line(name: str, m: dict[str, float]) -> str:

@@ -19,13 +19,15 @@ from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.scoring import score as scoring
+from recordings.scoring.stereo_metrics import SURFACES
 from recordings.scoring.table import ROWS, format_brief, format_score, terrain_lines
 from recordings.simulator import Simulation, ground_truth, write_log
+from recordings.simulator.texture import TerrainClass
 from stages.data import Cell, CellReason, Disparity, ElevationMap, NavigationMap, Transform
 from tests.recordings.sample_log import rewritten
 
 SMALL = Simulation(
-    frames=2, rate=1.0, width=320, height=240, relief_cells=512, abundance=0.2, color=False, seed=11
+    scene="mixed", frames=2, rate=1.0, width=320, height=240, relief_cells=512, abundance=0.2, color=False, seed=11
 )  # fmt: skip
 
 
@@ -108,6 +110,23 @@ BLIND = {
 
 def scored(tmp_path, truth, frames, **changes) -> scoring.Score:
     return scoring.score(Run(**changes).write(tmp_path / "out.mcap", frames), truth)
+
+
+def test_disparity_is_also_scored_by_the_class_of_the_surface(tmp_path, truth, frames):
+    codes = {kind.name.lower(): int(kind) for kind in TerrainClass if kind != TerrainClass.SKY}
+    assert codes == SURFACES
+    off = frames[0].terrain_class == TerrainClass.ROCK
+    found = scored(
+        tmp_path, truth, frames[:1], disparity=lambda pixels: pixels + np.float32(3) * off, skipped=(1,)
+    ).disparity
+    both = frames[0].seen == 255
+    for name, code in codes.items():
+        pixels = int(np.count_nonzero(both & (frames[0].terrain_class == code)))
+        hidden = int(np.count_nonzero((frames[1].seen == 255) & (frames[1].terrain_class == code)))
+        assert found["by_surface"][name]["pixels"] == pixels + hidden
+        bad = found["by_surface"][name]["bad_2"]
+        expected = (hidden + pixels * (name == "rock")) / max(pixels + hidden, 1)
+        assert math.isnan(bad) if pixels + hidden == 0 else bad == pytest.approx(expected)
 
 
 def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
