@@ -1,9 +1,9 @@
 """Fixtures of several test files: a short simulated traverse, and logs cut out of it."""
 
-from __future__ import annotations
-
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from flow.cli.main import main
+from recordings.ros2.cdr import TYPES
 
 settings.register_profile("untimed", deadline=None)  # the first example may compile a kernel
 settings.load_profile("untimed")
@@ -42,22 +43,47 @@ def roverflow(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
-def rewrite(source: Path, out: Path, change: Callable[[str, int, bytes], bytes | None]) -> Path:
-    """Copy a log message by message; `change(topic, index in topic, data)` gives the data to write, None to drop it."""
+def rewrite(
+    source: Path,
+    out: Path,
+    change: Callable[[str, int, bytes], bytes | None] = lambda topic, index, data: data,
+    *,
+    time: Callable[[str, int], int] = lambda topic, log_time: log_time,
+    order: Callable[[list[Any]], list[Any]] = list,
+    encode: Callable[[str, int, bytes], tuple[str, bytes]] = lambda topic, index, schema: ("cdr", schema),
+    silent: bool = False,
+    **options: Any,
+) -> Path:
+    """Copy a log message by message, as another kind of MCAP file; options: of mcap.writer.Writer.
+
+    change: (topic, index in topic, data) -> the data to write, None to drop it; time: (topic, log time) -> log time;
+    order: changes which message follows which; encode: (topic, index, schema) -> message encoding and schema; silent:
+    whether a topic without messages keeps its channel.
+    """
     with source.open("rb") as stream, out.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2")
-        channels: dict[str, int] = {}
-        counts: dict[str, int] = {}
-        for schema, channel, message in make_reader(stream).iter_messages():
-            index = counts.get(channel.topic, 0)
-            counts[channel.topic] = index + 1
-            data = change(channel.topic, index, message.data)
-            if data is None or schema is None:
-                continue
-            if channel.topic not in channels:
-                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
-            writer.add_message(channels[channel.topic], message.log_time, data, message.publish_time)
+        writer, channels, counts = Writer(file, **options), dict[Any, int](), Counter[str]()
+        writer.start(profile="ros2", library="test")
+        for schema, channel, message in order(list(make_reader(stream).iter_messages())):
+            topic, index = channel.topic, counts[channel.topic]
+            counts[topic] += 1
+            data, key = change(topic, index, message.data), (topic, *encode(topic, index, schema.data))
+            if key not in channels and (silent or data is not None):
+                known = writer.register_schema(schema.name, schema.encoding, key[2])
+                channels[key] = writer.register_channel(topic, key[1], known)
+            if data is not None:
+                writer.add_message(channels[key], time(topic, message.log_time), data, message.publish_time)
         writer.finish()
     return out
+
+
+def edit_of(topic: str, schema: str, edit: Callable[[int, Any], object]) -> Callable[[str, int, bytes], bytes]:
+    """A change for `rewrite`: `edit(index, message)` changes the decoded messages of topics that end so."""
+
+    def change(name: str, index: int, data: bytes) -> bytes:
+        if not name.endswith(topic):
+            return data
+        message = TYPES.deserialize_cdr(data, schema)
+        edit(index, message)
+        return bytes(TYPES.serialize_cdr(message, schema))
+
+    return change

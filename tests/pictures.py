@@ -5,8 +5,6 @@ visible cells. region.jpg: the regional map of a traverse and its navigation map
 devon.jpg, if ROVERFLOW_DATA is set: disparity and source of each pair; the images may not be reprinted.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

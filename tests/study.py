@@ -5,8 +5,6 @@ of a depth edge count separately. Pictures of image, disparity, source and confi
 command line.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -99,37 +97,18 @@ def blind(streams: dict[str, Any], case: Case) -> Disparity:
     )
 
 
-def at_once(streams: dict[str, Any], case: Case) -> Disparity:
-    """The view from the right, of the whole range at full size."""
-    return Match(disparities=case.disparities, paths=4)(streams["disparity/right/swapped"])
+def matched(prior: str = "", **parameters: Any) -> Chain:
+    """A match of the whole range at full size, near a stream of `rover` if one is named."""
+    return lambda streams, case: Match(disparities=case.disparities, **parameters)(
+        case.frame, *([streams[prior]] if prior else [])
+    )
 
 
-def unguided(streams: dict[str, Any], case: Case) -> Disparity:
-    """The match at full size without the coarse one."""
-    return Match(disparities=case.disparities)(case.frame)
-
-
-def eight(streams: dict[str, Any], case: Case) -> Disparity:
-    """The match at full size with 8 paths."""
-    match: Match = replace(stage("rover", "disparity/full"), paths=8, disparities=case.disparities)
-    return match(case.frame, streams["disparity/prior"])
-
-
-def unbanded(streams: dict[str, Any], case: Case) -> Disparity:
-    """The match at full size of all rows for the whole range."""
-    match: Match = replace(stage("rover", "disparity/full"), band_height=0, disparities=case.disparities)
-    return match(case.frame, streams["disparity/prior"])
-
-
-def everywhere(streams: dict[str, Any], case: Case) -> Disparity:
-    """The second match at full size with the whole range searched."""
-    return Match(disparities=case.disparities, paths=4)(case.frame, streams["disparity/full_filled"])
-
-
-def thrice(streams: dict[str, Any], case: Case) -> Disparity:
-    """The second match guided by what comes of itself."""
-    again: Match = stage("rover", "disparity/second")
-    return again(case.frame, streams["disparity"])
+def full(**parameters: Any) -> Chain:
+    """The match at full size near the coarse one, with these parameters."""
+    return lambda streams, case: replace(stage("rover", "disparity/full"), disparities=case.disparities, **parameters)(
+        case.frame, streams["disparity/prior"]
+    )
 
 
 def part_of_range(part: int) -> Chain:
@@ -169,14 +148,22 @@ STEPS: dict[str, Chain] = {
     "+ edges as in the image: rover": lambda streams, _: streams["disparity"],
 }
 VARIANTS: dict[str, Chain] = {
-    "rover without the coarse match": remade({"disparity/full": unguided}),
+    "rover without the coarse match": remade({"disparity/full": matched()}),
     "rover, coarse match not refined": remade({"disparity/half_refined": lambda streams, _: streams["disparity/half"]}),
     "rover without the right view": remade({"disparity/right": blind}),
-    "rover, right view of whole range": remade({"disparity/right": at_once}),
+    "rover, right view of whole range": remade(
+        {
+            "disparity/right": lambda streams, case: Match(disparities=case.disparities, paths=4)(
+                streams["disparity/right/swapped"]
+            )
+        }
+    ),
     "rover, not matched again": refined("disparity/full_checked"),
-    "rover, all rows the whole range": remade({"disparity/full": unbanded}),
-    "rover, again the whole range": remade({"disparity/second": everywhere}),
-    "rover, matched a third time": remade({"disparity/second": thrice}),
+    "rover, all rows the whole range": remade({"disparity/full": full(band_height=0)}),
+    "rover, again the whole range": remade({"disparity/second": matched("disparity/full_filled", paths=4)}),
+    "rover, matched a third time": remade(
+        {"disparity/second": lambda streams, case: stage("rover", "disparity/second")(case.frame, streams["disparity"])}
+    ),
     "rover with half the range": part_of_range(2),
     "rover with a third of the range": part_of_range(3),
     "rover, fractions from matching": refined("disparity/second_checked", subpixel_radius=0),
@@ -188,7 +175,7 @@ VARIANTS: dict[str, Chain] = {
     "rover, bilateral radius 6": refined("disparity/second_checked", bilateral_radius=6),
     "rover, edges of radius 5": refined("disparity/second_checked", edge_radius=5),
     "rover, 64 planes tried": refined("disparity/second_checked", hypotheses=64),
-    "rover with 8 paths": remade({"disparity/full": eight}),
+    "rover with 8 paths": remade({"disparity/full": full(paths=8)}),
     "fast": whole("fast"),
     "paper": whole("paper"),
 }

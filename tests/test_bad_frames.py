@@ -1,7 +1,5 @@
 """A run reports and skips frames without a map, and does not change the others."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -13,19 +11,12 @@ import pytest
 
 from recordings.mcap.file import iter_decoded
 from recordings.ros2 import from_msg as ros2
-from recordings.ros2.cdr import TYPES, make
-from tests.conftest import FRAMES, rewrite, roverflow
+from recordings.ros2.cdr import make
+from tests.conftest import FRAMES, edit_of, rewrite, roverflow
 
 BAD = 1  # the frame that is made bad
 MAPS = ("/nav/elevation_map", "/nav/navigation_map", "/nav/regional_map")
 Change = Callable[[str, int, bytes], bytes | None]
-
-
-def edited(schema: str, raw: bytes, /, **fields: Any) -> bytes:
-    message = TYPES.deserialize_cdr(raw, schema)
-    for name, value in fields.items():
-        setattr(message, name, value)
-    return bytes(TYPES.serialize_cdr(message, schema))
 
 
 def tilts_about(stamp: int, log: Path) -> set[int]:
@@ -37,14 +28,12 @@ def tilts_about(stamp: int, log: Path) -> set[int]:
 def images(paint: Callable[[int, int], np.ndarray]) -> Callable[[int, Path], Change]:
     """The images of the bad frame painted over."""
 
-    def change(topic: str, index: int, data: bytes) -> bytes:
-        if not topic.endswith("image_rect_color") or index != BAD:
-            return data
-        message: Any = TYPES.deserialize_cdr(data, "sensor_msgs/msg/Image")
-        picture = np.repeat(paint(message.height, message.width)[:, :, None], 3, axis=2)
-        return edited("sensor_msgs/msg/Image", data, data=np.ascontiguousarray(picture, np.uint8).reshape(-1))
+    def edit(index: int, message: Any) -> None:
+        if index == BAD:
+            picture = np.repeat(paint(message.height, message.width)[:, :, None], 3, axis=2)
+            message.data = np.ascontiguousarray(picture, np.uint8).reshape(-1)
 
-    return lambda stamp, log: change
+    return lambda stamp, log: edit_of("image_rect_color", "sensor_msgs/msg/Image", edit)
 
 
 def clear_sky(height: int, width: int) -> np.ndarray:
@@ -63,12 +52,10 @@ def no_tilt(stamp: int, log: Path) -> Change:
 def senseless_tilt(stamp: int, log: Path) -> Change:
     gone, nothing = tilts_about(stamp, log), make("geometry_msgs/msg/Quaternion", x=np.nan, y=0.0, z=0.0, w=1.0)
 
-    def change(topic: str, index: int, data: bytes) -> bytes:
-        if topic != "/imu/inclinometer" or index not in gone:
-            return data
-        return edited("sensor_msgs/msg/Imu", data, orientation=nothing)
+    def edit(index: int, message: Any) -> None:
+        message.orientation = nothing if index in gone else message.orientation
 
-    return change
+    return edit_of("/imu/inclinometer", "sensor_msgs/msg/Imu", edit)
 
 
 CASES: dict[str, tuple[Callable[[int, Path], Change], tuple[str, ...]]] = {
@@ -101,9 +88,7 @@ def sound(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
 
 
 @pytest.mark.parametrize("case", list(CASES))
-def test_a_bad_frame_is_reported_and_the_map_stays_correct(
-    case: str, traverse: Path, sound: dict[str, dict[int, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_frame_is_reported_and_the_map_stays_correct(case, traverse, sound, tmp_path, capsys):
     make, words = CASES[case]
     stamps = sorted(sound["/nav/elevation_map"])
     log, out = rewrite(traverse, tmp_path / "log.mcap", make(stamps[BAD], traverse)), tmp_path / "out.mcap"
@@ -129,7 +114,7 @@ def test_a_bad_frame_is_reported_and_the_map_stays_correct(
     assert max(status.level for message in losses for status in message.status) >= 1
 
 
-def test_a_run_without_points_writes_no_map(traverse: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_a_run_without_points_writes_no_map(traverse, tmp_path, capsys):  # type: ignore[no-untyped-def]
     out, nothing = tmp_path / "out.mcap", ("--set", "cleaned.max_range=0.1 m", "--set", "cleaned.margin=0 m")
     assert roverflow("run", traverse, "--set", "disparities=64", *nothing, "-o", out, "--no-rrd") == 3
     output = capsys.readouterr()
@@ -141,14 +126,13 @@ def test_a_run_without_points_writes_no_map(traverse: Path, tmp_path: Path, caps
     assert not counts.keys() & set(MAPS)
 
 
-def test_a_missing_baseline_is_reported_in_one_sentence(traverse: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
-    def change(topic: str, index: int, data: bytes) -> bytes | None:
-        if topic != "/stereo/right/camera_info":
-            return None if topic == "/tf_static" else data
-        message: Any = TYPES.deserialize_cdr(data, "sensor_msgs/msg/CameraInfo")
-        return edited("sensor_msgs/msg/CameraInfo", data, p=np.where(np.arange(12) == 3, 0.0, message.p))
+def test_a_missing_baseline_is_reported_in_one_sentence(traverse, tmp_path, capsys):  # type: ignore[no-untyped-def]
+    def unknown(index, info):
+        info.p = np.where(np.arange(12) == 3, 0.0, info.p)
 
-    log = rewrite(traverse, tmp_path / "log.mcap", change)
+    change = edit_of("/stereo/right/camera_info", "sensor_msgs/msg/CameraInfo", unknown)
+    without = lambda topic, *more: None if topic == "/tf_static" else change(topic, *more)  # noqa: E731
+    log = rewrite(traverse, tmp_path / "log.mcap", without)
     assert roverflow("run", log, "-o", tmp_path / "out.mcap", "--no-rrd") == 2
     output = capsys.readouterr().err
     assert "does not contain the baseline" in output

@@ -1,7 +1,5 @@
 """The command line on real files: arguments, outputs, and messages about what cannot be done."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """`roverflow import`: scenes of a data set become logs that run and score."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """`roverflow info` through a pipeline."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """Refusals of the command line: one sentence with what, where and the remedy, before anything is written."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re
@@ -61,27 +59,22 @@ def test_a_file_of_another_format_is_refused_in_one_sentence(tmp_path, capsys, c
     assert roverflow("info", tmp_path / ("long" * 100)) == 2
 
 
-def test_a_missing_stage_input_is_refused_before_the_run(traverse, tmp_path, capsys):
-    assert (
-        roverflow("run", traverse, "--set", "disparity/half/quarter.search_radius=4", "-o", tmp_path / "out.mcap") == 2
-    )
-    assert "stream 'disparity/half/quarter': Match.search_radius = 4 px needs a `prior`" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ("disparity=96", "disparity.parameter=value; did you mean 'disparities'?"),
         ("rover.max_slope=95deg", "must be at most 89 deg, not 95deg"),
+        ("settings.disparities=64", "a setting has no prefix; write disparities=value"),
+        ("disparity/half/quarter.search_radius=4", "quarter': Match.search_radius = 4 px needs a `prior`"),
     ],
 )
 def test_an_invalid_setting_is_quoted_as_written(traverse, tmp_path, capsys, change, words):
     for more in ((), ("--debug",)):  # which shows the way there, and changes no exit code
         assert roverflow("run", traverse, "--set", change, "-o", tmp_path / "out.mcap", *more) == 2
         printed = capsys.readouterr().err
-        assert printed.endswith(f"{words}\n")
+        assert words in printed.splitlines()[-1]
         assert ("Traceback" in printed) == bool(more)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("option", ["-o", "--rrd", "--summary"])
@@ -230,7 +223,7 @@ def test_a_range_without_images_is_refused(traverse, result, tmp_path, capsys, b
 def test_a_failed_export_does_not_block_the_next(result, tmp_path, capsys, monkeypatch):
     folder = tmp_path / "maps"
 
-    def full(*_: object) -> None:
+    def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
@@ -261,11 +254,6 @@ def test_a_failed_export_does_not_block_the_next(result, tmp_path, capsys, monke
 def test_a_simulation_beyond_its_limits_is_refused_by_option(tmp_path, capsys, option, value, printed):
     assert roverflow("simulate", tmp_path / "log.mcap", option, value) == 2
     assert printed in capsys.readouterr().err
-
-
-def test_a_section_in_place_of_a_setting_is_explained(traverse, tmp_path, capsys):
-    assert roverflow("run", traverse, "--set", "settings.disparities=64", "-o", tmp_path / "out.mcap") == 2
-    assert "a setting has no prefix; write disparities=value" in capsys.readouterr().err
 
 
 def test_an_output_without_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys):
@@ -299,20 +287,13 @@ def test_a_link_to_itself_is_replaced_by_the_output(tmp_path):
     ("--workers", "0", "must be a whole number of at least 1, not '0'"),
     ("--workers", "9" * 20, "must be at most 1024"),
     ("--start", "1e300", "at most 9e+09"),
+    *(("--start", odd, "must be seconds after the log's first message") for odd in ("nan", "inf", "-1", "soon")),
 ])  # fmt: skip
-def test_a_huge_number_is_refused(traverse, tmp_path, option, value, printed, capsys):
+def test_an_impossible_number_is_refused(traverse, tmp_path, option, value, printed, capsys):
     with pytest.raises(SystemExit) as caught:
-        roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, value)
+        roverflow("run", traverse, "-o", tmp_path / "out.mcap", f"{option}={value}")
     assert caught.value.code == 2
     assert printed in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "soon"])
-def test_an_odd_start_is_refused(traverse, seconds, capsys):
-    with pytest.raises(SystemExit) as caught:
-        roverflow("run", traverse, f"--start={seconds}")
-    assert caught.value.code == 2
-    assert "seconds after the log's first message" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--slope", "--tilt-noise", "--odometry-turn", "--rocks"])

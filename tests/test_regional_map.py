@@ -1,7 +1,5 @@
 """The regional map from the command line: computed with any pose, and exported as a whole."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import cv2

@@ -1,7 +1,5 @@
 """The start: foreign modules with roverflow's package names are named in one sentence, not in a traceback."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -22,7 +20,7 @@ def start(folder: Path, *path: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("name", ["flow.py", "stages.py", "recordings/__init__.py"])
-def test_a_foreign_module_on_the_path_is_named(tmp_path: Path, name: str) -> None:
+def test_a_foreign_module_on_the_path_is_named(tmp_path, name):
     foreign = tmp_path / "path" / name
     foreign.parent.mkdir(parents=True, exist_ok=True)
     foreign.write_text("raise RuntimeError('not ours')\n")
@@ -32,19 +30,19 @@ def test_a_foreign_module_on_the_path_is_named(tmp_path: Path, name: str) -> Non
     assert done.stderr.count("\n") == 1
 
 
-def test_without_foreign_modules_the_program_starts(tmp_path: Path) -> None:
+def test_without_foreign_modules_the_program_starts(tmp_path):
     done = start(tmp_path, ROOT)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("roverflow ")
 
 
-def test_python_m_flow_runs_the_program() -> None:
+def test_python_m_flow_runs_the_program():
     done = subprocess.run([sys.executable, "-m", "flow", "--version"], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stdout[:10]) == (0, "roverflow ")
 
 
 @pytest.mark.slow
-def test_an_overwritten_package_of_the_wheel_is_named(tmp_path: Path) -> None:
+def test_an_overwritten_package_of_the_wheel_is_named(tmp_path):
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"
     pip = [str(python), "-m", "pip", "install", "--quiet", "--no-deps", str(ROOT)]

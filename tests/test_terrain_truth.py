@@ -1,9 +1,6 @@
 """Simulated traverses from log to score: accurate maps with valid sigmas that contain the rocks."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +15,7 @@ COMPARED = {name: pipeline for name, pipeline in RUNS.items() if pipeline == "ro
 
 
 @pytest.mark.parametrize("pipeline", ["rover", "fast", "paper"])
-def test_tilt_errors_match_the_stated_tilt_sigma(pipeline: str) -> None:
+def test_tilt_errors_match_the_stated_tilt_sigma(pipeline):
     ground = {"frames": 30, "slope": float(SLOPE), "relief_cells": 512, "abundance": 0.0}
     simulation = Simulation(**ground, tilt_noise=float(TILT_NOISE), seed=21)
     tilts = measured_tilts(pipeline, simulation)
@@ -62,7 +59,7 @@ def traverse_of(seed: int, abundance: float) -> Simulation:
     )
 
 
-def test_two_frames_have_accurate_maps() -> None:
+def test_two_frames_have_accurate_maps():
     found = score([traverse_of(11, 0.15)], 15, COMPARED)
     assert found["rover"].tally.metrics()["rocks"]["0.2 m"]["visible"] >= 1
     check(found, alarms=0.08, slack=0.04)
@@ -71,13 +68,13 @@ def test_two_frames_have_accurate_maps() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("abundance", "alarms"), [(0.05, 0.03), (0.15, 0.08)])
-def test_three_traverses_have_accurate_maps(abundance: float, alarms: float) -> None:
+def test_three_traverses_have_accurate_maps(abundance, alarms):
     check(score([traverse_of(seed, abundance) for seed in (11, 12, 13)], 10, COMPARED), alarms)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 13])
-def test_rover_scores_better_than_paper(tmp_path: Path, seed: int) -> None:
+def test_rover_scores_better_than_paper(tmp_path, seed):
     log = tmp_path / "log.mcap"
     assert main(["simulate", str(log), "--frames", "4", "--size", "960x720", "--seed", str(seed)]) == 0
     scores: dict[str, Any] = {}
@@ -98,7 +95,7 @@ def test_rover_scores_better_than_paper(tmp_path: Path, seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_disparity_sigmas_contain_68_percent_at_every_confidence() -> None:
+def test_disparity_sigmas_contain_68_percent_at_every_confidence():
     ratios, confidences = [], []
     for seed, abundance in ((11, 0.05), (12, 0.15)):
         for given, exact, _ in frames(traverse_of(seed, abundance), 15):

@@ -3,8 +3,6 @@
 The logs are simulated traverses with an inclinometer noise of 0.3 degrees a sample. Slow: run by `make check-all`.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -48,7 +46,7 @@ def finding_of(log: Path, folder: Path) -> tuple[str, str]:
 
 
 @pytest.mark.slow
-def test_a_sound_log_has_no_fault(log: Path, tmp_path: Path) -> None:
+def test_a_sound_log_has_no_fault(log, tmp_path):
     severity, found = finding_of(log, tmp_path)
     assert severity == "note"
     assert found.startswith(("Tilt and camera agree to 0.", "Not enough motion in 50 frames to rule out a wrong mount"))
@@ -56,7 +54,7 @@ def test_a_sound_log_has_no_fault(log: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_named(log: Path, tmp_path: Path, fault: str) -> None:
+def test_a_fault_is_named(log, tmp_path, fault):
     plant, name = FAULTS[fault]
     severity, found = finding_of(plant(log, tmp_path / "faulty.mcap"), tmp_path)
     assert severity == "warning"
@@ -66,9 +64,7 @@ def test_a_fault_is_named(log: Path, tmp_path: Path, fault: str) -> None:
 
 
 @pytest.mark.slow
-def test_visual_poses_drift_by_less_than_a_hundredth_of_the_distance(
-    log: Path, simulation: Simulation, tmp_path: Path
-) -> None:
+def test_visual_poses_drift_by_less_than_a_hundredth_of_the_distance(log, simulation, tmp_path):
     finding_of(log, tmp_path)
     start, way, before = level_pose(simulation.base_at(simulation.stamp(0))).inverse(), 0.0, np.zeros(3)
     for _, _, pose in iter_decoded(tmp_path / "out.mcap", ["/nav/pose"]):

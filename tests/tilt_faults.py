@@ -1,7 +1,5 @@
 """Faults of an inclinometer, written into a log message by message, and a pipeline that looks for them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,9 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings.ros2.cdr import TYPES
 from stages.data import Array
-from tests.conftest import rewrite
+from tests.conftest import edit_of, rewrite
 
 # The part of the default pipeline that the tilt check and visual odometry need.
 PIPELINE = """
@@ -57,48 +54,36 @@ def radians_as_degrees(up: Array) -> Array:
 def changed_ups(log: Path, out: Path, change: Change) -> Path:
     """A copy of the log with every tilt changed."""
 
-    def edit(topic: str, index: int, data: bytes) -> bytes:
-        if topic != "/imu/inclinometer":
-            return data
-        message: Any = TYPES.deserialize_cdr(data, "sensor_msgs/msg/Imu")
+    def edit(index: int, message: Any) -> None:
         q = message.orientation
         up = change(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()[2])
         q.x, q.y, q.z, q.w = (float(value) for value in Rotation.align_vectors([[0, 0, 1]], [up])[0].as_quat())
-        return bytes(TYPES.serialize_cdr(message, "sensor_msgs/msg/Imu"))
 
-    return rewrite(log, out, edit)
+    return rewrite(log, out, edit_of("/imu/inclinometer", "sensor_msgs/msg/Imu", edit))
 
 
 def turned_mount(log: Path, out: Path, axis: str, degrees: float) -> Path:
     """A copy of the log with the inclinometer rotated about one of its own axes in the static transform."""
 
-    def edit(topic: str, index: int, data: bytes) -> bytes:
-        if topic != "/tf_static":
-            return data
-        message: Any = TYPES.deserialize_cdr(data, "tf2_msgs/msg/TFMessage")
+    def edit(index: int, message: Any) -> None:
         for transform in message.transforms:
             if transform.child_frame_id == "inclinometer_link":
                 q = transform.transform.rotation
                 turned = Rotation.from_quat([q.x, q.y, q.z, q.w]) * Rotation.from_euler(axis, degrees, degrees=True)
                 q.x, q.y, q.z, q.w = (float(value) for value in turned.as_quat())
-        return bytes(TYPES.serialize_cdr(message, "tf2_msgs/msg/TFMessage"))
 
-    return rewrite(log, out, edit)
+    return rewrite(log, out, edit_of("/tf_static", "tf2_msgs/msg/TFMessage", edit))
 
 
 def late_tilts(log: Path, out: Path, seconds: float) -> Path:
     """A copy of the log with late stamps of the tilts."""
 
-    def edit(topic: str, index: int, data: bytes) -> bytes:
-        if topic != "/imu/inclinometer":
-            return data
-        message: Any = TYPES.deserialize_cdr(data, "sensor_msgs/msg/Imu")
+    def edit(index: int, message: Any) -> None:
         stamp = message.header.stamp
         whole = stamp.sec * 10**9 + stamp.nanosec + round(seconds * 1e9)
         stamp.sec, stamp.nanosec = divmod(whole, 10**9)
-        return bytes(TYPES.serialize_cdr(message, "sensor_msgs/msg/Imu"))
 
-    return rewrite(log, out, edit)
+    return rewrite(log, out, edit_of("/imu/inclinometer", "sensor_msgs/msg/Imu", edit))
 
 
 FAULTS: dict[str, tuple[Callable[[Path, Path], Path], str]] = {

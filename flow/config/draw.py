@@ -29,17 +29,7 @@ class _Box:
 
 
 def draw(graph: Graph, form: str, expand: bool = False) -> str:
-    """The drawing of a graph.
-
-    Parameters
-    ----------
-    graph
-        A loaded pipeline.
-    form
-        "text", "mermaid" or "svg".
-    expand
-        Draw the streams inside templates one by one, not each template as one box.
-    """
+    """The drawing of a graph. form: "text", "mermaid" or "svg"; expand: draw the streams inside templates."""
     return {"text": _text, "mermaid": _mermaid, "svg": _svg}[form](graph, _boxes(graph, expand))
 
 

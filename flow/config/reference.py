@@ -63,16 +63,8 @@ class NodeReference:
 def stage_reference(name: str | None = None) -> list[NodeReference]:
     """The stages, aligners, source and sinks of the product, or the one called `name`.
 
-    Parameters
-    ----------
-    name
-        As in a pipeline file, "stages.Match", or without its module, "Match"; also a class of the user's own,
-        "my_module.Stage", or a data type, "Disparity".
-
-    Raises
-    ------
-    UsageError
-        If nothing has that name; the sentence contains the nearest one.
+    name: as in a pipeline file, "stages.Match", or without its module, "Match"; also a class of the user's own,
+    "my_module.Stage", or a data type, "Disparity". Raises UsageError, with the nearest name, if nothing is called so.
     """
     found = {use: kind for module in MODULES for use, kind in _usable(module)}
     if name is None:

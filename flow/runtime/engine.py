@@ -61,20 +61,9 @@ class _Work:
 class Engine:
     """Runs stages and sinks over frames.
 
-    Parameters
-    ----------
-    stages
-        In topological order.
-    sinks
-        Name -> (sink, the streams it gets).
-    ledger
-        Gets an entry for every loss.
-    workers
-        Number of threads.
-    capacity
-        Frames that an inbox holds.
-    on_frame
-        Called after every frame, with whether all of its streams are there.
+    stages: in topological order; sinks: name -> (sink, the streams it gets); ledger: gets an entry for every loss;
+    workers: threads; capacity: frames that an inbox holds; on_frame: called after every frame, with whether all of its
+    streams are there.
     """
 
     def __init__(

@@ -1,16 +1,17 @@
-"""Points of a result log as PLY: the cloud of a frame, and the cells of a regional map with their colors."""
+"""Points of a result log as PLY, binary little-endian: the cloud of a frame, the cells of a regional map in colours."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from recordings.export.mosaic import STRIP_ROWS, Mosaic
-from recordings.export.ply import COLORS, write_ply
 from stages.data import Array, PixelOrigin, Tiles, Transform
 
+COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+_PROPERTIES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 CELL_COLOR = np.dtype([("sigma", "f4"), ("rgb", "u1", (3,)), ("seen", "u1")])  # of one cell of a regional map
 _CENTRES = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 _POINTS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
@@ -82,3 +83,23 @@ def write_cells(path: Path, terrain: Mosaic, colors: Tiles, about: str) -> None:
             yield vertices
 
     write_ply(path, dtype, parts(), about)
+
+
+def write_ply(path: Path, dtype: np.dtype[np.void], parts: Iterable[Array], comment: str) -> None:
+    """Write vertices.
+
+    dtype: one property per field; parts: structured arrays (n,) of it; comment: one line of ASCII. The header contains
+    the number of points, so it is filled in at the end.
+    """
+    properties = "".join(f"property {_PROPERTIES[dtype[name].str]} {name}\n" for name in dtype.names or ())
+    begin, count = (
+        f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex ".encode("ascii", "replace"),
+        0,
+    )
+    with path.open("wb") as file:
+        file.write(begin + f"{count:>10d}\n{properties}end_header\n".encode())
+        for part in parts:
+            file.write(part.tobytes())
+            count += len(part)
+        file.seek(len(begin))
+        file.write(f"{count:>10d}".encode())

@@ -147,14 +147,10 @@ def write_frames(
 
 
 def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Find the left and the right images of a folder, in order.
+    """The left and the right images of a folder, in order.
 
-    Names such as a-left.png and a-right.png, left/1.png and right/1.png, im0.png and im1.png are pairs.
-
-    Raises
-    ------
-    LogError
-        If there are no pairs, or an image has no partner.
+    Names such as a-left.png and a-right.png, left/1.png and right/1.png, im0.png and im1.png are pairs. Raises LogError
+    if there are no pairs, or an image has no partner.
     """
     if not folder.is_dir():
         raise LogError(f"{folder} is not a folder; give the folder with the left and right images")

@@ -54,24 +54,9 @@ class MiddleburyScene:
 
 
 def import_scene(folder: Path, out: Path) -> str:
-    """Write a scene as a log of one frame. Assumes a level camera `HEIGHT` above the ground.
+    """Write a scene as a log of one frame; returns a sentence about the content and how to run it.
 
-    Parameters
-    ----------
-    folder : Path
-        The scene.
-    out : Path
-        The log.
-
-    Returns
-    -------
-    str
-        A sentence about the content and how to run it.
-
-    Raises
-    ------
-    LogError
-        If a file cannot be used.
+    Assumes a level camera `HEIGHT` above the ground. Raises LogError if a file cannot be used.
     """
     scene = read_scene(folder)
     write_frames(

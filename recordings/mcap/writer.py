@@ -6,8 +6,8 @@ images. The log gets its name when it is complete.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +28,8 @@ class Ros2Writer:
 
     Use it as a context manager: it closes the log at the end, and discards it after an exception.
 
-    Parameters
-    ----------
-    path : Path
-        The log.
-    keep : bool
-        If the disk is full or writing fails, keep the messages so far under another name.
-    compression : str
-        lz4, zstd or none.
-
-    Raises
-    ------
-    UnwritableError
-        If the log cannot be written.
+    keep: if the disk is full or writing fails, keep the messages so far under another name; compression: lz4, zstd or
+    none. Raises UnwritableError if the log cannot be written.
     """
 
     def __init__(self, path: Path, keep: bool = False, compression: str = "zstd") -> None:
@@ -65,7 +54,7 @@ class Ros2Writer:
         if not 0 <= stamp < LAST_STAMP:
             raise ValueError(f"{kind} for {topic}: the stamp {stamp} ns is outside ROS time; give ns since 1970")
         data = TYPES.serialize_cdr(message, kind)
-        try:
+        with self._reporting():
             channel = self._channel(topic, kind)
             count = self._counts[topic] = self._counts.get(topic, 0) + 1
             large = len(data) >= MIN_OWN_CHUNK_BYTES
@@ -74,27 +63,21 @@ class Ros2Writer:
             self._writer.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=count)
             if large:
                 self._writer.flush()
-        except OSError as error:
-            raise self._unwritable(error) from error
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append one metadata record, its keys in sorted order."""
-        try:
+        with self._reporting():
             self._writer.flush()
             self._writer.add_metadata(name, dict(sorted(values.items())))
-        except OSError as error:
-            raise self._unwritable(error) from error
 
     def close(self) -> None:
         """Finish the log and give it its name. Closing twice does nothing."""
         if self._file.closed:
             return
-        try:
+        with self._reporting():
             self._writer.finish()
             self._file.close()
             give_name(self._partial, self.path)
-        except OSError as error:
-            raise self._unwritable(error) from error
 
     def abort(self) -> None:
         """Discard the log; an earlier file at `path` stays. After `close`, does nothing."""
@@ -124,15 +107,19 @@ class Ros2Writer:
             raise ValueError(f"topic {topic} has the type {have}, so {kind} cannot be written to it")
         return channel
 
-    def _unwritable(self, error: OSError) -> LogError:
-        """Close the unfinished log and return the error; with `keep`, a log with messages stays."""
-        held = 0
-        with suppress(OSError):  # the unflushed rest is lost
-            self._file.close()
-        if self._keep:
-            with suppress(LogError), McapFile(self._partial) as log:
-                held = log.count(set(log.index.channels))
-        if not held:
-            self._partial.unlink(missing_ok=True)
-        kept = f" (its first {counted(held, 'message')} are in {self._partial})" if held else ""
-        return unwritable(self.path, error.strerror or str(error), kept)
+    @contextmanager
+    def _reporting(self) -> Iterator[None]:
+        """Turn an OSError into UnwritableError, and close the unfinished log; with `keep`, one with messages stays."""
+        try:
+            yield
+        except OSError as error:
+            held = 0
+            with suppress(OSError):  # the unflushed rest is lost
+                self._file.close()
+            if self._keep:
+                with suppress(LogError), McapFile(self._partial) as log:
+                    held = log.count(set(log.index.channels))
+            if not held:
+                self._partial.unlink(missing_ok=True)
+            kept = f" (its first {counted(held, 'message')} are in {self._partial})" if held else ""
+            raise unwritable(self.path, error.strerror or str(error), kept) from error

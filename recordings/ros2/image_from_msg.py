@@ -38,23 +38,10 @@ _ENCODINGS = _PLAIN | {f"{name}{bits}": (f"u{bits // 8}", 1, code) for name, cod
 
 
 def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
-    """Decode a sensor_msgs Image or CompressedImage.
+    """The pixels of a sensor_msgs Image or CompressedImage, gray (H, W) or RGB (H, W, 3), uint8 or uint16.
 
-    Parameters
-    ----------
-    message : sensor_msgs/Image or sensor_msgs/CompressedImage
-    size : tuple of int, optional
-        Width and height of the calibration; an image of another size is refused before it is decoded.
-
-    Returns
-    -------
-    ndarray
-        Gray (H, W) or RGB (H, W, 3), uint8 or uint16.
-
-    Raises
-    ------
-    LogError
-        If the image is damaged, cut, or in an unsupported encoding.
+    size: width and height of the calibration; an image of another size is refused before it is decoded. Raises LogError
+    if the image is damaged, cut, or in an unsupported encoding.
     """
     return _raw_pixels(message, size) if hasattr(message, "encoding") else _compressed_pixels(message, size)
 

@@ -38,7 +38,7 @@ TRUTHS = (
 CAMERA_RTOL = 1e-3  # of focal length and baseline; cameras that differ by less are the same
 
 
-@dataclass(frozen=True)
+@dataclass
 class Score:
     """Errors of a run. Shares 0 to 1, lengths m, disparities px, angles rad; NaN if nothing was measured.
 
@@ -75,10 +75,10 @@ class Score:
     disparity, terrain, tilt and pose are None if the truth has no such topics or no result fits them.
     """
 
-    frames: int
-    compared: int
-    missing: dict[str, list[int]]
-    unmatched: dict[str, int]
+    frames: int = 0
+    compared: int = 0
+    missing: dict[str, list[int]] = field(default_factory=dict)
+    unmatched: dict[str, int] = field(default_factory=dict)
     beyond: int = 0
     unscored: dict[str, dict[str, int]] = field(default_factory=dict)
     lost: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -121,7 +121,7 @@ def score(result: Path, truth: Path) -> Score:
     truths = iter_decoded(Path(truth), [*TRUTHS, "/tf_static"], tally.lost[str(truth)])
     for stamp, frame in frames(results, tally.noted(truths)):
         if stamp in tally.outside and not frame.keys() & {*RESULTS}:
-            tally.beyond += 1
+            tally.found.beyond += 1
             continue
         try:
             tally.add(stamp, frame)
@@ -136,11 +136,8 @@ class _Tally:
 
     def __init__(self, result: Path, truth: Path) -> None:
         self.result, self.truth = result, truth
+        self.found = Score()
         self.mounts: dict[str, Any] = {}
-        self.frames = self.compared = self.beyond = 0
-        self.missing: dict[str, list[int]] = {topic: [] for topic in RESULTS}
-        self.unmatched: dict[str, int] = {}
-        self.unscored: dict[str, dict[str, int]] = {}
         self.fitting = False  # whether a map of any frame was scored
         self.left_out: set[str] = set()  # topics of the current frame
         self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
@@ -155,9 +152,7 @@ class _Tally:
         self.surfaces: dict[str, StereoErrors] = {}
         self.terrain: TerrainTally | None = None
         self.tilts: list[float] = []
-        self.untilted: dict[str, int] = {}
         self.pose = PoseTally()
-        self.per_frame: list[dict[str, float]] = []
 
     def noted(self, messages: Messages) -> Messages:
         """The truth's messages but /tf_static; notes mounts, and stamps outside the part of the log that was run."""
@@ -174,13 +169,13 @@ class _Tally:
         self.seen_results.update(results)
         if not any(topic in frame for topic in TRUTHS):
             for topic in results:
-                self.unmatched[topic] = self.unmatched.get(topic, 0) + 1
+                self.found.unmatched[topic] = self.found.unmatched.get(topic, 0) + 1
             return
-        self.frames += 1
+        self.found.frames += 1
         self.left_out = set()
         for topic in RESULTS:
             if topic not in frame and topic.replace("/nav/", "/truth/") in frame:
-                self.missing[topic].append(stamp)
+                self.found.missing.setdefault(topic, []).append(stamp)
         row: dict[str, float] = {"stamp": stamp}
         if self._has({"/truth/disparity"}, {"/truth/occlusion"}, frame):
             row |= self._add_disparity(stamp, frame)
@@ -190,8 +185,8 @@ class _Tally:
             row |= self._add_tilt(frame)
         if "/truth/pose" in frame:
             row |= self.pose.add(frame["/truth/pose"], frame.get("/nav/pose"))
-        self.compared += not self.left_out.issuperset(results)
-        self.per_frame.append(row)
+        self.found.compared += not self.left_out.issuperset(results)
+        self.found.per_frame.append(row)
 
     def _has(self, needed: set[str], besides: set[str], frame: dict[str, Any]) -> bool:
         """Whether a frame has the truth topics `needed`, and those of `besides` that the log has.
@@ -205,7 +200,7 @@ class _Tally:
 
     def _leave_out(self, topic: str, why: str) -> None:
         self.left_out.add(topic)
-        counts = self.unscored.setdefault(topic, {})
+        counts = self.found.unscored.setdefault(topic, {})
         counts[why] = counts.get(why, 0) + 1
 
     def _add_disparity(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
@@ -290,38 +285,33 @@ class _Tally:
             true_up = (_rotation(true.quaternion) @ base_from_camera)[2]
             self.tilts.append(angle_between(_rotation(item.transform.rotation)[2], true_up))
             return {"tilt": self.tilts[-1]}
-        self.untilted[why] = self.untilted.get(why, 0) + 1
+        self.found.untilted[why] = self.found.untilted.get(why, 0) + 1
         return {}
 
     def score(self) -> Score:
         """The score. Raises LogError if there was nothing to compare."""
-        if not self.frames:
+        found = self.found
+        if not found.frames:
             damage = "".join(f" ({why})" for why in islice(self.lost[str(self.truth)], 1))
             raise LogError(
                 f"{self.truth} has no ground truth (/truth/...){damage}; give the log that has it with --truth"
             )
         if not self.seen_results:
             raise without_results(self.result, RESULTS)
-        if not self.compared:
-            misfits = [f"{topic}: {why}" for topic in RESULTS for why in self.unscored.get(topic, ())]
+        if not found.compared:
+            misfits = [f"{topic}: {why}" for topic in RESULTS for why in found.unscored.get(topic, ())]
             if misfits:
                 raise LogError(f"{self.result}: no result fits the truth in {self.truth}: {misfits[0]}")
             raise LogError(f"no result in {self.result} has a stamp of {self.truth}; score a run of that log")
-        tilts, unfit = self.tilts, not self.fitting and bool(self.unscored.keys() & {*RESULTS[1:]})
-        return Score(
-            self.frames, self.compared,
-            missing={topic: stamps for topic, stamps in self.missing.items() if stamps},
-            unmatched=self.unmatched,
-            beyond=self.beyond,
-            unscored=self.unscored,
-            lost={log: dict(why) for log, why in self.lost.items() if why},
-            disparity=self._disparity_metrics(),
-            terrain=self.terrain.metrics() if self.terrain and not unfit else None,
-            tilt={"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)} if tilts else None,
-            untilted=self.untilted,
-            pose=self.pose.metrics(),
-            per_frame=self.per_frame,
-        )  # fmt: skip
+        found.missing = {topic: found.missing[topic] for topic in RESULTS if topic in found.missing}
+        found.lost = {log: dict(why) for log, why in self.lost.items() if why}
+        found.disparity = self._disparity_metrics()
+        if self.terrain and (self.fitting or not found.unscored.keys() & {*RESULTS[1:]}):
+            found.terrain = self.terrain.metrics()
+        if tilts := self.tilts:
+            found.tilt = {"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)}
+        found.pose = self.pose.metrics()
+        return found
 
 
 def _layers(message: Any, onto: ElevationMap) -> dict[str, Array]:

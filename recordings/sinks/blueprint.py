@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import Enum, auto
+from enum import Enum
 
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumnKind, TimelineColumn
@@ -22,47 +22,15 @@ LEDGER, SUMMARY, SECONDS, QUEUES = "ledger", "summary", "seconds", "queues"
 MAX_LEGEND_LINES = 4  # the legend of more lines would hide the plot
 
 Specs = tuple["ViewSpec", ...]
-_View = (
-    rrb.Spatial2DView
-    | rrb.Spatial3DView
-    | rrb.TimeSeriesView
-    | rrb.TextLogView
-    | rrb.TextDocumentView
-    | rrb.BarChartView
-    | rrb.TensorView
+_Part = rrb.View | rrb.Container
+
+
+# The places of the layout. Derived images have another size than the camera's; OWN_... are of the user's own types.
+Panel = Enum(
+    "Panel",
+    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE CLOUD VOXELS TERRAIN CAMERA TRAJECTORY RELIEF "
+    "LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE OWN_IMAGE OWN_NUMBER OWN_TEXT OWN_BARS OWN_TENSOR",
 )
-_Part = _View | rrb.Tabs | rrb.Vertical | rrb.Horizontal | rrb.Grid
-
-
-class Panel(Enum):
-    """The places of the layout."""
-
-    LEFT = auto()
-    RIGHT = auto()
-    LEFT_DERIVED = auto()  # images of another size than the camera's
-    RIGHT_DERIVED = auto()
-    DISPARITY = auto()
-    SUPERPIXELS = auto()
-    SOURCE = auto()
-    CLOUD = auto()
-    VOXELS = auto()
-    TERRAIN = auto()
-    CAMERA = auto()
-    TRAJECTORY = auto()
-    RELIEF = auto()
-    LAYER = auto()
-    MAP = auto()
-    REASON = auto()
-    ANGLE = auto()
-    HEALTH = auto()
-    MATCHES = auto()
-    FEATURES = auto()
-    STAGE = auto()
-    OWN_IMAGE = auto()  # of a stream of the user's own type, as those below
-    OWN_NUMBER = auto()
-    OWN_TEXT = auto()
-    OWN_BARS = auto()
-    OWN_TENSOR = auto()
 
 
 @dataclass(frozen=True)
@@ -117,7 +85,7 @@ def _stack(parts: Iterable[_Part | None]) -> _Part | None:
     return rrb.Vertical(*present) if len(present) > 1 else (present[0] if present else None)
 
 
-def _flat_views(drawn: Specs, *panels: Panel) -> list[_View]:
+def _flat_views(drawn: Specs, *panels: Panel) -> list[rrb.View]:
     """The 2-D views of these panels; a title that two streams share is preceded by the stream's name."""
     specs = _at(drawn, *panels)
     streams: dict[str, set[str]] = {}
@@ -153,7 +121,7 @@ def _images(drawn: Specs) -> _Part | None:
     return rrb.Grid(*present, grid_columns=2) if present else None
 
 
-def _superpixels(drawn: Specs) -> list[_View]:
+def _superpixels(drawn: Specs) -> list[rrb.View]:
     """The superpixels' edges over the left image that was segmented."""
     images = [f"+ /{spec.path}" for spec in _at(drawn, Panel.LEFT)[-1:]]
     return [
@@ -169,8 +137,8 @@ def _space(drawn: Specs) -> _Part | None:
     return _stack([clouds, terrains])
 
 
-def _spaces(drawn: Specs, panel: Panel, name: str) -> list[_View]:
-    views: list[_View] = []
+def _spaces(drawn: Specs, panel: Panel, name: str) -> list[rrb.View]:
+    views: list[rrb.View] = []
     for frame_id in sorted({spec.frame_id for spec in _at(drawn, panel)}, key=lambda frame: frame != LEVEL_FRAME):
         paths = [spec.path for spec in _at(drawn, panel, Panel.CAMERA) if spec.frame_id == frame_id]
         # Behind the rover's right shoulder, looking down on the ground ahead; other frames have no such place.
@@ -187,7 +155,7 @@ def _spaces(drawn: Specs, panel: Panel, name: str) -> list[_View]:
     return views
 
 
-def _trajectories(drawn: Specs) -> list[_View]:
+def _trajectories(drawn: Specs) -> list[rrb.View]:
     start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     ranges = [rrb.VisibleTimeRange(timeline, start=start, end=now) for timeline in (CLOCK, FRAME)]
     return [
@@ -202,7 +170,7 @@ def _maps(drawn: Specs) -> _Part | None:
     return _stack([_tabs([*reliefs, *layers]), _tabs([*maps, *reasons])])
 
 
-def _plot(specs: Iterable[ViewSpec], title: str) -> _View | None:
+def _plot(specs: Iterable[ViewSpec], title: str) -> rrb.View | None:
     """The numbers of these specs over time."""
     contents = [f"+ /{spec.path}/**" for spec in specs]
     legend = rrb.PlotLegend("LeftTop")
@@ -240,7 +208,7 @@ def _below(drawn: Specs) -> _Part:
     return rrb.Horizontal(*plots, text, column_shares=[*shares, 2.0])
 
 
-def _own_plots(drawn: Specs) -> list[_View | None]:
+def _own_plots(drawn: Specs) -> list[rrb.View | None]:
     """For each stream of own numbers a plot; arrays of them as bar charts and tensors."""
     own = _at(drawn, Panel.OWN_NUMBER)
     streams = dict.fromkeys(spec.stream for spec in own)

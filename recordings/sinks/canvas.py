@@ -86,6 +86,12 @@ class Canvas:
         _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         self.log(path, rr.EncodedImage(contents=blob, media_type="image/jpeg"), view)
 
+    def log_values(self, values: Array, limits: tuple[float, float], view: ViewSpec) -> None:
+        """Values (H, W) in colours over a range; hover reads them. The palette's darkest end is left to unknown."""
+        low, high = limits
+        colors, ends = rr.components.Colormap.Turbo, (low - 0.1 * (high - low), high)
+        self.log(view.path, rr.DepthImage(values, meter=1.0, colormap=colors, depth_range=ends), view)
+
     def log_labels(self, view: ViewSpec, codes: Array, legend: Legend, beside: bool = False) -> None:
         """A label image (H, W); its names are above or beside it and appear on hover."""
         path = view.path

@@ -188,13 +188,8 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     canvas.log_scale(f"{relief.path}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
     _log_distances(canvas, f"{relief.path}/lines", terrain.shape, terrain)
     for name, layer in terrain.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
-        start, end = colormaps.value_limits(layer)
-        image = rr.DepthImage(
-            colormaps.birds_eye(layer.astype(np.float16)), meter=1.0, colormap=rr.components.Colormap.Turbo,
-            depth_range=(start - 0.1 * (end - start), end),  # the palette's darkest end is left to unknown cells
-        )  # fmt: skip
         view = ViewSpec(Panel.LAYER, stream, f"layers/{rr.escape_entity_path_part(name)}", f"{name}{suffix}")
-        canvas.log(view.path, image, view)
+        canvas.log_values(colormaps.birds_eye(layer.astype(np.float16)), colormaps.value_limits(layer), view)
     vertices, triangles = colormaps.surface(terrain)
     if len(triangles):
         colors = rgb[np.isfinite(elevation)]

@@ -71,10 +71,6 @@ def _log_image(canvas: Canvas, spec: ViewSpec, pixels: Array) -> None:
         canvas.log(spec.path, rr.EncodedImage(contents=png, media_type="image/png"), spec)
         return
     values = pixels.astype(np.float32)
-    low, high = value_limits(values)
-    # The palette's darkest end is left to unknown values.
-    image = rr.DepthImage(
-        values, meter=1.0, colormap=rr.components.Colormap.Turbo, depth_range=(low - 0.1 * (high - low), high)
-    )
-    canvas.log(spec.path, image, spec)
-    canvas.log_scale(f"{spec.path}/scale", pixels.shape, low, high, "", cv2.COLORMAP_TURBO)
+    limits = value_limits(values)
+    canvas.log_values(values, limits, spec)
+    canvas.log_scale(f"{spec.path}/scale", pixels.shape, *limits, "", cv2.COLORMAP_TURBO)

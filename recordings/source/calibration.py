@@ -48,34 +48,12 @@ class Camera:
 def calibrated_pair(
     models: tuple[CameraModel, CameraModel], names: tuple[str, str], topics: tuple[str, str], tree: TransformTree
 ) -> tuple[Camera, Camera]:
-    """The two cameras of a stereo pair.
+    """The left and the right camera of a stereo pair, with the names of their frames and the topics of their images.
 
     The baseline comes from the projection matrices P. If both P[0, 3] are 0 (two single calibrations), it comes from
-    the static transform between the cameras.
+    the static transform between the cameras. Images on a topic such as /left/image_rect are rectified. Raises LogError
+    if the two are not a stereo pair, or the baseline is unknown.
 
-    Parameters
-    ----------
-    models : tuple of CameraModel
-        Calibration of the left and the right camera, as in their CameraInfo.
-    names : tuple of str
-        Frames of the two cameras.
-    topics : tuple of str
-        Topics of their images; a name such as /left/image_rect means rectified images.
-    tree : TransformTree
-        The static transforms of the log.
-
-    Returns
-    -------
-    tuple of Camera
-        Left and right.
-
-    Raises
-    ------
-    LogError
-        If the two are not a stereo pair, or the baseline is unknown.
-
-    Examples
-    --------
     >>> k = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     >>> left, right = (np.column_stack([k, [shift, 0, 0]]) for shift in (0.0, -100.0))
     >>> models = tuple(CameraModel(640, 480, k, np.zeros(5), np.eye(3), p) for p in (left, right))

@@ -23,18 +23,11 @@ Stamps = NDArray[np.int64]
 def describe(
     log: McapLog, slop: int = 5_000_000, max_gap_of: Callable[[Sequence[int]], int] | None = None
 ) -> dict[str, Any]:
-    """The inventory of a log as plain JSON values.
+    """The inventory of an opened log as plain JSON values.
 
-    Pairs and tilts are counted by their stamps alone; a run may also lose messages that were logged too late.
-
-    Parameters
-    ----------
-    log : McapLog
-        An opened log.
-    slop : int
-        Largest difference between the stamps of the two images of a frame, ns.
-    max_gap_of : callable, optional
-        From the intervals of the tilts, ns, to the largest one around a frame; None: do not count frames with a tilt.
+    Pairs and tilts are counted by their stamps alone; a run may also lose messages that were logged too late. slop:
+    largest difference between the stamps of the two images of a frame, ns; max_gap_of: from the intervals of the tilts,
+    ns, to the largest one around a frame; None: do not count frames with a tilt.
     """
     resolution, lost = log.resolution, log.file.index.lost
     damage = sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems})

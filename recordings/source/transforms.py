@@ -37,13 +37,7 @@ class TransformTree:
     parents: dict[str, str] = field(default_factory=dict)
 
     def add(self, message: Any) -> None:
-        """Add a geometry_msgs/TransformStamped.
-
-        Raises
-        ------
-        LogError
-            If it contradicts the transforms so far, which are kept.
-        """
+        """Add a geometry_msgs/TransformStamped. Raises LogError if it contradicts those so far, which are kept."""
         transform = transform_of(message)
         parent, child = transform.parent, transform.child
         known = self.between(parent, child)
@@ -57,18 +51,7 @@ class TransformTree:
             raise LogError(f"the transform '{parent}' <- '{child}' contradicts an earlier one; the earlier one is used")
 
     def between(self, parent: str, child: str) -> Transform | None:
-        """The transform from `child` to `parent` by the shortest path.
-
-        Parameters
-        ----------
-        parent, child : str
-            Names of frames.
-
-        Returns
-        -------
-        Transform or None
-            None if nothing connects the frames, or a name is empty.
-        """
+        """The transform from frame `child` to `parent` by the shortest path; None if nothing connects them."""
         if not parent or not child:
             return None
         before, queue = {child: child}, deque([child] if parent in self.edges else [])

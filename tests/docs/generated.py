@@ -4,8 +4,6 @@ The tables of stages come from the fields of the dataclasses, those of commands 
 and a test fails when a page is not current.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from pathlib import Path

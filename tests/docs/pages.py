@@ -1,7 +1,5 @@
 """README and docs as the tests read them: links, headings, and blocks of code with their language."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -58,10 +58,10 @@ def slips(files: Iterable[Path], read: Callable[[Path], Iterable[tuple[int, str]
 
 
 @pytest.mark.parametrize("room", ["flow", "stages", "recordings", "tests"])
-def test_docstrings_comments_and_messages_keep_the_rule_of_words(room: str) -> None:
+def test_docstrings_comments_and_messages_keep_the_rule_of_words(room):
     files = sorted((pages.ROOT / room).rglob("*.py"))
     assert slips([file for file in files if file != Path(__file__)], texts) == []
 
 
-def test_pages_and_pipeline_files_keep_the_rule_of_words() -> None:
+def test_pages_and_pipeline_files_keep_the_rule_of_words():
     assert slips([*pages.PAGES, *(pages.ROOT / "flow" / "pipelines").rglob("*.yaml")], lines) == []

@@ -1,7 +1,5 @@
 """The sample log, the items of the undamaged log, and a rerun recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -233,70 +233,63 @@ def test_an_invalid_set_option_is_named(tmp_path, setting):
         loaded(tmp_path, overrides=[setting])
 
 
+SCALE = "tests.flow.toys.Scale, couple: both, factor: 25 cm, bad: [1, 2.5]"
+ADD = "tests.flow.toys.Add, a: twice, b: height"
+IMPORTS = "from __future__ import annotations\nfrom tests.flow.toys import *\n"
+OWN = (
+    IMPORTS
+    + """@dataclass(frozen=True)
+class Own:
+    a: {field} = 0
+    def __call__(self, {takes}) -> {returns}: ...
+"""
+)
+ODD = IMPORTS + "@dataclass(frozen=True)\nclass Own(Add):\n    __call__ = Add.__call__\n"
+ODD += "    def __post_init__(self):\n        {}['nix']\n"
+IDLE = OWN.format(field="int", takes="a: Couple | None = None", returns="Couple")
+PLAIN = "class Own:\n    def __call__(self): ...\n"
+
+
+def own(field="int", takes="couple: Couple", returns="Couple"):
+    return OWN.format(field=field, takes=takes, returns=returns)
+
+
+@pytest.mark.parametrize(("source", "replaced", "entry", "message"), [
+    ("1 / 0\n", SCALE, "Own", "5: cannot import 'MODULE': ZeroDivisionError"),
+    ("import sys\nsys.exit(3)\n", SCALE, "Own", "5: cannot import 'MODULE': SystemExit: 3"),
+    (own(field="list[Nix]"), SCALE, "Own, couple: both",
+     "5: the annotations of Own cannot be read: name 'Nix' is not defined"),
+    (own(takes="couple: Nix"), SCALE, "Own, couple: both",
+     "5: the annotations of Own.__call__ cannot be read: name 'Nix' is not defined"),
+    (own(takes="*couple: Couple"), SCALE, "Own, couple: both", "5: Own.__call__ must take each input by its name"),
+    (own(returns="Couple | None"), SCALE, "Own, couple: both",
+     "5: Own.__call__ does not say which one type it returns"),
+    (IDLE, ADD, "Own", "6: 'sum' has no input"),
+    (ODD, ADD, "Own, a: twice, b: height", "6: KeyError: 'nix' (MODULE.py, line 7; --debug"),
+    (PLAIN, SCALE, "Own", "5: MODULE.Own is no dataclass; decorate"),
+    (PLAIN + "def function(): ...\n", SCALE, "function", "5: MODULE.function is no dataclass; decorate"),
+])  # fmt: skip
+def test_a_mistake_in_a_module_of_ones_own_is_named_with_its_line(tmp_path, source, replaced, entry, message):
+    module = tmp_path.name
+    (tmp_path / f"{module}.py").write_text(source)
+    with pytest.raises(PipelineError, match=re.escape(f"toy.yaml:{message.replace('MODULE', module)}")) as caught:
+        loaded(tmp_path, GOOD.replace(replaced, f"{module}.{entry}"))
+    assert "did you mean" not in str(caught.value)  # such as the refused name itself
+
+
 def test_the_invalid_one_of_several_settings_is_named(tmp_path):
-    source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Odd(Scale):\n"
-    source += "    __call__ = Scale.__call__\n    def __post_init__(self):\n        raise ValueError('Odd.nap: no')\n"
-    (tmp_path / "strict.py").write_text(source)
-    text = GOOD.replace("tests.flow.toys.Scale", "strict.Odd")
-    with pytest.raises(PipelineError, match=r"--set twice.nap=1 s: Odd.nap: no"):
+    (tmp_path / "strict.py").write_text(
+        ODD.replace("Add", "Scale").replace("{}['nix']", "raise ValueError('Own.nap: no')")
+    )
+    text = GOOD.replace("tests.flow.toys.Scale", "strict.Own")
+    with pytest.raises(PipelineError, match=r"--set twice.nap=1 s: Own.nap: no"):
         loaded(tmp_path, text, overrides=["twice.nap=1 s", "twice.factor=2 m"])
 
 
 def test_stages_may_be_in_the_folder_of_the_pipeline_file(tmp_path):
-    source = "from tests.flow.toys import Scale\nclass Near(Scale):\n    pass\n"
-    (tmp_path / "beside.py").write_text(source)
+    (tmp_path / "beside.py").write_text("from tests.flow.toys import Scale\nclass Near(Scale):\n    pass\n")
     text = GOOD.replace("tests.flow.toys.Scale", "beside.Near")
     assert {node.name: node.use for node in loaded(tmp_path, text).nodes}["twice"] == "beside.Near"
-
-
-def test_a_module_that_does_not_import_is_named_with_its_line(tmp_path):
-    (tmp_path / "broken.py").write_text("1 / 0\n")
-    with pytest.raises(PipelineError, match=r"toy.yaml:5: cannot import 'broken': ZeroDivisionError"):
-        loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", "broken.Stage"))
-
-
-def test_a_module_that_exits_on_import_is_an_error_in_the_pipeline_file(tmp_path):
-    (tmp_path / "script.py").write_text("import sys\nsys.exit(3)\n")
-    with pytest.raises(PipelineError, match=r"toy.yaml:5: cannot import 'script': SystemExit: 3"):
-        loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", "script.Stage"))
-
-
-@pytest.mark.parametrize(("field", "takes", "returns", "message"), [
-    ("list[Nix]", "couple: Couple", "Couple", "the annotations of Own cannot be read: name 'Nix' is not defined"),
-    ("int", "couple: Nix", "Couple", "the annotations of Own.__call__ cannot be read: name 'Nix' is not defined"),
-    ("int", "*couple: Couple", "Couple", "Own.__call__ must take each input by its name"),
-    ("int", "couple: Couple", "Couple | None", "Own.__call__ does not say which one type it returns"),
-])  # fmt: skip
-def test_unclear_annotations_are_named_with_their_line(tmp_path, field, takes, returns, message):
-    source = "from __future__ import annotations\nfrom tests.flow.toys import *\n@dataclass(frozen=True)\nclass Own:\n"
-    source += f"    a: {field} = 0\n    def __call__(self, {takes}) -> {returns}: ...\n"
-    module = tmp_path.name
-    (tmp_path / f"{module}.py").write_text(source)
-    with pytest.raises(PipelineError, match=rf"toy.yaml:5: {re.escape(message)}"):
-        loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale, couple: both, factor: 25 cm, bad: [1, 2.5]",
-                                      f"{module}.Own, couple: both"))  # fmt: skip
-
-
-def test_a_stage_without_an_input_is_refused(tmp_path):
-    source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Idle:\n"
-    (tmp_path / "idle.py").write_text(source + "    def __call__(self, a: Couple | None = None) -> Couple: ...\n")
-    with pytest.raises(PipelineError, match=r"toy.yaml:6: 'sum' has no input"):
-        loaded(tmp_path, GOOD.replace("tests.flow.toys.Add, a: twice, b: height", "idle.Idle"))
-
-
-def test_a_hint_never_suggests_the_refused_name_itself(tmp_path):
-    (tmp_path / "plain.py").write_text("class Stage:\n    def __call__(self): ...\ndef function(): ...\n")
-    for name in ("Stage", "function"):
-        with pytest.raises(PipelineError, match=rf"toy.yaml:5: plain.{name} is no dataclass") as caught:
-            loaded(tmp_path, GOOD.replace("tests.flow.toys.Scale", f"plain.{name}"))
-        assert "did you mean" not in str(caught.value)
-
-
-def test_a_stage_whose_constructor_raises_is_named_with_its_line(tmp_path):
-    source = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Odd(Add):\n    __call__ = Add.__call__\n"
-    (tmp_path / "odd.py").write_text(source + "    def __post_init__(self):\n        {}['nix']\n")
-    with pytest.raises(PipelineError, match=r"toy.yaml:6: KeyError: 'nix' \(odd.py, line 6; --debug"):
-        loaded(tmp_path, GOOD.replace("tests.flow.toys.Add", "odd.Odd"))
 
 
 def test_a_recursive_anchor_is_refused(tmp_path):

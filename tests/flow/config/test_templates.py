@@ -232,9 +232,13 @@ def test_one_rover_reaches_every_stage_that_needs_it(name):
         ("rover.max_step=1s", "stages.TerrainFeatures.rover.max_step: '1s' is a time; expected a length in m"),
         ("rover.wheel=1km", "stages.TerrainFeatures.rover.wheel: must be at most 5 m, not 1km"),
         ("rover=3", "stages.TerrainFeatures.rover: expected a mapping of footprint, wheel_track, wheel, max_step"),
+        ("McapSink.compresion=zstd", "recordings.McapSink has no parameter 'compresion'; did you mean 'compression'?"),
+        ("McapSink.compression=zip", "recordings.McapSink.compression: must be one of lz4, zstd, none, not zip"),
+        ("McapSnk.compression=zstd", "there is no stream 'McapSnk'; did you mean 'McapSink'?"),
+        ("McapSink.also=[disparity/fall]", "there is no stream 'disparity/fall'; did you mean 'disparity/full'?"),
     ],
 )
-def test_a_mistake_in_the_rover_names_the_setting(override, message):
+def test_a_mistake_in_the_rover_or_a_sink_names_the_setting(override, message):
     with pytest.raises(PipelineError) as caught:
         load("rover", [override])
     assert str(caught.value).startswith(f"--set {override}: {message}")
@@ -245,18 +249,3 @@ def test_the_command_line_sets_parameters_of_sinks(prefix):
     graph = load("rover", [f"{prefix}McapSink.compression=zstd", f"{prefix}McapSink.also=[disparity/full]"])
     sink: Any = dict(graph.sinks)["recordings.McapSink"]
     assert (sink.compression, sink.also) == ("zstd", ("disparity/full",))
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("McapSink.compresion=zstd", "recordings.McapSink has no parameter 'compresion'; did you mean 'compression'?"),
-        ("McapSink.compression=zip", "recordings.McapSink.compression: must be one of lz4, zstd, none, not zip"),
-        ("McapSnk.compression=zstd", "there is no stream 'McapSnk'; did you mean 'McapSink'?"),
-        ("McapSink.also=[disparity/fall]", "there is no stream 'disparity/fall'; did you mean 'disparity/full'?"),
-    ],
-)
-def test_a_mistake_in_a_sink_names_the_setting(override, message):
-    with pytest.raises(PipelineError) as caught:
-        load("rover", [override])
-    assert str(caught.value).startswith(f"--set {override}: {message}")

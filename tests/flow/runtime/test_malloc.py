@@ -1,7 +1,5 @@
 """The program's threads share one heap, by glibc's own statistics."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

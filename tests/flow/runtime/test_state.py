@@ -1,7 +1,5 @@
 """A graph is configuration: its runs, one after the other or at once, share no state."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -67,39 +65,6 @@ def test_a_graph_run_in_two_threads_at_once_gives_the_bits_of_two_runs(tmp_path)
 
 
 @dataclass(frozen=True)
-class NoStart:
-    def __call__(self, couple: Couple, *, state: list[float]) -> Couple:
-        return couple
-
-
-@dataclass(frozen=True)
-class NoState:
-    def start(self) -> list[float]:
-        return []
-
-    def __call__(self, couple: Couple) -> Couple:
-        return couple
-
-
-@dataclass(frozen=True)
-class StateAsInput:
-    def start(self) -> list[float]:
-        return []
-
-    def __call__(self, couple: Couple, state: list[float]) -> Couple:
-        return couple
-
-
-@dataclass(frozen=True)
-class OnlyFinding:
-    def __call__(self, couple: Couple) -> Couple:
-        return couple
-
-    def finding(self, state: list[float]) -> None:
-        return None
-
-
-@dataclass(frozen=True)
 class CannotStart:
     def start(self) -> list[float]:
         raise OSError("no map on this disk")
@@ -108,15 +73,21 @@ class CannotStart:
         return couple
 
 
-@pytest.mark.parametrize(("stage", "sentence"), [
-    (NoStart, "NoStart.__call__ needs a 'state', so NoStart must have 'start', which makes it"),
-    (NoState, r"NoState has 'start', so its __call__ must take 'state' by keyword only \(after '\*'\)"),
-    (StateAsInput, r"StateAsInput has 'start', so its __call__ must take 'state' by keyword only"),
-    (OnlyFinding, "OnlyFinding.finding needs a 'state', so OnlyFinding must have 'start', which makes it"),
+START, FINDING = "def start(self): ...", "def finding(self, state): ..."
+
+
+@pytest.mark.parametrize(("methods", "takes", "sentence"), [
+    ("", ", *, state", "Half.__call__ needs a 'state', so Half must have 'start', which makes it"),
+    (START, "", r"Half has 'start', so its __call__ must take 'state' by keyword only \(after '\*'\)"),
+    (START, ", state", r"Half has 'start', so its __call__ must take 'state' by keyword only"),
+    (FINDING, "", "Half.finding needs a 'state', so Half must have 'start', which makes it"),
 ])  # fmt: skip
-def test_a_stage_with_half_of_a_state_is_refused_with_its_line(tmp_path, stage, sentence):
+def test_a_stage_with_half_of_a_state_is_refused_with_its_line(tmp_path, methods, takes, sentence):
+    call = f"def __call__(self, couple: Couple{takes}) -> Couple: ..."
+    head = "from tests.flow.toys import *\n@dataclass(frozen=True)\nclass Half:\n"
+    (tmp_path / f"{tmp_path.name}.py").write_text(f"{head}    {methods or 'pass'}\n    {call}\n")
     with pytest.raises(PipelineError, match=r"toy\.yaml:10: " + sentence):
-        graph(tmp_path, text=TOYS.replace("tests.flow.toys.Total", f"tests.flow.runtime.test_state.{stage.__name__}"))
+        graph(tmp_path, text=TOYS.replace("tests.flow.toys.Total", f"{tmp_path.name}.Half"))
 
 
 def test_a_stage_that_cannot_start_is_named_before_anything_runs(tmp_path):

@@ -1,7 +1,5 @@
 """Exported files, read by the programs they are for: GDAL, the rules of map_server, a PLY reader, PIL."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -77,7 +75,7 @@ def result(tmp_path: Path) -> Path:
     return path
 
 
-def test_gdal_reads_every_height_at_its_place_and_no_data_in_the_hole(result: Path, tmp_path: Path) -> None:
+def test_gdal_reads_every_height_at_its_place_and_no_data_in_the_hole(result, tmp_path):
     export(result, tmp_path / "out")
     with rasterio.open(tmp_path / "out" / "elevation.tif") as file:
         assert file.bounds == pytest.approx((-1.0, 1.0, 4.0, 4.0))
@@ -93,7 +91,7 @@ def test_gdal_reads_every_height_at_its_place_and_no_data_in_the_hole(result: Pa
         assert [file.xy(row, col) for row, col in np.argwhere(np.isnan(heights))] == [pytest.approx((1.05, 3.05))]
 
 
-def test_every_layer_is_a_file_and_newer_windows_replace_older_ones(result: Path, tmp_path: Path) -> None:
+def test_every_layer_is_a_file_and_newer_windows_replace_older_ones(result, tmp_path):
     files = export(result, tmp_path / "out")
     names = {"elevation.tif", "variance.tif", "last.tif", "hillshade.png", "hillshade.pgw", "points.ply",
              "navigation_map.pgm", "navigation_map.yaml"}  # fmt: skip
@@ -106,7 +104,7 @@ def test_every_layer_is_a_file_and_newer_windows_replace_older_ones(result: Path
     assert set(np.unique(last)) == {0, 1}
 
 
-def test_the_rim_of_a_window_does_not_replace_the_middle_of_another(tmp_path: Path) -> None:
+def test_the_rim_of_a_window_does_not_replace_the_middle_of_another(tmp_path):
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
         for frame, (corner, wrong) in enumerate([((0.0, 0.0), 0.0), ((3.0, 0.0), 9.0)]):
@@ -132,7 +130,7 @@ def as_map_server_reads(yaml_file: Path) -> tuple[Array, float, list[float]]:
     return cells[::-1], about["resolution"], about["origin"]
 
 
-def test_map_server_reads_free_hazard_and_unknown_at_their_places(result: Path, tmp_path: Path) -> None:
+def test_map_server_reads_free_hazard_and_unknown_at_their_places(result, tmp_path):
     export(result, tmp_path / "out")
     cells, resolution, origin = as_map_server_reads(tmp_path / "out" / "navigation_map.yaml")
     assert (resolution, origin) == (STEP, pytest.approx([-1.0, 1.0, 0.0]))
@@ -142,7 +140,7 @@ def test_map_server_reads_free_hazard_and_unknown_at_their_places(result: Path, 
     np.testing.assert_array_equal(cells, expected)
 
 
-def test_each_cell_in_the_ply_has_the_colour_of_its_best_point(result: Path, tmp_path: Path) -> None:
+def test_each_cell_in_the_ply_has_the_colour_of_its_best_point(result, tmp_path):
     export(result, tmp_path / "out")
     data = plyfile.PlyData.read(str(tmp_path / "out" / "points.ply"))
     assert "local frame 'odom'" in data.comments[0]
@@ -158,7 +156,7 @@ def test_each_cell_in_the_ply_has_the_colour_of_its_best_point(result: Path, tmp
     assert colours == {(1.05, 2.05): (10, 220, 30), (0.45, 2.05): (7, 8, 250)}
 
 
-def test_the_hillshade_has_light_from_the_north_west_and_a_world_file(tmp_path: Path) -> None:
+def test_the_hillshade_has_light_from_the_north_west_and_a_world_file(tmp_path):
     x, y = np.meshgrid((np.arange(60) + 0.5) * STEP, (np.arange(40) + 0.5) * STEP)
     mound = np.exp(-((x - 4) ** 2 + (y - 1) ** 2)).astype(np.float32)
     mound[0, 0] = np.nan
@@ -173,7 +171,7 @@ def test_the_hillshade_has_light_from_the_north_west_and_a_world_file(tmp_path: 
     shade = np.asarray(Image.open(tmp_path / "hillshade.png"))
     step_x, _, _, step_y, west, north = (float(line) for line in (tmp_path / "hillshade.pgw").read_text().split())
 
-    def at(px: float, py: float) -> int:
+    def at(px, py):
         return int(shade[round((py - north) / step_y), round((px - west) / step_x)])
 
     assert at(3.55, 1.45) > at(0.55, 3.55) > at(4.45, 0.55)
@@ -181,7 +179,7 @@ def test_the_hillshade_has_light_from_the_north_west_and_a_world_file(tmp_path: 
     assert shade.min(where=np.isfinite(mound[::-1]), initial=255) >= 1
 
 
-def test_frames_exports_the_maps_and_points_of_every_frame(result: Path, tmp_path: Path) -> None:
+def test_frames_exports_the_maps_and_points_of_every_frame(result, tmp_path):
     files = export(result, tmp_path / "out", frames=True)
     folders = sorted({file.parent.name for file in files})
     assert folders == [f"frame-{number:04d}-{START + number}" for number in (0, 1)]
@@ -197,7 +195,7 @@ def test_frames_exports_the_maps_and_points_of_every_frame(result: Path, tmp_pat
     assert (np.count_nonzero(cells == 0), np.count_nonzero(cells == 100)) == (30 * 20 - 1, 30 * 20)
 
 
-def test_a_map_far_from_its_frame_s_origin_keeps_its_place(tmp_path: Path) -> None:
+def test_a_map_far_from_its_frame_s_origin_keeps_its_place(tmp_path):
     """In a UTM frame float32 would be off by half a metre."""
     corner = (500_000.3, 5_400_000.7)
     layers = {"elevation": np.array([[1, 2], [3, np.nan]], np.float32)}
@@ -217,7 +215,7 @@ def test_a_map_far_from_its_frame_s_origin_keeps_its_place(tmp_path: Path) -> No
         assert file.bounds == pytest.approx((*corner, corner[0] + 0.2, corner[1] + 0.2), abs=1e-6, rel=0)
 
 
-def test_a_log_without_a_regional_map_names_the_remedy(tmp_path: Path) -> None:
+def test_a_log_without_a_regional_map_names_the_remedy(tmp_path):
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
         writer.write("/nav/points", ros2.point_cloud(cloud(0)), START)
@@ -228,7 +226,7 @@ def test_a_log_without_a_regional_map_names_the_remedy(tmp_path: Path) -> None:
     assert points.name == "points.ply"
 
 
-def test_the_readable_part_of_a_cut_log_is_exported(tmp_path: Path) -> None:
+def test_the_readable_part_of_a_cut_log_is_exported(tmp_path):
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
         for frame, corner in enumerate([(-1.0, 1.0), (0.0, 1.0)]):
@@ -249,7 +247,7 @@ def test_the_readable_part_of_a_cut_log_is_exported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("frames", [False, True])
-def test_a_log_without_nav_topics_is_refused(tmp_path: Path, frames: bool) -> None:
+def test_a_log_without_nav_topics_is_refused(tmp_path, frames):
     path = tmp_path / "raw.mcap"
     with Ros2Writer(path) as writer:
         writer.write("/lidar/points", ros2.point_cloud(cloud(0)), START)
@@ -267,13 +265,13 @@ def regional_log(path: Path, *maps: tuple[str, float]) -> Path:
     return path
 
 
-def test_maps_of_different_grids_are_refused(tmp_path: Path) -> None:
+def test_maps_of_different_grids_are_refused(tmp_path):
     path = regional_log(tmp_path / "out.mcap", ("odom", STEP), ("odom", 2 * STEP))
     with pytest.raises(LogError, match=r"the maps of the log differ: elevation at 0\.2 m in 'odom' after"):
         export(path, tmp_path / "out")
 
 
-def test_a_map_of_a_pose_that_jumped_is_refused_before_it_fills_the_disk(tmp_path: Path) -> None:
+def test_a_map_of_a_pose_that_jumped_is_refused_before_it_fills_the_disk(tmp_path):
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
         for frame, place in enumerate((0.0, 50_000.0)):
@@ -286,7 +284,7 @@ def test_a_map_of_a_pose_that_jumped_is_refused_before_it_fills_the_disk(tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_a_regional_map_that_was_reset_has_a_folder_per_frame_id(tmp_path: Path) -> None:
+def test_a_regional_map_that_was_reset_has_a_folder_per_frame_id(tmp_path):
     names = ("visual_odom", "visual_odom/2")
     export(regional_log(tmp_path / "out.mcap", *((name, STEP) for name in names)), tmp_path / "out")
     for number, folder in enumerate(("visual_odom", "visual_odom-2")):
@@ -294,7 +292,7 @@ def test_a_regional_map_that_was_reset_has_a_folder_per_frame_id(tmp_path: Path)
             assert np.unique(file.read(1)[np.isfinite(file.read(1))]) == [number]
 
 
-def test_an_unwritable_file_is_named_and_no_partial_file_is_left(result: Path, tmp_path: Path) -> None:
+def test_an_unwritable_file_is_named_and_no_partial_file_is_left(result, tmp_path):
     (tmp_path / "out" / "variance.tif").mkdir(parents=True)
     with pytest.raises(LogError, match=r"cannot write .*variance\.tif: it is a folder"):
         export(result, tmp_path / "out")
@@ -314,7 +312,7 @@ def test_file_names_stay_in_the_folder_and_are_unique():
         assert not name.startswith(".")
 
 
-def test_maps_are_exported_by_the_names_of_their_streams(tmp_path: Path) -> None:
+def test_maps_are_exported_by_the_names_of_their_streams(tmp_path):
     path = tmp_path / "out.mcap"
     elevation, navigation = window(0, (0.0, 2.0), (20, 30))
     with Ros2Writer(path) as writer:

@@ -1,7 +1,5 @@
 """The PNG pictures show what was published, the right way round."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -64,7 +62,7 @@ def cells_of(page: Array) -> Array:
     return page[MARGIN_PX + zoom // 2 :: zoom, MARGIN_PX + zoom // 2 :: zoom][:COLS, :ROWS]
 
 
-def test_ahead_is_up_and_left_is_left() -> None:
+def test_ahead_is_up_and_left_is_left():
     picture = cells_of(navigation_page(navigation()))
     expected = np.full((COLS, ROWS, 3), FREE)
     expected[0, 0] = HAZARD
@@ -74,14 +72,14 @@ def test_ahead_is_up_and_left_is_left() -> None:
     np.testing.assert_array_equal(picture, expected)
 
 
-def test_terrain_brightens_with_height_and_holes_stay_holes() -> None:
+def test_terrain_brightens_with_height_and_holes_stay_holes():
     picture = cells_of(elevation_page(terrain())).astype(int)
     assert tuple(picture[COLS - 1 - 4, ROWS - 1 - 3]) == colormaps.UNKNOWN_RGB
     green = picture[1:-1, 0, 1]  # viridis is greener the higher; the ramp rises ahead, which is up
     assert (np.diff(green) < 0).all()
 
 
-def test_near_is_red_far_is_blue_unknown_is_neither() -> None:
+def test_near_is_red_far_is_blue_unknown_is_neither():
     picture = disparity_page(disparity().pixels)[MARGIN_PX:, MARGIN_PX:]
     near, far = picture[46, 40].astype(int), picture[8, 40].astype(int)
     assert near[0] > near[2]
@@ -89,14 +87,14 @@ def test_near_is_red_far_is_blue_unknown_is_neither() -> None:
     assert tuple(picture[20, 4]) == colormaps.UNKNOWN_RGB
 
 
-def test_the_first_middle_and_last_frame_are_drawn(result: Path, tmp_path: Path) -> None:
+def test_the_first_middle_and_last_frame_are_drawn(result, tmp_path):
     written = draw(result, tmp_path / "pictures")
     assert [path.name for path in written] == [
         f"frame-{n:04d}-{name}.png" for n in (0, 2, 4) for name in ("disparity", "elevation", "navigation")
     ]
 
 
-def test_a_picture_from_the_log_is_the_picture_of_the_data(result: Path, tmp_path: Path) -> None:
+def test_a_picture_from_the_log_is_the_picture_of_the_data(result, tmp_path):
     """GridMap and OccupancyGrid order their cells differently; both keep the orientation."""
     files = {path.name: cv2.imread(str(path)) for path in draw(result, tmp_path)}
     pictures = {
@@ -109,7 +107,7 @@ def test_a_picture_from_the_log_is_the_picture_of_the_data(result: Path, tmp_pat
         np.testing.assert_array_equal(file[..., ::-1], picture)
 
 
-def test_a_log_without_results_is_named(tmp_path: Path) -> None:
+def test_a_log_without_results_is_named(tmp_path):
     path = tmp_path / "raw.mcap"
     with Ros2Writer(path) as log:
         log.write("/elsewhere", grid_map(terrain()), START)
@@ -117,7 +115,7 @@ def test_a_log_without_results_is_named(tmp_path: Path) -> None:
         draw(path, tmp_path)
 
 
-def test_a_map_without_known_cells_is_drawn() -> None:
+def test_a_map_without_known_cells_is_drawn():
     nothing = np.full((ROWS, COLS), np.nan, np.float32)
     page = elevation_page(ElevationMap(START, {"elevation": nothing}, 0.5, (0.0, -1.5), LEVEL_FRAME))
     assert (cells_of(page)[:-1] == colormaps.UNKNOWN_RGB).all()
@@ -126,7 +124,7 @@ def test_a_map_without_known_cells_is_drawn() -> None:
     ).all()
 
 
-def test_light_comes_from_ahead_on_the_left() -> None:
+def test_light_comes_from_ahead_on_the_left():
     x, y = np.meshgrid(np.arange(20), np.arange(20))
     towards, level, away = (
         colormaps.hillshade((share * (x + y)).astype(np.float32), 1.0)[10, 10] for share in (-0.3, 0.0, 0.3)
@@ -135,7 +133,7 @@ def test_light_comes_from_ahead_on_the_left() -> None:
 
 
 @given(rise_x=st.floats(-2, 2), rise_y=st.floats(-2, 2), hole=st.tuples(st.integers(2, 5), st.integers(2, 5)))
-def test_a_hole_does_not_change_the_shade_of_a_plane(rise_x: float, rise_y: float, hole: tuple[int, int]) -> None:
+def test_a_hole_does_not_change_the_shade_of_a_plane(rise_x, rise_y, hole):
     x, y = np.meshgrid(np.arange(8), np.arange(8))
     plane = rise_x * x + rise_y * y
     shade = colormaps.hillshade(plane, 1.0)
@@ -146,7 +144,7 @@ def test_a_hole_does_not_change_the_shade_of_a_plane(rise_x: float, rise_y: floa
 
 
 @given(st.integers(2, 9), st.integers(2, 9), st.integers(0, 2**32 - 1))
-def test_every_triangle_of_a_surface_joins_three_known_neighbours(rows: int, cols: int, seed: int) -> None:
+def test_every_triangle_of_a_surface_joins_three_known_neighbours(rows, cols, seed):
     random = np.random.default_rng(seed)
     elevation = random.normal(size=(rows, cols)).astype(np.float32)
     elevation[random.random((rows, cols)) < 0.3] = np.nan
@@ -159,7 +157,7 @@ def test_every_triangle_of_a_surface_joins_three_known_neighbours(rows: int, col
     np.testing.assert_allclose(area, 1.0)  # half a cell, seen from above anticlockwise
 
 
-def test_sixteen_bit_images_keep_their_contrast() -> None:
+def test_sixteen_bit_images_keep_their_contrast():
     """A 12 bit camera fills a quarter of a 16 bit range's bits, and must not come out black."""
     twelve = np.linspace(0, 4095, 256).astype(np.uint16).reshape(16, 16)
     bright, dark = np.tile(twelve, (16, 16)), np.tile(twelve // 2, (16, 16))

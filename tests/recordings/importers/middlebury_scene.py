@@ -1,7 +1,5 @@
 """A small Middlebury scene: an asymmetric pattern in front of a plane, with values exact in float32."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Middlebury scenes become logs with the ground truth of the scene."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -55,7 +53,7 @@ def result(log: Path, frame: StereoFrame, pixels: np.ndarray) -> Path:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_a_pfm_is_read_from_the_bottom_in_either_byte_order(tmp_path: Path, order: str) -> None:
+def test_a_pfm_is_read_from_the_bottom_in_either_byte_order(tmp_path, order):
     pixels = np.arange(6, dtype=np.float32).reshape(2, 3) + np.float32(0.25)
     pixels[0, 2], pixels[1, 0] = np.inf, -np.inf
     path = write_pfm(tmp_path / "d.pfm", pixels, order)
@@ -65,7 +63,7 @@ def test_a_pfm_is_read_from_the_bottom_in_either_byte_order(tmp_path: Path, orde
     np.testing.assert_array_equal(read_pfm(path), expected)
 
 
-def test_images_and_camera_of_a_scene_are_in_its_log(tmp_path: Path) -> None:
+def test_images_and_camera_of_a_scene_are_in_its_log(tmp_path):
     log, words = imported(write_scene(tmp_path / "Box"))
     assert words.endswith("run it with --set disparities=32")
     frame = frame_of(log)
@@ -76,7 +74,7 @@ def test_images_and_camera_of_a_scene_are_in_its_log(tmp_path: Path) -> None:
     assert (camera.baseline, camera.width, camera.height, camera.raw) == (0.25, 96, 64, None)
 
 
-def test_a_plane_has_its_distance(tmp_path: Path) -> None:
+def test_a_plane_has_its_distance(tmp_path):
     """Z = baseline * f / (d + doffs): 0.25 m * 100 px / (5 + 12.5) px, the box at 25 / 25.5."""
     log, _ = imported(write_scene(tmp_path / "Box"))
     message, camera = truth_of(log)["/truth/disparity"], frame_of(log).camera
@@ -87,7 +85,7 @@ def test_a_plane_has_its_distance(tmp_path: Path) -> None:
     np.testing.assert_allclose(distance[np.isfinite(distance)], ours[np.isfinite(distance)], rtol=1e-6)
 
 
-def test_the_truth_is_that_of_the_scene(tmp_path: Path) -> None:
+def test_the_truth_is_that_of_the_scene(tmp_path):
     log, words = imported(write_scene(tmp_path / "Box"))
     assert "with true disparities and occlusions" in words
     truth = truth_of(log)
@@ -104,7 +102,7 @@ def test_the_truth_is_that_of_the_scene(tmp_path: Path) -> None:
     assert (about.metadata["scene"], about.metadata["ndisp"]) == ("Box", "21")
 
 
-def test_the_score_counts_known_errors_exactly(tmp_path: Path) -> None:
+def test_the_score_counts_known_errors_exactly(tmp_path):
     log, _ = imported(write_scene(tmp_path / "Box"))
     frame, true, mask = frame_of(log), scenes.true_disparity(), scenes.occlusion()
     pixels = np.where(np.isfinite(true), true, np.float32(9))
@@ -136,7 +134,7 @@ def test_the_score_counts_known_errors_exactly(tmp_path: Path) -> None:
     assert f"{bad:.2f}%" in next(line for line in table.splitlines() if "seen by both" in line)
 
 
-def test_either_name_of_the_truth_is_read(tmp_path: Path) -> None:
+def test_either_name_of_the_truth_is_read(tmp_path):
     source = tmp_path / "trainingH"
     for name in ("Vintage", "Adirondack-perfect"):
         scene = write_scene(source / name)
@@ -156,9 +154,7 @@ def test_either_name_of_the_truth_is_read(tmp_path: Path) -> None:
         (("mask0nocc.png",), {"/truth/disparity"}, "without occlusions (no mask0nocc.png)"),
     ],
 )
-def test_a_scene_without_truth_is_reported(
-    tmp_path: Path, without: tuple[str, ...], topics: set[str], words: str
-) -> None:
+def test_a_scene_without_truth_is_reported(tmp_path, without, topics, words):
     log, sentence = imported(write_scene(tmp_path / "Box", without))
     assert set(truth_of(log)) == topics
     assert words in sentence
@@ -216,7 +212,7 @@ def calibrate(**changes: object):
         ),
     ],
 )
-def test_a_damaged_scene_is_refused_and_leaves_no_log(tmp_path: Path, damage, words: str) -> None:
+def test_a_damaged_scene_is_refused_and_leaves_no_log(tmp_path, damage, words):
     folder = write_scene(tmp_path / "Box")
     damage(folder)
     with pytest.raises(LogError, match=words) as caught:
@@ -225,7 +221,7 @@ def test_a_damaged_scene_is_refused_and_leaves_no_log(tmp_path: Path, damage, wo
     assert [path.name for path in tmp_path.iterdir()] == ["Box"]
 
 
-def test_folders_without_scenes_and_files_for_several_logs_are_refused(tmp_path: Path) -> None:
+def test_folders_without_scenes_and_files_for_several_logs_are_refused(tmp_path):
     write_scene(tmp_path / "training" / "Box")
     for out in (tmp_path / "out.mcap", tmp_path / "training" / "Box" / "im0.png"):
         with pytest.raises(LogError, match="give a folder for the logs instead of"):
@@ -236,7 +232,7 @@ def test_folders_without_scenes_and_files_for_several_logs_are_refused(tmp_path:
         logs_of(tmp_path / "nowhere", tmp_path / "logs")
 
 
-def test_real_scenes_score_from_their_logs_as_from_their_files(tmp_path: Path) -> None:
+def test_real_scenes_score_from_their_logs_as_from_their_files(tmp_path):
     from stages.matching.match import Match
     from tests.bench.stereo_scores import errors, load_scene
 

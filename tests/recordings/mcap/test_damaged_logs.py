@@ -1,7 +1,5 @@
 """Damaged and foreign logs: the readable part is read correctly, the rest is reported as lost."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -28,7 +26,8 @@ from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MAGIC, Index, LostMessage
 from recordings.source.inventory import format_description
-from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, inventory_of, items_of, rewritten
+from tests.conftest import rewrite
+from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, inventory_of, items_of
 
 
 def record(opcode: int, content: bytes) -> bytes:
@@ -74,22 +73,18 @@ def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]]
 @pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no compression", "lz4", "no index"])
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(share=st.floats(0, 1, exclude_max=True))
-def test_a_cut_log_loses_only_the_part_after_the_cut(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, share: float
-) -> None:
+def test_a_cut_log_loses_only_the_part_after_the_cut(sample, whole, tmp_path, layout, share):
     full = tmp_path / "full.mcap"
     if not full.exists():
-        rewritten(sample, full, **LAYOUTS[layout])
+        rewrite(sample, full, **LAYOUTS[layout])
     content = full.read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(content[: int(share * len(content))])
     check_nothing_is_lost_silently(cut, whole, times_of(full, int(share * len(content)), math.inf))
 
 
-def test_messages_before_the_cut_in_a_chunk_are_rescued(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path
-) -> None:
-    full = rewritten(sample, tmp_path / "full.mcap", compression=CompressionType.NONE)  # one chunk
+def test_messages_before_the_cut_in_a_chunk_are_rescued(sample, whole, tmp_path):
+    full = rewrite(sample, tmp_path / "full.mcap", compression=CompressionType.NONE)  # one chunk
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(full.read_bytes()[: int(full.stat().st_size * 0.6)])
     events = items_of(cut)
@@ -102,12 +97,10 @@ def test_messages_before_the_cut_in_a_chunk_are_rescued(
 @pytest.mark.parametrize("layout", ["small chunks", "no index", "no compression"])
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-def test_a_flipped_bit_never_becomes_data(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, share: float, bit: int
-) -> None:
+def test_a_flipped_bit_never_becomes_data(sample, whole, tmp_path, layout, share, bit):
     full = tmp_path / "full.mcap"
     if not full.exists():
-        rewritten(sample, full, **LAYOUTS[layout])
+        rewrite(sample, full, **LAYOUTS[layout])
     content = bytearray(full.read_bytes())
     place = int(share * len(content))
     content[place] ^= 1 << bit
@@ -116,10 +109,8 @@ def test_a_flipped_bit_never_becomes_data(
     check_nothing_is_lost_silently(damaged, whole, times_of(full, place, place + 1))
 
 
-def test_a_broken_chunk_loses_its_own_messages_with_their_times(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path
-) -> None:
-    full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500)
+def test_a_broken_chunk_loses_its_own_messages_with_their_times(sample, whole, tmp_path):
+    full = rewrite(sample, tmp_path / "full.mcap", chunk_size=500)
     with full.open("rb") as file:
         chunks = make_reader(file).get_summary().chunk_indexes
         topics = {number: c.topic for number, c in make_reader(file).get_summary().channels.items()}
@@ -137,8 +128,8 @@ def test_a_broken_chunk_loses_its_own_messages_with_their_times(
     assert inventory_of(damaged)["damage"]
 
 
-def test_a_log_that_lost_all_images_reports_the_damage(sample: Path, tmp_path: Path) -> None:
-    full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500, use_statistics=False)
+def test_a_log_that_lost_all_images_reports_the_damage(sample, tmp_path):
+    full = rewrite(sample, tmp_path / "full.mcap", chunk_size=500, use_statistics=False)
     with full.open("rb") as file:
         summary = make_reader(file).get_summary()
     content, broken = bytearray(full.read_bytes()), []
@@ -157,10 +148,8 @@ def test_a_log_that_lost_all_images_reports_the_damage(sample: Path, tmp_path: P
         assert log.resolution.unavailable["left"].endswith("give a log with images")
 
 
-def test_a_broken_record_length_loses_that_record(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path
-) -> None:
-    full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500, index_types=IndexType.NONE, use_statistics=False)
+def test_a_broken_record_length_loses_that_record(sample, whole, tmp_path):
+    full = rewrite(sample, tmp_path / "full.mcap", chunk_size=500, index_types=IndexType.NONE, use_statistics=False)
     content = bytearray(full.read_bytes())
     chunks = [match.start() for match in re.finditer(rb"\x06.{5}\0{3}.{28}\x04\0\0\0zstd", content, re.DOTALL)]
     assert len(chunks) > 10
@@ -176,7 +165,7 @@ def test_a_broken_record_length_loses_that_record(
     assert good == [essence(item) for _, _, item in whole]  # the chunk itself was whole
 
 
-def test_a_broken_length_does_not_fill_the_memory(tmp_path: Path) -> None:
+def test_a_broken_length_does_not_fill_the_memory(tmp_path):
     resource = pytest.importorskip("resource")
     path = tmp_path / "sparse.mcap"
     with path.open("wb") as file:
@@ -189,7 +178,7 @@ def test_a_broken_length_does_not_fill_the_memory(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", [b"zstd", b"lz4"])
-def test_a_chunk_larger_than_stated_is_broken_and_not_unpacked(tmp_path: Path, compression: bytes) -> None:
+def test_a_chunk_larger_than_stated_is_broken_and_not_unpacked(tmp_path, compression):
     resource = pytest.importorskip("resource")
     pack = {b"zstd": zstandard.ZstdCompressor(level=1).compress, b"lz4": lz4.frame.compress}[compression]
     packed = pack(bytes(1 << 28))
@@ -202,7 +191,7 @@ def test_a_chunk_larger_than_stated_is_broken_and_not_unpacked(tmp_path: Path, c
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 
-def test_a_chunk_beyond_the_size_limit_is_broken() -> None:
+def test_a_chunk_beyond_the_size_limit_is_broken():
     content = struct.pack("<QQQII", 0, 1, 1 << 50, 0, 4) + b"zstd" + struct.pack("<Q", 1) + b"x"
     with pytest.raises(ValueError, match="the limit is"):
         unpack_chunk(content)
@@ -210,15 +199,13 @@ def test_a_chunk_beyond_the_size_limit_is_broken() -> None:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("layout", ["small chunks", "no message index", "no index", "no chunks"])
-def test_an_impossible_log_time_loses_its_message(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str
-) -> None:
+def test_an_impossible_log_time_loses_its_message(sample, whole, tmp_path, layout):
     third = [time for time, stream, _ in whole if stream == "left"][2]
 
-    def damage(topic: str, time: int) -> int:
+    def damage(topic, time):
         return time | 1 << 63 if (topic, time) == (LEFT, third) else time
 
-    path = rewritten(sample, tmp_path / "log.mcap", damage, **LAYOUTS[layout])
+    path = rewrite(sample, tmp_path / "log.mcap", time=damage, **LAYOUTS[layout])
     *events, (time, stream, error) = items_of(path)
     assert [essence(item) for _, _, item in events] == [
         essence(item) for at, stream, item in whole if (at, stream) != (third, "left")
@@ -228,7 +215,7 @@ def test_an_impossible_log_time_loses_its_message(
     assert inventory_of(path)["end"] == whole[-1][0]
 
 
-def test_losses_are_placed_after_the_last_message_before_them() -> None:
+def test_losses_are_placed_after_the_last_message_before_them():
     index = Index()
     for time in (5, 9, 7):
         index.count_message(1, time)
@@ -237,21 +224,17 @@ def test_losses_are_placed_after_the_last_message_before_them() -> None:
     assert index.latest == 9
 
 
-def test_statistics_without_channel_counts_do_not_mean_an_empty_log(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_statistics_without_channel_counts_do_not_mean_an_empty_log(sample, whole, tmp_path, monkeypatch):
     written = Statistics.write
     monkeypatch.setattr(Statistics, "write", lambda self, to: written(replace(self, channel_message_counts={}), to))
-    path = rewritten(sample, tmp_path / "log.mcap", chunk_size=500)
+    path = rewrite(sample, tmp_path / "log.mcap", chunk_size=500)
     assert [essence(item) for _, _, item in items_of(path)] == [essence(item) for _, _, item in whole]
 
 
 @pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no index", "no crcs"])
 @pytest.mark.parametrize("second", ["log", "zeros"])
-def test_bytes_after_the_end_of_a_log_are_reported(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str, second: str
-) -> None:
-    first = rewritten(sample, tmp_path / "first.mcap", **LAYOUTS[layout]).read_bytes()
+def test_bytes_after_the_end_of_a_log_are_reported(sample, whole, tmp_path, layout, second):
+    first = rewrite(sample, tmp_path / "first.mcap", **LAYOUTS[layout]).read_bytes()
     path = tmp_path / "log.mcap"
     path.write_bytes(first + (first if second == "log" else bytes(5000)))
     *events, (_, stream, lost) = items_of(path)
@@ -264,8 +247,8 @@ def test_bytes_after_the_end_of_a_log_are_reported(
     assert inventory_of(path)["damage"] == [sentence]
 
 
-def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample: Path, tmp_path: Path) -> None:
-    full = rewritten(sample, tmp_path / "full.mcap", chunk_size=500)
+def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample, tmp_path):
+    full = rewrite(sample, tmp_path / "full.mcap", chunk_size=500)
     with McapFile(full) as log:
         good = len(list(log.messages(set(log.index.channels))))
         log.index.chunks[2].chunk_start_offset = (1 << 63) - 1
@@ -285,14 +268,14 @@ def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample: Path, tmp_pa
         (b"\x89MCAP0\r\n", "contains no messages that can be read: the log is cut"),
     ],
 )
-def test_a_file_of_another_format_is_refused_by_its_name(tmp_path: Path, content: bytes, sentence: str) -> None:
+def test_a_file_of_another_format_is_refused_by_its_name(tmp_path, content, sentence):
     path = tmp_path / "log.mcap"
     path.write_bytes(content)
     with pytest.raises(LogError, match=rf"log\.mcap {sentence}"):
         McapSource().open(path)
 
 
-def test_a_missing_file_a_folder_and_an_empty_log_are_refused(tmp_path: Path) -> None:
+def test_a_missing_file_a_folder_and_an_empty_log_are_refused(tmp_path):
     with pytest.raises(LogError, match=r"cannot read .*none\.mcap: No such file"):
         McapSource().open(tmp_path / "none.mcap")
     with pytest.raises(LogError, match="is a folder; give the"):
@@ -306,7 +289,7 @@ def test_a_missing_file_a_folder_and_an_empty_log_are_refused(tmp_path: Path) ->
         McapSource().open(tmp_path / "no.mcap")
 
 
-def test_all_messages_of_the_conformance_suite_are_read() -> None:
+def test_all_messages_of_the_conformance_suite_are_read():
     folder, checked = data_folder("logs/conformance"), 0
     for path in sorted(folder.rglob("*.mcap")):
         records = json.loads(path.with_suffix(".json").read_text())["records"]
@@ -320,7 +303,7 @@ def test_all_messages_of_the_conformance_suite_are_read() -> None:
     assert checked == 205
 
 
-def test_every_real_log_is_described_or_refused() -> None:
+def test_every_real_log_is_described_or_refused():
     refused = []
     paths = [path for path in sorted(data_folder("logs").rglob("*")) if path.suffix in (".mcap", ".bag")]
     for path in paths:
@@ -336,14 +319,14 @@ def test_every_real_log_is_described_or_refused() -> None:
     assert all("contains no messages" in text or "is a ROS 1 bag" in text or "is empty" in text for text in refused)
 
 
-def test_the_field_log_has_its_tilt_at_ten_hertz() -> None:
+def test_the_field_log_has_its_tilt_at_ten_hertz():
     path = data_folder("logs/field") / "SO_bag_0.mcap"
     tilts = [item for _, stream, item in items_of(path) if stream == "inclinometer"]
     assert len(tilts) == 161
     assert all(abs(np.linalg.norm(tilt.up) - 1) < 1e-9 for tilt in tilts)
 
 
-def test_messages_of_an_undefined_channel_are_reported(tmp_path: Path) -> None:
+def test_messages_of_an_undefined_channel_are_reported(tmp_path):
     log = tmp_path / "log.mcap"
     with log.open("wb") as file:
         writer = Writer(file, use_chunking=False, use_statistics=False)

@@ -1,10 +1,7 @@
 """After the recorder's clock was set back, messages are lost until its old time, and no others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +9,8 @@ import pytest
 from recordings import McapSource
 from recordings.mcap.index import MAX_JITTER_NS
 from recordings.source import topics as mcap_messages
-from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, inventory_of, items_of, rewritten
+from tests.conftest import rewrite
+from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essence, inventory_of, items_of
 
 BACK = 2 * PERIOD + PERIOD // 2
 FIRST = 3  # the first frame after the clock was set back
@@ -30,10 +28,8 @@ def set_back(messages: list[Any]) -> list[Any]:
 
 
 @pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
-def test_messages_after_a_set_back_clock_are_lost_until_its_old_time(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, options: dict[str, Any]
-) -> None:
-    path = rewritten(sample, tmp_path / "log.mcap", order=set_back, **options)
+def test_messages_after_a_set_back_clock_are_lost_until_its_old_time(sample, whole, tmp_path, options):
+    path = rewrite(sample, tmp_path / "log.mcap", order=set_back, **options)
     events = items_of(path)
     good = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
     assert good == [essence(item) for time, _, item in whole if time < START + FIRST * PERIOD]
@@ -55,17 +51,15 @@ def test_messages_after_a_set_back_clock_are_lost_until_its_old_time(
 
 
 @pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
-def test_nothing_is_lost_from_a_second_beyond_the_old_time(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, options: dict[str, Any]
-) -> None:
-    def back_and_on(messages: list[Any]) -> list[Any]:
+def test_nothing_is_lost_from_a_second_beyond_the_old_time(sample, whole, tmp_path, options):
+    def back_and_on(messages):
         """Two seconds per frame; the clock set back before FIRST and corrected after it."""
         for _, _, message in messages:
             is_back = (message.log_time - START) // PERIOD == FIRST
             message.log_time = START + 20 * (message.log_time - START - (BACK if is_back else 0))
         return messages
 
-    events = items_of(rewritten(sample, tmp_path / "log.mcap", order=back_and_on, **options))
+    events = items_of(rewrite(sample, tmp_path / "log.mcap", order=back_and_on, **options))
     lost = [(stream, item) for _, stream, item in events if isinstance(item, Exception)]
     assert sorted(stream for stream, _ in lost) == ["inclinometer", "left", "left", "odometry", "right", "right"]
     good = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
@@ -73,49 +67,43 @@ def test_nothing_is_lost_from_a_second_beyond_the_old_time(
 
 
 @pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
-def test_images_and_tilts_across_a_set_back_clock_are_not_joined(
-    sample: Path, tmp_path: Path, options: dict[str, Any]
-) -> None:
-    def rare_images(messages: list[Any]) -> list[Any]:
+def test_images_and_tilts_across_a_set_back_clock_are_not_joined(sample, tmp_path, options):
+    def rare_images(messages):
         """The clock set back, without the left images of frames 1 and 2: they alone do not show it."""
         rare = range(START + PERIOD, START + FIRST * PERIOD)
         kept = [found for found in messages if found[1].topic != LEFT or found[2].log_time not in rare]
         return set_back(kept)
 
-    path = rewritten(sample, tmp_path / "log.mcap", order=rare_images, **options)
+    path = rewrite(sample, tmp_path / "log.mcap", order=rare_images, **options)
     left = [item for _, stream, item in items_of(path) if stream == "left"]
     assert [item.stamp for item in left if not isinstance(item, Exception)] == [START]
     assert len([item for item in left if str(item).startswith(f"{LEFT}: the log's clock was set back")]) == 2
 
 
 @pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
-def test_a_log_written_by_topic_or_with_jitter_loses_nothing(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, options: dict[str, Any]
-) -> None:
-    def by_topic(messages: list[Any]) -> list[Any]:
+def test_a_log_written_by_topic_or_with_jitter_loses_nothing(sample, whole, tmp_path, options):
+    def by_topic(messages):
         """By topic, and in each the messages two by two in the wrong order."""
         topics = dict.fromkeys(channel.topic for _, channel, _ in messages)
         rows = [[found for found in messages if found[1].topic == topic] for topic in topics]
         assert max(b[2].log_time - a[2].log_time for row in rows for a, b in pairwise(row)) == MAX_JITTER_NS
         return [row[place] for row in rows for place in sorted(range(len(row)), key=lambda number: number ^ 1)]
 
-    events = items_of(rewritten(sample, tmp_path / "log.mcap", order=by_topic, **options))
+    events = items_of(rewrite(sample, tmp_path / "log.mcap", order=by_topic, **options))
     assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
     assert sorted((t, s, essence(i)) for t, s, i in events) == sorted((t, s, essence(i)) for t, s, i in whole)
 
 
-def test_a_clock_set_back_to_the_start_keeps_the_sensors(
-    sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clock_set_back_to_the_start_keeps_the_sensors(sample, tmp_path, monkeypatch):
     monkeypatch.setattr(mcap_messages, "_MAX_SAMPLES", 1)  # lost messages come first and may exceed the sample
 
-    def far_back(messages: list[Any]) -> list[Any]:
+    def far_back(messages):
         for _, _, message in messages:
             if message.log_time >= START + FIRST * PERIOD:
                 message.log_time -= 100 * PERIOD
         return messages
 
-    with McapSource().open(rewritten(sample, tmp_path / "log.mcap", order=far_back)) as log:
+    with McapSource().open(rewrite(sample, tmp_path / "log.mcap", order=far_back)) as log:
         assert log.missing == {}
         stamps = [
             item.stamp for _, stream, item in log.events() if stream == "left" and not isinstance(item, Exception)
@@ -124,23 +112,23 @@ def test_a_clock_set_back_to_the_start_keeps_the_sensors(
 
 
 @pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
-def test_a_single_log_time_that_leaps_ahead_is_damage(sample: Path, tmp_path: Path, options: dict[str, Any]) -> None:
-    def one_ahead(messages: list[Any]) -> list[Any]:
+def test_a_single_log_time_that_leaps_ahead_is_damage(sample, tmp_path, options):
+    def one_ahead(messages):
         found = next(m for _, channel, m in messages if channel.topic == LEFT and m.log_time > START + PERIOD)
         found.log_time += 10**13
         return messages
 
-    events = items_of(rewritten(sample, tmp_path / "log.mcap", order=one_ahead, **options))
+    events = items_of(rewrite(sample, tmp_path / "log.mcap", order=one_ahead, **options))
     assert not [item for _, _, item in events if isinstance(item, Exception)]
     assert sum(stream == "left" for _, stream, _ in events) == FRAMES
 
 
-def test_static_transforms_hold_whenever_they_were_logged(sample: Path, tmp_path: Path) -> None:
-    def late_before(messages: list[Any]) -> list[Any]:
+def test_static_transforms_hold_whenever_they_were_logged(sample, tmp_path):
+    def late_before(messages):
         (schema, channel, message), *others = messages
         assert channel.topic == "/tf_static"
         nothing = replace(message, log_time=START + 9 * PERIOD, data=message.data[:4] + bytes(4))
         return [(schema, channel, nothing), (schema, channel, message), *others]
 
-    with McapSource().open(rewritten(sample, tmp_path / "log.mcap", order=late_before)) as log:
+    with McapSource().open(rewrite(sample, tmp_path / "log.mcap", order=late_before)) as log:
         assert (log.missing, log.resolution.problems) == ({}, [])

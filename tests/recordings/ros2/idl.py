@@ -1,8 +1,6 @@
 """ROS 2 message types as rosidl writes them in IDL, and rosbag2 into its logs: with comments, includes, annotations,
 typedefs for arrays of fixed size, and a module of constants."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from recordings.ros2.cdr import TYPES

@@ -1,7 +1,5 @@
 """ROS 2 messages to data: colour order, byte order, angles as directions."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2
@@ -22,7 +20,7 @@ from tests.recordings.sample_log import HEIGHT, WIDTH, picture
 
 
 @given(st.floats(-60, 60), st.floats(-60, 60), st.floats(-180, 180))
-def test_up_agrees_with_a_rotated_rover(pitch: float, roll: float, yaw: float) -> None:
+def test_up_agrees_with_a_rotated_rover(pitch, roll, yaw):
     # Euler: nose up is a negative turn about y (left), left side up a positive one about x (forward).
     attitude = Rotation.from_euler("ZYX", [yaw, -pitch, roll], degrees=True)
     up = attitude.inv().apply([0, 0, 1])
@@ -36,12 +34,12 @@ def test_up_agrees_with_a_rotated_rover(pitch: float, roll: float, yaw: float) -
         assert attitude.apply([0, 1, 0])[2] > 0  # the left side is up
 
 
-def test_impossible_angles_are_refused() -> None:
+def test_impossible_angles_are_refused():
     with pytest.raises(LogError, match="check unit and tilt_model"):
         up_of(1.2, 1.2, "axis")
 
 
-def test_a_calibration_respects_region_of_interest_and_binning() -> None:
+def test_a_calibration_respects_region_of_interest_and_binning():
     k = np.array([[500.0, 0, 330], [0, 510, 250], [0, 0, 1]])
     p = np.array([[490.0, 0, 320, -120], [0, 490, 240, 0], [0, 0, 1, 0]])
     message = camera_info(1, "cam", CameraModel(640, 480, k, np.zeros(5), np.eye(3), p))
@@ -66,14 +64,14 @@ def raw_image(encoding: str, rows: np.ndarray, width: int, big: bool = False) ->
     ("encoding", "order"),
     [("rgb8", [0, 1, 2]), ("bgr8", [2, 1, 0]), ("8UC3", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0])],
 )
-def test_every_colour_order_is_read_as_rgb(encoding: str, order: list[int], padding: int) -> None:
+def test_every_colour_order_is_read_as_rgb(encoding, order, padding):
     rgb = picture(7)
     rows = np.pad(rgb[:, :, order].reshape(HEIGHT, -1), ((0, 0), (0, padding)), constant_values=99)
     np.testing.assert_array_equal(pixels_of(raw_image(encoding, rows, WIDTH)), rgb)
 
 
 @pytest.mark.parametrize("big", [False, True])
-def test_gray_of_16_bit_is_read_in_its_byte_order(big: bool) -> None:
+def test_gray_of_16_bit_is_read_in_its_byte_order(big):
     gray = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 257 + 3
     rows = gray.astype(">u2" if big else "<u2").view(np.uint8)
     out = pixels_of(raw_image("mono16", rows, WIDTH, big))
@@ -83,7 +81,7 @@ def test_gray_of_16_bit_is_read_in_its_byte_order(big: bool) -> None:
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_a_bayer_image_of_one_colour_has_that_colour(pattern: str) -> None:
+def test_a_bayer_image_of_one_colour_has_that_colour(pattern):
     colour = {"r": 200, "g": 90, "b": 30}
     tile = np.array([colour[letter] for letter in pattern], np.uint8).reshape(2, 2)
     out = pixels_of(raw_image(f"bayer_{pattern}8", np.tile(tile, (8, 12)), 24))
@@ -95,7 +93,7 @@ def compressed(data: bytes, kind: str) -> Any:
     return make("sensor_msgs/msg/CompressedImage", header=header(1, "cam"), format=kind, data=content)
 
 
-def test_compressed_images_are_decoded_and_cut_ones_refused() -> None:
+def test_compressed_images_are_decoded_and_cut_ones_refused():
     rgb = picture(3)
     png = cv2.imencode(".png", rgb[:, :, ::-1])[1].tobytes()
     np.testing.assert_array_equal(pixels_of(compressed(png, "rgb8; png compressed bgr8")), rgb)
@@ -110,7 +108,7 @@ def test_compressed_images_are_decoded_and_cut_ones_refused() -> None:
 
 
 @pytest.mark.parametrize("padding", [b"\0" * 16, b"\0" * 9999, b"\xff" * 16, b"\n", b"\xff\xd9" + b" " * 500])
-def test_padding_after_a_compressed_image_is_harmless(padding: bytes) -> None:
+def test_padding_after_a_compressed_image_is_harmless(padding):
     pixels = np.full((16, 24, 3), (200, 90, 30), np.uint8)
     jpeg = cv2.imencode(".jpg", pixels)[1].tobytes()
     assert pixels_of(compressed(jpeg + padding, "jpeg"), (24, 16)).shape == (16, 24, 3)
@@ -118,9 +116,7 @@ def test_padding_after_a_compressed_image_is_harmless(padding: bytes) -> None:
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("optimize", [0, 1])
-def test_an_image_of_another_size_is_refused_before_decoding(
-    suffix: str, optimize: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_image_of_another_size_is_refused_before_decoding(suffix, optimize, monkeypatch):
     flags = [cv2.IMWRITE_JPEG_PROGRESSIVE, optimize] if suffix == ".jpg" else []
     data = cv2.imencode(suffix, picture(1), flags)[1].tobytes()
     assert pixels_of(compressed(data, suffix), (WIDTH, HEIGHT)).shape == (HEIGHT, WIDTH, 3)
@@ -132,7 +128,7 @@ def test_an_image_of_another_size_is_refused_before_decoding(
 
 
 @pytest.mark.parametrize(("first", "known"), [(0.25, True), (0.0, False), (-1.0, False)])
-def test_a_zero_or_negative_covariance_is_none(first: float, known: bool) -> None:
+def test_a_zero_or_negative_covariance_is_none(first, known):
     origin = {"position": make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)}
     turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
     pose = make(

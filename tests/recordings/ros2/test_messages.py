@@ -1,7 +1,5 @@
 """Our data as ROS 2 messages: other decoders read the same values."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import signal
@@ -128,7 +126,7 @@ def through_rosbags(message: Any) -> Any:
     return (store if name in store.types else TYPES).deserialize_cdr(TYPES.serialize_cdr(message, name), name)
 
 
-def test_another_decoder_reads_the_same_numbers(written: Path) -> None:
+def test_another_decoder_reads_the_same_numbers(written):
     sent = one_of_each()
     with written.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -140,7 +138,7 @@ def test_another_decoder_reads_the_same_numbers(written: Path) -> None:
     assert read["/diagnostics"].status[0].message == "no texture"
 
 
-def test_iter_decoded_returns_each_message_with_topic_and_time(written: Path) -> None:
+def test_iter_decoded_returns_each_message_with_topic_and_time(written):
     read = {topic: (stamp, message) for topic, stamp, message in iter_decoded(written)}
     for topic, message in one_of_each().items():
         assert read[topic][0] == STAMP
@@ -148,7 +146,7 @@ def test_iter_decoded_returns_each_message_with_topic_and_time(written: Path) ->
     assert [topic for topic, _, _ in iter_decoded(written, ["/grid"])] == ["/grid"]
 
 
-def test_a_grid_map_starts_at_the_corner_of_largest_x_and_y() -> None:
+def test_a_grid_map_starts_at_the_corner_of_largest_x_and_y():
     ours = terrain()
     message = grid_map(ours)
     assert (message.info.length_x, message.info.length_y) == (1.5, 1.0)
@@ -167,7 +165,7 @@ def test_a_grid_map_starts_at_the_corner_of_largest_x_and_y() -> None:
 @given(
     st.integers(1, 7), st.integers(1, 7), st.floats(0.01, 2.0), st.floats(-50, 50), st.integers(0, 6), st.integers(0, 6)
 )
-def test_a_grid_map_is_read_back_unchanged(rows: int, cols: int, cell: float, x: float, outer: int, inner: int) -> None:
+def test_a_grid_map_is_read_back_unchanged(rows, cols, cell, x, outer, inner):
     layer = np.random.default_rng(rows * 10 + cols).normal(size=(rows, cols)).astype(np.float32)
     ours = ElevationMap(STAMP, {"elevation": layer}, cell, (x, -x / 3), "odom")
     message = grid_map(ours)
@@ -182,7 +180,7 @@ def test_a_grid_map_is_read_back_unchanged(rows: int, cols: int, cell: float, x:
     assert (back.resolution, back.frame_id, back.stamp) == (cell, "odom", STAMP)
 
 
-def test_an_occupancy_grid_starts_at_the_lower_left() -> None:
+def test_an_occupancy_grid_starts_at_the_lower_left():
     message = occupancy_grid(navigation())
     assert (message.info.width, message.info.height) == (3, 2)
     assert (message.info.origin.position.x, message.info.origin.position.y) == (-1.0, 4.0)
@@ -192,7 +190,7 @@ def test_an_occupancy_grid_starts_at_the_lower_left() -> None:
     assert (back.resolution, back.origin, back.frame_id) == (0.05, (-1.0, 4.0), "level")
 
 
-def test_disparity_obeys_depth_equals_f_times_t_over_d() -> None:
+def test_disparity_obeys_depth_equals_f_times_t_over_d():
     message = disparity_image(disparity(cx_right=12.0))
     d = read_disparity(message)
     np.testing.assert_array_equal(d, disparity().pixels + 2)
@@ -201,7 +199,7 @@ def test_disparity_obeys_depth_equals_f_times_t_over_d() -> None:
     np.testing.assert_array_equal(read_disparity(disparity_image(disparity())), disparity().pixels)
 
 
-def test_a_cloud_packs_colours_as_in_pcl() -> None:
+def test_a_cloud_packs_colours_as_in_pcl():
     message = point_cloud(cloud())
     assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
         ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("rgb", 12, 7), ("sigma", 16, 7),
@@ -212,7 +210,7 @@ def test_a_cloud_packs_colours_as_in_pcl() -> None:
     np.testing.assert_array_equal(rows[:, 16:].copy().view("<f4")[:, 0], cloud().sigma)
 
 
-def test_a_transform_message_turns_points_like_its_transform() -> None:
+def test_a_transform_message_turns_points_like_its_transform():
     transform = Transform("level", "camera", np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0.0]]), [1, 2, 3])
     sent = transform_message([(transform, STAMP)]).transforms[0]
     assert (sent.header.frame_id, sent.child_frame_id, stamp_of(sent.header)) == ("level", "camera", STAMP)
@@ -223,12 +221,12 @@ def test_a_transform_message_turns_points_like_its_transform() -> None:
     np.testing.assert_allclose(turned + np.array([t.x, t.y, t.z]), transform(v), atol=1e-12)
 
 
-def test_equal_calls_write_equal_bytes(tmp_path: Path) -> None:
+def test_equal_calls_write_equal_bytes(tmp_path):
     digests = [hashlib.sha256(write_sample(tmp_path / name).read_bytes()).hexdigest() for name in ("a", "b")]
     assert digests[0] == digests[1]
 
 
-def test_a_log_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
+def test_a_log_gets_its_name_when_it_is_complete(tmp_path):
     path = tmp_path / "out.mcap"
     path.write_bytes(b"the log before")
     with Ros2Writer(path) as writer:
@@ -238,12 +236,12 @@ def test_a_log_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_an_unwritable_path_is_named(tmp_path: Path) -> None:
+def test_an_unwritable_path_is_named(tmp_path):
     with pytest.raises(LogError, match=r"cannot write .*nowhere/out\.mcap: No such file"):
         Ros2Writer(tmp_path / "nowhere" / "out.mcap")
 
 
-def test_an_output_that_is_a_folder_is_refused_at_once(tmp_path: Path) -> None:
+def test_an_output_that_is_a_folder_is_refused_at_once(tmp_path):
     (tmp_path / "out.mcap").mkdir()
     with pytest.raises(LogError, match=r"cannot write .*out\.mcap: it is a folder"):
         Ros2Writer(tmp_path / "out.mcap")
@@ -254,7 +252,7 @@ def test_an_output_that_is_a_folder_is_refused_at_once(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["late.mcap", "out.mcap"]
 
 
-def test_two_writers_of_one_path_each_write_a_complete_log(tmp_path: Path) -> None:
+def test_two_writers_of_one_path_each_write_a_complete_log(tmp_path):
     path = tmp_path / "out.mcap"
     writers = [Ros2Writer(path), Ros2Writer(path)]
     for number in range(1, 50):
@@ -266,7 +264,7 @@ def test_two_writers_of_one_path_each_write_a_complete_log(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_log_is_renamed_after_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_is_renamed_after_it_is_on_the_disk(tmp_path, monkeypatch):
     order: list[str] = []
     settle, replace = os.fsync, Path.replace
     monkeypatch.setattr(os, "fsync", lambda number: (order.append("settled"), settle(number))[1])
@@ -276,14 +274,14 @@ def test_a_log_is_renamed_after_it_is_on_the_disk(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("stamp", [-1, 2**31 * 10**9])
-def test_a_stamp_outside_ros_time_is_refused(tmp_path: Path, stamp: int) -> None:
+def test_a_stamp_outside_ros_time_is_refused(tmp_path, stamp):
     with Ros2Writer(tmp_path / "out.mcap") as writer:
         with pytest.raises(ValueError, match=f"the stamp {stamp} ns is outside ROS time"):
             writer.write("/image", image(1, "cam", np.zeros((2, 2), np.uint8)), stamp)
         writer.abort()
 
 
-def test_a_full_disk_is_reported_and_leaves_no_file(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_leaves_no_file(tmp_path):
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -301,10 +299,10 @@ def test_a_full_disk_is_reported_and_leaves_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_codecs_are_built_safely_by_many_threads() -> None:
+def test_codecs_are_built_safely_by_many_threads():
     text = "".join(f"float64 field{number}\n" for number in range(20)).encode()
 
-    def decoded(number: int) -> float:
+    def decoded(number):
         decoder = decoder_for(f"vendor_msgs/msg/Kind{number % 4}", "ros2msg", text)
         return float(decoder(b"\0\1\0\0" + np.arange(20.0).tobytes()).field19)
 
@@ -312,7 +310,7 @@ def test_codecs_are_built_safely_by_many_threads() -> None:
         assert set(pool.map(decoded, range(64))) == {19.0}
 
 
-def test_a_schema_may_leave_out_standard_types() -> None:
+def test_a_schema_may_leave_out_standard_types():
     decoder = decoder_for("vendor_msgs/msg/Tilt", "ros2msg", b"std_msgs/Header header\nfloat32 pitch\n")
     header = make("std_msgs/msg/Header", stamp=make("builtin_interfaces/msg/Time", sec=1, nanosec=2), frame_id="abc")
     raw = bytes(TYPES.serialize_cdr(header, "std_msgs/msg/Header")) + np.float32(2.5).tobytes()
@@ -320,7 +318,7 @@ def test_a_schema_may_leave_out_standard_types() -> None:
     assert (message.header.frame_id, message.pitch) == ("abc", 2.5)
 
 
-def test_idl_schemas_of_rosidl_are_read(tmp_path: Path) -> None:
+def test_idl_schemas_of_rosidl_are_read(tmp_path):
     seen = set()
     with write_sample(tmp_path / "log.mcap").open("rb") as log:
         for schema, _, message in make_reader(log).iter_messages():
@@ -338,19 +336,19 @@ RECURSIVE = {
 
 
 @pytest.mark.parametrize("text", RECURSIVE.values(), ids=RECURSIVE)
-def test_a_schema_that_contains_itself_is_refused(text: bytes) -> None:
+def test_a_schema_that_contains_itself_is_refused(text):
     with pytest.raises(LogError, match="vendor_msgs/msg/Odd contains itself"):
         decoder_for("vendor_msgs/msg/Odd", "ros2msg", text)
 
 
-def test_a_schema_with_byte_order_mark_or_crlf_is_read() -> None:
+def test_a_schema_with_byte_order_mark_or_crlf_is_read():
     plain = "std_msgs/Header header\nfloat32 pitch # 0 to 90 °\n"
     for text in (plain.encode("latin-1"), plain.replace("\n", "\r\n").encode(), plain.encode("utf-8-sig")):
         decode = decoder_for("vendor_msgs/msg/Tilt", "ros2msg", text)
         assert decode(b"\0\1\0\0" + struct.pack("<iII4xf", 5, 6, 1, 0.25)).pitch == 0.25
 
 
-def test_an_empty_schema_means_a_type_without_fields() -> None:
+def test_an_empty_schema_means_a_type_without_fields():
     decoder = decoder_for("test_msgs/msg/Empty", "ros2msg", b"")
     assert type(decoder(b"\0\1\0\0\0")).__name__.endswith("Empty")
     with pytest.raises(Exception, match="size mismatch"):
@@ -359,12 +357,12 @@ def test_an_empty_schema_means_a_type_without_fields() -> None:
 
 @settings(max_examples=30)
 @given(st.binary(max_size=80))
-def test_an_invalid_schema_is_a_log_error(text: bytes) -> None:
+def test_an_invalid_schema_is_a_log_error(text):
     with suppress(LogError):  # any other exception fails the test
         decoder_for("vendor_msgs/msg/Odd", "ros2msg", text)
 
 
-def test_messages_of_real_recorders_are_decoded() -> None:
+def test_messages_of_real_recorders_are_decoded():
     folder = data_folder("logs/rosbag2")
     talker = folder / "rosbag2_py__test__resources__mcap__talker__talker.mcap"
     assert sum(1 for _ in iter_decoded(talker)) == 20
@@ -372,7 +370,7 @@ def test_messages_of_real_recorders_are_decoded() -> None:
     assert sum(1 for _ in iter_decoded(cdr)) == 7
 
 
-def test_a_point_cloud_is_read_with_padding_and_either_byte_order() -> None:
+def test_a_point_cloud_is_read_with_padding_and_either_byte_order():
     rng = np.random.default_rng(3)
     points, colors = rng.normal(size=(7, 3)).astype(np.float32), rng.integers(0, 256, (7, 3), dtype=np.uint8)
     points[2] = np.nan
@@ -390,7 +388,7 @@ def test_a_point_cloud_is_read_with_padding_and_either_byte_order() -> None:
         read_point_cloud(replace(message, fields=[replace(message.fields[0], datatype=8), *message.fields[1:]]))
 
 
-def test_a_point_cloud_contains_the_origin_of_its_points() -> None:
+def test_a_point_cloud_contains_the_origin_of_its_points():
     points = np.arange(9, dtype=np.float32).reshape(3, 3)
     source = np.array([PixelOrigin.MEASURED, PixelOrigin.FILLED, PixelOrigin.PLANE], np.uint8)
     black, index = np.zeros((3, 3), np.uint8), np.arange(3, dtype=np.int32)
@@ -399,7 +397,7 @@ def test_a_point_cloud_contains_the_origin_of_its_points() -> None:
     assert "source" not in read_point_cloud(point_cloud(replace(cloud, source=None)))
 
 
-def test_the_error_of_an_unparsable_schema_is_short() -> None:
+def test_the_error_of_an_unparsable_schema_is_short():
     text = b"MSG: what is this\n" + b"int64 number\n" * 200
     with pytest.raises(LogError, match="schema 'vendor_msgs/msg/Long' cannot be parsed") as caught:
         decoder_for("vendor_msgs/msg/Long", "ros2msg", text)

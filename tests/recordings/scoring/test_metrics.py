@@ -1,7 +1,5 @@
 """Error metrics, on cases small enough to work out by hand."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pose errors are errors of the path; origin and heading of the frame of reference do not matter."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

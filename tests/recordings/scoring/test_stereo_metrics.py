@@ -1,7 +1,5 @@
 """Disparity errors, on cases small enough to work out by hand and against the definition written out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

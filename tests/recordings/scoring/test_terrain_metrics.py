@@ -1,7 +1,5 @@
 """The scores of maps count errors, hallucinated values and hidden rocks correctly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -45,7 +43,7 @@ def scored(truth: TrueGround, layers: dict[str, Array], cells: Array | None = No
     return tally.metrics()
 
 
-def test_heights_count_in_visible_cells_and_levelling_removes_a_plane() -> None:
+def test_heights_count_in_visible_cells_and_levelling_removes_a_plane():
     truth = flat_truth()
     tilted = np.where(X > 0.05, 0.02 * X + 0.01, np.nan)
     tilted[(X > 0.05) & (Y > 0)] = np.nan
@@ -57,7 +55,7 @@ def test_heights_count_in_visible_cells_and_levelling_removes_a_plane() -> None:
     assert found["0-2 m"]["seen"] + found["2-4 m"]["seen"] == found["0-4 m"]["seen"]
 
 
-def test_values_out_of_view_are_hallucinated_those_between_pixels_not() -> None:
+def test_values_out_of_view_are_hallucinated_those_between_pixels_not():
     truth = flat_truth()
     elevation = np.full((N, N), np.nan)
     elevation[160, 161:261] = 0  # seen
@@ -69,7 +67,7 @@ def test_values_out_of_view_are_hallucinated_those_between_pixels_not() -> None:
     assert found["between_pixels"] == pytest.approx(10 / 150)
 
 
-def test_stated_sigmas_cover_their_errors_and_tilt_only_the_total() -> None:
+def test_stated_sigmas_cover_their_errors_and_tilt_only_the_total():
     truth, random = flat_truth(), np.random.default_rng(1)
     sigma, tilt = 0.01 + 0.002 * RADIUS, 0.02
     noise = random.normal(0, 1, (N, N)) * sigma
@@ -83,7 +81,7 @@ def test_stated_sigmas_cover_their_errors_and_tilt_only_the_total() -> None:
     assert silent["random"] == found["random"]
 
 
-def test_intervals_are_summed_over_the_given_tilt_errors() -> None:
+def test_intervals_are_summed_over_the_given_tilt_errors():
     truth, random, tilt = flat_truth(), np.random.default_rng(3), 0.003
     own, others = np.array([0.2 * tilt, 0.1 * tilt]), random.normal(0, tilt, (400, 2))
     lean = own[0] * X + own[1] * Y
@@ -96,7 +94,7 @@ def test_intervals_are_summed_over_the_given_tilt_errors() -> None:
     assert total["2"] == pytest.approx(0.954, abs=0.02)
 
 
-def test_a_rock_is_visible_by_half_its_height_and_detected_by_a_hazard() -> None:
+def test_a_rock_is_visible_by_half_its_height_and_detected_by_a_hazard():
     rocks = (
         (4.0, 0.0, 0.5, 0.25, 400.0, 0.9),  # found
         (4.0, 2.0, 0.5, 0.35, 400.0, 0.9),  # missed: the hazard is two cells off
@@ -117,7 +115,7 @@ def test_a_rock_is_visible_by_half_its_height_and_detected_by_a_hazard() -> None
     }  # fmt: skip
 
 
-def test_unknown_is_neither_a_false_alarm_nor_a_detection() -> None:
+def test_unknown_is_neither_a_false_alarm_nor_a_detection():
     truth = flat_truth(((4.0, 0.0, 0.5, 0.25, 400.0, 0.9), (-3.0, 0.0, 0.5, 0.25, 0.0, 0.0)))
     nothing = scored(truth, {}, None)
     assert nothing["hazards"]["unknown"] == 1
@@ -132,7 +130,7 @@ def test_unknown_is_neither_a_false_alarm_nor_a_detection() -> None:
     assert np.isnan(hazards["by_slope"]["0-5 deg"])
 
 
-def test_frames_add_up_and_the_table_prints() -> None:
+def test_frames_add_up_and_the_table_prints():
     truth = flat_truth(((4.0, 0.0, 0.5, 0.25, 400.0, 0.9),))
     tally = TerrainTally()
     for height in (0.0, 0.1):
@@ -146,7 +144,7 @@ def test_frames_add_up_and_the_table_prints() -> None:
     assert all(len(line) <= 100 for line in text.splitlines())
 
 
-def test_a_truth_without_the_simulators_layers_is_no_truth() -> None:
+def test_a_truth_without_the_simulators_layers_is_no_truth():
     terrain = ElevationMap(1, {"elevation": np.zeros((4, 4), np.float32)}, 0.05, (0.0, 0.0), "level")
     assert TrueGround.of(terrain, np.zeros((4, 4), bool), np.zeros((0, 6))) is None
 
@@ -157,7 +155,7 @@ def simulated() -> tuple[Any, ElevationMap]:
     return truth, ground_truth.truth_maps(SMALL, SMALL.stamp(0), truth)[0]
 
 
-def test_visible_cells_are_in_view_and_the_others_in_view_adjoin_them(simulated: Any) -> None:
+def test_visible_cells_are_in_view_and_the_others_in_view_adjoin_them(simulated):
     layers = simulated[1].layers
     visible, in_view = layers["visible"] > 0.5, layers["in_view"] > 0.5
     assert in_view[visible].all()
@@ -170,7 +168,7 @@ def test_visible_cells_are_in_view_and_the_others_in_view_adjoin_them(simulated:
     assert np.median(np.abs(mean - layers["elevation"])[smooth]) < 0.002
 
 
-def test_a_point_below_the_ground_or_behind_the_camera_is_not_in_sight(simulated: Any) -> None:
+def test_a_point_below_the_ground_or_behind_the_camera_is_not_in_sight(simulated):
     truth, terrain = simulated
     row, col = np.nonzero(terrain.layers["visible"] > 0.5)
     x, y = (-8 + (index + 0.5) * 0.05 for index in (col, row))
@@ -181,7 +179,7 @@ def test_a_point_below_the_ground_or_behind_the_camera_is_not_in_sight(simulated
     assert not in_sight(SMALL, truth, behind).any()
 
 
-def test_rocks_in_view_span_what_shows_of_them(simulated: Any) -> None:
+def test_rocks_in_view_span_what_shows_of_them(simulated):
     truth, _ = simulated
     pixels, shown = rocks_in_view(SMALL, truth).T
     assert (pixels[shown > 0] >= 1).all()

@@ -1,7 +1,5 @@
 """One small frame of everything as a rerun recording, and ways to read such a recording back."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -94,9 +92,16 @@ def scene(stamp: int = START) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def record_of(path: Path, records: Iterable[Record], summary: Mapping[str, Any] | None = None, **settings: Any) -> Path:
+def record_of(
+    path: Path,
+    records: Iterable[Record],
+    summary: Mapping[str, Any] | None = None,
+    streams: Mapping[str, Any] = STREAMS,
+    **settings: Any,
+) -> Path:
     sink = RerunSink(**settings)
-    sink.open(path, STREAMS, {"log": "traverse.mcap"})
+    assert all(sink.wants(name, kind) for name, kind in streams.items())
+    sink.open(path, streams, {"log": "traverse.mcap"})
     for record in records:
         sink.write(record)
     sink.close(summary or {"verdict": "COMPLETE"})

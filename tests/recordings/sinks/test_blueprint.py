@@ -1,7 +1,5 @@
 """The blueprint has one view, with a name of its own, for every entity that was logged."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from recordings.sinks.blueprint import Panel, ViewSpec, blueprint
@@ -12,7 +10,7 @@ def views(part: Any) -> list[Any]:
     return [view for inner in part.contents for view in views(inner)] if hasattr(part, "grid_columns") else [part]
 
 
-def test_the_blueprint_has_a_view_for_each_entity_and_no_empty_one() -> None:
+def test_the_blueprint_has_a_view_for_each_entity_and_no_empty_one():
     specs = [
         ViewSpec(Panel.LEFT, "rectified", "left", "left"),
         ViewSpec(Panel.DISPARITY, "matched", "pixels", "matched"),
@@ -21,8 +19,8 @@ def test_the_blueprint_has_a_view_for_each_entity_and_no_empty_one() -> None:
     assert sorted(names) == ["ledger", "left", "matched", "run"]
 
 
-def test_two_streams_of_one_type_have_tabs_of_two_names() -> None:
-    def names(*streams: str) -> list[str]:
+def test_two_streams_of_one_type_have_tabs_of_two_names():
+    def names(*streams):
         panels = ((Panel.RELIEF, "relief"), (Panel.LAYER, "elevation"), (Panel.LAYER, "slope"))
         specs = [ViewSpec(panel, stream, title, title) for stream in streams for panel, title in panels]
         specs.append(ViewSpec(Panel.RELIEF, "regional", "relief", "relief (odom)"))
@@ -35,7 +33,7 @@ def test_two_streams_of_one_type_have_tabs_of_two_names() -> None:
     ]  # fmt: skip
 
 
-def test_a_plot_of_many_lines_has_no_legend() -> None:
+def test_a_plot_of_many_lines_has_no_legend():
     for stages in (2, 25):
         specs = [ViewSpec(Panel.STAGE, root, str(n), str(n)) for root in ("seconds", "queues") for n in range(stages)]
         plots = views(blueprint(specs).root_container)[:2]

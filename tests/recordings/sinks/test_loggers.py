@@ -1,9 +1,6 @@
 """Every picture of a recording shows the frame's data at their places, with their values."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +8,6 @@ import pytest
 import rerun as rr
 
 from recordings.sinks.loggers import same_view
-from recordings.sinks.rerun_sink import RerunSink
 from stages.data import LEVEL_FRAME, Cell, Pose, StereoCamera, StereoFrame, Transform
 from tests.recordings.sinks.recorded_scene import (
     HEIGHT,
@@ -27,7 +23,7 @@ from tests.recordings.sinks.recorded_scene import (
 )
 
 
-def test_disparities_are_stored_to_an_eighth_of_a_px_unknown_as_0(rrd: Path) -> None:
+def test_disparities_are_stored_to_an_eighth_of_a_px_unknown_as_0(rrd):
     blob = rows(rrd, "/disparity/pixels", "EncodedDepthImage:blob")[0][2][0]
     stored = decoded(blob, cv2.IMREAD_UNCHANGED) / 8.0
     truth = scene()["disparity"].pixels
@@ -36,7 +32,7 @@ def test_disparities_are_stored_to_an_eighth_of_a_px_unknown_as_0(rrd: Path) -> 
     assert (stored[~known] == 0).all()
 
 
-def test_superpixel_edges_lie_between_different_labels(rrd: Path) -> None:
+def test_superpixel_edges_lie_between_different_labels(rrd):
     edges = decoded(rows(rrd, "/disparity/superpixels", "EncodedImage:blob")[0][2][0], cv2.IMREAD_GRAYSCALE)
     assert edges.shape == (HEIGHT, WIDTH)
     column, row = np.arange(WIDTH) % 8 == 7, np.arange(HEIGHT) % 8 == 7
@@ -44,12 +40,12 @@ def test_superpixel_edges_lie_between_different_labels(rrd: Path) -> None:
     np.testing.assert_array_equal(edges > 0, row[:, None] | column)
 
 
-def test_images_are_recognisable(rrd: Path) -> None:
+def test_images_are_recognisable(rrd):
     left = decoded(rows(rrd, "/rectified/left", "EncodedImage:blob")[0][2][0], cv2.IMREAD_GRAYSCALE)
     assert np.abs(left.astype(int) - scene()["rectified"].left).mean() < 8
 
 
-def test_the_same_pixels_are_stored_once(rrd: Path, tmp_path: Path) -> None:
+def test_the_same_pixels_are_stored_once(rrd, tmp_path):
     assert "/stereo/left" not in entities(rrd)
     items = scene()
     raw = items["stereo"]
@@ -57,17 +53,17 @@ def test_the_same_pixels_are_stored_once(rrd: Path, tmp_path: Path) -> None:
     assert {"/stereo/left", "/rectified/left"} <= entities(record_of(tmp_path / "raw.rrd", [Record(START, items)]))
 
 
-def test_clouds_are_thinned_by_a_fixed_stride(tmp_path: Path) -> None:
+def test_clouds_are_thinned_by_a_fixed_stride(tmp_path):
     path = record_of(tmp_path / "few.rrd", [Record(START, scene())], max_points=300)
     positions = rows(path, "/points/points", "Points3D:positions")[0][2]
     np.testing.assert_array_equal(positions, scene()["points"].points[::4])
 
 
-def test_a_cloud_in_the_camera_frame_is_not_drawn(rrd: Path) -> None:
+def test_a_cloud_in_the_camera_frame_is_not_drawn(rrd):
     assert not any(path.startswith("/cloud") for path in entities(rrd))
 
 
-def test_the_surface_has_no_triangle_across_a_hole(rrd: Path) -> None:
+def test_the_surface_has_no_triangle_across_a_hole(rrd):
     vertices = np.array(rows(rrd, "/elevation_map/surface", "Mesh3D:vertex_positions")[0][2])
     triangles = np.array(rows(rrd, "/elevation_map/surface", "Mesh3D:triangle_indices")[0][2])
     terrain = scene()["elevation_map"]
@@ -79,48 +75,44 @@ def test_the_surface_has_no_triangle_across_a_hole(rrd: Path) -> None:
     assert len(triangles) == 2 * (29 * 39 - 5 * 6) + 2
 
 
-def test_maps_are_seen_from_above_with_forward_up_and_left_left(rrd: Path) -> None:
+def test_maps_are_seen_from_above_with_forward_up_and_left_left(rrd):
     """The one hazard is at row 2 (right, y small) and column 3 (near, x small): lower right in the picture."""
     blob = bytes(rows(rrd, "/navigation_map/cells/labels", "SegmentationImage:buffer")[0][2][0])
     picture = np.frombuffer(blob, np.uint8).reshape(40, 30)
     assert np.argwhere(picture == Cell.HAZARD).tolist() == [[40 - 1 - 3, 30 - 1 - 2]]
 
 
-def test_hazards_are_drawn_on_the_ground_at_their_cells(rrd: Path) -> None:
+def test_hazards_are_drawn_on_the_ground_at_their_cells(rrd):
     position = rows(rrd, "/navigation_map/hazards", "Points3D:positions")[0][2]
     ground = scene()["elevation_map"].layers["elevation"][2, 3]
     np.testing.assert_allclose(position, [[0.35, -1.25, ground + 0.03]], atol=1e-6)
 
 
-def test_a_regional_map_is_drawn_in_its_own_frame_of_reference(tmp_path: Path) -> None:
+def test_a_regional_map_is_drawn_in_its_own_frame_of_reference(tmp_path):
     items = scene()
     near, cells = items["elevation_map"], items["navigation_map"]
     level = Transform("odom", LEVEL_FRAME, np.eye(3), [6.0, 0.0, 2.0])
     layers = {name: layer + np.float32(2.0) for name, layer in near.layers.items()}
     items["regional_map"] = replace(near, layers=layers, origin=(5.0, -1.5), frame_id="odom", level=level)
     items["regional_navigation_map"] = replace(cells, origin=(5.0, -1.5), frame_id="odom")
-    sink = RerunSink()
-    sink.open(tmp_path / "run.rrd", dict.fromkeys(items, object), {})
-    sink.write(Record(START, items))
-    sink.close({"verdict": "COMPLETE"})
+    path = record_of(tmp_path / "run.rrd", [Record(START, items)], streams={n: type(item) for n, item in items.items()})
     ground = near.layers["elevation"][2, 3]
     for stream, place in (("navigation_map", (0.35, -1.25, 0)), ("regional_navigation_map", (5.35, -1.25, 2))):
-        position = rows(tmp_path / "run.rrd", f"/{stream}/hazards", "Points3D:positions")[0][2]
+        position = rows(path, f"/{stream}/hazards", "Points3D:positions")[0][2]
         np.testing.assert_allclose(position, [np.add(place, (0, 0, ground + 0.03))], atol=1e-6)
-    assert len(rows(tmp_path / "run.rrd", "/regional_map/surface", "Mesh3D:vertex_positions")) == 1
+    assert len(rows(path, "/regional_map/surface", "Mesh3D:vertex_positions")) == 1
     names, spots = (
-        rows(tmp_path / "run.rrd", "/regional_map/relief/lines/distances", f"Points2D:{part}")[0][2]
-        for part in ("labels", "positions")
+        rows(path, "/regional_map/relief/lines/distances", f"Points2D:{part}")[0][2] for part in ("labels", "positions")
     )
     # 40 columns from x = 5: the rover, at x = 6, is 10 columns from the lower edge, and in the middle of 30 rows.
     assert spots[names.index("rover")] == [15.0, 30.0]
 
 
-def test_the_camera_is_drawn_at_the_sensor_of_the_cloud(rrd: Path) -> None:
+def test_the_camera_is_drawn_at_the_sensor_of_the_cloud(rrd):
     assert rows(rrd, "/rectified/camera", "Transform3D:translation")[0][2] == [pytest.approx([0.0, 0.0, 0.9])]
 
 
-def test_scalars_are_those_of_the_frame(rrd: Path) -> None:
+def test_scalars_are_those_of_the_frame(rrd):
     assert [value for *_, value in rows(rrd, "/seconds/disparity", "Scalars:scalars")] == [[0.5]] * 3
     assert [value for *_, value in rows(rrd, "/queues/matched", "Scalars:scalars")] == [[3.0]] * 3
     steps = rows(rrd, "/queues/matched", "SeriesLines:interpolation_mode")
@@ -129,7 +121,7 @@ def test_scalars_are_those_of_the_frame(rrd: Path) -> None:
     assert tilt == [pytest.approx(np.degrees(0.1))]
 
 
-def test_curves_of_one_plot_differ_in_colour(rrd: Path) -> None:
+def test_curves_of_one_plot_differ_in_colour(rrd):
     names = [
         *("/tilt/" + axis for axis in ("x axis up", "y axis up")),
         *("/points/camera " + way for way in ("pitch down", "roll right")),
@@ -140,7 +132,7 @@ def test_curves_of_one_plot_differ_in_colour(rrd: Path) -> None:
     assert len({found[0][2][0] for found in colours}) == 4
 
 
-def test_the_tilt_check_is_plotted_and_its_fault_logged_once(rrd: Path, tmp_path: Path) -> None:
+def test_the_tilt_check_is_plotted_and_its_fault_logged_once(rrd, tmp_path):
     (_, _, turn), *_ = rows(rrd, "/health/" + rr.escape_entity_path_part("tilt off turn"), "Scalars:scalars")
     assert turn[0] == pytest.approx(np.degrees(0.01))
     assert rows(rrd, "/motion/features", "Scalars:scalars")[0][2] == [321.0]
@@ -156,12 +148,11 @@ def test_the_tilt_check_is_plotted_and_its_fault_logged_once(rrd: Path, tmp_path
     assert rows(path, "/ledger", "TextLog:level")[-1][2] == ["WARN"]
 
 
-def test_the_logs_own_pose_is_drawn_once(tmp_path: Path) -> None:
-    sink, items = RerunSink(), scene()
-    sink.open(tmp_path / "run.rrd", {"logged": Pose, "pose": Pose}, {})
-    sink.write(Record(START, {"logged": items["pose"], "pose": items["pose"]}))
-    sink.close({"verdict": "COMPLETE"})
-    assert [path for path in entities(tmp_path / "run.rrd") if "trajectory" in path] == ["/pose/trajectory"]
+def test_the_logs_own_pose_is_drawn_once(tmp_path):
+    pose = scene()["pose"]
+    record = Record(START, {"logged": pose, "pose": pose})
+    path = record_of(tmp_path / "run.rrd", [record], streams={"logged": Pose, "pose": Pose})
+    assert [entity for entity in entities(path) if "trajectory" in entity] == ["/pose/trajectory"]
 
 
 def test_a_pair_is_drawn_alike_with_a_moved_right_image():

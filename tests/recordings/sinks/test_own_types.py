@@ -1,7 +1,5 @@
 """Images, numbers, texts, tables and dataclasses of a stage are drawn, and written in a standard form."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +12,13 @@ from numpy.typing import NDArray
 
 from flow.config.loader import load
 from flow.errors import PipelineError
-from recordings import McapSink, RerunSink
+from recordings import McapSink
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
 from recordings.sinks.own_types import leaves, refusal
 from stages.data import Disparity, StereoFrame, Transform
 from tests.conftest import roverflow
-from tests.recordings.sinks.recorded_scene import START, Record, decoded, entities, rows, scene
+from tests.recordings.sinks.recorded_scene import START, Record, decoded, entities, record_of, rows, scene
 
 PIPELINE = """\
 source: {use: recordings.McapSource}
@@ -92,20 +90,14 @@ def written(path: Path, kinds: dict[str, Any], *frames: dict[str, Any]) -> dict[
 
 
 def drawn(path: Path, kinds: dict[str, Any], *frames: dict[str, Any]) -> set[str]:
-    sink = RerunSink()
-    assert all(sink.wants(name, kind) for name, kind in kinds.items())
-    sink.open(path, kinds, {})
-    for number, items in enumerate(frames):
-        sink.write(Record(START + number, items))
-    sink.close({})
-    return entities(path)
+    return entities(record_of(path, [Record(START + n, items) for n, items in enumerate(frames)], streams=kinds))
 
 
 @pytest.mark.parametrize(("value", "kind", "message"), [
     (0.5, float, "Float64"), (3, float, "Float64"), (np.float32(0.5), np.float32, "Float64"), (7, int, "Int64"),
     (True, bool, "Bool"), (np.bool_(False), bool, "Bool"), ("dusty", str, "String"),
 ])  # fmt: skip
-def test_numbers_and_texts_become_std_msgs(tmp_path: Path, value: Any, kind: Any, message: str) -> None:
+def test_numbers_and_texts_become_std_msgs(tmp_path, value, kind, message):
     read = written(tmp_path / "out.mcap", {"own": kind}, {"own": value})["/nav/own"]
     assert (read.__msgtype__, read.data) == (f"std_msgs/msg/{message}", value)
 
@@ -114,7 +106,7 @@ def test_numbers_and_texts_become_std_msgs(tmp_path: Path, value: Any, kind: Any
     (np.uint8, (4, 6), "mono8"), (np.uint8, (4, 6, 3), "rgb8"), (np.uint16, (4, 6), "mono16"),
     (np.float32, (4, 6), "32FC1"), (np.float16, (4, 6), "32FC1"), (bool, (4, 6), "mono8"), (np.int32, (4, 6), "32SC1"),
 ])  # fmt: skip
-def test_images_become_sensor_msgs_images(tmp_path: Path, dtype: Any, shape: tuple[int, ...], encoding: str) -> None:
+def test_images_become_sensor_msgs_images(tmp_path, dtype, shape, encoding):
     pixels = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
     read = written(tmp_path / "out.mcap", {"own/image": np.ndarray}, {"own/image": pixels})["/nav/own/image"]
     assert (read.__msgtype__, read.encoding, read.height, read.width) == ("sensor_msgs/msg/Image", encoding, 4, 6)
@@ -124,7 +116,7 @@ def test_images_become_sensor_msgs_images(tmp_path: Path, dtype: Any, shape: tup
         np.testing.assert_array_equal(read.data.view(np.float32).reshape(4, 6), pixels)
 
 
-def test_a_dataclass_becomes_a_topic_per_field(tmp_path: Path) -> None:
+def test_a_dataclass_becomes_a_topic_per_field(tmp_path):
     read = written(tmp_path / "out.mcap", {"own": Report}, {"own": report()})
     del read["/nav/diagnostics"]
     types = {topic.removeprefix("/nav/own/"): message.__msgtype__ for topic, message in read.items()}
@@ -139,12 +131,12 @@ def test_a_dataclass_becomes_a_topic_per_field(tmp_path: Path) -> None:
     assert read["/nav/own/histogram"].data.tolist() == [0, 1, 2, 3]
 
 
-def test_keys_of_a_table_that_share_a_topic_are_an_error(tmp_path: Path) -> None:
+def test_keys_of_a_table_that_share_a_topic_are_an_error(tmp_path):
     with pytest.raises(LogError, match="cannot write both 'own/a b' and 'own/a_b' to /nav/own/a_b"):
         written(tmp_path / "out.mcap", {"own": dict[str, float]}, {"own": {"a b": 1.0, "a_b": 2.0}})
 
 
-def test_a_value_unlike_its_annotation_is_an_error(tmp_path: Path) -> None:
+def test_a_value_unlike_its_annotation_is_an_error(tmp_path):
     with pytest.raises(LogError, match="cannot write 'own/a': a value of type bytes has no standard form"):
         written(tmp_path / "out.mcap", {"own": dict}, {"own": {"a": b"raw"}})
 
@@ -155,11 +147,11 @@ def test_a_value_unlike_its_annotation_is_an_error(tmp_path: Path) -> None:
     (dict[str, bytes], "bytes has no standard form"),
     (float | None, ""), (tuple[int, ...], ""), (NDArray[Any], ""),
 ])  # fmt: skip
-def test_a_type_without_a_standard_form_is_refused(kind: Any, why: str) -> None:
+def test_a_type_without_a_standard_form_is_refused(kind, why):
     assert refusal(kind) == why
 
 
-def test_the_refusal_names_the_field_and_the_line(tmp_path: Path) -> None:
+def test_the_refusal_names_the_field_and_the_line(tmp_path):
     file = tmp_path / "own.yaml"
     file.write_text(PIPELINE.replace("Edges", "Listing"))
     with pytest.raises(PipelineError) as refused:
@@ -170,7 +162,7 @@ def test_the_refusal_names_the_field_and_the_line(tmp_path: Path) -> None:
     )
 
 
-def test_a_pipeline_of_own_types_runs(tmp_path: Path, traverse: Path) -> None:
+def test_a_pipeline_of_own_types_runs(tmp_path, traverse):
     file, out = tmp_path / "own.yaml", tmp_path / "out.mcap"
     file.write_text(PIPELINE)
     assert roverflow("run", traverse, "-p", file, "-o", out) == 0
@@ -179,7 +171,7 @@ def test_a_pipeline_of_own_types_runs(tmp_path: Path, traverse: Path) -> None:
     assert {"/sharpness", "/edges"} <= entities(out.with_suffix(".rrd"))
 
 
-def test_own_types_are_drawn_field_by_field(tmp_path: Path) -> None:
+def test_own_types_are_drawn_field_by_field(tmp_path):
     path = tmp_path / "own.rrd"
     found = drawn(
         path, {"own/report": Report, "level": int, "note": str}, {"own/report": report(), "level": 3, "note": "dry"}
@@ -192,11 +184,11 @@ def test_own_types_are_drawn_field_by_field(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mask, 255 * np.eye(4, 5))
 
 
-def test_an_image_that_a_frame_lacks_is_cleared(tmp_path: Path) -> None:
+def test_an_image_that_a_frame_lacks_is_cleared(tmp_path):
     path = tmp_path / "own.rrd"
     drawn(path, {"own": np.ndarray}, {"own": np.ones((4, 5), np.float32)}, {})
     assert [row[1] for row in rows(path, "/own", "Clear:is_recursive") if row[2] is not None] == [1]
 
 
-def test_leaves_have_their_paths() -> None:
+def test_leaves_have_their_paths():
     assert dict(leaves({"a": {"b": 1}, "c": None}, dict)) == {("a", "b"): 1.0}

@@ -1,7 +1,5 @@
 """PNG of 16 bits, read back by OpenCV and by Pillow."""
 
-from __future__ import annotations
-
 import io
 
 import cv2

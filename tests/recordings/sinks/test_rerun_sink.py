@@ -1,13 +1,10 @@
 """The rerun recording contains every intermediate at its own time, and clears those that a frame lacks."""
 
-from __future__ import annotations
-
 import math
 import resource
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 import rerun as rr
@@ -19,7 +16,13 @@ from stages.data import Mount
 from tests.recordings.sinks.recorded_scene import START, STEP, STREAMS, Loss, Record, entities, record_of, rows, scene
 
 
-def test_every_intermediate_is_recorded(rrd: Path) -> None:
+def opened(path):
+    sink = RerunSink()
+    sink.open(path, STREAMS, {})
+    return sink
+
+
+def test_every_intermediate_is_recorded(rrd):
     assert entities(rrd) >= {
         "/rectified/left", "/rectified/right", "/matched/pixels", "/matched/source/labels", "/disparity/pixels",
         "/disparity/source/labels", "/disparity/superpixels", "/points/points", "/elevation_map/relief",
@@ -29,12 +32,12 @@ def test_every_intermediate_is_recorded(rrd: Path) -> None:
     }  # fmt: skip
 
 
-def test_entities_have_the_stamp_of_their_frame_in_nanoseconds(rrd: Path) -> None:
+def test_entities_have_the_stamp_of_their_frame_in_nanoseconds(rrd):
     times = [(clock, frame) for clock, frame, _ in rows(rrd, "/disparity/pixels", "EncodedDepthImage:blob")]
     assert times == [(START + n * STEP, n) for n in range(3)]
 
 
-def test_only_the_logs_clock_and_the_frame_count_are_timelines(rrd: Path) -> None:
+def test_only_the_logs_clock_and_the_frame_count_are_timelines(rrd):
     """The wall clock in a recording would make two equal runs differ."""
     names = {
         column.name for chunk in rr.chunk.RrdReader(str(rrd)).stream() for column in chunk.to_record_batch().schema
@@ -43,13 +46,13 @@ def test_only_the_logs_clock_and_the_frame_count_are_timelines(rrd: Path) -> Non
     assert not names & {"log_time", "log_tick"}
 
 
-def test_legends_that_do_not_change_are_stored_once(rrd: Path) -> None:
+def test_legends_that_do_not_change_are_stored_once(rrd):
     for legend in ("/disparity/source/legend", "/disparity/pixels/scale/text", "/elevation_map/relief/lines/distances"):
         assert [frame for _, frame, _ in rows(rrd, legend, "Points2D:positions")] == [0], legend
     assert len(rows(rrd, "/disparity/source", "AnnotationContext:context")) == 1
 
 
-def test_entities_that_a_frame_lacks_are_cleared_at_that_frame(tmp_path: Path) -> None:
+def test_entities_that_a_frame_lacks_are_cleared_at_that_frame(tmp_path):
     """Otherwise the viewer shows the earlier picture at this frame."""
     lost = ("stereo", "rectified", "disparity", "points", "elevation_map")
     second = {name: item for name, item in scene(START + STEP).items() if name not in lost}
@@ -72,7 +75,7 @@ def test_entities_that_a_frame_lacks_are_cleared_at_that_frame(tmp_path: Path) -
         assert [bool(blob) for blob in blobs] == [True, False, True], entity
 
 
-def test_stage_times_are_stored_once_with_gaps_for_missing_stages(tmp_path: Path) -> None:
+def test_stage_times_are_stored_once_with_gaps_for_missing_stages(tmp_path):
     """However many frames are sent at once."""
     count, without = 2 * PLOT_BATCH + 1, (5, PLOT_BATCH)
     records = [
@@ -88,7 +91,7 @@ def test_stage_times_are_stored_once_with_gaps_for_missing_stages(tmp_path: Path
     assert [value for _, n, value in times if n not in without] == [row[2] for row in expected if row[1] not in without]
 
 
-def test_a_sink_that_is_opened_again_starts_a_new_recording(tmp_path: Path) -> None:
+def test_a_sink_that_is_opened_again_starts_a_new_recording(tmp_path):
     sink = RerunSink()
     for name, end in (("given up", sink.discard), ("second", lambda: sink.close({"verdict": "COMPLETE"}))):
         sink.open(tmp_path / f"{name}.rrd", STREAMS, {})
@@ -99,7 +102,7 @@ def test_a_sink_that_is_opened_again_starts_a_new_recording(tmp_path: Path) -> N
     assert drawn == {"/seconds/second"}
 
 
-def test_losses_are_logged_at_their_own_stamps(tmp_path: Path) -> None:
+def test_losses_are_logged_at_their_own_stamps(tmp_path):
     lost = Loss("tilt", START - 7, "tilt", "unaligned", "no message within 200 ms")
     late = Loss("right", START + 9, "left", "unmatched", "no partner within 5 ms")
     summary = {"verdict": "INCOMPLETE", "drops": {"unaligned": 1, "unmatched": 1}, "entries": (late,)}
@@ -116,10 +119,9 @@ def test_losses_are_logged_at_their_own_stamps(tmp_path: Path) -> None:
     assert "traverse.mcap" in documents[-1]
 
 
-def test_frames_may_come_from_different_threads(tmp_path: Path) -> None:
+def test_frames_may_come_from_different_threads(tmp_path):
     """rerun sets its clocks per thread; a thread without them logs for all times."""
-    sink = RerunSink()
-    sink.open(tmp_path / "threads.rrd", STREAMS, {})
+    sink = opened(tmp_path / "threads.rrd")
     for n in range(4):
         record = Record(START + n * STEP, scene(START + n * STEP))
         thread = threading.Thread(target=sink.write, args=(record,))
@@ -131,15 +133,14 @@ def test_frames_may_come_from_different_threads(tmp_path: Path) -> None:
     assert times == [(START + n * STEP, n) for n in range(4)]
 
 
-def test_a_recording_passes_reruns_own_check(rrd: Path) -> None:
+def test_a_recording_passes_reruns_own_check(rrd):
     check = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(rrd)], capture_output=True, text=True)
     assert check.returncode == 0, check.stderr
 
 
-def test_a_recording_has_its_name_only_when_it_is_complete(tmp_path: Path) -> None:
+def test_a_recording_has_its_name_only_when_it_is_complete(tmp_path):
     path = tmp_path / "run.rrd"
-    sink = RerunSink()
-    sink.open(path, STREAMS, {})
+    sink = opened(path)
     sink.write(Record(START, scene()))
     assert not path.exists()
     sink.close({"verdict": "COMPLETE"})
@@ -147,40 +148,37 @@ def test_a_recording_has_its_name_only_when_it_is_complete(tmp_path: Path) -> No
     assert [file.name for file in tmp_path.iterdir()] == ["run.rrd"]
 
 
-def test_a_run_without_frames_leaves_a_recording_with_its_verdict(tmp_path: Path) -> None:
+def test_a_run_without_frames_leaves_a_recording_with_its_verdict(tmp_path):
     path = record_of(tmp_path / "empty.rrd", [], {"verdict": "INCOMPLETE", "drops": {"unreadable": 2}})
     assert rows(path, "/ledger", "TextLog:text")[-1][2] == ["INCOMPLETE: 0 frames, 2 unreadable"]
 
 
-def test_a_rerun_error_is_raised_and_not_only_a_warning(tmp_path: Path) -> None:
-    sink = RerunSink()
-    sink.open(tmp_path / "run.rrd", STREAMS, {})
+def test_a_rerun_error_is_raised_and_not_only_a_warning(tmp_path):
+    sink = opened(tmp_path / "run.rrd")
     with pytest.raises((ValueError, TypeError)):
         sink.write(Record(START, {}, seconds={"matched": "soon"}))  # type: ignore[dict-item]
     sink.close({})
 
 
-def test_an_unwritable_end_leaves_no_file(tmp_path: Path) -> None:
-    sink = RerunSink()
-    sink.open(tmp_path / "run.rrd", STREAMS, {})
+def test_an_unwritable_end_leaves_no_file(tmp_path):
+    sink = opened(tmp_path / "run.rrd")
     sink.write(Record(START, scene(START)))
     with pytest.raises(OverflowError):
         sink.close({"entries": [Loss("left", 1 << 63, "source", "unreadable", "gone")]})
     assert not list(tmp_path.iterdir())
 
 
-def test_an_unwritable_path_is_named(tmp_path: Path) -> None:
+def test_an_unwritable_path_is_named(tmp_path):
     with pytest.raises(LogError, match="nowhere"):
         RerunSink().open(tmp_path / "nowhere" / "run.rrd", STREAMS, {})
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path, monkeypatch):
     """rerun reports an unexpected full disk only in its log, so the sink checks for it."""
     monkeypatch.setattr("recordings.sinks.rerun_sink._room", lambda file: RESERVED_BYTES)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    sink = RerunSink()
-    sink.open(tmp_path / "run.rrd", STREAMS, {})
+    sink = opened(tmp_path / "run.rrd")
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
     try:
         for n in range(3):
@@ -193,11 +191,10 @@ def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_recording_ends_before_the_disk_is_full(tmp_path: Path) -> None:
+def test_a_recording_ends_before_the_disk_is_full(tmp_path):
     """rerun's writer never returns if the disk is full or the file cannot grow."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    sink = RerunSink()
-    sink.open(tmp_path / "run.rrd", STREAMS, {})
+    sink = opened(tmp_path / "run.rrd")
     resource.setrlimit(resource.RLIMIT_FSIZE, (RESERVED_BYTES // 2, limits[1]))
     try:
         with pytest.raises(LogError, match=r"cannot write .* 64 MB more can be written"):
@@ -208,18 +205,18 @@ def test_a_recording_ends_before_the_disk_is_full(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["run.rrd"]
 
 
-def test_every_type_with_a_logger_is_wanted() -> None:
+def test_every_type_with_a_logger_is_wanted():
     wanted = {kind for kind in (*STREAMS.values(), Mount) if RerunSink().wants("any", kind)}
     assert wanted == set(STREAMS.values())
 
 
 @pytest.mark.parametrize("settings", [{"max_points": 0}, {"jpeg_quality": 0}, {"jpeg_quality": 101}])
-def test_settings_out_of_range_are_refused(settings: dict[str, int]) -> None:
+def test_settings_out_of_range_are_refused(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         RerunSink(**settings)  # type: ignore[arg-type]
 
 
-def test_a_sink_that_is_not_open_writes_nothing_and_closes(tmp_path: Path) -> None:
+def test_a_sink_that_is_not_open_writes_nothing_and_closes(tmp_path):
     sink = RerunSink()
     sink.close({"verdict": "COMPLETE"})
     with pytest.raises(LogError, match="is a folder"):
@@ -230,10 +227,9 @@ def test_a_sink_that_is_not_open_writes_nothing_and_closes(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_sinks_on_one_path_do_not_mix(tmp_path: Path) -> None:
-    path, sinks = tmp_path / "run.rrd", [RerunSink(), RerunSink()]
-    for sink in sinks:
-        sink.open(path, STREAMS, {})
+def test_two_sinks_on_one_path_do_not_mix(tmp_path):
+    path = tmp_path / "run.rrd"
+    sinks = [opened(path), opened(path)]
     assert len(list(tmp_path.iterdir())) == 2
     for sink in sinks:
         sink.close({"verdict": "COMPLETE"})

@@ -1,9 +1,6 @@
 """The topics of a log are found by schema and name; ambiguous ones are reported, not guessed."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,9 +9,21 @@ import pytest
 from recordings import McapSource
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
-from recordings.ros2.to_msg import camera_info, image, transform_message
-from stages.data import Transform
-from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, TILT, items_of, model, picture, write_sample
+from recordings.ros2.to_msg import camera_info, image, odometry, transform_message
+from stages.data import Pose, Transform
+from tests.recordings.sample_log import (
+    FRAMES,
+    LEFT,
+    PERIOD,
+    RIGHT,
+    START,
+    TILT,
+    changed,
+    items_of,
+    model,
+    picture,
+    write_sample,
+)
 
 
 def images(path: Path, topics: dict[str, str], infos: dict[str, str]) -> Path:
@@ -30,7 +39,7 @@ def images(path: Path, topics: dict[str, str], infos: dict[str, str]) -> Path:
     return path
 
 
-def test_two_stereo_cameras_are_equally_good(tmp_path: Path) -> None:
+def test_two_stereo_cameras_are_equally_good(tmp_path):
     sides = ("left", "right")
     topics = [f"/{place}/{side}/{kind}" for place, kind in (("front", "image_raw"), ("rear", "image_rect"))
               for side in sides]  # fmt: skip
@@ -47,10 +56,10 @@ def test_two_stereo_cameras_are_equally_good(tmp_path: Path) -> None:
         assert (log.topics["left"], log.topics["right"]) == (topics[2], topics[1])
 
 
-def test_one_camera_may_send_its_images_compressed(tmp_path: Path) -> None:
+def test_one_camera_may_send_its_images_compressed(tmp_path):
     packed = cv2.imencode(".png", picture(0))[1].ravel()
 
-    def edit(topic: str, number: int, message: Any) -> Any:
+    def edit(topic, number, message):
         if topic != LEFT:
             return message
         return make("sensor_msgs/msg/CompressedImage", header=message.header, format="png", data=packed)
@@ -61,7 +70,7 @@ def test_one_camera_may_send_its_images_compressed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("raw", ["/cam/left/image_raw", "/cam/left_raw/image_raw"])
-def test_rectified_images_are_preferred(tmp_path: Path, raw: str) -> None:
+def test_rectified_images_are_preferred(tmp_path, raw):
     names = [raw, "/cam/left/image_rect"]
     topics = [*names, *(name.replace("left", "right") for name in names)]
     path = images(tmp_path / "log.mcap", dict.fromkeys(topics, "a"), {})
@@ -71,7 +80,7 @@ def test_rectified_images_are_preferred(tmp_path: Path, raw: str) -> None:
 
 
 @pytest.mark.parametrize(("frame", "found"), [("front_left", True), ("rear_left", False), ("", False)])
-def test_a_calibration_elsewhere_must_have_the_frame_of_the_images(tmp_path: Path, frame: str, found: bool) -> None:
+def test_a_calibration_elsewhere_must_have_the_frame_of_the_images(tmp_path, frame, found):
     topics = {f"/front/{side}/image_rect": frame.replace("left", side) for side in ("left", "right")}
     infos = {f"/calibration/{side}": f"front_{side}" if frame else "" for side in ("left", "right")}
     with McapSource().open(images(tmp_path / "log.mcap", topics, infos)) as log:
@@ -80,7 +89,7 @@ def test_a_calibration_elsewhere_must_have_the_frame_of_the_images(tmp_path: Pat
             assert "no CameraInfo belongs to /front/left/image_rect" in log.missing["left"]
 
 
-def test_the_calibration_below_the_image_topic_is_preferred(tmp_path: Path) -> None:
+def test_the_calibration_below_the_image_topic_is_preferred(tmp_path):
     topics = {f"/cam/{side}": side for side in ("left", "right")}
     infos = {f"/cam/{side}/camera_info": side for side in topics.values()} | {"/cam/camera_info": "other"}
     with McapSource().open(images(tmp_path / "log.mcap", topics, infos)) as log:
@@ -88,14 +97,7 @@ def test_the_calibration_below_the_image_topic_is_preferred(tmp_path: Path) -> N
         assert [camera.frame_id for camera in log.resolution.cameras] == ["left", "right"]
 
 
-def test_a_navigation_camera_is_found(tmp_path: Path) -> None:
-    names = ("/nav/left/image_rect", "/nav/right/image_rect")
-    with McapSource().open(write_sample(tmp_path / "log.mcap", names=names)) as log:
-        assert log.missing == {}
-        assert (log.topics["left"], log.topics["right"]) == names
-
-
-def test_truth_topics_are_used_only_if_set(tmp_path: Path) -> None:
+def test_truth_topics_are_used_only_if_set(tmp_path):
     names = ("/truth/left/image_rect", "/truth/right/image_rect")
     path = write_sample(tmp_path / "log.mcap", names=names)
     with McapSource().open(path) as log:
@@ -105,10 +107,7 @@ def test_truth_topics_are_used_only_if_set(tmp_path: Path) -> None:
         assert log.topics["right"] == names[1]
 
 
-def test_a_pose_among_results_is_named_but_not_used(tmp_path: Path) -> None:
-    from recordings.ros2.to_msg import odometry
-    from stages.data import Pose
-
+def test_a_pose_among_results_is_named_but_not_used(tmp_path):
     path = tmp_path / "log.mcap"
     with Ros2Writer(path) as writer:
         writer.write("/nav/odometry", odometry(Pose(START, [0, 0, 0], [0, 0, 0, 1], "odom", "base_link")), START)
@@ -142,76 +141,54 @@ def moving(path: Path, *links: tuple[str, str]) -> Path:
         ),
     ],
 )
-def test_transforms_with_no_pose_or_two_are_refused(tmp_path: Path, links: list[Any], sentence: str) -> None:
+def test_transforms_with_no_pose_or_two_are_refused(tmp_path, links, sentence):
     with McapSource(odometry="/tf").open(moving(tmp_path / "log.mcap", *links)) as log:
         assert f"the source's 'odometry' is set to /tf, where {sentence}" in log.refused["odometry"]
 
 
-def test_the_pose_in_odom_is_preferred_to_that_in_map(tmp_path: Path) -> None:
+def test_the_pose_in_odom_is_preferred_to_that_in_map(tmp_path):
     path = moving(tmp_path / "log.mcap", WHEEL, MAP, ODOM)
     assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
 
 
 @pytest.mark.parametrize("given", [None, "/odom"])
-def test_a_pose_of_a_frame_not_joined_to_the_camera_is_refused(tmp_path: Path, given: str | None) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == "/odom":
-            message.child_frame_id = "foot"
-        return message
-
+def test_a_pose_of_a_frame_not_joined_to_the_camera_is_refused(tmp_path, given):
+    edit = changed("/odom", {"child_frame_id": "foot"})
     with McapSource(odometry=given).open(write_sample(tmp_path / "log.mcap", edit)) as log:
         sentence = "/odom is the pose of 'foot', but no static transform joins it to the camera 'left_optical'"
         assert sentence in log.missing["odometry"]
         assert ("odometry" in log.refused) == (given is not None)
 
 
-def test_a_leading_slash_of_a_frame_is_ignored(tmp_path: Path) -> None:
+def test_a_leading_slash_of_a_frame_is_ignored(tmp_path):
     path = moving(tmp_path / "log.mcap", ("/odom", "/base_link"))
     assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
 
 
-def test_the_pose_is_that_of_the_set_base_frame(tmp_path: Path) -> None:
+def test_the_pose_is_that_of_the_set_base_frame(tmp_path):
     path = moving(tmp_path / "log.mcap", MAP, ("odom", "foot"))
     poses = items_of(path, McapSource(odometry="/tf", base_frame="foot"))
     assert [pose.position[0] for _, _, pose in poses] == [number * PERIOD for number in range(5)]
 
 
 @pytest.mark.parametrize("bad", [5, FRAMES])
-def test_an_imu_without_unit_quaternions_is_no_inclinometer(tmp_path: Path, bad: int) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == TILT and number < bad:
-            for name in "xyzw":
-                setattr(message.orientation, name, 0.0)
-        return message
-
+def test_an_imu_without_unit_quaternions_is_no_inclinometer(tmp_path, bad):
+    edit = changed(TILT, {f"orientation.{name}": 0.0 for name in "xyzw"}, range(bad))
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         sentence = f"{TILT} contains no orientation (the quaternion of the inclinometer is not a rotation: [0.0, 0.0"
         assert sentence in log.missing["inclinometer"]
 
 
-def test_an_imu_that_begins_invalid_is_an_inclinometer(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == TILT and number == 0:
-            message.orientation_covariance = np.full(9, -1.0)
-        return message
-
+def test_an_imu_that_begins_invalid_is_an_inclinometer(tmp_path):
+    edit = changed(TILT, {"orientation_covariance": np.full(9, -1.0)}, [0])
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
         losses = [(stream, str(item)) for _, stream, item in log.events() if isinstance(item, Exception)]
     assert [stream for stream, _ in losses] == ["inclinometer"]
 
 
-def test_an_imu_that_is_invalid_for_long_is_an_inclinometer(tmp_path: Path, monkeypatch: Any) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == TILT and number < FRAMES - 2:
-            message.orientation_covariance = np.full(9, -1.0)
-        return message
-
+def test_an_imu_that_is_invalid_for_long_is_an_inclinometer(tmp_path, monkeypatch):
+    edit = changed(TILT, {"orientation_covariance": np.full(9, -1.0)}, range(FRAMES - 2))
     monkeypatch.setattr("recordings.source.topics._MAX_SAMPLES", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
-
-
-def test_both_names_of_the_sample_are_its_pair(sample: Path) -> None:
-    with McapSource().open(sample) as log:
-        assert (log.topics["left"], log.topics["right"]) == (LEFT, RIGHT)

@@ -1,9 +1,6 @@
 """The inventory of a log for `roverflow info`."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +10,7 @@ from recordings import McapSource
 from recordings.ros2.to_msg import transform_message
 from recordings.source.inventory import format_description
 from stages.data import Transform
+from tests.conftest import rewrite
 from tests.recordings.sample_log import (
     BASELINE,
     FRAMES,
@@ -22,11 +20,11 @@ from tests.recordings.sample_log import (
     START,
     TILT,
     TRANSFORMS,
+    changed,
+    dropped,
     inventory_of,
-    rewritten,
     write_sample,
 )
-from tests.recordings.source.test_log import copied
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +34,7 @@ def description(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return described
 
 
-def test_rates_and_gaps_are_those_of_the_log(description: dict[str, Any]) -> None:
+def test_rates_and_gaps_are_those_of_the_log(description):
     topics = {topic["topic"]: topic for topic in description["topics"]}
     assert topics[LEFT]["messages"] == FRAMES
     assert topics[LEFT]["hz"] == pytest.approx(1e9 / PERIOD)
@@ -46,7 +44,7 @@ def test_rates_and_gaps_are_those_of_the_log(description: dict[str, Any]) -> Non
     assert description["missing"] == {}
 
 
-def test_calibration_transforms_and_pairs_are_reported(description: dict[str, Any]) -> None:
+def test_calibration_transforms_and_pairs_are_reported(description):
     assert description["calibration"]["baseline"] == BASELINE
     assert description["calibration"]["rectified"] is True
     assert description["transforms"] == ["base_link <- imu_link", "base_link <- left_optical"]
@@ -55,8 +53,8 @@ def test_calibration_transforms_and_pairs_are_reported(description: dict[str, An
     assert (frames["left"], frames["right"], frames["pairs"], frames["with_tilt"]) == (FRAMES,) * 4
 
 
-def test_the_text_lists_topics_streams_and_missing_streams(tmp_path: Path) -> None:
-    path = write_sample(tmp_path / "log.mcap", lambda topic, number, m: None if topic == "/odom" else m)
+def test_the_text_lists_topics_streams_and_missing_streams(tmp_path):
+    path = write_sample(tmp_path / "log.mcap", dropped("/odom"))
     text = format_description(inventory_of(path))
     line = next(line for line in text.splitlines() if line.startswith(LEFT))
     assert line.split() == [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100", "s", "left"]
@@ -65,8 +63,8 @@ def test_the_text_lists_topics_streams_and_missing_streams(tmp_path: Path) -> No
     assert f"{frames}; 5 left images with a tilt (readings at most 200 ms apart)" in text
 
 
-def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path):
+    def edit(topic, number, message):
         if topic == RIGHT and number in (1, 2):
             message.header.stamp.nanosec += 6_000_000 if number == 1 else 4_000_000
         if topic == TILT and number in (1, 2, 3):
@@ -84,8 +82,8 @@ def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path: Path) -> No
     assert "readings at most 400 ms apart" in text
 
 
-def test_repeated_stamps_count_once_and_are_reported(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_repeated_stamps_count_once_and_are_reported(tmp_path):
+    def edit(topic, number, message):
         if topic in (LEFT, RIGHT, TILT) and number == 2:
             message.header.stamp.nanosec -= PERIOD
         return message
@@ -98,15 +96,15 @@ def test_repeated_stamps_count_once_and_are_reported(tmp_path: Path) -> None:
     assert described["damage"] == [f"{topic}: {sentence}" for topic in (LEFT, RIGHT, TILT)]
 
 
-def test_without_cameras_no_pairs_are_reported(tmp_path: Path) -> None:
+def test_without_cameras_no_pairs_are_reported(tmp_path):
     edit = lambda topic, _, message: None if topic.endswith("camera_info") else message  # noqa: E731
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
     assert "missing: left: no CameraInfo belongs to" in text
     assert "frames:" not in text
 
 
-def test_similar_tilt_errors_are_grouped_in_one_line(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_similar_tilt_errors_are_grouped_in_one_line(tmp_path):
+    def edit(topic, number, message):
         if topic == TILT and number:
             message.orientation.x = message.orientation.y = message.orientation.z = 0.0
             message.orientation.w = 0.0 if number < 3 else 0.25
@@ -120,8 +118,8 @@ def test_similar_tilt_errors_are_grouped_in_one_line(tmp_path: Path) -> None:
     )
 
 
-def test_streams_without_stamps_are_noted(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_streams_without_stamps_are_noted(tmp_path):
+    def edit(topic, number, message):
         if topic in (LEFT, "/odom"):
             message.header.stamp.sec = message.header.stamp.nanosec = 0
         return message
@@ -134,8 +132,8 @@ def test_streams_without_stamps_are_noted(tmp_path: Path) -> None:
     ]
 
 
-def test_a_calibration_of_another_image_size_is_doubted(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_a_calibration_of_another_image_size_is_doubted(tmp_path):
+    def edit(topic, number, message):
         if topic.endswith("camera_info"):
             message.width, message.height = 2 * message.width + 12, 2 * message.height
         return message
@@ -167,10 +165,8 @@ def test_a_calibration_of_another_image_size_is_doubted(tmp_path: Path) -> None:
         ),
     ],
 )  # fmt: skip
-def test_a_baseline_from_or_against_the_transform_is_noted(
-    tmp_path: Path, errors: float, told_by_transform: float, note: str
-) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_a_baseline_from_or_against_the_transform_is_noted(tmp_path, errors, told_by_transform, note):
+    def edit(topic, number, message):
         if topic == "/tf_static":
             beside = Transform("left_optical", "right_optical", np.eye(3), [told_by_transform, 0, 0])
             return transform_message([(transform, START) for transform in (*TRANSFORMS, beside)])
@@ -189,8 +185,8 @@ def test_a_baseline_from_or_against_the_transform_is_noted(
     assert f"note: right: {described['notes']['right']}" in format_description(described).splitlines()
 
 
-def test_a_missing_right_calibration_is_reported(tmp_path: Path) -> None:
-    edit = lambda topic, _, message: None if topic == "/stereo/right/camera_info" else message  # noqa: E731
+def test_a_missing_right_calibration_is_reported(tmp_path):
+    edit = dropped("/stereo/right/camera_info")
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
     listed = "the log's CameraInfo topics are /stereo/left/camera_info"
     why = f"no CameraInfo belongs to {RIGHT} ({listed}); set 'right_info'"
@@ -200,8 +196,8 @@ def test_a_missing_right_calibration_is_reported(tmp_path: Path) -> None:
     ]
 
 
-def test_undecodable_topics_are_listed_once(tmp_path: Path) -> None:
-    path = copied(write_sample(tmp_path / "log.mcap"), tmp_path / "odd.mcap", lambda *of: ("protobuf", of[2]))
+def test_undecodable_topics_are_listed_once(tmp_path):
+    path = rewrite(write_sample(tmp_path / "log.mcap"), tmp_path / "odd.mcap", encode=lambda *of: ("protobuf", of[2]))
     text = format_description(inventory_of(path))
     assert text.count("cannot be decoded") == text.count(f"{LEFT}: its messages are in 'protobuf'") == 1
     assert "missing: left, right: the log has no camera image" in text
@@ -209,14 +205,14 @@ def test_undecodable_topics_are_listed_once(tmp_path: Path) -> None:
         assert all(f"{LEFT}: its messages" in log.missing[stream] for stream in ("left", "inclinometer", "odometry"))
 
 
-def test_singular_and_plural_are_correct(tmp_path: Path) -> None:
+def test_singular_and_plural_are_correct(tmp_path):
     edit = lambda topic, number, message: None if number else message  # noqa: E731
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
     assert "1 stereo pair (stamps within 5 ms) from 1 left image and 1 right image; 1 left image with" in text
 
 
-def test_damage_is_reported(tmp_path: Path) -> None:
-    path = rewritten(write_sample(tmp_path / "sample.mcap"), tmp_path / "log.mcap", chunk_size=500)
+def test_damage_is_reported(tmp_path):
+    path = rewrite(write_sample(tmp_path / "sample.mcap"), tmp_path / "log.mcap", chunk_size=500)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     description = inventory_of(path)
     assert not description["indexed"]
@@ -224,12 +220,6 @@ def test_damage_is_reported(tmp_path: Path) -> None:
     assert "damaged: the log is cut" in format_description(description)
 
 
-def test_an_imu_without_orientation_is_no_inclinometer(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == TILT:
-            message.orientation_covariance = np.full(9, -1.0)
-        return message
-
-    description = inventory_of(write_sample(tmp_path / "log.mcap", edit))
-    assert "contains no orientation" in description["missing"]["inclinometer"]
-    assert description["frames"]["with_tilt"] == 0
+def test_without_a_tilt_no_frame_has_one(tmp_path):
+    edit = changed(TILT, {"orientation_covariance": np.full(9, -1.0)})
+    assert inventory_of(write_sample(tmp_path / "log.mcap", edit))["frames"]["with_tilt"] == 0

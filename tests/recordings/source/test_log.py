@@ -1,22 +1,19 @@
 """Changes in the middle of a log and types with wrong fields lose their own messages and are reported."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from recordings import McapSource
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
+from tests.conftest import rewrite
 from tests.recordings.sample_log import (
     FRAMES,
     LAYOUTS,
@@ -25,9 +22,9 @@ from tests.recordings.sample_log import (
     RIGHT,
     START,
     TILT,
+    changed,
     inventory_of,
     items_of,
-    rewritten,
     write_sample,
 )
 
@@ -35,43 +32,17 @@ INFO = "/stereo/left/camera_info"
 IMAGE_LAG = 1000  # ns between an image's stamp and its log time in the sample
 
 
-def copied(source: Path, out: Path, encode: Callable[[str, int, bytes], tuple[str, bytes]]) -> Path:
-    """The same messages; `encode`: (topic, number, schema) -> message encoding and schema."""
-    with source.open("rb") as stream, out.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channels: dict[Any, int] = {}
-        counts: dict[str, int] = {}
-        for schema, channel, message in make_reader(stream).iter_messages():
-            number = counts[channel.topic] = counts.get(channel.topic, -1) + 1
-            key = (channel.topic, *encode(channel.topic, number, schema.data))
-            if key not in channels:
-                known = writer.register_schema(schema.name, schema.encoding, key[2])
-                channels[key] = writer.register_channel(channel.topic, key[1], known)
-            writer.add_message(channels[key], message.log_time, message.data, message.publish_time)
-        writer.finish()
-    return out
-
-
 @pytest.mark.parametrize("lag", [0, 50_000_000])
-def test_an_image_under_another_calibration_is_lost(tmp_path: Path, lag: int) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_an_image_under_another_calibration_is_lost(tmp_path, lag):
+    def edit(topic, number, message):
         if topic == INFO and number in (2, 3):
             message.k = message.k * 1.5
         return message
 
     plain = write_sample(tmp_path / "plain.mcap", edit)
-    path = tmp_path / "log.mcap"
-    with plain.open("rb") as stream, path.open("wb") as file:  # the calibration logged after its image
-        writer, channels = Writer(file), dict[str, int]()
-        writer.start()
-        for schema, channel, message in make_reader(stream).iter_messages():
-            if channel.topic not in channels:
-                known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", known)
-            log_time = message.log_time + (lag if channel.topic == INFO else 0)
-            writer.add_message(channels[channel.topic], log_time, message.data, message.publish_time)
-        writer.finish()
+    # The calibration is logged after its image.
+    late = lambda topic, time: time + (lag if topic == INFO else 0)  # noqa: E731
+    path = rewrite(plain, tmp_path / "log.mcap", time=late)
     events = items_of(path)
     assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
     lost = [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]
@@ -95,7 +66,7 @@ def calibrated_once_more(path: Path, layout: str, again: Any = 2) -> Path:
 
     slow = lambda topic, time: START + 20 * (time - START)  # noqa: E731
     plain = write_sample(path.with_name("plain.mcap"), edit)
-    return rewritten(plain, path, slow, **LAYOUTS[layout])
+    return rewrite(plain, path, time=slow, **LAYOUTS[layout])
 
 
 def left_of(log: Any) -> tuple[list[int], list[str]]:
@@ -106,7 +77,7 @@ def left_of(log: Any) -> tuple[list[int], list[str]]:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_calibration_change_before_the_range_is_known(tmp_path: Path, layout: str) -> None:
+def test_a_calibration_change_before_the_range_is_known(tmp_path, layout):
     path = calibrated_once_more(tmp_path / "log.mcap", layout)
     with McapSource().open(path, start=7) as log:
         read, lost = left_of(log.events())
@@ -118,7 +89,7 @@ def test_a_calibration_change_before_the_range_is_known(tmp_path: Path, layout: 
         assert f"where it changes ({START + 2 * PERIOD} ns)" in left_of(log.events())[1][0]
 
 
-def test_a_damaged_calibration_keeps_the_previous_one_in_force(tmp_path: Path) -> None:
+def test_a_damaged_calibration_keeps_the_previous_one_in_force(tmp_path):
     path = calibrated_once_more(tmp_path / "log.mcap", "small chunks", again=3)
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -136,26 +107,19 @@ def test_a_damaged_calibration_keeps_the_previous_one_in_force(tmp_path: Path) -
         assert (read, lost[-1].rpartition("(")[2]) == ([], f"at or before {START + 2 * PERIOD} ns)")
 
 
-def test_a_tilt_of_another_sensor_is_lost(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == TILT and number == 3:
-            message.header.frame_id = "other_imu"
-        return message
-
-    events = items_of(write_sample(tmp_path / "log.mcap", edit))
+def test_a_tilt_of_another_sensor_is_lost(tmp_path):
+    events = items_of(write_sample(tmp_path / "log.mcap", changed(TILT, {"header.frame_id": "other_imu"}, [3])))
     lost = [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]
     assert [(time, stream) for time, stream, _ in lost] == [(START + 3 * PERIOD, "inclinometer")]
     assert "its frame is 'other_imu', but the mount is that of 'imu_link'" in lost[0][2]
 
 
 @pytest.mark.parametrize(("topic", "stream"), [(TILT, "inclinometer"), (LEFT, "left"), (INFO, "left")])
-def test_undecodable_messages_of_a_used_topic_are_counted(
-    sample: Path, tmp_path: Path, topic: str, stream: str
-) -> None:
-    def encode(name: str, number: int, schema: bytes) -> tuple[str, bytes]:
+def test_undecodable_messages_of_a_used_topic_are_counted(sample, tmp_path, topic, stream):
+    def encode(name, number, schema):
         return ("json" if name == topic and number >= 3 else "cdr"), schema
 
-    path = copied(sample, tmp_path / "log.mcap", encode)
+    path = rewrite(sample, tmp_path / "log.mcap", encode=encode)
     with McapSource().open(path) as log:
         assert log.missing == {}
         assert log.frames == (3 if topic == LEFT else FRAMES)
@@ -169,11 +133,11 @@ def test_undecodable_messages_of_a_used_topic_are_counted(
     assert described["damage"] == [losses[0][1]]
 
 
-def test_undecodable_images_are_named_with_the_reason(sample: Path, tmp_path: Path) -> None:
-    def encode(name: str, number: int, schema: bytes) -> tuple[str, bytes]:
+def test_undecodable_images_are_named_with_the_reason(sample, tmp_path):
+    def encode(name, number, schema):
         return ("protobuf" if name in (LEFT, RIGHT) else "cdr"), schema
 
-    with McapSource().open(copied(sample, tmp_path / "log.mcap", encode)) as log:
+    with McapSource().open(rewrite(sample, tmp_path / "log.mcap", encode=encode)) as log:
         assert log.missing["left"].startswith("the log has no camera image")
         assert f"cannot be decoded: {LEFT}: its messages are in 'protobuf'" in log.missing["left"]
 
@@ -188,13 +152,11 @@ def test_undecodable_images_are_named_with_the_reason(sample: Path, tmp_path: Pa
         (INFO, (b"float64[12] p", b"float64[4] p\nfloat64[8] q"), "left"),
     ],
 )
-def test_a_type_with_wrong_fields_is_reported(
-    sample: Path, tmp_path: Path, topic: str, fields: tuple[bytes, bytes], stream: str
-) -> None:
-    def encode(name: str, number: int, schema: bytes) -> tuple[str, bytes]:
+def test_a_type_with_wrong_fields_is_reported(sample, tmp_path, topic, fields, stream):
+    def encode(name, number, schema):
         return "cdr", schema.replace(*fields) if name == topic else schema
 
-    path = copied(sample, tmp_path / "log.mcap", encode)
+    path = rewrite(sample, tmp_path / "log.mcap", encode=encode)
     with McapSource().open(path) as log:
         assert stream in log.missing
         list(log.events())
@@ -202,7 +164,7 @@ def test_a_type_with_wrong_fields_is_reported(
 
 
 @pytest.mark.parametrize("start", [None, 0.35])
-def test_excerpts_are_spread_over_the_whole_log(tmp_path: Path, start: float | None) -> None:
+def test_excerpts_are_spread_over_the_whole_log(tmp_path, start):
     with McapSource().open(write_sample(tmp_path / "log.mcap"), start=start) as log:
         excerpts = [list(events) for events in log.excerpts(2, {"left", "right"})]
     stamps = [[(stream, (item.stamp - START) // PERIOD) for _, stream, item in events] for events in excerpts]
@@ -212,13 +174,13 @@ def test_excerpts_are_spread_over_the_whole_log(tmp_path: Path, start: float | N
     ]
 
 
-def test_at_most_one_excerpt_begins_at_a_frame(tmp_path: Path) -> None:
+def test_at_most_one_excerpt_begins_at_a_frame(tmp_path):
     with McapSource().open(write_sample(tmp_path / "log.mcap")) as log:
         assert len(list(log.excerpts(20, {"left", "right"}))) == FRAMES
         assert len(list(log.excerpts(3, {"left", "right"}))) == 3
 
 
-def test_a_ros_1_bag_is_refused_with_the_converting_command(tmp_path: Path) -> None:
+def test_a_ros_1_bag_is_refused_with_the_converting_command(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     kind, header, stamp, point = (
         store.types[name] for name in (
@@ -238,6 +200,6 @@ def test_a_ros_1_bag_is_refused_with_the_converting_command(tmp_path: Path) -> N
     assert (read.point.x, read.point.y, read.point.z) == (1.0, 2.0, 3.0)
 
 
-def test_ros_1_messages_are_refused_with_the_converting_command(sample: Path, tmp_path: Path) -> None:
-    with McapSource().open(copied(sample, tmp_path / "log.mcap", lambda *of: ("ros1", of[2]))) as log:
+def test_ros_1_messages_are_refused_with_the_converting_command(sample, tmp_path):
+    with McapSource().open(rewrite(sample, tmp_path / "log.mcap", encode=lambda *of: ("ros1", of[2]))) as log:
         assert "in 'ros1', not in the 'cdr' of ROS 2; convert the bag itself: rosbags-co" in log.missing["left"]

@@ -1,7 +1,5 @@
 """Reading logs: recorded data bit for bit, damage and missing streams reported."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any
@@ -14,10 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.errors import LogError
+from recordings.mcap.file import iter_decoded
+from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AngleField
 from recordings.ros2.to_msg import header, transform_message
 from stages.data import CameraImage, Mount, Transform
+from tests.conftest import rewrite
 from tests.recordings.sample_log import (
     BASELINE,
     FRAMES,
@@ -30,12 +31,13 @@ from tests.recordings.sample_log import (
     TILT,
     TRANSFORMS,
     WIDTH,
+    changed,
+    dropped,
     essence,
     inventory_of,
     items_of,
     model,
     picture,
-    rewritten,
     tilt_quaternion,
     write_sample,
 )  # fmt: skip
@@ -48,7 +50,7 @@ def missing(path: Path, source: McapSource | None = None) -> dict[str, str]:
         return log.missing
 
 
-def test_messages_are_read_bit_for_bit(sample: Path) -> None:
+def test_messages_are_read_bit_for_bit(sample):
     with McapSource().open(sample) as log:
         assert (log.missing, log.frames) == ({}, FRAMES)
         assert log.topics == {"left": LEFT, "right": RIGHT, "inclinometer": TILT, "odometry": "/odom"}
@@ -71,7 +73,7 @@ def test_messages_are_read_bit_for_bit(sample: Path) -> None:
         )  # fmt: skip
 
 
-def test_the_mount_comes_first_and_follows_the_static_transforms(whole: list[tuple[int, str, Any]]) -> None:
+def test_the_mount_comes_first_and_follows_the_static_transforms(whole):
     time, stream, mount = whole[0]
     assert (time, stream) == (START, "mount")
     assert isinstance(mount, Mount)
@@ -81,8 +83,8 @@ def test_the_mount_comes_first_and_follows_the_static_transforms(whole: list[tup
     np.testing.assert_allclose(mount.base_from_camera([[0, 0, 2.0]]), [[2.5, 0.1, 0.9]], atol=1e-12)
 
 
-def test_the_mount_holds_after_a_clock_was_set_back(tmp_path: Path) -> None:
-    def set_back(topic: str, number: int, message: Any) -> Any:
+def test_the_mount_holds_after_a_clock_was_set_back(tmp_path):
+    def set_back(topic, number, message):
         if number >= 3:
             message.header.stamp.sec -= 3600
         return message
@@ -95,33 +97,21 @@ def test_the_mount_holds_after_a_clock_was_set_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_file_layout_gives_the_same_items(
-    sample: Path, whole: list[tuple[int, str, Any]], tmp_path: Path, layout: str
-) -> None:
-    other = rewritten(sample, tmp_path / "other.mcap", **LAYOUTS[layout])
+def test_every_file_layout_gives_the_same_items(sample, whole, tmp_path, layout):
+    other = rewrite(sample, tmp_path / "other.mcap", **LAYOUTS[layout])
     assert [(t, s, essence(i)) for t, s, i in items_of(other)] == [(t, s, essence(i)) for t, s, i in whole]
     assert inventory_of(other)["frames"]["pairs"] == FRAMES
 
 
-def test_messages_are_read_in_log_time_order(sample: Path, tmp_path: Path) -> None:
-    backwards = tmp_path / "backwards.mcap"
-    with sample.open("rb") as source, backwards.open("wb") as target:
-        writer = Writer(target, chunk_size=2000)
-        writer.start()
-        known: dict[int, int] = {}
-        messages = list(make_reader(source).iter_messages())
-        for schema, channel, message in sorted(messages, key=lambda found: found[1].topic, reverse=True):
-            if channel.id not in known:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                known[channel.id] = writer.register_channel(channel.topic, "cdr", number)
-            writer.add_message(known[channel.id], message.log_time, message.data, message.publish_time)
-        writer.finish()
+def test_messages_are_read_in_log_time_order(sample, tmp_path):
+    by_topic = lambda messages: sorted(messages, key=lambda found: found[1].topic, reverse=True)  # noqa: E731
+    backwards = rewrite(sample, tmp_path / "backwards.mcap", order=by_topic, chunk_size=2000)
     times = [time for time, _, _ in items_of(backwards)]
     assert times == sorted(times)
     assert len(times) == 4 * FRAMES + 1
 
 
-def test_a_range_contains_complete_frames_and_their_tilts(sample: Path) -> None:
+def test_a_range_contains_complete_frames_and_their_tilts(sample):
     with McapSource().open(sample, start=0.1, end=0.3) as log:
         assert log.frames == 2
         events = list(log.events())
@@ -134,39 +124,25 @@ def test_a_range_contains_complete_frames_and_their_tilts(sample: Path) -> None:
         McapSource().open(sample, start=0.3, end=0.2)
 
 
-def drop(*prefixes: str) -> Any:
-    return lambda topic, number, message: None if topic.startswith(prefixes) else message
-
-
-def change(topic: str, **values: Any) -> Any:
-    def edit(name: str, number: int, message: Any) -> Any:
-        if name == topic:
-            for field, value in values.items():
-                setattr(message, field, value)
-        return message
-
-    return edit
-
-
 @pytest.mark.parametrize(
     ("edit", "stream", "sentence"),
     [
-        (drop("/stereo/right"), "right", f"the log has only one image topic \\({LEFT}\\), but stereo needs two"),
-        (drop("/stereo"), "left", "the log has no camera image"),
-        (drop(INFO), "left", f"no CameraInfo belongs to {LEFT} .*; set 'left_info' of the source"),
-        (drop(TILT), "inclinometer", "the log has no tilt"),
-        (drop(TILT), "mount", "the mount needs an inclinometer"),
-        (drop("/tf_static"), "mount", r"no static transform joins the camera \('left_optical'\) and the inclinometer"),
-        (drop("/odom"), "odometry", "the log has no nav_msgs/Odometry"),
-        (change(TILT, orientation_covariance=np.full(9, -1.0)), "inclinometer", "contains no orientation"),
-        (change("/stereo/right/camera_info", p=np.hstack([model().k, np.zeros((3, 1))]).reshape(-1)), "left",
+        (dropped("/stereo/right"), "right", f"the log has only one image topic \\({LEFT}\\), but stereo needs two"),
+        (dropped("/stereo"), "left", "the log has no camera image"),
+        (dropped(INFO), "left", f"no CameraInfo belongs to {LEFT} .*; set 'left_info' of the source"),
+        (dropped(TILT), "inclinometer", "the log has no tilt"),
+        (dropped(TILT), "mount", "the mount needs an inclinometer"),
+        (dropped("/tf_static"), "mount", r"static transform joins the camera \('left_optical'\) and the inclinometer"),
+        (dropped("/odom"), "odometry", "the log has no nav_msgs/Odometry"),
+        (changed(TILT, {"orientation_covariance": np.full(9, -1.0)}), "inclinometer", "contains no orientation"),
+        (changed("right/camera_info", {"p": np.hstack([model().k, np.zeros((3, 1))]).reshape(-1)}), "left",
          "does not contain the baseline"),
-        (change("/stereo/right/camera_info", p=np.hstack([model().k, [[5.0], [0], [0]]]).reshape(-1)), "left",
+        (changed("right/camera_info", {"p": np.hstack([model().k, [[5.0], [0], [0]]]).reshape(-1)}), "left",
          f"the baseline is -0.25 m, so {LEFT} is the right camera"),
-        (change(INFO, k=np.zeros(9), p=np.zeros(12)), "left", "is not calibrated"),
+        (changed(INFO, {"k": np.zeros(9), "p": np.zeros(12)}), "left", "is not calibrated"),
     ],
 )  # fmt: skip
-def test_missing_streams_are_reported_with_the_remedy(tmp_path: Path, edit: Any, stream: str, sentence: str) -> None:
+def test_missing_streams_are_reported_with_the_remedy(tmp_path, edit, stream, sentence):
     problems = missing(write_sample(tmp_path / "log.mcap", edit))
     assert stream in problems
     assert re.search(sentence, problems[stream]), problems[stream]
@@ -179,9 +155,10 @@ def test_missing_streams_are_reported_with_the_remedy(tmp_path: Path, edit: Any,
         ("/camera/infra1/image_rect_raw", "/camera/infra2/image_rect_raw"),
         ("/rover0/stereo/l/image", "/rover0/stereo/r/image"),
         ("/stereoLeft/image", "/stereoRight/image"),
+        ("/nav/left/image_rect", "/nav/right/image_rect"),
     ],
 )
-def test_pairs_are_found_by_common_camera_names(tmp_path: Path, names: tuple[str, str]) -> None:
+def test_pairs_are_found_by_common_camera_names(tmp_path, names):
     with McapSource().open(write_sample(tmp_path / "log.mcap", names=names)) as log:
         assert (log.topics["left"], log.topics["right"]) == names
         assert {item.stamp for _, stream, item in log.events() if stream == "left"} == {
@@ -189,20 +166,14 @@ def test_pairs_are_found_by_common_camera_names(tmp_path: Path, names: tuple[str
         }
 
 
-def test_equally_good_pairs_are_named_and_none_is_chosen(sample: Path, tmp_path: Path) -> None:
+def test_equally_good_pairs_are_named_and_none_is_chosen(sample, tmp_path):
     both = tmp_path / "both.mcap"
     front = write_sample(tmp_path / "front.mcap", names=("/front/left/image_rect", "/front/right/image_rect"))
-    with both.open("wb") as target:
-        writer = Writer(target)
-        writer.start()
+    with Ros2Writer(both) as writer:
         for path in (sample, front):
-            with path.open("rb") as source:
-                for schema, channel, message in make_reader(source).iter_messages():
-                    if path == sample or channel.topic.startswith("/front"):
-                        number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                        known = writer.register_channel(channel.topic, "cdr", number)
-                        writer.add_message(known, message.log_time, message.data, message.publish_time)
-        writer.finish()
+            for topic, stamp, message in iter_decoded(path):
+                if path == sample or topic.startswith("/front"):
+                    writer.write(topic, message, stamp)
     problems = missing(both)["left"]
     assert "/front/left/image_rect with /front/right/image_rect" in problems
     assert "set 'left' and 'right' of the source" in problems
@@ -212,11 +183,11 @@ def test_equally_good_pairs_are_named_and_none_is_chosen(sample: Path, tmp_path:
     assert "which is not a suitable topic of the log" in missing(both, McapSource(left="/nope"))["left"]
 
 
-def test_single_calibrations_are_joined_by_their_transform(tmp_path: Path) -> None:
+def test_single_calibrations_are_joined_by_their_transform(tmp_path):
     turned = Rotation.from_euler("y", 2, degrees=True).as_matrix()
     beside = Transform("left_optical", "right_optical", turned, [0.3, 0, 0.01])
 
-    def edit(topic: str, number: int, message: Any) -> Any:
+    def edit(topic, number, message):
         if topic == "/tf_static":
             return transform_message([(t, START) for t in (*TRANSFORMS, beside)])
         if topic.endswith("camera_info"):
@@ -241,8 +212,8 @@ def test_single_calibrations_are_joined_by_their_transform(tmp_path: Path) -> No
     assert depth == pytest.approx((camera.raw[0].r @ point)[2], rel=1e-9)
 
 
-def test_a_bad_message_is_lost_alone(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_a_bad_message_is_lost_alone(tmp_path):
+    def edit(topic, number, message):
         if topic == LEFT and number == 1:
             message.data = message.data[:-5]
         if topic == RIGHT and number == 2:
@@ -262,13 +233,8 @@ def test_a_bad_message_is_lost_alone(tmp_path: Path) -> None:
     assert len(events) == 4 * FRAMES + 1
 
 
-def test_an_unsupported_encoding_is_reported_before_the_run(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == RIGHT:
-            message.encoding = "yuv422_yuy2"
-        return message
-
-    path = write_sample(tmp_path / "log.mcap", edit)
+def test_an_unsupported_encoding_is_reported_before_the_run(tmp_path):
+    path = write_sample(tmp_path / "log.mcap", changed(RIGHT, {"encoding": "yuv422_yuy2"}))
     with McapSource().open(path) as log:
         assert list(log.missing) == ["right"]
         assert log.missing["right"].startswith(f"{RIGHT}: the image encoding 'yuv422_yuy2' is not supported")
@@ -278,10 +244,8 @@ def test_an_unsupported_encoding_is_reported_before_the_run(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("whole", [None, FRAMES // 2])
-def test_a_camera_with_only_broken_images_is_missing(
-    tmp_path: Path, whole: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_a_camera_with_only_broken_images_is_missing(tmp_path, whole, monkeypatch):
+    def edit(topic, number, message):
         if topic == RIGHT and number != whole:
             message.data = message.data[:-5]
         return message
@@ -324,9 +288,7 @@ def cropped(message: Any) -> Any:
         ),
     ],
 )  # fmt: skip
-def test_mismatched_images_are_reported_unless_some_match(
-    tmp_path: Path, topic: str, change: Any, problems: dict[str, str], odd: range
-) -> None:
+def test_mismatched_images_are_reported_unless_some_match(tmp_path, topic, change, problems, odd):
     edit = lambda name, number, message: change(message) if name == topic and number in odd else message  # noqa: E731
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == (problems if len(odd) == FRAMES else {})
@@ -347,12 +309,12 @@ def bare(tmp_path: Path, x: float, y: float) -> Path:
 PITCH, ROLL = AngleField("vector.x", "deg", 1), AngleField("vector.y", "deg", -1)
 
 
-def test_plain_angles_are_not_guessed(tmp_path: Path) -> None:
+def test_plain_angles_are_not_guessed(tmp_path):
     problems = missing(bare(tmp_path, 10, 20))["inclinometer"]
     assert "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source" in problems
 
 
-def test_plain_angles_are_read_by_the_settings(tmp_path: Path) -> None:
+def test_plain_angles_are_read_by_the_settings(tmp_path):
     source = McapSource(pitch=PITCH, roll=ROLL, tilt_model="axis")
     tilt = next(item for _, stream, item in items_of(bare(tmp_path, 10, 20), source) if stream == "inclinometer")
     p, r = np.deg2rad([10, -20])
@@ -374,13 +336,13 @@ def test_plain_angles_are_read_by_the_settings(tmp_path: Path) -> None:
         ({"camera_from_inclinometer": [[1, 0], [0, 1], [0, 0], [0, 0]]}, "must be a unit quaternion"),
     ],
 )
-def test_incomplete_angle_settings_are_refused(settings_: dict[str, Any], sentence: str) -> None:
+def test_incomplete_angle_settings_are_refused(settings_, sentence):
     with pytest.raises(ValueError, match=sentence):
         McapSource(**settings_)
 
 
-def test_a_stamp_of_zero_is_replaced_by_the_log_time(tmp_path: Path) -> None:
-    def edit(topic: str, number: int, message: Any) -> Any:
+def test_a_stamp_of_zero_is_replaced_by_the_log_time(tmp_path):
+    def edit(topic, number, message):
         if topic in (LEFT, RIGHT):
             message.header = header(0, message.header.frame_id)
         return message
@@ -390,12 +352,12 @@ def test_a_stamp_of_zero_is_replaced_by_the_log_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bounds", [{"start": float("nan")}, {"end": float("inf")}])
-def test_a_range_that_is_not_finite_is_refused(sample: Path, bounds: dict[str, float]) -> None:
+def test_a_range_that_is_not_finite_is_refused(sample, bounds):
     with pytest.raises(LogError, match="must be in seconds after the log's first message, not"):
         McapSource().open(sample, **bounds)
 
 
-def test_channels_in_other_encodings_are_ignored(sample: Path, whole: list[Any], tmp_path: Path) -> None:
+def test_channels_in_other_encodings_are_ignored(sample, whole, tmp_path):
     out = tmp_path / "mixed.mcap"
     with sample.open("rb") as source, out.open("wb") as target:
         writer = Writer(target)
