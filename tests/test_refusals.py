@@ -173,10 +173,19 @@ def test_the_demo_refuses_a_folder_with_other_files(traverse, tmp_path, capsys):
     check_folder(folder)
 
 
-@pytest.mark.parametrize("options", [("--rrd", "out.mcap"), ("--summary", "out.mcap")])
-def test_one_file_is_never_two_outputs(traverse, tmp_path, capsys, options):
-    assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", options[0], tmp_path / options[1]) == 2
-    assert "two outputs" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("option", "name", "words"),
+    [
+        ("-o", "nowhere/out.mcap", "there is no folder"),
+        *((option, "taken", "taken is a folder or a device") for option in ("-o", "--rrd", "--summary")),
+        *((option, "out.mcap", "is given for two outputs") for option in ("--rrd", "--summary")),
+    ],
+)
+def test_an_impossible_output_is_refused_before_anything_runs(traverse, tmp_path, capsys, option, name, words):
+    (tmp_path / "taken").mkdir()
+    assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, tmp_path / name) == 2
+    assert words in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
 def test_a_device_is_never_replaced_by_a_file(traverse, tmp_path, capsys):
@@ -254,19 +263,6 @@ def test_a_failed_export_does_not_block_the_next(result, tmp_path, capsys, monke
 def test_a_simulation_beyond_its_limits_is_refused_by_option(tmp_path, capsys, option, value, printed):
     assert roverflow("simulate", tmp_path / "log.mcap", option, value) == 2
     assert printed in capsys.readouterr().err
-
-
-def test_an_output_without_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys):
-    assert roverflow("run", traverse, *SMALL, "-o", tmp_path / "nowhere" / "out.mcap", "--no-rrd") == 2
-    assert "nowhere" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("option", ["-o", "--rrd", "--summary"])
-def test_an_output_that_is_a_folder_is_refused_before_anything_runs(traverse, tmp_path, capsys, option):
-    (tmp_path / "taken").mkdir()
-    assert roverflow("run", traverse, "-o", tmp_path / "out.mcap", option, tmp_path / "taken") == 2
-    assert "taken is a folder or a device" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
 @pytest.mark.parametrize("log", [".", "/", ""])

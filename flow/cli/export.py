@@ -16,7 +16,6 @@ HELP = "maps of a result log as GeoTIFF, PGM with YAML (map_server), PLY and PNG
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     sub.add_argument("result", type=Path, metavar="OUT.mcap")
     sub.add_argument("folder", type=Path, metavar="DIR", help="folder for the files, made where it is missing")
     sub.add_argument("--frames", action="store_true", help="maps and points of every frame, not the regional map")

@@ -12,7 +12,6 @@ HELP = "draw the dataflow of a pipeline"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     add_pipeline_options(sub)
     sub.add_argument("--format", choices=("text", "mermaid", "svg"), default="text")
     sub.add_argument("--expand", action="store_true", help="draw the streams inside templates one by one")

@@ -17,7 +17,6 @@ HELP = "show what a log contains, and what is missing"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     sub.add_argument("log", type=Path, metavar="LOG.mcap")
     add_pipeline_options(sub)
     sub.add_argument("--json", action="store_true", help="print JSON")

@@ -19,7 +19,6 @@ HELP = "replay a log through a pipeline"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     sub.add_argument("log", type=Path, metavar="LOG.mcap")
     add_pipeline_options(sub)
     sub.add_argument("-o", "--out", type=Path, metavar="OUT.mcap", help="result log (LOG-nav.mcap)")

@@ -13,7 +13,6 @@ HELP = "errors of a result log against ground truth"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     sub.add_argument("result", type=Path, metavar="OUT.mcap")
     sub.add_argument("--truth", type=Path, metavar="LOG.mcap", help="log with the /truth topics (the result itself)")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write every figure as JSON")

@@ -18,7 +18,6 @@ HELP = "list stages, aligners, source and sinks; with a name, its inputs and par
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     sub.add_argument("name", nargs="?", metavar="NAME", help="such as Match, my_module.Stage or Disparity")
 
 

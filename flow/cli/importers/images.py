@@ -14,7 +14,6 @@ HELP = "a folder of rectified left and right images"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     sub.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
     sub.add_argument("out", type=Path, metavar="OUT.mcap")
     camera = "rectified pair: fx, cx, cy (px), baseline (m); optionally fy, cx_right, width, height"

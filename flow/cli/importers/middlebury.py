@@ -15,7 +15,6 @@ HELP = "a Middlebury scene with ground truth (camera pose unknown: assumes level
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     sub.add_argument("source", type=Path, metavar="SOURCE", help="folder of a scene, or a folder of scenes")
     sub.add_argument("out", type=Path, metavar="OUT", help="log; for a folder of scenes, the folder of their logs")
 

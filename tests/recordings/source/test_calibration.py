@@ -66,11 +66,13 @@ def test_cameras_that_are_not_parallel_need_rectification(tmp_path, rotation, pl
     assert not left.rectified
     assert -right.model.p[0, 3] / right.model.p[0, 0] == pytest.approx(np.linalg.norm(place))
     point = np.array([0.3, -0.2, 4.0])
-    rows = []
+    places = []
     for camera, seen in ((left, point), (right, beside.inverse()(point))):
         projected = camera.model.p[:, :3] @ camera.model.r @ seen
-        rows.append(projected[1] / projected[2])
-    assert rows[0] == pytest.approx(rows[1], abs=1e-9)
+        places.append(projected[:2] / projected[2])
+    assert places[0][1] == pytest.approx(places[1][1], abs=1e-9)
+    disparity = places[0][0] - places[1][0] + right.model.p[0, 2] - left.model.p[0, 2]
+    assert -right.model.p[0, 3] / disparity == pytest.approx((left.model.r @ point)[2], rel=1e-9)  # the depth
     with McapSource().open(single_calibrations(tmp_path / "rect.mcap", RECTIFIED, beside, fx)) as log:
         assert "are rectified by their names, but the cameras are not parallel by" in log.missing["left"]
 

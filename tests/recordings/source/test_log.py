@@ -19,7 +19,6 @@ from tests.recordings.sample_log import (
     LAYOUTS,
     LEFT,
     PERIOD,
-    RIGHT,
     START,
     TILT,
     changed,
@@ -131,15 +130,6 @@ def test_undecodable_messages_of_a_used_topic_are_counted(sample, tmp_path, topi
     counts = [(item["encoding"], item["messages"]) for item in described["topics"] if item["topic"] == topic]
     assert sorted(counts) == [("cdr", 3), ("json", 2)]
     assert described["damage"] == [losses[0][1]]
-
-
-def test_undecodable_images_are_named_with_the_reason(sample, tmp_path):
-    def encode(name, number, schema):
-        return ("protobuf" if name in (LEFT, RIGHT) else "cdr"), schema
-
-    with McapSource().open(rewrite(sample, tmp_path / "log.mcap", encode=encode)) as log:
-        assert log.missing["left"].startswith("the log has no camera image")
-        assert f"cannot be decoded: {LEFT}: its messages are in 'protobuf'" in log.missing["left"]
 
 
 @pytest.mark.parametrize(

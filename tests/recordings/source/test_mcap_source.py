@@ -12,12 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.mcap.file import iter_decoded
-from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AngleField
-from recordings.ros2.to_msg import header, transform_message
-from stages.data import CameraImage, Mount, Transform
+from recordings.ros2.to_msg import header
+from stages.data import CameraImage, Mount
 from tests.conftest import rewrite
 from tests.recordings.sample_log import (
     BASELINE,
@@ -164,52 +162,6 @@ def test_pairs_are_found_by_common_camera_names(tmp_path, names):
         assert {item.stamp for _, stream, item in log.events() if stream == "left"} == {
             START + n * PERIOD for n in range(FRAMES)
         }
-
-
-def test_equally_good_pairs_are_named_and_none_is_chosen(sample, tmp_path):
-    both = tmp_path / "both.mcap"
-    front = write_sample(tmp_path / "front.mcap", names=("/front/left/image_rect", "/front/right/image_rect"))
-    with Ros2Writer(both) as writer:
-        for path in (sample, front):
-            for topic, stamp, message in iter_decoded(path):
-                if path == sample or topic.startswith("/front"):
-                    writer.write(topic, message, stamp)
-    problems = missing(both)["left"]
-    assert "/front/left/image_rect with /front/right/image_rect" in problems
-    assert "set 'left' and 'right' of the source" in problems
-    with McapSource(left="/front/left/image_rect").open(both) as log:
-        assert log.topics["right"] == "/front/right/image_rect"
-        assert "left" not in log.missing
-    assert "which is not a suitable topic of the log" in missing(both, McapSource(left="/nope"))["left"]
-
-
-def test_single_calibrations_are_joined_by_their_transform(tmp_path):
-    turned = Rotation.from_euler("y", 2, degrees=True).as_matrix()
-    beside = Transform("left_optical", "right_optical", turned, [0.3, 0, 0.01])
-
-    def edit(topic, number, message):
-        if topic == "/tf_static":
-            return transform_message([(t, START) for t in (*TRANSFORMS, beside)])
-        if topic.endswith("camera_info"):
-            message.p, message.d = np.zeros(12), np.array([-0.1, 0, 0, 0, 0])
-        return message
-
-    path = write_sample(tmp_path / "log.mcap", edit, names=("/left/image_raw", "/right/image_raw"))
-    with McapSource().open(path) as log:
-        events = list(log.events())
-    left, right = (next(i for _, s, i in events if s == side) for side in ("left", "right"))
-    camera = left.pair_with(right).camera
-    assert camera.baseline == pytest.approx(np.hypot(0.3, 0.01))
-    assert camera.raw is not None
-    # The rays to a far point, rotated by R and projected by P, have the same row in both cameras.
-    point = np.array([0.4, -0.3, 5.0])
-    seen_left = camera.raw[0].p @ [*(camera.raw[0].r @ point), 1]
-    in_right = beside.inverse()(point)
-    seen_right = camera.raw[1].p[:, :3] @ camera.raw[1].r @ in_right
-    assert seen_left[1] / seen_left[2] == pytest.approx(seen_right[1] / seen_right[2], abs=1e-9)
-    disparity = seen_left[0] / seen_left[2] - seen_right[0] / seen_right[2]
-    depth = camera.fx * camera.baseline / (disparity + camera.cx_right - camera.cx)
-    assert depth == pytest.approx((camera.raw[0].r @ point)[2], rel=1e-9)
 
 
 def test_a_bad_message_is_lost_alone(tmp_path):
