@@ -27,6 +27,7 @@ EPOCH = 1_700_000_000 * SECOND
 DAY = 86_400 * SECOND
 MAX_DAYS = 4000  # from the epoch on; limited by the 32-bit seconds of a ROS time
 SENSOR_MARGIN = SECOND // 2  # that the slow sensors run before the first frame and after the last
+GROUND = ("sand", "dust", "bedrock")  # fields whose shares are at most 1 together
 ROW_BLOCK = 32  # rows of one task of a thread
 # The Devon Island rover's rectified camera (1280 pixels wide).
 DEVON_WIDTH, DEVON_F, DEVON_CX, DEVON_CY, DEVON_HEIGHT = 1280, 968.999694824, 635.139038086, 463.537109375, 960
@@ -138,12 +139,16 @@ class Simulation:
         if self.scene in SCENES:
             for name, value in defaults_of(self.scene).items():
                 if getattr(self, name) is None:
-                    object.__setattr__(self, name, value)
+                    object.__setattr__(self, name, min(value, self._ground_left()) if name in GROUND else value)
         check_parameters(self)
         if (total := self.sand + self.dust + self.bedrock) > 1 + 1e-9:
             raise ValueError(f"Simulation.sand must be at most 1 with dust and bedrock, not {total:g} together")
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
+
+    def _ground_left(self) -> float:
+        """Share of the ground that the set shares leave."""
+        return max(1.0 - sum(getattr(self, name) or 0.0 for name in GROUND), 0.0)
 
     @cached_property
     def camera(self) -> StereoCamera:

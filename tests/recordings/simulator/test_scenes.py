@@ -157,6 +157,8 @@ def test_a_set_parameter_wins_over_its_scene(scene):
     assert simulation.noise == 7.0
     assert simulation.sun_elevation == defaults_of(scene)["sun_elevation"]
     assert scene in OPTIONS["scene"][4]
+    bare = Simulation(scene=scene, sand=1.0)
+    assert (bare.dust, bare.bedrock) == (0.0, 0.0)
 
 
 def test_an_unknown_scene_or_too_much_ground_is_refused(tmp_path, capsys):
