@@ -55,8 +55,9 @@ def check(found: dict[str, Run], alarms: float, slack: float = 0.0) -> None:
 
 def traverse_of(seed: int, abundance: float) -> Simulation:
     return Simulation(
-        frames=30, seed=seed, abundance=abundance, slope=float(SLOPE), tilt_noise=float(TILT_NOISE), threads=1
-    )
+        scene="gravel", frames=30, seed=seed, abundance=abundance, slope=float(SLOPE), tilt_noise=float(TILT_NOISE),
+        threads=1,
+    )  # fmt: skip
 
 
 def test_two_frames_have_accurate_maps():
@@ -76,7 +77,8 @@ def test_three_traverses_have_accurate_maps(abundance, alarms):
 @pytest.mark.parametrize("seed", [11, 13])
 def test_rover_scores_better_than_paper(tmp_path, seed):
     log = tmp_path / "log.mcap"
-    assert main(["simulate", str(log), "--frames", "4", "--size", "960x720", "--seed", str(seed)]) == 0
+    traverse = ("--scene", "gravel", "--frames", "4", "--size", "960x720", "--seed", str(seed))
+    assert main(["simulate", str(log), *traverse]) == 0
     scores: dict[str, Any] = {}
     for pipeline in ("rover", "paper"):
         out, table = tmp_path / f"{pipeline}.mcap", tmp_path / f"{pipeline}.json"

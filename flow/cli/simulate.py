@@ -20,7 +20,7 @@ DEGREE, PERCENT, MILLISECOND = math.radians(1), 0.01, 0.001
 
 # option -> (field of recordings.simulator.Simulation, its type, its unit, name of the value, help)
 OPTIONS: dict[str, tuple[str, type, float, str | None, str]] = {
-    "scene": ("scene", str, 1, "NAME", "defaults for gravel, mixed, dunes, dusk or bedrock (gravel)"),
+    "scene": ("scene", str, 1, "NAME", "defaults for gravel, mixed, dunes, dusk or bedrock (mixed)"),
     "frames": ("frames", int, 1, None, "number of stereo frames (12)"),
     "seed": ("seed", int, 1, None, "random seed of terrain and noise (1)"),
     "baseline": ("baseline", float, 1, "M", "distance between the cameras (0.24)"),

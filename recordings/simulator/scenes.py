@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import radians
 
 SCENES = ("gravel", "mixed", "dunes", "dusk", "bedrock")
-DEFAULT_SCENE = "gravel"
+DEFAULT_SCENE = "mixed"
 
 # Field of Simulation -> its default in each of SCENES.
 _TABLE: dict[str, tuple[float, ...]] = {

@@ -9,5 +9,6 @@ argparse.ArgumentParser("python -m tests.bench", description=about).parse_args()
 matching.main()
 refining.main()
 pipeline.main()
-terrain.main(["--stride", "10"])
+for scene in ("gravel", "mixed"):
+    terrain.main(["--scene", scene, "--stride", "10"])
 regional.main()

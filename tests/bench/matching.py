@@ -34,7 +34,7 @@ def colour_pair() -> StereoFrame:
     """The frame that is timed."""
     data = os.environ.get("ROVERFLOW_DATA")
     if not data:
-        simulation = Simulation(frames=2, width=WIDTH, height=HEIGHT, abundance=0.15)
+        simulation = Simulation(scene="gravel", frames=2, width=WIDTH, height=HEIGHT, abundance=0.15)
         return StereoFrame(0, *simulation.frame(1).images, simulation.camera)
     scene = Path(data) / "middlebury-q" / "Motorcycle"
     images = [cv2.cvtColor(cv2.imread(str(scene / f"im{i}.png")), cv2.COLOR_BGR2RGB) for i in (0, 1)]

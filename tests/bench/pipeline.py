@@ -24,7 +24,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for size, disparities in SIZES.items():
             log = Path(folder) / f"{size}.mcap"
-            _roverflow("simulate", log, "--frames", FRAMES, "--size", size)
+            _roverflow("simulate", log, "--scene", "gravel", "--frames", FRAMES, "--size", size)
             for pipeline in ("rover", "fast", "paper"):
                 _bench(log, pipeline, size, disparities, cores)
 

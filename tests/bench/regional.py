@@ -74,7 +74,7 @@ def main() -> None:
 def traverse_of(seed: int, abundance: float) -> Simulation:
     """A traverse as the table has them."""
     return Simulation(
-        frames=FRAMES, seed=seed, abundance=abundance, slope=np.radians(8), tilt_noise=np.radians(0.3)
+        scene="gravel", frames=FRAMES, seed=seed, abundance=abundance, slope=np.radians(8), tilt_noise=np.radians(0.3)
     )  # fmt: skip
 
 

@@ -31,6 +31,7 @@ from flow.runtime.malloc import keep_freed_memory
 from recordings.scoring.table import ROWS, terrain_figures, terrain_lines
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
 from recordings.simulator import ground_truth, traverse
+from recordings.simulator.scenes import SCENES
 from recordings.simulator.simulation import FrameTruth, Simulation
 from recordings.source.tilt_noise import WINDOW, TiltNoise
 from stages.data import Array, Cell, Disparity, Mount, PixelOrigin, StereoFrame, Tilt, Transform
@@ -177,6 +178,7 @@ def main(given: Sequence[str] | None = None) -> None:
     camera = "distance between the cameras and their height, m, and how far they look down"
     names, default = ("BASELINE", "HEIGHT", "DEG"), (0.24, 0.9, 15.0)
     parser.add_argument("--camera", type=float, nargs=3, default=default, metavar=names, help=camera)
+    parser.add_argument("--scene", choices=SCENES, default="gravel", help="what the ground looks like")
     parser.add_argument("--size", type=arguments.size, default=(1280, 960), metavar="WxH", help="of the images")
     parser.add_argument("--runs", nargs="+", choices=[*RUNS, "true"], default=list(RUNS))
     parser.add_argument("--rings", action="store_true", help="also the score by distance")
@@ -189,13 +191,14 @@ def main(given: Sequence[str] | None = None) -> None:
     everything = {}
     for rocks in options.rocks:
         simulations = [
-            Simulation(frames=options.frames, seed=seed, abundance=rocks, slope=float(SLOPE), threads=1,
-                       tilt_noise=float(TILT_NOISE), width=width, height=height, baseline=baseline,
+            Simulation(scene=options.scene, frames=options.frames, seed=seed, abundance=rocks, slope=float(SLOPE),
+                       threads=1, tilt_noise=float(TILT_NOISE), width=width, height=height, baseline=baseline,
                        camera_height=above, pitch_down=float(np.radians(down))) for seed in options.seeds
         ]  # fmt: skip
         found = score(simulations, options.stride, runs)
         count = len(next(iter(found.values())).seconds)
-        print(f"\nrocks k = {rocks}, {count} frames of {width}x{height}, seeds {', '.join(map(str, options.seeds))}")
+        ground = f"scene {options.scene}, rocks k = {rocks}"
+        print(f"\n{ground}, {count} frames of {width}x{height}, seeds {', '.join(map(str, options.seeds))}")
         columns = [[*ROWS, "disparity to navigation map, ms on one core"], *(figures(run) for run in found.values())]
         print(f"{'':66}" + "".join(f"{name.split(',')[-1].strip():>26}" for name in found))
         for label, *cells in zip(*columns, strict=True):

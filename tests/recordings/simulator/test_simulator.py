@@ -18,7 +18,7 @@ from recordings.simulator.odometry import dead_reckoning
 from stages.data import Cell, Transform
 
 SMALL = Simulation(
-    frames=2, rate=1.0, width=400, height=300, relief_cells=512, abundance=0.12, color=False, noise=0.0,
+    scene="gravel", frames=2, rate=1.0, width=400, height=300, relief_cells=512, abundance=0.12, color=False, noise=0.0,
     tilt_noise=0.0, frame_offset=0.0, seed=5,
 )  # fmt: skip
 

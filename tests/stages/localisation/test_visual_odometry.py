@@ -22,7 +22,7 @@ Input = tuple[StereoFrame, Disparity]
 @pytest.fixture(scope="module")
 def drive() -> tuple[list[Input], list[Transform]]:
     """Frames of a drive with their true disparities, and where the camera truly was (world <- camera)."""
-    simulation = Simulation(frames=FRAMES, width=320, height=240, relief_cells=512, seed=5)
+    simulation = Simulation(scene="gravel", frames=FRAMES, width=320, height=240, relief_cells=512, seed=5)
     inputs, cameras = [], []
     for index in range(FRAMES):
         truth, stamp = simulation.frame(index), simulation.stamp(index)

@@ -249,7 +249,7 @@ def test_a_wrong_prior_does_not_overrule_the_images(slope):
 
 
 def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
-    simulation = Simulation(frames=3, width=480, height=360)
+    simulation = Simulation(scene="gravel", frames=3, width=480, height=360)
     parts = []
     for index in range(simulation.frames):
         made = simulation.frame(index)

@@ -56,7 +56,7 @@ def test_rover_beats_paper_matching_and_the_released_code_on_real_scenes():
 
 @pytest.mark.parametrize("pipeline", ["rover", "fast"])
 def test_ground_nearly_four_times_as_near_as_the_range_is_known(pipeline):
-    simulation = Simulation(frames=1, width=320, height=240, seed=1, abundance=0.1)
+    simulation = Simulation(scene="gravel", frames=1, width=320, height=240, seed=1, abundance=0.1)
     camera, found = simulation.camera, simulation.frame(0)
     truth = camera.fx * camera.baseline / found.depth
     frame = StereoFrame(1, *found.images, camera)
@@ -77,7 +77,7 @@ def test_ground_nearly_four_times_as_near_as_the_range_is_known(pipeline):
 def test_confidence_is_the_share_that_is_right_on_a_held_out_frame():
     stated, right = [], []
     for seed, abundance in ((21, 0.08), (22, 0.18)):
-        simulation = Simulation(frames=2, width=480, height=360, seed=seed, abundance=abundance)
+        simulation = Simulation(scene="gravel", frames=2, width=480, height=360, seed=seed, abundance=abundance)
         camera, found = simulation.camera, simulation.frame(1)
         truth = camera.fx * camera.baseline / found.depth
         frame = StereoFrame(seed, *found.images, camera)
