@@ -2,13 +2,13 @@
 
 import argparse
 
-from tests.bench import matching, pipeline, refining, regional, terrain
+from tests.bench import matching, pipeline, refining, regional, terrain, weak_texture
 
-about = "All benchmarks, ten minutes and more; python -m tests.bench.NAME runs one."
+about = "All benchmarks, half an hour; python -m tests.bench.NAME runs one."
 argparse.ArgumentParser("python -m tests.bench", description=about).parse_args()
 matching.main()
 refining.main()
 pipeline.main()
-for scene in ("gravel", "mixed"):
-    terrain.main(["--scene", scene, "--stride", "10"])
+weak_texture.main(["--frames", "1"])
+terrain.main(["--stride", "10"])
 regional.main()

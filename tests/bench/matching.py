@@ -44,7 +44,11 @@ def colour_pair() -> StereoFrame:
 
 def gray_pair() -> StereoFrame:
     """The same in gray."""
-    frame = colour_pair()
+    return in_gray(colour_pair())
+
+
+def in_gray(frame: StereoFrame) -> StereoFrame:
+    """A colour frame in gray."""
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.left, frame.right))
     return replace(frame, left=left, right=right)
 

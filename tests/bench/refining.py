@@ -10,9 +10,10 @@ from __future__ import annotations
 import functools
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -46,20 +47,21 @@ COLUMNS = "bad-0.5  bad-1  bad-2 | all -0.5     -1     -2 |   RMS"
 
 
 def stereo_part(
-    pipeline: str, frame: StereoFrame, disparities: int, threads: int = 1, entry: str = "stereo", **given: Disparity
-) -> dict[str, Any]:
+    pipeline: str, frame: StereoFrame, disparities: int, threads: int = 1, entry: str = "stereo",
+    changes: Mapping[str, Any] = MappingProxyType({}), **given: Disparity,
+) -> dict[str, Any]:  # fmt: skip
     """The streams that a pipeline's disparity of one frame depends on, by name; the frame enters as stream `entry`.
 
-    disparities: the range at full size; a coarser one keeps its share of it; given: streams that are not made but
-    taken as they are.
+    disparities: the range at full size; a coarser one keeps its share of it; changes: parameters of every stage that
+    has them; given: streams that are not made but taken as they are.
     """
     streams: dict[str, Any] = {entry: frame, **given}
     for node in _needed(pipeline, frozenset(streams)):
         actor, names = node.actor, {field.name for field in fields(node.actor)}
         if "disparities" in names:
             actor = replace(actor, disparities=round(actor.disparities * disparities / DISPARITIES))
-        if "threads" in names:
-            actor = replace(actor, threads=threads)
+        changed = {"threads": threads, **changes}
+        actor = replace(actor, **{name: value for name, value in changed.items() if name in names})
         streams[node.name] = actor(**{port: streams[name] for port, name in node.inputs.items()})
     return streams
 

@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -178,7 +179,7 @@ def main(given: Sequence[str] | None = None) -> None:
     camera = "distance between the cameras and their height, m, and how far they look down"
     names, default = ("BASELINE", "HEIGHT", "DEG"), (0.24, 0.9, 15.0)
     parser.add_argument("--camera", type=float, nargs=3, default=default, metavar=names, help=camera)
-    parser.add_argument("--scene", choices=SCENES, default="gravel", help="what the ground looks like")
+    parser.add_argument("--scenes", choices=SCENES, nargs="+", default=["gravel", "mixed"], help="looks of the ground")
     parser.add_argument("--size", type=arguments.size, default=(1280, 960), metavar="WxH", help="of the images")
     parser.add_argument("--runs", nargs="+", choices=[*RUNS, "true"], default=list(RUNS))
     parser.add_argument("--rings", action="store_true", help="also the score by distance")
@@ -189,15 +190,15 @@ def main(given: Sequence[str] | None = None) -> None:
     runs = {name: RUNS[name] for name in RUNS if name in options.runs or ("true" in options.runs and "true" in name)}
     (width, height), (baseline, above, down) = options.size, options.camera
     everything = {}
-    for rocks in options.rocks:
+    for rocks, scene in product(options.rocks, options.scenes):
         simulations = [
-            Simulation(scene=options.scene, frames=options.frames, seed=seed, abundance=rocks, slope=float(SLOPE),
+            Simulation(scene=scene, frames=options.frames, seed=seed, abundance=rocks, slope=float(SLOPE),
                        threads=1, tilt_noise=float(TILT_NOISE), width=width, height=height, baseline=baseline,
                        camera_height=above, pitch_down=float(np.radians(down))) for seed in options.seeds
         ]  # fmt: skip
         found = score(simulations, options.stride, runs)
         count = len(next(iter(found.values())).seconds)
-        ground = f"scene {options.scene}, rocks k = {rocks}"
+        ground = f"scene {scene}, rocks k = {rocks}"
         print(f"\n{ground}, {count} frames of {width}x{height}, seeds {', '.join(map(str, options.seeds))}")
         columns = [[*ROWS, "disparity to navigation map, ms on one core"], *(figures(run) for run in found.values())]
         print(f"{'':66}" + "".join(f"{name.split(',')[-1].strip():>26}" for name in found))
@@ -206,7 +207,7 @@ def main(given: Sequence[str] | None = None) -> None:
         if options.rings:
             for name, run in found.items():
                 print("\n".join(["", name, *terrain_lines(run.tally.metrics())]))
-        everything[str(rocks)] = {name: run.tally.metrics() for name, run in found.items()}
+        everything[f"{scene}, {rocks}"] = {name: run.tally.metrics() for name, run in found.items()}
     if options.json is not None:
         options.json.write_text(json.dumps(everything, indent=2))
 
