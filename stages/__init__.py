@@ -12,6 +12,7 @@ from stages.data import (
     CellReason,
     Disparity,
     ElevationMap,
+    ImageNoise,
     MatchHealth,
     Mount,
     NavigationMap,
@@ -30,6 +31,7 @@ from stages.data import (
 from stages.localisation.pose_filter import PoseFilter
 from stages.localisation.tilt.check import CheckTilt
 from stages.localisation.visual_odometry import VisualOdometry
+from stages.matching.image_noise import MeasureNoise
 from stages.matching.lr_check import LeftRightCheck
 from stages.matching.match import Match
 from stages.matching.match_health import CheckMatches
@@ -57,11 +59,13 @@ __all__ = [
     "ElevationMap",
     "Fuse",
     "Halve",
+    "ImageNoise",
     "LeftRightCheck",
     "Level",
     "Match",
     "MatchHealth",
     "MatchOpenCV",
+    "MeasureNoise",
     "Mount",
     "NavigationMap",
     "PixelOrigin",

@@ -18,8 +18,9 @@ from stages.stage import Stage, check_joined, parameter
 class Reproject(Stage):
     """Triangulates a disparity image.
 
-    The standard deviation of a matched disparity falls geometrically with its confidence, from `sigma_worst` at 0 to
-    `sigma_best` at 1 (see "Stated sigmas" in docs/terrain.md).
+    The standard deviation of a matched disparity is its own, `Disparity.sigma`. Where the image has none, it falls
+    geometrically with the confidence, from `sigma_worst` at 0 to `sigma_best` at 1 (see "Stated sigmas" in
+    docs/terrain.md).
 
     Examples
     --------

@@ -10,7 +10,7 @@ horizontal heading, y left.
 from __future__ import annotations
 
 from stages.data.arrays import Array
-from stages.data.camera import CameraImage, CameraModel, StereoCamera, StereoFrame
+from stages.data.camera import CameraImage, CameraModel, ImageNoise, StereoCamera, StereoFrame
 from stages.data.cloud import PointCloud, VoxelMap
 from stages.data.disparity import Disparity, MatchHealth
 from stages.data.maps import LEVEL_FRAME, Cell, CellReason, ElevationMap, NavigationMap
@@ -29,6 +29,7 @@ __all__ = [
     "CellReason",
     "Disparity",
     "ElevationMap",
+    "ImageNoise",
     "MatchHealth",
     "Mount",
     "NavigationMap",

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from flow.contracts import StageError
-from stages.data.arrays import Array, publish_image, publish_stamp, publish_vector
+from stages.data.arrays import Array, publish, publish_image, publish_stamp, publish_vector
 
 CALIBRATION_RTOL = 1e-3  # by which focal lengths or cy of a rectified pair may differ: a pixel at 1000 px
 _OPENCV = (0, 4, 5, 8, 12, 14)  # numbers of coefficients; they define the model, whatever a driver calls it
@@ -237,3 +237,23 @@ class StereoFrame:
                 f"StereoFrame: images are {self.left.shape[1]}x{self.left.shape[0]}, "
                 f"the calibration is for {self.camera.width}x{self.camera.height}"
             )
+
+
+@dataclass(frozen=True, eq=False)
+class ImageNoise:
+    """The noise of an image.
+
+    Parameters
+    ----------
+    stamp
+        Nanoseconds.
+    sigma
+        (256,) float32: standard deviation of a pixel at each gray level, in gray levels of 8 bit.
+    """
+
+    stamp: int
+    sigma: Array
+
+    def __post_init__(self) -> None:
+        publish_stamp(self)
+        publish(self, "sigma", (256,), np.float32)

@@ -28,6 +28,8 @@ class Disparity:
         (H, W) int32 superpixel labels of refinement, or None.
     camera
         The rectified camera, if it is known.
+    sigma
+        (H, W) float32, px, standard deviation of a known disparity that is no blunder (inf = no evidence), or None.
 
     Examples
     --------
@@ -45,6 +47,7 @@ class Disparity:
     confidence: Array
     segments: Array | None = None
     camera: StereoCamera | None = None
+    sigma: Array | None = None
 
     def __post_init__(self) -> None:
         publish_stamp(self)
@@ -53,6 +56,8 @@ class Disparity:
         publish(self, "confidence", self.pixels.shape, np.float32)
         if self.segments is not None:
             publish(self, "segments", self.pixels.shape, np.int32)
+        if self.sigma is not None:
+            publish(self, "sigma", self.pixels.shape, np.float32)
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,17 @@ import numpy as np
 
 from flow.contracts import StageError
 from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
+from stages.matching.image_noise import noise_levels
 from stages.matching.intensity import eight_bit, gray
-from stages.matching.kernels.prior_cost import prior_costs
+from stages.matching.kernels.prior_cost import MAX_GAIN, prior_costs
 from stages.matching.kernels.row_ranges import Range, lanes_for, row_ranges, whole_range
 from stages.matching.kernels.semiglobal import Matches, match
 from stages.matching.kernels.sgm_local import SearchWindows, windows_around
 from stages.matching.kernels.sgm_params import SgmParams
+from stages.matching.kernels.texture import gradient, information, match_variance, stereo_noise
 from stages.stage import Stage, check_rectified, parameter
 
+F32 = np.float32
 MIN_SIDE = 16  # px, of an image
 MAX_BYTE = 255
 RANGE_TOLERANCE = 2.0  # px; a prior farther outside the search range shows that the match is not in it
@@ -98,6 +101,9 @@ class Match(Stage):
     lr_tolerance: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
     max_speckle_size: int = parameter(40, "largest isolated patch that is dropped, in pixels", low=0)
     prior_weight: float = parameter(0.5, "cost of each pixel of distance from the prior", low=0, high=16)
+    weak_texture_gain: float = parameter(
+        4.0, "factor of `prior_weight` where noise leaves a match uncertain by 1 px", low=1, high=MAX_GAIN
+    )
     search_radius: int = parameter(
         0, "distance from the prior that is searched at least; pixels without a prior are not searched; 0: the whole"
         " range everywhere",
@@ -138,7 +144,7 @@ class Match(Stage):
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
         search = self._search_range(frame.camera)
         area = self._search_area(prior, search, len(left))
-        guide = None if prior is None else self._prior_costs(prior, search, area)
+        guide = None if prior is None else self._prior_costs(prior, search, area, left, right)
         excluded = None if prior is None else self._excluded(prior, search, area)
         found = match(left, right, self._params(search), guide, area, excluded, self.threads, self.max_memory << 20)
         if prior is not None and self.out_of_range == "prior" and not self.search_radius:
@@ -191,13 +197,21 @@ class Match(Stage):
             return row_ranges(prior.pixels, self.band_height, search.start, len(search), self.threads)
         return whole_range(rows, len(search))
 
-    def _prior_costs(self, prior: Disparity, search: range, area: SearchArea) -> tuple[Array, Array]:
+    def _prior_costs(
+        self, prior: Disparity, search: range, area: SearchArea, image: Array, other: Array
+    ) -> tuple[Array, Array]:
         if isinstance(area, SearchWindows):
             first, lanes = area.first, area.width.lanes
         else:
             firsts = [np.full((each.end - each.top, 1), search.start + each.first, np.int32) for each in area]
             first, lanes = np.concatenate(firsts), lanes_for(len(search))
-        return prior_costs(prior.pixels, first, lanes, self.prior_weight, MAX_PRIOR_DISTANCE, self.threads)
+        gain = None
+        if self.prior_weight and self.weak_texture_gain > 1:
+            slopes = gradient(image), gradient(other)
+            noise = stereo_noise(prior.pixels, image, slopes, noise_levels(image), self.threads)
+            variance = match_variance(information(image, slopes[0], noise, self.threads))
+            gain = 1 + F32(self.weak_texture_gain - 1) * np.minimum(variance, 1)
+        return prior_costs(prior.pixels, first, lanes, self.prior_weight, MAX_PRIOR_DISTANCE, self.threads, gain)
 
     def _excluded(self, prior: Disparity, search: range, area: SearchArea) -> Array:
         """Why pixels are excluded from the search, (H, W) uint8: codes of `PixelOrigin`, 0 where they are searched.

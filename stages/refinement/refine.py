@@ -14,10 +14,10 @@ import numpy as np
 
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Disparity, StereoFrame
+from stages.matching.image_noise import noise_levels
 from stages.matching.intensity import eight_bit, gray
-from stages.matching.kernels.blank_windows import contrast
+from stages.matching.kernels.texture import contrast
 from stages.refinement.kernels.bilateral import joint_bilateral
-from stages.refinement.kernels.correlation import correlation
 from stages.refinement.kernels.depth_edges import sharpen_edges
 from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.refinement.kernels.label_origin import Trust, label_origin
@@ -26,6 +26,7 @@ from stages.refinement.kernels.plane_fit import Planes, fit_planes
 from stages.refinement.kernels.region_merging import merge_regions
 from stages.refinement.kernels.slic import superpixels
 from stages.refinement.kernels.subpixel import fit_brightness
+from stages.refinement.kernels.support import supported
 from stages.refinement.kernels.valid_extent import Extent, extent
 from stages.stage import Stage, check_joined, check_same_time, parameter
 
@@ -50,8 +51,9 @@ TRUST = Trust(
 class Refine(Stage):
     """A denser and smoother disparity image, with its superpixels.
 
-    A match that moves by at most 0.5 px stays MEASURED if left and right image correlate there, else it becomes FILLED.
-    A match that moves farther becomes PLANE, as does a hole that a plane fills. Other filled holes are FILLED. The
+    A match that moves by at most 0.5 px and two sigmas stays MEASURED if the images correlate over its support and its
+    sigma is small, else it becomes FILLED. A match that moves farther becomes PLANE, as does a hole that a plane fills.
+    Other filled holes are FILLED, but MEASURED where both cameras see them and their support passes the same tests. The
     confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that stays unknown keeps
     its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or OUT_OF_VIEW. See
     docs/refinement.md.
@@ -102,8 +104,15 @@ class Refine(Stage):
         3, "radius of the weighted median that moves depth edges to edges of the image; 0: none", unit="px", low=0,
         high=16,
     )  # fmt: skip
+    support: bool = parameter(True, "whether matches of weak texture move to the planes of windows that grow")
     min_correlation: float = parameter(
-        0.5, "correlation of the images around a match below which it becomes FILLED; 0: no test", low=0, high=1
+        0.4,
+        "correlation of the images over a pixel's support below which it becomes FILLED; 0: no test; needs `support`",
+        low=0,
+        high=1,
+    )
+    max_sigma: float = parameter(
+        0.5, "standard deviation above which a pixel becomes FILLED; needs `support`", unit="px", low=0
     )
     threads: int = parameter(
         1, "largest number of cores for one frame (two are used); does not change the result", low=1
@@ -120,13 +129,14 @@ class Refine(Stage):
         within = extent(smoothed, self.threads)
         planar, labels, agreed = self._with_planes(smoothed, weights, within, image, disparity.stamp)
         filled, kinds = self._filled(planar, within, image)
-        refined = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
-        consistent = self._consistent(refined, kinds != KEPT, guide, right)
+        sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
+        refined, sigma, consistent = self._supported(sharp, kinds != KEPT, guide, right)
         source, confidence = label_origin(
-            matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, INLIER_DISTANCE, TRUST,
+            matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, sigma, INLIER_DISTANCE, TRUST,
             self.threads,
         )  # fmt: skip
-        return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera)
+        stated = sigma if self.support else None
+        return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera, stated)
 
     def _matches(self, disparity: Disparity, saturated: Array, guide: Array, right: Array) -> tuple[Array, ...]:
         """Trusted matches with subpixel fractions fitted to brightness, their weights, and reasons of the others."""
@@ -192,11 +202,15 @@ class Refine(Stage):
             return pixels
         return joint_bilateral(pixels, guide, self.bilateral_radius, BILATERAL_GRAY, BILATERAL_DISPARITY, self.threads)
 
-    def _consistent(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> Array:
-        """Where left and right image correlate at the refined disparity, (H, W) bool."""
-        if self.min_correlation == 0:
-            return np.ones(pixels.shape, bool)
-        return correlation(pixels, guessed, guide, right, self.threads) >= F32(self.min_correlation)
+    def _supported(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> tuple[Array, Array, Array]:
+        """The supported disparities, their sigma, px, and where the images agree with them, (H, W) bool."""
+        if not self.support:
+            return pixels, np.zeros(pixels.shape, np.float32), np.ones(pixels.shape, bool)
+        found = supported(pixels, guessed, guide, right, noise_levels(guide), self.threads)
+        consistent = found.sigma <= F32(self.max_sigma)
+        if self.min_correlation:
+            consistent &= found.correlation >= F32(self.min_correlation)
+        return found.pixels, found.sigma, consistent
 
     def _sharpened(self, pixels: Array, guessed: Array, guide: Array) -> Array:
         if self.edge_radius == 0:

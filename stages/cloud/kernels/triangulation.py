@@ -46,6 +46,7 @@ def triangulate(
         float(max_depth),
         bool(filled),
         (float(np.log(sigma.best)), float(np.log(sigma.worst)), float(sigma.plane), float(sigma.filled)),
+        np.empty(0, np.float32) if disparity.sigma is None else np.ascontiguousarray(disparity.sigma).ravel(),
     )
 
 
@@ -60,7 +61,7 @@ def _depth(disparity, source, shift, focal_baseline, max_depth, filled):
 
 
 @kernel
-def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, sigmas):
+def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, sigmas, own):
     fx, fy, cx, cy, focal_baseline, shift = camera
     log_best, log_worst, sigma_plane, sigma_filled = sigmas
     count = 0
@@ -84,6 +85,8 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
                 sigma_d = sigma_filled
             elif source[i] == _PLANE:
                 sigma_d = sigma_plane
+            elif own.size:
+                sigma_d = np.float64(own[i])
             else:
                 trust = min(np.float64(confidence[i]), 1.0) if confidence[i] > 0.0 else 0.0
                 sigma_d = np.exp(log_worst + (log_best - log_worst) * trust)
@@ -107,6 +110,7 @@ def triangulate_reference(
     rgb = colors[v, u] if colors.ndim == 3 else np.repeat(colors[v, u][:, None], 3, axis=1)
     trust = np.clip(np.nan_to_num(confidence[v, u].astype(np.float64)), 0, 1)
     sigma_d = sigma.worst * (sigma.best / sigma.worst) ** trust
+    sigma_d = sigma_d if disparity.sigma is None else disparity.sigma[v, u].astype(np.float64)
     sigma_d = np.where(source[v, u] == PixelOrigin.PLANE, sigma.plane, sigma_d)
     sigma_d = np.where(source[v, u] == PixelOrigin.FILLED, sigma.filled, sigma_d)
     sigma_z = z * z / (camera.fx * camera.baseline) * sigma_d

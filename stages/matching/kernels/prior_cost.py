@@ -2,7 +2,7 @@
 
 A disparity costs more the farther it is from the prior, up to a limit beyond which the images alone decide. The trick:
 the costs of all disparities of a pixel are a stretch of one table, so a pixel only stores where its stretch begins.
-Four tables serve priors in steps of a quarter pixel; a fifth, of zeros, serves pixels without a prior.
+Four tables serve priors in steps of a quarter pixel, for each weight; one of zeros serves pixels without a prior.
 """
 
 from __future__ import annotations
@@ -12,19 +12,24 @@ import numpy as np
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
+from stages.matching.kernels.texture import BLOCK
 
+F32 = np.float32
 PHASES = 4
+GAINS, MAX_GAIN = 7, 4.0  # factors of the weight, 1 to the largest, with tables of their own
 TABLE_MARGIN = 16  # lanes
 
 
 def prior_costs(
-    prior: Array, minimum: int | Array, lanes: int, weight: float, max_distance: float, threads: int = 1
-) -> tuple[Array, Array]:
+    prior: Array, minimum: int | Array, lanes: int, weight: float, max_distance: float, threads: int = 1,
+    gain: Array | None = None,
+) -> tuple[Array, Array]:  # fmt: skip
     """The index at which each pixel's costs begin, and the table of costs.
 
     prior: (H, W) float32, px, NaN = none; minimum: the smallest disparity searched, px, or that of each pixel, int32
     that broadcasts to (H, W); weight: cost per pixel of distance, in units of the matching cost; max_distance: px, from
-    which the cost grows no more; threads: 2 share the work, with the same result. Returns (H, W) int32 and (m,) uint8.
+    which the cost grows no more; threads: 2 share the work, with the same result; gain: what the weight is multiplied
+    by in each block of 4 x 4 px, (rows, cols) float32, 1 to MAX_GAIN. Returns (H, W) int32 and (m,) uint8.
     """
     far = (
         lanes + int(np.ceil(max_distance)) + TABLE_MARGIN
@@ -32,26 +37,34 @@ def prior_costs(
     length = 2 * far + lanes
     place = np.arange(length) - far
     phase = np.arange(PHASES)[:, np.newaxis] / PHASES
-    costs = np.clip(np.round(weight * np.minimum(np.abs(place - phase), max_distance)), 0, 255)
+    distance = np.minimum(np.abs(place - phase), max_distance)
+    gains = np.ones(1) if gain is None else np.linspace(1, MAX_GAIN, GAINS)
+    costs = np.clip(np.round(weight * gains[:, np.newaxis, np.newaxis] * distance), 0, 255)
     table = np.concatenate([costs.ravel(), np.zeros(lanes)]).astype(np.uint8)
     begin, least = np.empty(prior.shape, np.int32), np.broadcast_to(minimum, prior.shape)
+    steps = np.zeros((0, 0), np.uint8)
+    if gain is not None:
+        steps = np.rint((gain - 1) * F32((GAINS - 1) / (MAX_GAIN - 1))).astype(np.uint8)
 
     def work(first: int, end: int) -> None:
         apart = np.subtract(prior[first:end], least[first:end], dtype=np.float32)
-        _begin(apart, -PHASES * (far - lanes), PHASES * far, length, far, begin[first:end])
+        _begin(apart, -PHASES * (far - lanes), PHASES * far, length, far, steps, len(gains), first, begin[first:end])
 
     by_bands(shared_by(threads), len(prior), work)
     return begin, table
 
 
 @kernel
-def _begin(apart, least, most, length, far, begin):
+def _begin(apart, least, most, length, far, steps, gains, first, begin):
     for y in range(apart.shape[0]):
         for x in range(apart.shape[1]):
             quarters = np.rint(apart[y, x] * np.float32(PHASES))
             known = np.isfinite(quarters)
             whole = np.int64(min(max(quarters, least), most)) if known else 0
-            begin[y, x] = (whole % PHASES) * length + far - whole // PHASES if known else PHASES * length
+            table = PHASES * (steps[(first + y) // BLOCK, x // BLOCK] if steps.size else 0)
+            begin[y, x] = (
+                (table + whole % PHASES) * length + far - whole // PHASES if known else gains * PHASES * length
+            )
 
 
 def prior_costs_reference(prior: Array, minimum: int, lanes: int, weight: float, reach: float) -> Array:

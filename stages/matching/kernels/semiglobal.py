@@ -27,7 +27,6 @@ from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace, Workspaces
 from stages.data import Array
 from stages.matching.kernels.aggregation import aggregate_row
-from stages.matching.kernels.blank_windows import contrast, drop_unmatchable
 from stages.matching.kernels.gradient import smoothed_costs
 from stages.matching.kernels.matching_inputs import MatchingInputs, matching_inputs
 from stages.matching.kernels.row_ranges import Range, by_range, lanes_for, move_paths
@@ -35,6 +34,7 @@ from stages.matching.kernels.selection import find_partners, find_winners, fit_r
 from stages.matching.kernels.sgm_local import SearchWindows, match_windows
 from stages.matching.kernels.sgm_params import SgmParams
 from stages.matching.kernels.speckles import drop_speckles
+from stages.matching.kernels.texture import contrast, drop_unmatchable
 
 _workspaces = Workspaces()
 Layers = tuple[Array, Array, Array]  # disparities, evidence, source

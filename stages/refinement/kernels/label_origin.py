@@ -5,14 +5,16 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
 
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, PixelOrigin
-from stages.refinement.kernels.holes import KEPT, MISMATCH
+from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION
 
 F32 = np.float32
 MATCH_CONFIDENCES = 0.5, 0.75, 1.0
+SIGMA_STEPS = 64  # in one px, of the table of the share of errors within 1 px
 MEASURED, PLANE, FILLED = int(PixelOrigin.MEASURED), int(PixelOrigin.PLANE), int(PixelOrigin.FILLED)
 
 
@@ -28,28 +30,31 @@ class Trust(NamedTuple):
 
 
 def label_origin(
-    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, correlated: Array, reasons: Array,
-    max_move: float, trust: Trust, threads: int = 1,
+    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, consistent: Array, reasons: Array,
+    sigma: Array, max_move: float, trust: Trust, threads: int = 1,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Source and confidence of each pixel, (H, W) uint8 codes of `PixelOrigin` and float32.
 
     matches: (H, W) float32, px, NaN = none, before refinement; confidence: (H, W) float32 of the matches; agreed:
     (H, W) bool, pixels that a plane moved or filled; kinds: (H, W) uint8 of `holes.fill_holes`; refined: (H, W)
-    float32, the result; correlated: (H, W) bool, pixels where the images correlate; reasons: (H, W) uint8, codes of
-    pixels that stay unknown; max_move: px that a MEASURED pixel may differ from its match.
+    float32, the result; consistent: (H, W) bool, pixels where the images agree with it; reasons: (H, W) uint8, codes of
+    pixels that stay unknown; sigma: (H, W) float32, px, of the result, 0 = not stated; max_move: px that a MEASURED
+    pixel may differ from its match, beside two sigmas. A filled pixel is MEASURED where the images agree with it and
+    its sigma is stated.
     """
     source, worth = np.empty(matches.shape, np.uint8), np.empty(matches.shape, np.float32)
     steps = np.arange(256) / 255
     tables = np.array(
         [np.interp(steps, MATCH_CONFIDENCES, values) for values in (trust.agreed, trust.alone)], np.float32
     )
-    others = np.array(trust[2:], np.float32)
+    others = np.array([np.interp(0.5, MATCH_CONFIDENCES, trust.agreed), *trust[2:]], np.float32)
+    within = special.erf(SIGMA_STEPS / np.maximum(np.arange(256), 1) / np.sqrt(2)).astype(np.float32)
 
     def label(first: int, end: int) -> None:
         rows = slice(first, end)
         _label(
-            matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], correlated[rows], reasons[rows],
-            F32(max_move), tables, others, source[rows], worth[rows],
+            matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], consistent[rows], reasons[rows],
+            sigma[rows], F32(max_move), tables, others, within, source[rows], worth[rows],
         )  # fmt: skip
 
     by_bands(shared_by(threads), len(matches), label)
@@ -57,19 +62,26 @@ def label_origin(
 
 
 @kernel
-def _label(matches, confidence, agreed, kinds, refined, correlated, reasons, max_move, tables, others, source, worth):
-    replaced, plane, mismatch, occlusion = others
+def _label(
+    matches, confidence, agreed, kinds, refined, consistent, reasons, sigma, max_move, tables, others, within, source,
+    worth,
+):  # fmt: skip
+    backed, replaced, plane, mismatch, occlusion = others
     for y in range(matches.shape[0]):
         for x in range(matches.shape[1]):
             d, match = refined[y, x], matches[y, x]
+            blur = np.int64(np.rint(min(sigma[y, x] * F32(SIGMA_STEPS), F32(255))))
+            near = abs(d - match) <= max_move + F32(2) * sigma[y, x]
             if d != d:
                 source[y, x], worth[y, x] = reasons[y, x], F32(0)
-            elif abs(d - match) <= max_move and not correlated[y, x]:
+            elif near and not consistent[y, x]:
                 source[y, x], worth[y, x] = FILLED, mismatch
-            elif abs(d - match) <= max_move:
+            elif near:
                 source[y, x] = MEASURED
                 step = np.int64(np.rint(min(max(confidence[y, x], F32(0)), F32(1)) * F32(255)))
-                worth[y, x] = tables[0 if agreed[y, x] else 1, step]
+                worth[y, x] = tables[0 if agreed[y, x] else 1, step] * within[blur]
+            elif match != match and kinds[y, x] != OCCLUSION and consistent[y, x] and sigma[y, x] > 0:
+                source[y, x], worth[y, x] = MEASURED, backed * within[blur]
             elif match == match:
                 source[y, x], worth[y, x] = PLANE, replaced
             elif kinds[y, x] == KEPT:
@@ -79,18 +91,29 @@ def _label(matches, confidence, agreed, kinds, refined, correlated, reasons, max
 
 
 def label_origin_reference(
-    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, correlated: Array, reasons: Array,
-    max_move: float, trust: Trust,
+    matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, consistent: Array, reasons: Array,
+    sigma: Array, max_move: float, trust: Trust,
 ) -> tuple[Array, Array]:  # fmt: skip
     """`label_origin` in plain numpy."""
     own = np.rint(np.clip(confidence, 0, 1) * F32(255)).astype(np.float64) / 255
-    stayed = np.abs(refined - matches) <= F32(max_move)
+    stayed = np.abs(refined - matches) <= F32(max_move) + 2 * sigma
+    blur = np.rint(np.minimum(sigma * F32(SIGMA_STEPS), 255)).astype(np.float64)
+    within = special.erf(SIGMA_STEPS / np.maximum(blur, 1) / np.sqrt(2))
     conditions = [
-        np.isnan(refined), stayed & ~correlated, stayed & agreed, stayed, np.isfinite(matches), kinds == KEPT,
+        np.isnan(refined), stayed & ~consistent, stayed & agreed, stayed,
+        np.isnan(matches) & (kinds != OCCLUSION) & consistent & (sigma > 0), np.isfinite(matches), kinds == KEPT,
         kinds == MISMATCH,
     ]  # fmt: skip
-    codes: list[Any] = [reasons.astype(int), FILLED, MEASURED, MEASURED, PLANE, PLANE, FILLED]
-    tables = [np.interp(own, MATCH_CONFIDENCES, values) for values in (trust.agreed, trust.alone)]
-    worths: list[Any] = [0.0, trust.mismatch, *tables, trust.replaced, trust.plane, trust.mismatch]
+    codes: list[Any] = [reasons.astype(int), FILLED, MEASURED, MEASURED, MEASURED, PLANE, PLANE, FILLED]
+    tables = [np.interp(own, MATCH_CONFIDENCES, values) * within for values in (trust.agreed, trust.alone)]
+    worths: list[Any] = [
+        0.0,
+        trust.mismatch,
+        *tables,
+        np.interp(0.5, MATCH_CONFIDENCES, trust.agreed) * within,
+        trust.replaced,
+        trust.plane,
+        trust.mismatch,
+    ]
     source = np.select(conditions, codes, FILLED).astype(np.uint8)
     return source, np.select(conditions, worths, trust.occlusion).astype(np.float32)

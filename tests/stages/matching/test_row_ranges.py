@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from stages.compiled.simd import Width
 from stages.data import Disparity, PixelOrigin
 from stages.matching.kernels.aggregation import aggregate_reference
-from stages.matching.kernels.blank_windows import contrast, drop_unmatchable_reference
 from stages.matching.kernels.census import census_costs_reference
 from stages.matching.kernels.gradient import smoothed_costs_reference
 from stages.matching.kernels.matching_inputs import matching_inputs
@@ -27,6 +26,7 @@ from stages.matching.kernels.row_ranges import (
 )
 from stages.matching.kernels.selection import select_reference
 from stages.matching.kernels.semiglobal import match
+from stages.matching.kernels.texture import contrast, drop_unmatchable_reference
 from stages.matching.match import Match
 from tests.stages.matching.test_census import params_of
 from tests.stages.matching.test_match import same

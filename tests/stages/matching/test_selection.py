@@ -10,10 +10,10 @@ from stages.compiled.parallel import shared_by
 from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace
 from stages.data import PixelOrigin
-from stages.matching.kernels.blank_windows import drop_unmatchable, drop_unmatchable_reference
 from stages.matching.kernels.row_ranges import lanes_for
 from stages.matching.kernels.selection import find_partners, find_winners, fit_row, select_reference
 from stages.matching.kernels.speckles import drop_speckles, drop_speckles_reference
+from stages.matching.kernels.texture import drop_unmatchable, drop_unmatchable_reference
 from tests.stages.matching.test_census import params_of
 
 

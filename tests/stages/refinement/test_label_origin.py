@@ -22,11 +22,23 @@ def test_origin_and_confidence_equal_the_reference(height, width, seed, threads)
     kinds = np.where(np.isnan(matches), rng.integers(0, 4, shape), KEPT).astype(np.uint8)
     confidence = rng.uniform(-0.1, 1.1, shape).astype(np.float32)
     reasons = rng.choice(np.array([0, 4, 6, 10], np.uint8), shape)
-    given = matches, confidence, rng.random(shape) < 0.5, kinds, refined, rng.random(shape) < 0.8, reasons, 0.5, TRUST
+    sigma = rng.choice([0, 0.1, 0.3, 2, 1e6], shape).astype(np.float32)
+    given = (
+        matches,
+        confidence,
+        rng.random(shape) < 0.5,
+        kinds,
+        refined,
+        rng.random(shape) < 0.8,
+        reasons,
+        sigma,
+        0.5,
+        TRUST,
+    )
     source, worth = label_origin(*given, threads)
     expected, expected_worth = label_origin_reference(*given)
     assert np.array_equal(source, expected)
-    assert np.array_equal(worth, expected_worth)
+    assert np.allclose(worth, expected_worth, rtol=1e-6)
 
 
 def test_every_origin_has_its_own_confidence():
@@ -35,10 +47,29 @@ def test_every_origin_has_its_own_confidence():
     refined = np.array([[8.5, 8, 8, 8.6, 8, 8, 8, nan]], np.float32)
     kinds = np.array([[KEPT, KEPT, KEPT, KEPT, KEPT, MISMATCH, OCCLUSION, OPEN]], np.uint8)
     agreed = np.array([[True, False, False, True, True, False, False, False]])
-    correlated = np.array([[True, True, False, True, True, True, True, True]])
+    correlated = np.array([[True, True, False, True, False, False, True, True]])
     reasons = np.full((1, 8), PixelOrigin.LEFT_RIGHT, np.uint8)
     own = np.full((1, 8), 0.75, np.float32)
-    source, worth = label_origin(matches, own, agreed, kinds, refined, correlated, reasons, 0.5, TRUST)
+    source, worth = label_origin(
+        matches, own, agreed, kinds, refined, correlated, reasons, np.zeros((1, 8), np.float32), 0.5, TRUST
+    )
     names = [PixelOrigin(code).name for code in source[0]]
     assert names == ["MEASURED", "MEASURED", "FILLED", "PLANE", "PLANE", "FILLED", "FILLED", "LEFT_RIGHT"]
     assert np.allclose(worth[0], [0.98, 0.86, 0.58, 0.83, 0.84, 0.58, 0.56, 0], atol=1e-3)
+
+
+def test_a_hole_that_the_images_support_is_measured_unless_it_is_hidden():
+    hole, own = np.full((1, 3), np.nan, np.float32), np.ones((1, 3), np.float32)
+    kinds = np.array([[KEPT, MISMATCH, OCCLUSION]], np.uint8)
+    supported, nothing = np.ones((1, 3), bool), np.zeros((1, 3), np.uint8)
+    sigma = np.full((1, 3), 0.2, np.float32)
+    source, _ = label_origin(hole, own, supported, kinds, own, supported, nothing, sigma, 0.5, TRUST)
+    assert [PixelOrigin(code).name for code in source[0]] == ["MEASURED", "MEASURED", "FILLED"]
+
+
+def test_confidence_falls_with_sigma():
+    one, nothing = np.ones((1, 3), np.float32), np.zeros((1, 3), np.uint8)
+    yes = np.ones((1, 3), bool)
+    sigma = np.array([[0.1, 0.5, 1.0]], np.float32)
+    _, worth = label_origin(one, one, yes, nothing, one, yes, nothing, sigma, 0.5, TRUST)
+    assert np.allclose(worth[0] / worth[0, 0], [1, 0.954, 0.683], atol=2e-3)

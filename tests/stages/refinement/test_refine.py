@@ -48,7 +48,7 @@ def test_noise_falls_and_holes_close_on_the_right_side_of_edges(box):
 
 def test_source_is_the_origin_of_every_pixel(box):
     frame, matches, _ = box
-    refined = Refine(superpixels=200, min_superpixel_size=1, subpixel_radius=0, min_correlation=0)(frame, matches)
+    refined = Refine(superpixels=200, min_superpixel_size=1, subpixel_radius=0, support=False)(frame, matches)
     known, matched = np.isfinite(refined.pixels), np.isfinite(matches.pixels)
     near = np.abs(refined.pixels - matches.pixels) <= 0.5
     assert near[matched].mean() > 0.9
@@ -86,12 +86,12 @@ def test_a_replaced_match_becomes_plane_with_less_confidence(median, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(module, "MAX_CORRECTION", 1000.0)
         patch.setattr(module, "MIN_INLIER_SHARE", 0)
-        replaced = Refine(plane_weight=1, median_size=median, min_correlation=0)(frame, matches)
+        replaced = Refine(plane_weight=1, median_size=median, support=False)(frame, matches)
     assert replaced.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert replaced.source[60, 80] == PixelOrigin.PLANE
     assert replaced.confidence[60, 80] < 0.85
     assert (replaced.source == PixelOrigin.MEASURED).sum() == HEIGHT * WIDTH - 1
-    kept = Refine(median_size=median, bilateral_radius=0, edge_radius=0, min_correlation=0)(frame, matches)
+    kept = Refine(median_size=median, bilateral_radius=0, edge_radius=0, support=False)(frame, matches)
     assert (kept.pixels[60, 80], kept.source[60, 80]) == (30, PixelOrigin.MEASURED)
     assert kept.confidence[60, 80] == np.float32(0.97)
 
@@ -102,7 +102,7 @@ def test_a_lone_match_has_no_median_and_stays(monkeypatch):
     frame, pixels, source, confidence = flat_scene(5.0)
     pixels[50:70, 60:100], source[50:70, 60:100] = np.nan, 0
     pixels[60, 80], source[60, 80] = 20, 1
-    refine = Refine(fill=False, plane_fill=False, superpixels=1, min_superpixel_size=1)
+    refine = Refine(fill=False, plane_fill=False, superpixels=1, min_superpixel_size=1, support=False)
     refined = refine(frame, Disparity(5, pixels, source, confidence))
     assert refined.pixels[60, 80] == pytest.approx(20, abs=0.01)
 
@@ -139,7 +139,7 @@ def test_a_match_far_from_its_plane_is_not_overwritten(box):
     stone = np.s_[100:106, 120:126]
     pixels[stone], source[stone], confidence[stone] = truth[stone] + 6, PixelOrigin.MEASURED, 0.8
     matches = replace(matches, pixels=pixels, source=source, confidence=confidence)
-    refined = Refine(superpixels=60, min_superpixel_size=1)(frame, matches)
+    refined = Refine(superpixels=60, min_superpixel_size=1, support=False)(frame, matches)
     assert np.abs(refined.pixels[101:105, 121:125] - truth[101:105, 121:125] - 6).max() < 1
 
 
@@ -196,6 +196,7 @@ BARE = {
     "plane_weight": 0,
     "plane_fill": False,
     "fill": False,
+    "support": False,
 }
 
 
@@ -229,7 +230,7 @@ def test_depth_edges_move_onto_image_edges(box):
 def test_a_match_moves_to_its_median_where_that_is_near():
     frame, pixels, source, confidence = flat_scene()
     pixels[60, 80], pixels[60, 100] = 8.9, 11
-    bare = {"plane_weight": 0, "surface_size": 0, "bilateral_radius": 0, "edge_radius": 0}
+    bare = {"plane_weight": 0, "surface_size": 0, "bilateral_radius": 0, "edge_radius": 0, "support": False}
     moved = Refine(median_size=5, **bare)(frame, Disparity(5, pixels, source, confidence))
     assert (moved.pixels[60, 80], moved.pixels[60, 100]) == (8, 11)
 

@@ -62,7 +62,7 @@ def test_a_plane_counts_matches_by_their_confidence(surface_size, min_valid, mon
     pixels[doubted], confidence[doubted] = 8.4, 0.5
     hole = np.s_[50:55, 70:75]
     pixels[hole], source[hole], confidence[hole] = np.nan, 0, 0
-    refine = Refine(median_size=0, bilateral_radius=0, edge_radius=0, **parameters)
+    refine = Refine(median_size=0, bilateral_radius=0, edge_radius=0, support=False, **parameters)
     filled = refine(frame, Disparity(5, pixels, source, confidence))
     half = doubted[np.isfinite(pixels)].mean()
     mean = (8 * (1 - half) + 8.4 * half * 0.5) / (1 - half + half * 0.5)
@@ -75,7 +75,7 @@ def test_a_region_pulls_half_as_far_and_agreement_adds_confidence(monkeypatch):
     pixels[60, 80], pixels[60, 90] = 8.4, 8.7
     pixels[30, 30], source[30, 30] = np.nan, 0
     matches = Disparity(5, pixels, source, confidence)
-    steps = {"median_size": 0, "bilateral_radius": 0, "edge_radius": 0, "min_correlation": 0}
+    steps = {"median_size": 0, "bilateral_radius": 0, "edge_radius": 0, "support": False}
     drawn = Refine(plane_weight=1, **steps, **SURFACES_ONLY)(frame, matches)
     assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
     assert drawn.pixels[60, 90] == np.float32(8.7)

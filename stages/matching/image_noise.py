@@ -1,0 +1,95 @@
+"""The noise of an image, from the image: sensor noise and rounding, by brightness.
+
+A second difference in both directions removes slopes and straight edges: in the smoothest blocks of an image, noise is
+what remains. Shot noise grows with the light: its variance is a line over the gray levels.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import optimize
+
+from stages.data import Array, ImageNoise, StereoFrame
+from stages.matching.intensity import eight_bit, gray
+from stages.stage import Stage
+
+# Response to white noise of one gray level has a standard deviation of 1 (Immerkaer, 1996).
+SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
+BLOCK = 8  # px, side of the blocks whose mean square response is a sample of the variance
+SMOOTH_SHARE = 0.05  # of the blocks of one brightness count as smooth
+SMOOTH_VARIANCE = 0.55  # mean square response at that share of blocks of white noise, over its variance
+LEVELS, MIN_BIN = 256, 16  # gray levels
+TEXTURED = 2.0  # a bin whose variance is this many times that of the line contains texture
+DARKEST, BRIGHTEST = 4, 244  # mean levels between which clipping does not reduce the noise
+MIN_BLOCKS = 60  # of a bin of brightness
+MIN_VARIANCE = 1 / 12  # of rounding
+
+
+@dataclass(frozen=True)
+class MeasureNoise(Stage):
+    """The noise of a frame's left image, as the standard deviation of a pixel at each gray level.
+
+    References
+    ----------
+    J. Immerkaer, "Fast Noise Variance Estimation", CVIU 64(2), 1996; A. Foi et al., "Practical Poissonian-Gaussian
+    Noise Modeling and Fitting for Single-Image Raw-Data", IEEE TIP 17(10), 2008.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from stages import MeasureNoise, StereoCamera, StereoFrame
+    >>> camera = StereoCamera(fx=300.0, fy=300.0, cx=160.0, cy=120.0, baseline=0.1, width=320, height=240)
+    >>> image = np.rint(np.random.default_rng(0).normal(120, 2, (240, 320))).astype(np.uint8)
+    >>> noise = MeasureNoise()(StereoFrame(0, image, image, camera))
+    >>> round(float(noise.sigma[120]), 1)
+    2.0
+    """
+
+    def __call__(self, frame: StereoFrame) -> ImageNoise:
+        return ImageNoise(frame.stamp, noise_levels(gray(eight_bit(frame.left, frame.right)[0])))
+
+
+def noise_levels(image: Array) -> Array:
+    """Standard deviation of the noise at each gray level, (256,) float32, of an image (H, W) uint8."""
+    variance, level = _samples(image)
+    edges = [0, *range(MIN_BIN, LEVELS, MIN_BIN), LEVELS]
+    groups = [(level >= low) & (level < high) for low, high in itertools.pairwise(edges)]
+    groups = [group for group in groups if group.sum() >= MIN_BLOCKS] or [np.ones(level.shape, bool)]
+    if not level.size:  # a black or white image
+        return np.full(LEVELS, np.sqrt(MIN_VARIANCE), np.float32)
+    levels = np.array([level[group].mean() for group in groups])
+    smooth = np.array([np.quantile(variance[group], SMOOTH_SHARE) for group in groups]) / SMOOTH_VARIANCE
+    offset, gain = _line(levels, np.maximum(smooth, MIN_VARIANCE), np.array([group.sum() for group in groups]))
+    return np.asarray(np.sqrt(MIN_VARIANCE + offset + gain * np.arange(LEVELS)), dtype=np.float32)
+
+
+def _samples(image: Array) -> tuple[Array, Array]:
+    """Mean square response and mean level of the blocks that are not clipped."""
+    rows, cols = (extent // BLOCK for extent in image.shape)
+    if not rows or not cols:
+        return np.zeros(0), np.zeros(0)
+    whole = image[: rows * BLOCK, : cols * BLOCK]
+    response = cv2.filter2D(whole, cv2.CV_32F, SECOND_DIFFERENCE)
+    variance = cv2.resize(response * response, (cols, rows), interpolation=cv2.INTER_AREA).ravel()
+    level = cv2.resize(whole, (cols, rows), interpolation=cv2.INTER_AREA).ravel()
+    unclipped = (level >= DARKEST) & (level <= BRIGHTEST)
+    return variance[unclipped], level[unclipped]
+
+
+def _line(level: Array, variance: Array, count: Array) -> tuple[float, float]:
+    """Offset and slope, none of them negative, of the variance beyond that of rounding over the gray level.
+
+    level, variance, count: (n,), of the bins; bins far above the line contain texture and are left out.
+    """
+    weight = np.sqrt(count / variance)
+    terms = np.stack([np.ones_like(level), level], axis=1)
+    while True:
+        (offset, gain), _ = optimize.nnls(terms * weight[:, None], (variance - MIN_VARIANCE) * weight)
+        textured = (variance > TEXTURED * (MIN_VARIANCE + terms @ (offset, gain))) & (weight > 0)
+        if not textured.any() or textured[weight > 0].all():
+            return float(offset), float(gain)
+        weight = np.where(textured, 0.0, weight)

@@ -1,0 +1,76 @@
+"""What texture allows: information, expected variance of a match, noise of two images, the sky."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.matching.kernels.texture import (
+    BLOCK,
+    below_sky,
+    gradient,
+    information,
+    information_reference,
+    match_variance,
+    stereo_noise,
+)
+
+NOISE = np.full(256, 1.5, np.float32)
+
+
+def noisy(shape, sigma=1.5, seed=0, level=120.0, contrast=0.0):
+    """An image of white noise on smooth texture of a contrast, gray levels."""
+    rng = np.random.default_rng(seed)
+    texture = cv2.GaussianBlur(np.random.default_rng(77).standard_normal(shape), (0, 0), 2)
+    picture = level + contrast * texture / texture.std() + sigma * rng.standard_normal(shape)
+    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 30), st.integers(1, 40), st.integers(0, 2**31), st.sampled_from([1, 2]))
+def test_information_equals_the_reference(height, width, seed, threads):
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, (height, width), np.uint8)
+    noise = rng.uniform(0.3, 5, 256).astype(np.float32)
+    found = information(image, gradient(image), noise, threads)
+    assert np.allclose(found, information_reference(image, gradient(image), noise), rtol=1e-4, atol=1e-2)
+
+
+def test_noise_alone_contains_no_information():
+    image = noisy((400, 400))
+    total, area = information(image, gradient(image), NOISE).sum(axis=(1, 2))
+    textured = noisy((400, 400), contrast=6.0)
+    assert abs(total / area) < 0.02 * information(textured, gradient(textured), NOISE)[0].sum() / area
+
+
+def test_a_match_is_the_more_uncertain_the_weaker_the_texture():
+    images = [noisy((80, 80), contrast=contrast) for contrast in (0.0, 1.0, 3.0, 12.0)]
+    sigmas = [float(np.sqrt(np.median(match_variance(information(i, gradient(i), NOISE))))) for i in images]
+    assert sigmas == sorted(sigmas, reverse=True)
+    assert sigmas[0] > 0.5
+    assert sigmas[-1] < 0.1
+
+
+@pytest.mark.parametrize(("sigma", "shown"), [(1.5, 1.5), (4.5, 4.5)])
+def test_the_noise_of_two_images_is_what_they_do_not_share(sigma, shown):
+    left, right = (noisy((320, 400), sigma=sigma, seed=seed, contrast=5.0) for seed in (1, 2))
+    none_moved = np.zeros(left.shape, np.float32)
+    noise = stereo_noise(none_moved, left, (gradient(left), gradient(right)), NOISE)
+    assert np.allclose(noise, shown, rtol=0.1)
+
+
+def test_the_noise_of_two_images_is_at_least_that_of_one():
+    left = noisy((320, 400), contrast=5.0)
+    same = stereo_noise(np.zeros(left.shape, np.float32), left, (gradient(left), gradient(left)), NOISE)
+    assert np.array_equal(same, NOISE)
+    unmatched = stereo_noise(np.full(left.shape, np.nan, np.float32), left, (gradient(left),) * 2, NOISE)
+    assert np.array_equal(unmatched, NOISE)
+
+
+def test_the_sky_ends_at_the_uppermost_texture():
+    image = noisy((200, 240), contrast=0.0)
+    image[120:] = noisy((80, 240), contrast=20.0, seed=3)
+    ground = below_sky(information(image, gradient(image), NOISE))
+    assert ground[120 // BLOCK + 1 :].all()
+    assert ground[: 120 // BLOCK - 1].mean() < 0.05

@@ -1,0 +1,179 @@
+"""Support that follows texture: kernels equal their references; ground is smoothed, rocks are kept."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.compiled.parallel import shared_by
+from stages.matching.image_noise import noise_levels
+from stages.matching.kernels.texture import gradient, information_scale
+from stages.refinement.kernels.blocks import (
+    BLOCKS,
+    PLANES,
+    block_sums,
+    block_sums_reference,
+    coarser,
+    fit_window_reference,
+    fit_windows,
+)
+from stages.refinement.kernels.support import _blend, blend_reference, supported
+
+ALONE = shared_by(1)
+
+
+def case(height, width, seed):
+    """Sloping disparities with noise, holes and guesses, and images."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width]
+    pixels = (9 + 0.05 * x + 0.1 * y + rng.normal(0, 0.3, (height, width))).astype(np.float32)
+    pixels[rng.random(pixels.shape) < 0.1] = np.nan
+    images = [rng.integers(0, 256, (height, width), np.uint8) for _ in range(2)]
+    return pixels, rng.random(pixels.shape) < 0.2, images, rng.uniform(0.5, 3, 256).astype(np.float32)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 2**31), st.sampled_from([1, 2]))
+def test_sums_of_both_sizes_equal_the_reference(height, width, seed, threads):
+    pixels, guessed, (left, right), noise = case(height, width, seed)
+    slopes, scale = (gradient(left), gradient(right)), information_scale(noise)
+    small = block_sums(pixels, guessed, left, slopes, scale, 3, shared_by(threads))
+    large, _ = coarser(small, np.zeros(small.shape, PLANES), 4)
+    for blocks, size in ((small, 4), (large, 8)):
+        expected = block_sums_reference(pixels, guessed, left, slopes, scale, size)
+        rows, cols = expected["n"].shape
+        for name, values in expected.items():
+            tolerance = 1e-3 * max(1.0, float(np.abs(values).max()))
+            assert np.allclose(blocks[name][:rows, :cols], values, atol=tolerance), name
+            assert not blocks[name][rows:].any()
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**31))
+def test_planes_equal_least_squares_over_the_matches_of_the_window(seed):
+    pixels, guessed, (left, right), noise = case(32, 48, seed)
+    slopes = gradient(left), gradient(right)
+    blocks = block_sums(pixels, guessed, left, slopes, information_scale(noise), 3, ALONE)
+    blocks["variance"] = np.random.default_rng(seed).uniform(0.01, 0.3, blocks.shape)
+    start = np.zeros(blocks.shape, PLANES)
+    start["a"], start["b"], start["c"] = 0.04, 0.12, blocks["mean"] + 0.1
+    found = fit_windows(blocks, start, 2, 4, ALONE)
+    y, x = np.nonzero(np.isfinite(pixels) & ~guessed)
+    for j, i in ((0, 0), (3, 5), (7, 11)):
+        within = (abs(y // 4 - j) <= 2) & (abs(x // 4 - i) <= 2)
+        across, down = x[within] - 4 * i - 1.5, y[within] - 4 * j - 1.5
+        numbers = (y // 4 * blocks.shape[1] + x // 4)[within]
+        points = np.stack([across, down, pixels[y, x][within], numbers], axis=1).astype(np.float64)
+        first = np.array([start[j, i][name] for name in "abc"], np.float64)
+        plane, residual = fit_window_reference(points, first, blocks["variance"].ravel().astype(np.float64))
+        assert np.allclose([found[j, i][name] for name in "abc"], plane, atol=2e-3)
+        assert found[j, i]["residual"] == pytest.approx(residual, rel=0.02, abs=1e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 13), st.integers(1, 17), st.integers(0, 2**31))
+def test_the_last_step_equals_the_reference(height, width, seed):
+    rng = np.random.default_rng(seed)
+    pixels, guessed, _, _ = case(height, width, seed)
+    shape = 4, 8  # blocks
+    blocks, planes = np.zeros(shape, BLOCKS), np.zeros(shape, PLANES)
+    for name in ("n", "a", "b", "c", "residual", "correlation"):
+        planes[name] = rng.uniform(0, 0.3, shape)
+    planes["c"] += 10
+    planes["n"][rng.random(shape) < 0.2] = 0
+    blocks["n"] = rng.integers(0, 17, shape)
+    variance, spread, near = (rng.uniform(0.01, 0.5, shape).astype(np.float32) for _ in range(3))
+    given = pixels, guessed, blocks, planes, variance, spread, near, rng.random(shape) < 0.8
+    result = [np.empty(pixels.shape, np.float32) for _ in range(3)]
+    _blend(*given, 0, height, *result)
+    for layer, expected in zip(result, blend_reference(*given), strict=True):
+        assert np.allclose(layer, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
+
+
+def views(contrast, disparity, seed=0, noise=1.5):
+    """A pair of noisy images of ground with texture of a contrast, gray levels, at a disparity (H, W)."""
+    height, width = disparity.shape
+    rng = np.random.default_rng(seed)
+    texture = cv2.GaussianBlur(rng.standard_normal((height, width + 80)), (0, 0), 1.5)
+    right = 120 + contrast * texture / texture.std()
+    x = np.arange(width, dtype=np.float32)[None] - disparity.astype(np.float32) + 40
+    rows = np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], x.shape)
+    left = cv2.remap(right.astype(np.float32), x, np.ascontiguousarray(rows), cv2.INTER_LINEAR)
+    pair = left, right[:, 40 : 40 + width]
+    return [
+        np.clip(np.rint(image + noise * rng.standard_normal(image.shape)), 0, 255).astype(np.uint8) for image in pair
+    ]
+
+
+def ground(noise, seed=5):
+    """True disparities of sloping ground with a step of 3 px, and noisy matches of it."""
+    y, x = np.mgrid[:160, :240]
+    truth = 8 + 0.05 * y + 3.0 * ((abs(y - 80) < 12) & (abs(x - 120) < 12))
+    errors = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(truth.shape), (0, 0), 2)
+    return truth, (truth + noise * errors / errors.std()).astype(np.float32)
+
+
+def rms(errors):
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def test_weak_texture_gets_planes_and_strong_texture_keeps_its_matches():
+    truth, matches = ground(noise=0.4)
+    nothing_guessed = np.zeros(truth.shape, bool)
+    away = np.ones(truth.shape, bool)
+    away[60:101, 100:141] = False
+    left, right = views(2.0, truth)
+    weak = supported(matches, nothing_guessed, left, right, noise_levels(left))
+    assert rms((weak.pixels - truth)[away]) < 0.4 * rms((matches - truth)[away])
+    truth, matches = ground(noise=0.05)
+    relief = (matches + 0.3 * np.sin(np.arange(240) / 3)).astype(np.float32)
+    left, right = views(30.0, relief)
+    strong = supported(relief, nothing_guessed, left, right, noise_levels(left))
+    assert rms((strong.pixels - relief)[away]) < 0.05
+
+
+def test_a_small_rock_on_weak_texture_keeps_its_height():
+    truth, matches = ground(noise=0.4)
+    left, right = views(2.0, truth)
+    found = supported(matches, np.zeros(truth.shape, bool), left, right, noise_levels(left)).pixels
+    assert np.median((found - truth)[72:89, 112:129]) == pytest.approx(0, abs=0.3)
+    assert rms((found - truth)[40:60, 100:140]) < 0.25
+
+
+def test_sigma_contains_the_errors_it_states():
+    truth, matches = ground(noise=0.4)
+    away = np.ones(truth.shape, bool)
+    away[60:101, 100:141] = False
+    for contrast in (1.0, 2.0):
+        left, right = views(contrast, truth)
+        found = supported(matches, np.zeros(truth.shape, bool), left, right, noise_levels(left))
+        assert np.mean(abs(found.pixels - truth)[away] < 2 * found.sigma[away]) > 0.8
+
+
+def test_matches_of_noise_have_no_correlation_and_a_large_sigma():
+    left, right = (
+        np.rint(np.random.default_rng(seed).normal(120, 1.5, (160, 240))).astype(np.uint8) for seed in (1, 2)
+    )
+    _, matches = ground(noise=0.4)
+    found = supported(matches, np.zeros(left.shape, bool), left, right, noise_levels(left))
+    assert np.mean((found.correlation > 0.4) & (found.sigma < 0.5)) < 0.02
+
+
+def test_a_guess_is_evidence_only_where_matches_share_its_block():
+    truth, matches = ground(noise=0.1)
+    left, right = views(8.0, truth)
+    guessed = np.zeros(truth.shape, bool)
+    guessed[20:40, 20:40] = True
+    guessed[100:103, 60] = True
+    found = supported(matches, guessed, left, right, noise_levels(left))
+    assert np.all(found.sigma[20:40, 20:40] > 100)
+    assert np.all(found.sigma[100:103, 60] < 0.5)
+
+
+def test_threads_do_not_change_the_result():
+    truth, matches = ground(noise=0.4)
+    left, right = views(2.0, truth)
+    given = matches, np.zeros(truth.shape, bool), left, right, noise_levels(left)
+    for one, two in zip(supported(*given, 1), supported(*given, 2), strict=True):
+        assert np.array_equal(one, two)
