@@ -112,7 +112,7 @@ class Refine(Stage):
         high=1,
     )
     max_sigma: float = parameter(
-        0.5, "standard deviation above which a pixel becomes FILLED; needs `support`", unit="px", low=0
+        0.6, "standard deviation above which a pixel becomes FILLED; needs `support`", unit="px", low=0
     )
     threads: int = parameter(
         1, "largest number of cores for one frame (two are used); does not change the result", low=1

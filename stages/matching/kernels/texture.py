@@ -20,13 +20,11 @@ WINDOW = 5  # px, of the census
 BLOCK = 4  # px, side of the blocks that share one estimate
 # Gradient along the row of a slightly smoothed image: smoothing removes more noise than texture.
 DERIVATIVE, SMOOTHING = np.array([-0.5, -1, 0, 1, 0.5], np.float32), np.array([1, 2, 1], np.float32)
-GRADIENT_GAIN, NOISE_GAIN = (
-    16.0,
-    15.0,
-)  # its response to a slope of 1 per px, its variance for white noise of variance 1
+GRADIENT_GAIN, NOISE_GAIN = 16.0, 15.0  # its response to a slope of 1 per px; its variance for noise of variance 1
 PATCH, DIFFERENT_SHARE = 16, 0.25  # px, and the share of patches whose images differ by noise alone
 TEXTURE_PIXELS = 81  # whose gradients bound the error of a match
 MIN_TEXTURE = 3.0  # information of three blocks in a row, 1/px^2, that noise alone hardly has
+SKY_REACH, MAX_DEVIATIONS = 12, 3.0  # px below the first texture, and standard deviations of the noise, of sky
 MIN_INFORMATION = 1e-3  # of a pixel, 1/px^2
 # Standard deviation of a match whose bound is s: FLOOR and CEILING s^2 / (s^2 + HALF^2), added in squares. Measured on
 # ground away from depth edges.
@@ -98,13 +96,21 @@ def match_variance(found: Array) -> Array:
     return np.asarray(F32(FLOOR**2) + (F32(CEILING) * bound / (bound + F32(HALF**2))) ** 2)
 
 
-def below_sky(found: Array) -> Array:
-    """Blocks at or below the uppermost texture of their column, (rows, cols) bool; found: the blocks' `information`.
+def sky_end(found: Array, image: Array, noise: Array) -> Array:
+    """The row at which ground begins in each column, (W,) int64; what is above may be sky, whose matches are noise.
 
-    What is above may be sky, whose matches are noise.
+    Ground begins at the uppermost texture of the column. The block of 4 px that contains it may also contain sky:
+    pixels that differ from those above the block by noise alone. found: the blocks' `information`; image: (H, W)
+    uint8; noise: (256,) float32.
     """
-    along = cv2.boxFilter(found[0], -1, (3, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(np.logical_or.accumulate(along >= F32(MIN_TEXTURE), axis=0))
+    height, width = image.shape
+    along = cv2.boxFilter(found[0], -1, (3, 1), normalize=False, borderType=cv2.BORDER_CONSTANT) >= F32(MIN_TEXTURE)
+    first = np.where(along.any(axis=0), along.argmax(axis=0) * BLOCK, height).repeat(BLOCK)[:width]
+    rows = first + np.arange(-3 * BLOCK, SKY_REACH)[:, np.newaxis]
+    levels = image[np.clip(rows, 0, height - 1), np.arange(width)].astype(np.float32)
+    sky = levels[: 2 * BLOCK].mean(axis=0)
+    differ = np.abs(levels[3 * BLOCK :] - sky) > MAX_DEVIATIONS * noise[sky.astype(np.uint8)]
+    return np.asarray(np.where((first > 0) & differ.any(axis=0), first + differ.argmax(axis=0), first))
 
 
 def summed(layer: Array) -> Array:

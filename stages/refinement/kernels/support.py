@@ -17,11 +17,11 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 from stages.matching.kernels.texture import (
     BLOCK,
-    below_sky,
     gradient,
     information,
     information_scale,
     match_variance,
+    sky_end,
     stereo_noise,
     summed,
 )
@@ -31,7 +31,8 @@ F32 = np.float32
 LEVELS = 3  # sizes of blocks: 4, 8 and 16 px
 RADIUS = 2  # blocks; windows of 5 x 5 blocks are 20, 40 and 80 px wide
 CORRELATED = 100.0  # px, the area over which the errors of matches are alike
-EXCESS, SYSTEMATIC = 2.1, 0.065  # of the errors over the bound; px, of what no averaging removes
+EXCESS, SYSTEMATIC = 1.9, 0.04  # of the errors over the bound; px, of what no averaging removes
+BEND_REACH, MAX_BEND = 3, 0.45  # px; where the surface bends, an error is about as large as the bend
 PIXEL_SIGMAS, PIXEL_DEVIATION = 10.0, 0.1  # a match farther off the plane than both together is of another surface
 MIN_BACKING = 4  # matches in the block of a guessed pixel that is supported
 
@@ -59,7 +60,7 @@ def supported(pixels: Array, guessed: Array, left: Array, right: Array, noise: A
     slopes = both(lambda: gradient(left), lambda: gradient(right))
     noise = stereo_noise(np.where(guessed, F32(np.nan), pixels), left, slopes, noise, threads)
     texture = information(left, slopes[0], noise, threads)
-    variance, ground = match_variance(texture), below_sky(texture)
+    variance, first_row = match_variance(texture), sky_end(texture, left, noise)
     blocks = block_sums(pixels, guessed, left, slopes, information_scale(noise), LEVELS, both)
     blocks["variance"][: variance.shape[0], : variance.shape[1]] = variance
     alike, smallest = _correlated(blocks), blocks
@@ -70,8 +71,9 @@ def supported(pixels: Array, guessed: Array, left: Array, right: Array, noise: A
         planes.append(fit_windows(blocks, start, RADIUS, size, both))
     shrunk, spread = _shrunk(planes)
     result = Support(*(np.empty(pixels.shape, np.float32) for _ in Support._fields))
-    given = pixels, guessed, smallest, shrunk, variance, spread, alike, ground
+    given = pixels, guessed, smallest, shrunk, variance, spread, alike, first_row
     by_bands(both, len(pixels), lambda first, end: _blend(*given, first, end, *result))
+    by_bands(both, len(pixels), lambda first, end: _add_bend(result.pixels, first, end, result.sigma))
     return result
 
 
@@ -117,7 +119,7 @@ def _plane_variance(planes: Array) -> Array:
 
 @kernel
 def _blend(
-    pixels, guessed, blocks, planes, variance, spread, correlated, ground, first, end, moved, sigma, correlation
+    pixels, guessed, blocks, planes, variance, spread, correlated, first_row, first, end, moved, sigma, correlation
 ):
     """Each pixel moves towards the planes of the four blocks around it, as far as it lies on them."""
     rows, cols = planes.shape
@@ -162,7 +164,7 @@ def _blend(
                     share = own / (own + relief) * min(F32(2) * weights, F32(1))
                     moved[y, x] = d + share * value / weights
                     random, common = share * share * random / weights, share * common / weights
-                if ground[j, i] and (not guessed[y, x] or blocks[j, i].n >= MIN_BACKING):
+                if y >= first_row[x] and (not guessed[y, x] or blocks[j, i].n >= MIN_BACKING):
                     random += (F32(1) - share) ** 2 * own
                     sigma[y, x] = np.sqrt(F32(EXCESS**2) * random + F32(SYSTEMATIC**2))
                     near_correlation = correlated[j, i]
@@ -170,9 +172,37 @@ def _blend(
                     correlation[y, x] = min(mean, F32(2) * near_correlation)
 
 
+@kernel
+def _add_bend(pixels, first, end, sigma):
+    """Add, in place, how far each pixel is off the middle between those at BEND_REACH on both sides."""
+    height, width = pixels.shape
+    for y in range(first, end):
+        above, below = y - BEND_REACH, y + BEND_REACH
+        for x in range(width):
+            d, bend = pixels[y, x], F32(0)
+            if above >= 0 and below < height:
+                off = F32(0.5) * abs(pixels[above, x] + pixels[below, x] - d - d)
+                bend = off if off > bend else bend
+            if BEND_REACH <= x < width - BEND_REACH:
+                off = F32(0.5) * abs(pixels[y, x - BEND_REACH] + pixels[y, x + BEND_REACH] - d - d)
+                bend = off if off > bend else bend
+            bend = min(bend, F32(MAX_BEND))
+            sigma[y, x] = np.sqrt(sigma[y, x] * sigma[y, x] + bend * bend)
+
+
+def add_bend_reference(pixels: Array, sigma: Array) -> Array:
+    """`_add_bend` in plain numpy: the new standard deviations."""
+    wide = np.pad(pixels.astype(np.float64), BEND_REACH, constant_values=np.nan)
+    inner, bends = slice(BEND_REACH, -BEND_REACH), []
+    for axis in (0, 1):
+        both = sum(np.roll(wide, shift, axis)[inner, inner] for shift in (BEND_REACH, -BEND_REACH))
+        bends.append(np.abs(both / 2 - pixels))
+    return np.asarray(np.hypot(sigma, np.minimum(np.nan_to_num(np.fmax(*bends)), MAX_BEND)))
+
+
 def blend_reference(
     pixels: Array, guessed: Array, blocks: Array, planes: Array, variance: Array, spread: Array, correlated: Array,
-    ground: Array,
+    first_row: Array,
 ) -> Support:  # fmt: skip
     """The last step of `supported`, in plain numpy and float64, pixel by pixel."""
     result = Support(pixels.astype(np.float64), np.full(pixels.shape, np.inf), np.zeros(pixels.shape))
@@ -189,7 +219,7 @@ def blend_reference(
         if sums[0] > 0:
             share = own / (own + max(mean[2] - own, 0)) * min(2 * sums[0], 1)
         result.pixels[y, x] = d + share * mean[1]
-        if ground[y // BLOCK, x // BLOCK] and (not guessed[y, x] or blocks["n"][y // BLOCK, x // BLOCK] >= MIN_BACKING):
+        if y >= first_row[x] and (not guessed[y, x] or blocks["n"][y // BLOCK, x // BLOCK] >= MIN_BACKING):
             random, near_correlation = share**2 * mean[3] + (1 - share) ** 2 * own, correlated[y // BLOCK, x // BLOCK]
             result.sigma[y, x] = np.sqrt(EXCESS**2 * random + SYSTEMATIC**2)
             result.correlation[y, x] = min(share * mean[4] + (1 - share) * near_correlation, 2 * near_correlation)

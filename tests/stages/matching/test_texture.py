@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from stages.matching.kernels.texture import (
     BLOCK,
-    below_sky,
     gradient,
     information,
     information_reference,
     match_variance,
+    sky_end,
     stereo_noise,
 )
 
@@ -68,9 +68,11 @@ def test_the_noise_of_two_images_is_at_least_that_of_one():
     assert np.array_equal(unmatched, NOISE)
 
 
-def test_the_sky_ends_at_the_uppermost_texture():
-    image = noisy((200, 240), contrast=0.0)
-    image[120:] = noisy((80, 240), contrast=20.0, seed=3)
-    ground = below_sky(information(image, gradient(image), NOISE))
-    assert ground[120 // BLOCK + 1 :].all()
-    assert ground[: 120 // BLOCK - 1].mean() < 0.05
+def test_ground_begins_where_texture_or_brightness_ends_the_sky():
+    sky, blank = noisy((200, 240), contrast=0.0), np.full((200, 240), 90, np.uint8)
+    textured = noisy((200, 240), contrast=20.0, seed=3)
+    for above, first, within in ((sky, 120, BLOCK), (sky + 60, 122, 1)):  # the block from row 120 on shows sky as well
+        image = np.concatenate([above[:first], textured[first:]])
+        found = sky_end(information(image, gradient(image), NOISE), image, NOISE)
+        assert np.mean(abs(found - first) <= within) > 0.9
+    assert (sky_end(information(blank, gradient(blank), NOISE), blank, NOISE) == 200).all()

@@ -18,7 +18,7 @@ from stages.refinement.kernels.blocks import (
     fit_window_reference,
     fit_windows,
 )
-from stages.refinement.kernels.support import _blend, blend_reference, supported
+from stages.refinement.kernels.support import _add_bend, _blend, add_bend_reference, blend_reference, supported
 
 ALONE = shared_by(1)
 
@@ -84,11 +84,21 @@ def test_the_last_step_equals_the_reference(height, width, seed):
     planes["n"][rng.random(shape) < 0.2] = 0
     blocks["n"] = rng.integers(0, 17, shape)
     variance, spread, near = (rng.uniform(0.01, 0.5, shape).astype(np.float32) for _ in range(3))
-    given = pixels, guessed, blocks, planes, variance, spread, near, rng.random(shape) < 0.8
+    given = pixels, guessed, blocks, planes, variance, spread, near, rng.integers(0, height + 1, width)
     result = [np.empty(pixels.shape, np.float32) for _ in range(3)]
     _blend(*given, 0, height, *result)
     for layer, expected in zip(result, blend_reference(*given), strict=True):
         assert np.allclose(layer, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 13), st.integers(1, 17), st.integers(0, 2**31))
+def test_bends_equal_the_reference(height, width, seed):
+    pixels, _, _, _ = case(height, width, seed)
+    sigma = np.random.default_rng(seed).uniform(0.05, 0.5, pixels.shape).astype(np.float32)
+    expected = add_bend_reference(pixels, sigma)
+    _add_bend(pixels, 0, height, sigma)
+    assert np.allclose(sigma, expected, rtol=1e-4, atol=1e-5)
 
 
 def views(contrast, disparity, seed=0, noise=1.5):
