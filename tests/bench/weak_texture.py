@@ -25,9 +25,9 @@ from tests.bench.stereo_scores import rows_filled
 
 LENGTH, SEEDS = 8, (31, 32, 33)  # frames and seeds of the traverses of each variant
 VARIANTS: dict[str, dict[str, Any]] = {
-    "mixed: noise 1.5, sand of 2 levels": {},
-    **{f"noise of {noise} gray levels": {"noise": noise} for noise in (0.5, 3.0, 5.0)},
-    **{f"sand of {contrast:g} gray levels": {"sand_contrast": contrast} for contrast in (1.0, 4.0, 8.0)},
+    "mixed: noise 1.5, sand of contrast 2": {},
+    **{f"noise {noise}": {"noise": noise} for noise in (0.5, 3.0, 5.0)},
+    **{f"sand of contrast {contrast:g}": {"sand_contrast": contrast} for contrast in (1.0, 4.0, 8.0)},
     **{f"blur of {blur} px": {"blur": blur} for blur in (0.5, 1.0, 1.5)},
     "exposure difference of 15 %": {"exposure_difference": 0.15},
     "the same and blur of 1.2 px": {"exposure_difference": 0.15, "blur": 1.2},
