@@ -9,6 +9,7 @@ import pytest
 from recordings.simulator import Simulation
 from stages.data import PixelOrigin, StereoFrame
 from stages.matching.match import Match
+from tests.bench import weak_texture
 from tests.bench.refining import RELEASED, stereo_part
 from tests.bench.stereo_scores import errors, rows_filled
 from tests.study import real, simulated
@@ -37,6 +38,15 @@ def test_on_a_simulated_frame_rover_beats_paper_and_matching_alone():
     assert (fast[:6] < 0.9 * paper[:6]).all()
     assert rover[6] < min(matched[6], paper[6])
     assert rover[7] > 99
+
+
+def test_support_removes_errors_on_sand_and_dust_and_adds_none_elsewhere():
+    found = weak_texture.scores({"width": 640, "height": 480}, 1)
+    bad = {key: errors.metrics()["bad_0.5"] for key, errors in found.items()}
+    shares = {"sand": (0.75, 0.35), "dust": (0.65, 0.45), "gravel": (1, 0.5), "rock": (1, 0.6)}
+    for surface, (of_plain, of_opencv) in shares.items():
+        assert bad["rover", surface] < of_plain * bad["without support", surface]
+        assert bad["rover", surface] < of_opencv * bad["OpenCV HH", surface]
 
 
 @pytest.mark.slow
