@@ -17,6 +17,7 @@ from flow.runtime.malloc import keep_freed_memory
 from recordings.scoring.stereo_metrics import SURFACES, StereoErrors
 from recordings.simulator import Simulation
 from recordings.simulator.scenes import SCENES
+from recordings.simulator.simulation import FrameTruth
 from stages import StereoFrame
 from stages.data import Array
 from tests.bench.matching import in_gray, opencv
@@ -45,9 +46,8 @@ def ways(frame: StereoFrame, disparities: int) -> Iterator[tuple[str, Array]]:
     yield "OpenCV HH", rows_filled(np.where(sixteenths < 0, np.nan, sixteenths / 16).astype(np.float32))
 
 
-def scores(variant: dict[str, Any], count: int) -> dict[tuple[str, str], StereoErrors]:
-    """The errors on `count` frames of every seed, by (way, surface), where surface `all` is every pixel."""
-    found: dict[tuple[str, str], StereoErrors] = {}
+def cases(variant: dict[str, Any], count: int) -> Iterator[tuple[StereoFrame, int, Array, FrameTruth]]:
+    """Frame, search range, true disparity, px (NaN: not scored), and truth of `count` frames of every seed."""
     for seed in SEEDS:
         simulation = Simulation(frames=LENGTH, seed=seed, **variant)
         camera, disparities = simulation.camera, DISPARITIES * simulation.width // 1280
@@ -55,11 +55,18 @@ def scores(variant: dict[str, Any], count: int) -> dict[tuple[str, str], StereoE
             made = simulation.frame(index)
             truth = camera.fx * camera.baseline / made.depth
             truth[(truth <= 0) | (truth >= disparities) | (np.arange(camera.width) < disparities)] = np.nan
-            for way, pixels in ways(StereoFrame(index, *made.images, camera), disparities):
-                surfaces = StereoErrors.by_surface(pixels, truth, made.seen, made.terrain_class)
-                surfaces["all"] = StereoErrors.of(pixels, truth, made.seen, 0)
-                for surface, errors in surfaces.items():
-                    found[way, surface] = found.get((way, surface), StereoErrors()) + errors
+            yield StereoFrame(index, *made.images, camera), disparities, truth, made
+
+
+def scores(variant: dict[str, Any], count: int) -> dict[tuple[str, str], StereoErrors]:
+    """The errors on `count` frames of every seed, by (way, surface), where surface `all` is every pixel."""
+    found: dict[tuple[str, str], StereoErrors] = {}
+    for frame, disparities, truth, made in cases(variant, count):
+        for way, pixels in ways(frame, disparities):
+            surfaces = StereoErrors.by_surface(pixels, truth, made.seen, made.terrain_class)
+            surfaces["all"] = StereoErrors.of(pixels, truth, made.seen, 0)
+            for surface, errors in surfaces.items():
+                found[way, surface] = found.get((way, surface), StereoErrors()) + errors
     return found
 
 

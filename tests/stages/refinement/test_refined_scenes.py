@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recordings.scoring.stereo_metrics import SEEN_BY_BOTH, SURFACES
 from recordings.simulator import Simulation
 from stages.data import PixelOrigin, StereoFrame
 from stages.matching.match import Match
@@ -120,3 +121,18 @@ def test_confidence_is_the_share_right_of_real_and_of_simulated_pixels():
         found = [right[area].mean() for (_, right), area in zip(pools, within, strict=True)]
         assert np.mean(found) == pytest.approx(np.mean(claimed), abs=0.1)
         assert found == pytest.approx(claimed, abs=0.25)
+
+
+@pytest.mark.slow
+def test_sigmas_contain_68_and_95_percent_on_sand_gravel_and_rock():
+    ratios: dict[str, list[np.ndarray]] = {"sand": [], "gravel": [], "rock": []}
+    for frame, disparities, truth, made in weak_texture.cases({}, 2):
+        found = stereo_part("rover", frame, disparities)["disparity"]
+        scored = (found.source == PixelOrigin.MEASURED) & (made.seen == SEEN_BY_BOTH) & np.isfinite(truth)
+        for surface in ratios:
+            within = scored & (made.terrain_class == SURFACES[surface])
+            ratios[surface].append((np.abs(found.pixels - truth) / found.sigma)[within])
+    for parts in ratios.values():
+        ratio = np.concatenate(parts)
+        assert (ratio <= 1).mean() == pytest.approx(0.68, abs=0.08)
+        assert (ratio <= 2).mean() == pytest.approx(0.95, abs=0.04)
