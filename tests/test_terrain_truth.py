@@ -24,11 +24,12 @@ def test_tilt_errors_match_the_stated_tilt_sigma(pipeline):
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(stated, rel=0.12)
 
 
-def check(found: dict[str, Run], alarms: float, slack: float = 0.0) -> None:
+def check(found: dict[str, Run], alarms: float, slack: float = 0.0, cautious: float = 0.0) -> None:
     """What maps must be, on frames of any traverse: of `rover`, and of the same stages given true disparity and tilt.
 
     alarms: how many of the truly safe cells may be called hazards, on ground of any slope to 15 degrees; slack: by how
-    much more the intervals may miss where the traverse has few tilts.
+    much more the intervals may miss where the traverse has few tilts; cautious: by how much more the intervals of
+    random errors may contain.
     """
     true, rover = (found[name].tally.metrics() for name in ("rover, true disparity and tilt", "rover"))
     heights, intervals, rocks, hazards = (rover[name] for name in ("heights", "intervals", "rocks", "hazards"))
@@ -37,9 +38,9 @@ def check(found: dict[str, Run], alarms: float, slack: float = 0.0) -> None:
     assert heights["4-8 m"]["levelled"]["rmse"] <= 0.04
     assert heights["0-8 m"]["completeness"] >= 0.97
     assert heights["0-8 m"]["levelled"]["within_5cm"] >= 0.95
-    assert rover["hallucinated"]["of_cells"] <= 0.01
-    for interval in (intervals["random"], intervals["total"]):
-        assert abs(interval["1"] - 0.68) <= 0.07 + slack
+    assert rover["hallucinated"]["of_cells"] <= 0.0125
+    for interval, more in ((intervals["random"], cautious), (intervals["total"], 0.0)):
+        assert -0.07 - slack <= interval["1"] - 0.68 <= 0.07 + slack + more
         assert abs(interval["2"] - 0.95) <= 0.04 + slack
     assert rocks["0.2 m"]["detected"] >= 0.98 * rocks["0.2 m"]["visible"]
     assert rocks["0.3 m"]["detected"] == rocks["0.3 m"]["visible"]
@@ -52,9 +53,9 @@ def check(found: dict[str, Run], alarms: float, slack: float = 0.0) -> None:
         assert np.isnan(share) or share <= alarms
 
 
-def traverse_of(seed: int, abundance: float) -> Simulation:
+def traverse_of(seed: int, abundance: float, scene: str = "mixed") -> Simulation:
     return Simulation(
-        scene="gravel", frames=30, seed=seed, abundance=abundance, slope=float(SLOPE), tilt_noise=float(TILT_NOISE),
+        scene=scene, frames=30, seed=seed, abundance=abundance, slope=float(SLOPE), tilt_noise=float(TILT_NOISE),
         threads=1,
     )  # fmt: skip
 
@@ -67,9 +68,11 @@ def test_two_frames_have_accurate_maps():
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
+@pytest.mark.parametrize(("scene", "cautious"), [("mixed", 0.0), ("gravel", 0.1)])
 @pytest.mark.parametrize(("abundance", "alarms"), [(0.05, 0.03), (0.15, 0.08)])
-def test_three_traverses_have_accurate_maps(abundance, alarms):
-    check(score([traverse_of(seed, abundance) for seed in (11, 12, 13)], 10, COMPARED), alarms)
+def test_three_traverses_have_accurate_maps(abundance, alarms, scene, cautious):
+    traverses = [traverse_of(seed, abundance, scene) for seed in (11, 12, 13)]
+    check(score(traverses, 10, COMPARED), alarms, cautious=cautious)
 
 
 @pytest.mark.slow

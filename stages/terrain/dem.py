@@ -47,16 +47,13 @@ class Voxelise(Stage):
     max_range: float = parameter(
         8.0, "horizontal range from the level frame's origin kept in the map", unit="m", low=0.1, high=200.0
     )
-    tail_factor: float = parameter(
-        1.2, "variance of a point over the square of the sigma that contains 68 % of the errors", low=0.0
-    )
-    correlated_points: float = parameter(12.0, "neighbouring points that share one matching error", low=1.0)
+    correlated_points: float = parameter(4.0, "neighbouring points that share one matching error", low=1.0)
     systematic_share: float = parameter(
-        0.06, "share of the points' variance that no averaging removes", low=0.0, high=1.0
+        0.95, "share of the points' variance that no averaging removes", low=0.0, high=1.0
     )
-    scatter_share: float = parameter(0.15, "share of the scatter beyond slope and noise in the variance", low=0.0)
-    curvature_share: float = parameter(0.4, "share of the squared curvature in the variance", low=0.0)
-    rim_share: float = parameter(0.12, "share of the squared rise in the variance of a cell beside a hole", low=0.0)
+    scatter_share: float = parameter(0.22, "share of the scatter beyond slope and noise in the variance", low=0.0)
+    curvature_share: float = parameter(0.38, "share of the squared curvature in the variance", low=0.0)
+    rim_share: float = parameter(0.15, "share of the squared rise in the variance of a cell beside a hole", low=0.0)
     splat_sigmas: float = parameter(
         0.0, "reach of a measured point along its line of sight, in standard deviations of its depth, into cells "
         "without points; 0 = none", low=0.0,
@@ -149,7 +146,7 @@ class Voxelise(Stage):
         uneven = np.maximum(scatter - rise / 12 - NOISE_IN_SCATTER * noise, 0.0)
         beside_hole = ~binary_erosion(np.isfinite(mean), np.ones((3, 3)))
         return np.asarray(
-            self.tail_factor * noise * (self.systematic_share + np.minimum(1.0, self.correlated_points / n))
+            noise * (self.systematic_share + np.minimum(1.0, self.correlated_points / n))
             + self.scatter_share * uneven
             + self.curvature_share * curvature * curvature
             + np.where(beside_hole, self.rim_share * rise, 0.0)

@@ -152,7 +152,7 @@ def test_holes_stay_empty_and_an_empty_cloud_makes_an_empty_map() -> None:
 
 
 PURE = Voxelise(
-    tail_factor=1.0, correlated_points=1.0, systematic_share=0.0, scatter_share=0.0, curvature_share=0.0, rim_share=0.0
+    correlated_points=1.0, systematic_share=0.0, scatter_share=0.0, curvature_share=0.0, rim_share=0.0
 )
 
 
