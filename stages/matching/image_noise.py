@@ -1,7 +1,8 @@
 """The noise of an image, from the image: sensor noise and rounding, by brightness.
 
-A second difference in both directions removes slopes and straight edges: in the smoothest blocks of an image, noise is
-what remains. Shot noise grows with the light: its variance is a line over the gray levels.
+A fourth difference in both directions removes slopes, straight edges and most of the texture that a lens shows: in the
+smoothest blocks of an image, noise is what remains. Shot noise grows with the light: its variance is a line over the
+gray levels.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from stages.data import Array, ImageNoise, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.stage import Stage
 
-# Response to white noise of one gray level has a standard deviation of 1 (Immerkaer, 1996).
-SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
+# Along rows and columns. The lens blurs what it shows of texture; white noise of variance 1 keeps that variance.
+FOURTH_DIFFERENCE = np.array([1, -4, 6, -4, 1], np.float32) / np.sqrt(70, dtype=np.float32)
 BLOCK = 8  # px, side of the blocks whose mean square response is a sample of the variance
 SMOOTH_SHARE = 0.05  # of the blocks of one brightness count as smooth
-SMOOTH_VARIANCE = 0.55  # mean square response at that share of blocks of white noise, over its variance
+SMOOTH_VARIANCE = 0.45  # mean square response at that share of blocks of white noise, over its variance
 LEVELS, MIN_BIN = 256, 16  # gray levels
 TEXTURED = 2.0  # a bin whose variance is this many times that of the line contains texture
 DARKEST, BRIGHTEST = 4, 244  # mean levels between which clipping does not reduce the noise
@@ -73,7 +74,7 @@ def _samples(image: Array) -> tuple[Array, Array]:
     if not rows or not cols:
         return np.zeros(0), np.zeros(0)
     whole = image[: rows * BLOCK, : cols * BLOCK]
-    response = cv2.filter2D(whole, cv2.CV_32F, SECOND_DIFFERENCE)
+    response = cv2.sepFilter2D(whole, cv2.CV_32F, FOURTH_DIFFERENCE, FOURTH_DIFFERENCE)
     variance = cv2.resize(response * response, (cols, rows), interpolation=cv2.INTER_AREA).ravel()
     level = cv2.resize(whole, (cols, rows), interpolation=cv2.INTER_AREA).ravel()
     unclipped = (level >= DARKEST) & (level <= BRIGHTEST)
