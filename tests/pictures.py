@@ -2,12 +2,14 @@
 
 terrain.jpg: for three frames the left image, the elevation, the reasons of the navigation map, and the truth in the
 visible cells. region.jpg: the regional map of a traverse and its navigation map. Both are of simulated traverses.
-devon.jpg, if ROVERFLOW_DATA is set: disparity and source of each pair; the images may not be reprinted.
+devon.jpg, if ROVERFLOW_DATA is set: disparity, source and shaded disparities of each pair; the images may not be
+reprinted.
 """
 
 import os
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,7 +20,7 @@ from flow.cli.main import main as roverflow
 from recordings.simulator import Simulation
 from recordings.sinks import colormaps
 from stages.data import Array, Cell, CellReason, ElevationMap
-from tests.bench.refining import DISPARITIES, stereo_part
+from tests.bench.refining import DISPARITIES, stage, stereo_part
 from tests.bench.terrain import frames, measured_tilt, through
 from tests.study import devon
 
@@ -89,14 +91,31 @@ def region_picture() -> Array:
 
 
 def devon_picture(data: Path) -> Array:
-    """Disparity and source of the Devon Island pairs in a folder of real data, a row for each, RGB."""
+    """Disparity and source of the Devon Island pairs, and shaded disparities without and with support, RGB.
+
+    Two rows for each pair in a folder of real data.
+    """
     rows = []
     for _, frame in devon(data):
-        disparity = stereo_part("rover", frame, DISPARITIES, threads=2)["disparity"]
+        streams = stereo_part("rover", frame, DISPARITIES, threads=2, entry="rectified")
+        disparity = streams["disparity"]
+        plain = replace(stage("rover", "disparity"), support=False)(frame, streams["disparity/second_checked"])
         known = np.where(np.isfinite(disparity.pixels)[..., None], colormaps.disparity_colors(disparity.pixels), 0)
-        pictures = known.astype(np.uint8), colormaps.legend_colors(disparity.source, colormaps.SOURCE_LEGEND)
-        rows.append(np.hstack([cv2.resize(picture, None, fx=0.5, fy=0.5) for picture in pictures]))
+        origin = colormaps.legend_colors(disparity.source, colormaps.SOURCE_LEGEND)
+        for pictures in ((known.astype(np.uint8), origin), (_shaded(plain.pixels), _shaded(disparity.pixels))):
+            rows.append(
+                np.hstack(
+                    [cv2.resize(picture, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA) for picture in pictures]
+                )
+            )
     return np.vstack(rows)
+
+
+def _shaded(pixels: Array) -> Array:
+    """A disparity image lit from the left: mid-gray where it is constant along the row, black where it is unknown."""
+    slope = cv2.Sobel(pixels, cv2.CV_32F, 1, 0, scale=1 / 8)
+    gray = np.where(np.isfinite(slope), np.clip(128 + 400 * slope, 1, 255), 0).astype(np.uint8)
+    return np.dstack([gray] * 3)
 
 
 def _ahead(painted: Array, terrain: ElevationMap) -> Array:

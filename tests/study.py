@@ -30,6 +30,7 @@ PLAIN: dict[str, Any] = {
 LAST: dict[str, Any] = {"bilateral_radius": 0, "edge_radius": 0, "support": False}
 SEEDS = (1, 2, 3)
 ABUNDANCES = (0.05, 0.15, 0.10)
+PLANE, STEP, CONTRASTS = 25, 8, (0, 2, 4, 8)  # px, side and spacing of planes; gray levels from which classes begin
 EDGE_STEP, EDGE_REACH = 2.0, 3  # px of disparity that make an edge of depth, px from it that count as near
 SOURCE_COLOURS = np.full((len(PixelOrigin), 3), 40, np.uint8)
 SOURCE_COLOURS[1:4] = [70, 160, 70], [70, 110, 210], [230, 150, 50]
@@ -311,6 +312,32 @@ def devon(folder: Path) -> Iterator[tuple[str, StereoFrame]]:
         yield left.stem.replace("left", "").strip("_-"), StereoFrame(1, *pair, camera)
 
 
+def print_scatter(name: str, frame: StereoFrame, found: dict[str, Disparity]) -> None:
+    """Print how far measured disparities are off robust planes over 25x25 px (1.48 MAD, px), by contrast."""
+    gray = cv2.cvtColor(frame.left, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    detail = np.square(gray - cv2.GaussianBlur(gray, (0, 0), 3))
+    contrast = np.sqrt(cv2.GaussianBlur(detail, (0, 0), 8))
+    rows, cols = (places.ravel() for places in np.mgrid[:PLANE, :PLANE])
+    terms = np.stack([cols, rows, np.ones_like(cols)], axis=1).astype(np.float64)
+    for way, disparity in found.items():
+        measured = np.where(disparity.source == PixelOrigin.MEASURED, disparity.pixels, np.nan)
+        scatter: list[list[float]] = [[] for _ in CONTRASTS]
+        for y, x in np.ndindex(*((extent - PLANE) // STEP for extent in measured.shape)):
+            window = measured[y * STEP : y * STEP + PLANE, x * STEP : x * STEP + PLANE].ravel()
+            used = np.isfinite(window)
+            for _ in range(3):
+                if used.sum() < 0.5 * window.size:
+                    break
+                off = np.abs(window - terms @ np.linalg.lstsq(terms[used], window[used])[0])
+                deviation = 1.4826 * np.median(off[used])
+                used = off <= 2.5 * deviation
+            else:
+                level = contrast[y * STEP + PLANE // 2, x * STEP + PLANE // 2]
+                scatter[int(np.searchsorted(CONTRASTS, level, side="right")) - 1].append(float(deviation))
+        figures = ", ".join(f"{np.median(values):.3f}" for values in scatter)
+        print(f"{name}, {way}: scatter about planes, px, at a contrast from {CONTRASTS} gray levels: {figures}")
+
+
 def main(folder: Path) -> None:
     """Print the tables and write the pictures."""
     cv2.setNumThreads(1)
@@ -322,7 +349,12 @@ def main(folder: Path) -> None:
         print_fills(cases)
         print_worth(cases)
         for name, frame in devon(data):
-            pictures(folder, name, frame, stereo_part("rover", frame, 192)["disparity"])
+            ways = {
+                "without support": stereo_part("rover", frame, 192, changes={"support": False})["disparity"],
+                "rover": stereo_part("rover", frame, 192)["disparity"],
+            }
+            print_scatter(name, frame, ways)
+            pictures(folder, name, frame, ways["rover"])
     cases = simulated()
     print_table("simulated frames", measure(cases), None)
     print_fills(cases)
