@@ -5,6 +5,7 @@ A tally sums up frames in the memory of one. The terms:
 - *visible*: a cell within `MAX_DISTANCE` of base_link that a pixel of both cameras hits (true layer `visible`);
 - *in view*: a cell with a line of sight from both cameras, through a pixel or between pixels (true layer `in_view`);
 - *hallucinated*: a value in a cell that is not in view;
+- *unseen*: a value in a cell that is not visible; *claimed* if the layer `interpolated` does not mark it;
 - *levelled*: minus the best-fit plane of the frame's errors over the visible cells, which removes tilt and offset;
 - a *visible rock*: both cameras see at least `MIN_ROCK_SHARE` of its height and `MIN_ROCK_PIXELS` of its pixels; one of
   which they see any pixel is *partly visible*. It is detected if a hazard cell is on it or one cell beside it;
@@ -106,12 +107,15 @@ class TerrainTally:
             ring = truth.seen & in_ring(radius, *limits)
             for errors, values in zip(parts, (error, levelled), strict=True):
                 errors.add(values[ring])
-        within = in_ring(radius, 0.0, MAX_DISTANCE)
+        within, marked = in_ring(radius, 0.0, MAX_DISTANCE), layers.get("interpolated", np.zeros_like(elevation)) == 1
         counts = {
             "values": known & within,
             "hallucinated": known & within & ~truth.in_view,
             "between_pixels": known & within & truth.in_view & ~truth.seen,
-            "cells": within,
+            "unseen": known & within & ~truth.seen,
+            "claimed": known & within & ~truth.seen & ~marked,
+            "values_seen": known & within & truth.seen,
+            "marked_seen": known & within & truth.seen & marked,
         }
         self.counts.update(_summed(counts))
         if "variance" in layers:
@@ -126,9 +130,10 @@ class TerrainTally:
         """All metrics; shares 0 to 1, lengths m, NaN if nothing was measured.
 
         heights: ring -> seen (visible cells), completeness, and `HeightErrors.metrics` raw and levelled; hallucinated:
-        as share of all values and of all cells within 8 m; between_pixels: values in view but not visible, as share of
-        all values; intervals: share of levelled errors within 1 and 2 stated random sigmas (random), and of raw errors
-        within sigmas of random and common variance (total); rocks: "0.2 m", "0.3 m" -> visible, detected, recall,
+        as share of all values; between_pixels, unseen, claimed: as share of all values (between_pixels: in view but not
+        visible); marked_seen: visible values marked interpolated, as share of the visible ones; intervals: share
+        of levelled errors within 1 and 2 stated random sigmas (random), and of raw errors within sigmas of random and
+        common variance (total); rocks: "0.2 m", "0.3 m" -> visible, detected, recall,
         partly_visible, partly_visible_detected; hazards: see `_hazards`.
         """
         c = self.counts
@@ -154,8 +159,9 @@ class TerrainTally:
 
         return {
             "heights": heights,
-            "hallucinated": {"of_values": part("hallucinated", "values"), "of_cells": part("hallucinated", "cells"),
-                        "between_pixels": part("between_pixels", "values")},
+            "hallucinated": {"of_values": part("hallucinated", "values"),
+                        "between_pixels": part("between_pixels", "values"), "unseen": part("unseen", "values"),
+                        "claimed": part("claimed", "values"), "marked_seen": part("marked_seen", "values_seen")},
             "intervals": {name: {str(k): part(f"{name}_in_{k}", f"{name}_judged") for k in (1, 2)}
                           for name in ("random", "total")},
             "rocks": rocks,

@@ -12,16 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_erosion
 
-from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
+from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Transform
 from stages.stage import Stage, check_cells, check_level, parameter
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
 from stages.terrain.kernels.grid import FIGURES, Grid, cell_percentile, cell_statistics
 from stages.terrain.kernels.occlusion import occlusion_ceiling
 from stages.terrain.kernels.splat_along_ray import splat_along_ray
+from stages.terrain.kernels.staying_points import staying_points
 
 MIN_SPLAT_CELLS = 0.5  # points with a shorter reach are not splatted
 MIN_SPLATS = 2  # in a cell without a point of its own
 SPLAT_COUNT = 0.5  # the count of such a cell: less than one point
+MIN_STAYING_POINTS = 6  # with fewer after a move of one sigma, a cell may rest on the pixels of its neighbours
 NOISE_IN_SCATTER = 0.5  # share of the points' noise that their scatter shows, because neighbours err alike
 SUMS = [FIGURES.index(name) for name in ("count", "sum", "sum_of_squares", "noise")]
 
@@ -30,8 +32,9 @@ SUMS = [FIGURES.index(name) for name in ("count", "sum", "sum_of_squares", "nois
 class Voxelise(Stage):
     """Averages a levelled cloud over the cells of a grid.
 
-    Adds the layers elevation, minimum, maximum, count, variance and common_variance; occluded and ceiling if the camera
-    is known; filled if the cloud contains points that were not measured; percentile_P for each of `percentiles`.
+    Adds the layers elevation, minimum, maximum, count, variance and common_variance; interpolated, occluded and ceiling
+    if the camera is known; filled if the cloud contains points that were not measured; percentile_P for each of
+    `percentiles`.
     docs/terrain.md defines the layers and the model of variance.
 
     Examples
@@ -54,6 +57,10 @@ class Voxelise(Stage):
     scatter_share: float = parameter(0.22, "share of the scatter beyond slope and noise in the variance", low=0.0)
     curvature_share: float = parameter(0.38, "share of the squared curvature in the variance", low=0.0)
     rim_share: float = parameter(0.15, "share of the squared rise in the variance of a cell beside a hole", low=0.0)
+    sight_share: float = parameter(
+        1.0, "share of the squared fall of the line of sight within a cell, in the variance of an interpolated cell "
+        "beside a hole", low=0.0,
+    )  # fmt: skip
     splat_sigmas: float = parameter(
         0.0, "reach of a measured point along its line of sight, in standard deviations of its depth, into cells "
         "without points; 0 = none", low=0.0,
@@ -127,13 +134,21 @@ class Voxelise(Stage):
         scatter = np.maximum(squares / n - mean * mean, 0.0)
         middle = np.arange(len(count)) + 0.5
         x, y = middle[None, :] * self.resolution + grid.origin[0], middle[:, None] * self.resolution + grid.origin[1]
+        variance = self._variance(n, mean, scatter, noise / n, cloud, x, y)
+        more = {}
+        if cloud.sensor is not None:
+            interpolated = staying_points(cloud.points, cloud.sigma, cloud.sensor, grid) < MIN_STAYING_POINTS
+            more["interpolated"] = np.where(empty, np.nan, interpolated)
+            fall = self.resolution * _sight_fall(cloud.sensor, mean, x, y)
+            variance = variance + np.where(interpolated & _beside_hole(mean), self.sight_share * fall * fall, 0.0)
         return {
             "elevation": mean,
             "minimum": np.where(empty, np.nan, minimum),
             "maximum": np.where(empty, np.nan, maximum),
             "count": count,
-            "variance": self._variance(n, mean, scatter, noise / n, cloud, x, y),
+            "variance": variance,
             "common_variance": np.where(empty, np.nan, cloud.tilt_sigma**2 * (x * x + y * y)),
+            **more,
         }
 
     def _variance(
@@ -144,17 +159,28 @@ class Voxelise(Stage):
         rise = east * east + north * north
         noise = noise * _lever(cloud, mean, x, y, east / self.resolution, north / self.resolution) ** 2
         uneven = np.maximum(scatter - rise / 12 - NOISE_IN_SCATTER * noise, 0.0)
-        beside_hole = ~binary_erosion(np.isfinite(mean), np.ones((3, 3)))
         return np.asarray(
             noise * (self.systematic_share + np.minimum(1.0, self.correlated_points / n))
             + self.scatter_share * uneven
             + self.curvature_share * curvature * curvature
-            + np.where(beside_hole, self.rim_share * rise, 0.0)
+            + np.where(_beside_hole(mean), self.rim_share * rise, 0.0)
         )
 
 
 def _statistics(cloud: PointCloud, grid: Grid) -> Array:
     return cell_statistics(cloud.points, cloud.sigma, grid)
+
+
+def _beside_hole(height: Array) -> Array:
+    """Which cells (rows, cols) are empty or have an empty neighbour."""
+    return ~np.asarray(binary_erosion(np.isfinite(height), np.ones((3, 3))))
+
+
+def _sight_fall(sensor: Transform, height: Array, x: Array, y: Array) -> Array:
+    """How far the line of sight to each cell (rows, cols) falls per metre of horizontal distance."""
+    eye = sensor.translation
+    with np.errstate(divide="ignore"):
+        return np.asarray((eye[2] - height) / np.hypot(x - eye[0], y - eye[1]))
 
 
 def _lever(cloud: PointCloud, height: Array, x: Array, y: Array, east: Array, north: Array) -> Array:

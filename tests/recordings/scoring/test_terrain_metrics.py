@@ -61,10 +61,14 @@ def test_values_out_of_view_are_hallucinated_those_between_pixels_not():
     elevation[160, 161:261] = 0  # seen
     elevation[100:110, 160] = 0  # in view, no pixel
     elevation[100:140, 100] = 0  # hidden
-    found = scored(truth, {"elevation": elevation})["hallucinated"]
+    interpolated = np.where(np.isfinite(elevation), 0.0, np.nan)
+    interpolated[100:135, 100] = interpolated[160, 161:186] = 1
+    found = scored(truth, {"elevation": elevation, "interpolated": interpolated})["hallucinated"]
     assert found["of_values"] == pytest.approx(40 / 150)
-    assert found["of_cells"] == pytest.approx(40 / np.count_nonzero(RADIUS < 8))
     assert found["between_pixels"] == pytest.approx(10 / 150)
+    assert found["unseen"] == pytest.approx(50 / 150)
+    assert found["claimed"] == pytest.approx(15 / 150)
+    assert found["marked_seen"] == pytest.approx(25 / 100)
 
 
 def test_stated_sigmas_cover_their_errors_and_tilt_only_the_total():

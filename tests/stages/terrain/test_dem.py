@@ -18,6 +18,7 @@ from stages.terrain.kernels.cell_gradient import gradient_and_curvature, gradien
 from stages.terrain.kernels.grid import Grid, cell_statistics, cell_statistics_reference
 from stages.terrain.kernels.occlusion import occlusion_ceiling, occlusion_ceiling_reference
 from stages.terrain.kernels.splat_along_ray import splat_along_ray, splat_along_ray_reference
+from stages.terrain.kernels.staying_points import staying_points, staying_points_reference
 from tests.stages.terrain.terrain_scene import (
     CAMERA,
     HEIGHT,
@@ -81,7 +82,7 @@ def test_the_order_of_points_changes_at_most_the_last_bits() -> None:
 def test_the_layers_of_one_cell_are_those_of_its_points() -> None:
     heights = np.array([0.1, 0.2, 0.6])
     points = np.column_stack([np.full(3, 2.01), np.full(3, -1.02), heights])
-    grid = Voxelise(percentiles=(50.0, 75.0), scatter_share=1.0)(cloud_of(points, sigma=0.0))
+    grid = Voxelise(percentiles=(50.0, 75.0), scatter_share=1.0)(cloud_of(points, 0.0, sensor=None))
     row, col = int((-1.02 - grid.origin[1]) / 0.05), int((2.01 - grid.origin[0]) / 0.05)
     value = {name: float(layer[row, col]) for name, layer in grid.layers.items()}
     assert value == pytest.approx(
@@ -152,7 +153,7 @@ def test_holes_stay_empty_and_an_empty_cloud_makes_an_empty_map() -> None:
 
 
 PURE = Voxelise(
-    correlated_points=1.0, systematic_share=0.0, scatter_share=0.0, curvature_share=0.0, rim_share=0.0
+    correlated_points=1.0, systematic_share=0.0, scatter_share=0.0, curvature_share=0.0, rim_share=0.0, sight_share=0.0
 )
 
 
@@ -277,6 +278,27 @@ def test_splats_fill_cells_that_points_miss_by_their_depth_sigma() -> None:
     near = Voxelise(splat_sigmas=2.0, max_splat=0.05)(cloud).layers["count"] > 0
     assert gained[near & ~own].all()
     assert own.sum() < near.sum() < own.sum() + gained.sum()
+
+
+def test_staying_points_kernel_equals_the_reference() -> None:
+    points = scattered(4).astype(np.float32)
+    ahead = points[(points - SENSOR.translation) @ SENSOR.rotation[:, 2] > 1].repeat(4, axis=0)
+    sigma = np.random.default_rng(5).uniform(0, 0.1, len(ahead)).astype(np.float32)
+    arguments = (ahead, sigma, SENSOR, GRID)
+    got, want = staying_points(*arguments), staying_points_reference(*arguments)
+    assert 0 < want.sum() < len(ahead)
+    np.testing.assert_array_equal(got, want)
+
+
+def test_cells_whose_points_may_belong_to_neighbours_are_interpolated() -> None:
+    sure, doubtful, splatted = (Voxelise(splat_sigmas=4.0)(rows_apart(sigma)).layers for sigma in (0.002, 0.04, 0.06))
+    own = sure["count"] > 0
+    assert (sure["interpolated"][own] == 0).all()
+    assert np.isnan(sure["interpolated"][~own]).all()
+    assert (doubtful["interpolated"][own] == 1).all()
+    assert (splatted["interpolated"][splatted["count"] == 0.5] == 1).all()
+    # Beside a hole the ground may fall as steeply as the line of sight, here by about 1 cm within a cell.
+    assert np.sqrt(doubtful["variance"][own].min()) > 0.9 * 0.05 * HEIGHT / 6 > np.sqrt(sure["variance"][own].max())
 
 
 @pytest.mark.parametrize(
