@@ -81,18 +81,25 @@ class FrameRecord:
 
 
 class Severity(StrEnum):
-    """How much a finding matters. A run prints warnings last, because results may be wrong."""
+    """How much a finding matters. A run prints warnings and faults last."""
 
     NOTE = "note"
-    WARNING = "warning"
+    WARNING = "warning"  # results may be wrong
+    FAULT = "fault"  # results are wrong
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence about a whole run or log. It is no loss, and changes neither the ledger nor the verdict."""
+    """One sentence about a whole run or log. It is no loss. A fault makes the verdict INCOMPLETE.
+
+    about: what a fault is in, such as "tilt"; assumes: what a warning takes for sound. A warning whose assumption has a
+    fault becomes a note, so that one cause gives one warning.
+    """
 
     sentence: str
     severity: Severity = Severity.NOTE
+    about: str = ""
+    assumes: str = ""
 
     def as_dict(self) -> dict[str, str]:
         """The finding in plain JSON values."""

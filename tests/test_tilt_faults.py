@@ -35,19 +35,19 @@ def log(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return path
 
 
-def finding_of(log: Path, folder: Path) -> tuple[str, str]:
-    """Severity and sentence of a run's finding about the tilt."""
+def finding_of(log: Path, folder: Path, code: int) -> tuple[str, str]:
+    """Severity and sentence of the finding about the tilt, of a run that exits with a code."""
     pipeline, summary = folder / "check.yaml", folder / "summary.json"
     pipeline.write_text(PIPELINE)
     arguments = ["-p", pipeline, "-o", folder / "out.mcap", "--no-rrd", "--summary", summary]
-    main(["run", *map(str, [log, *arguments])])
+    assert main(["run", *map(str, [log, *arguments])]) == code
     found = json.loads(summary.read_text())["findings"]["health"]
     return found["severity"], found["sentence"]
 
 
 @pytest.mark.slow
 def test_a_sound_log_has_no_fault(log, tmp_path):
-    severity, found = finding_of(log, tmp_path)
+    severity, found = finding_of(log, tmp_path, 0)
     assert severity == "note"
     assert found.startswith(("Tilt and camera agree to 0.", "Not enough motion in 50 frames to rule out a wrong mount"))
 
@@ -56,8 +56,8 @@ def test_a_sound_log_has_no_fault(log, tmp_path):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named(log, tmp_path, fault):
     plant, name = FAULTS[fault]
-    severity, found = finding_of(plant(log, tmp_path / "faulty.mcap"), tmp_path)
-    assert severity == "warning"
+    severity, found = finding_of(plant(log, tmp_path / "faulty.mcap"), tmp_path, 3)
+    assert severity == "fault"
     fault = found.split(". ")[0].lower()
     assert name in fault, found
     assert " or " not in fault, found
@@ -65,7 +65,7 @@ def test_a_fault_is_named(log, tmp_path, fault):
 
 @pytest.mark.slow
 def test_visual_poses_drift_by_less_than_a_hundredth_of_the_distance(log, simulation, tmp_path):
-    finding_of(log, tmp_path)
+    finding_of(log, tmp_path, 0)
     start, way, before = level_pose(simulation.base_at(simulation.stamp(0))).inverse(), 0.0, np.zeros(3)
     for _, _, pose in iter_decoded(tmp_path / "out.mcap", ["/nav/pose"]):
         true = start.after(simulation.base_at(stamp_of(pose.header)))

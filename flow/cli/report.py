@@ -1,4 +1,4 @@
-"""What a run prints at its end: the verdict, notes, losses, outputs, and warnings last."""
+"""What a run prints at its end: the verdict, notes, losses, outputs, warnings, and faults last."""
 
 from __future__ import annotations
 
@@ -46,7 +46,10 @@ def headline(summary: dict[str, Any]) -> str:
     abandoned = f", {drops[LossReason.ABANDONED]} abandoned" if LossReason.ABANDONED in drops else ""
     lost = ", ".join(f"{number} {reason}" for reason, number in losses.items())
     count = f", {counted(sum(losses.values()), 'loss', 'losses')}: {lost}" if losses else ""
-    return f"{summary['verdict']}: {outcome}{abandoned}{count}; {summary['frames_per_second']:.2f} frames/s"
+    groups = [summary.get(group, {}) for group in ("surveys", "findings")]
+    faulty = [name for group in groups for name, item in group.items() if item["severity"] == Severity.FAULT]
+    faults = f", fault reported by {' and '.join(faulty)}" if faulty else ""
+    return f"{summary['verdict']}: {outcome}{abandoned}{count}{faults}; {summary['frames_per_second']:.2f} frames/s"
 
 
 def report(summary: dict[str, Any]) -> None:
@@ -65,6 +68,8 @@ def report(summary: dict[str, Any]) -> None:
         say(f"  wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
     for line in [line for part in found for line in lines(part, Severity.WARNING)]:
         say(f"WARNING: {line}")
+    for line in [line for part in found for line in lines(part, Severity.FAULT)]:
+        say(f"FAULT: {line}")
 
 
 def _moment(stamp: int, begin: int | None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from flow.contracts import Finding, Severity
@@ -22,8 +23,8 @@ def checked(returned: Any) -> Finding | None:
     if not isinstance(returned, Finding):
         return warning(f"the stage must return a flow.contracts.Finding or None, not {returned!r:.80}")
     if returned.severity not in tuple(Severity):
-        levels = " or ".join(Severity)
-        return warning(f"{returned.sentence} (a Finding's severity must be {levels}, not '{returned.severity}')")
+        levels = ", ".join(Severity)
+        return warning(f"{returned.sentence} (a Finding's severity must be one of {levels}, not '{returned.severity}')")
     return returned
 
 
@@ -36,7 +37,22 @@ def findings(graph: Graph, states: Mapping[str, Any]) -> dict[str, Finding]:
                 found[node.name] = checked(node.actor.finding(states[node.name]))
             except Exception as error:  # must not leave the outputs open
                 found[node.name] = warning(failure(error))
-    return {name: finding for name, finding in found.items() if finding is not None}
+    return explained({name: finding for name, finding in found.items() if finding is not None})
+
+
+def explained(found: dict[str, Finding]) -> dict[str, Finding]:
+    """The findings, with notes in place of the warnings that a fault may explain."""
+    faults = {finding.about: name for name, finding in found.items() if finding.severity is Severity.FAULT}
+    for name, finding in found.items():
+        if finding.severity is Severity.WARNING and finding.assumes and finding.assumes in faults:
+            cause = f"The fault that {faults[finding.assumes]} reports may be the cause."
+            found[name] = replace(finding, severity=Severity.NOTE, sentence=f"{finding.sentence} {cause}")
+    return found
+
+
+def has_fault(found: Mapping[str, Finding]) -> bool:
+    """Whether any finding is a fault."""
+    return any(finding.severity is Severity.FAULT for finding in found.values())
 
 
 def as_dicts(found: Mapping[str, Finding]) -> dict[str, dict[str, str]]:

@@ -14,7 +14,7 @@ from typing import Any
 from flow.contracts import Event, Finding, Log, Sink, Verdict
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.runtime.engine import Engine
-from flow.runtime.findings import as_dicts, findings, warning
+from flow.runtime.findings import as_dicts, findings, has_fault, warning
 from flow.runtime.frame_assembler import FrameAssembler
 from flow.runtime.graph import Graph
 from flow.runtime.interrupts import Stop
@@ -146,7 +146,9 @@ def run(
         sinks.errors += [engine.failure] if engine.failure else []
         times = {"wall_seconds": time.perf_counter() - wall, "start_seconds": started}
         times["cpu_seconds"] = time.process_time() - cpu
-        complete = at_end and engine.complete == engine.admitted and not len(ledger) and not sinks.errors
+        found = _notes(log, graph) | findings(graph, engine.states)
+        faulty = has_fault(found) or has_fault(prepared.findings)
+        complete = at_end and not faulty and engine.complete == engine.admitted and not len(ledger) and not sinks.errors
         sinks.discard(only_empty=engine.through > 0)
         summary = {
             "verdict": str(Verdict.COMPLETE if complete else Verdict.INCOMPLETE),
@@ -156,7 +158,7 @@ def run(
             **_counts(assembler, engine, ledger, times),
             "surveys": as_dicts(prepared.findings),
             "fixed": prepared.fixed,
-            "findings": as_dicts(_notes(log, graph) | findings(graph, engine.states)),
+            "findings": as_dicts(found),
             "outputs": [str(outputs[use]) for use in sinks.opened],
             "withheld": [str(outputs[use]) for use in sinks.withheld],
         }

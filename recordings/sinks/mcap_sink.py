@@ -191,7 +191,7 @@ def _transforms(items: Iterable[Any]) -> Iterator[Transform]:
 
 def _finding(stream: str, finding: Mapping[str, str]) -> tuple[int, str, str, dict[str, str]]:
     """The diagnostic status of a finding of the run."""
-    level = _WARN if finding["severity"] == "warning" else _OK
+    level = {"warning": _WARN, "fault": _ERROR}.get(finding["severity"], _OK)
     return level, stream, finding["sentence"], {"finding": finding["sentence"], "severity": finding["severity"]}
 
 

@@ -32,6 +32,7 @@ from stages.data import Array, ElevationMap, Mount, Pose, StereoFrame
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
+LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
 STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
 FOOTER_MAGIC = b"RRF2FOOT"  # at the end of a whole recording, before a checksum of 4 bytes
 
@@ -153,7 +154,7 @@ class RerunSink:
         self._recording.log(LEDGER, rr.TextLog(text, level=level))
         found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
         for stream, finding in found:
-            level = rr.TextLogLevel.WARN if finding["severity"] == "warning" else rr.TextLogLevel.INFO
+            level = LEVELS.get(finding["severity"], rr.TextLogLevel.INFO)
             self._recording.log(LEDGER, rr.TextLog(f"{stream}: {finding['sentence']}", level=level))
         facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
         for key in {"surveys", "findings"} & facts.keys():

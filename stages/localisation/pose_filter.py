@@ -101,7 +101,7 @@ class PoseFilter(Stage):
     def finding(self, state: PoseMemory) -> Finding | None:
         """The source of the poses if it is not the log; a warning if tracking was lost or the log's poses are wrong."""
         if problem := state.check.problem():
-            return Finding(problem, Severity.WARNING)
+            return Finding(problem, Severity.WARNING, assumes="tilt")  # both use the mount of the camera
         losses = counted(state.segment - 1, "time")
         if state.estimate is None:
             if state.segment < 2:

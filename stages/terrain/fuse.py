@@ -122,7 +122,7 @@ class Fuse(Stage):
                 f"z of the pose's frame '{state.frame_id}' is {lean:.0f} degrees off the vertical of the tilt. The map "
                 "is upright, but its horizontal distances are too short. Record the pose in a frame whose z points up."
             )
-        return Finding(" ".join(found), Severity.WARNING) if found else None
+        return Finding(" ".join(found), Severity.WARNING, assumes="tilt") if found else None
 
     def _check(self, cloud: PointCloud, state: FusedMap) -> None:
         if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
@@ -153,7 +153,7 @@ class Fuse(Stage):
             levelling = state.levelling.moved(pose, stated).tilted(up, tilt_sigma)
             expected = levelling.plane(up)
             plane, covariance, overlaps = self._fitted(cells[frame.known], observed, expected)
-            if self._jumped(plane - expected, state):
+            if self._jumped(plane, expected, state):
                 state.reset(frame.terrain.frame_id, frame.terrain.stamp)
                 state.resets += 1
                 cells = np.zeros_like(cells)
@@ -162,8 +162,8 @@ class Fuse(Stage):
         if state.levelling is None:
             levelling = MapLevelling.begin(pose, stated).tilted(up, tilt_sigma).placed()
         levelling = levelling.corrected()
-        state.levelling, state.rejected = levelling, 0
-        return cells, levelling.plane(up)
+        state.levelling, state.plane, state.rejected = levelling, levelling.plane(up), 0
+        return cells, state.plane
 
     @property
     def _plane_sigma(self) -> Array:
@@ -190,14 +190,15 @@ class Fuse(Stage):
             plane = np.array([np.median(off), 0.0, 0.0])
         return plane, covariance, len(off) > 0
 
-    def _jumped(self, change: Array, state: FusedMap) -> bool:
+    def _jumped(self, plane: Array, expected: Array, state: FusedMap) -> bool:
         """Whether too many frames in succession do not align; raises StageError for the first of them.
 
-        change: (3,), of the aligning plane from the expected one.
+        plane: (3,), that aligns the frame. It must be near the expected one, or near that of the last frame.
         """
-        change = np.abs(change)
-        if np.all(change <= MAX_JUMP * self._plane_sigma):
+        changes = [np.abs(plane - other) for other in (expected, state.plane)]
+        if any(np.all(change <= MAX_JUMP * self._plane_sigma) for change in changes):
             return False
+        change = changes[0]
         state.rejected += 1
         if state.rejected < MAX_REJECTED:
             raise StageError(

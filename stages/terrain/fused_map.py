@@ -38,6 +38,7 @@ class FusedMap:
     has_ceiling: bool = False  # whether the frames contain occluded cells
     cells: Tiles = field(default_factory=lambda: Tiles(CELL))
     levelling: MapLevelling | None = None  # None before the first frame
+    plane: Array = field(default_factory=lambda: np.zeros(3))  # that aligned the last frame
     up_sum: Array = field(default_factory=lambda: np.zeros(3))  # of the tilts, in the map's frame
     rejected: int = 0  # frames in succession that did not align
     resets: int = 0  # because of them

@@ -65,7 +65,7 @@ def register(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tuple
     if lean > _MAX_LEAN:
         raise StageError(
             f"Fuse: z of the pose's frame '{pose.frame_id}' is {np.degrees(lean):.0f} degrees off the vertical of the "
-            "tilt; give a pose in a frame whose z points up"
+            "tilt; check the tilt, or give a pose in a frame whose z points up"
         )
     yaw = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
     rotation = Rotation.from_euler("z", yaw).as_matrix()

@@ -91,10 +91,11 @@ class Total:
         return Couple(couple.stamp, sum(state))
 
     def finding(self, state: list[float]) -> Finding | None:
-        """The sum of all, a warning from 30 on; it fails at 12."""
+        """The sum of all, a warning from 30 on, a fault at 42; it fails at 12."""
         if sum(state) == 12:
             raise RuntimeError("unlucky")
         severity = Severity.WARNING if sum(state) >= 30 else Severity.NOTE
+        severity = Severity.FAULT if sum(state) == 42 else severity
         return Finding(f"the sum is {sum(state)}", severity) if state else None
 
 

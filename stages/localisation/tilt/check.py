@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from flow.contracts import Finding, Severity
 from stages.data import Array, CameraMotion, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.localisation.tilt.causes import Evidence
-from stages.localisation.tilt.diagnosis import INCONSISTENT, Diagnosis, diagnose, off_level
+from stages.localisation.tilt.diagnosis import INCONSISTENT, OFF_GROUND, Diagnosis, diagnose, off_level
 from stages.robust_weights import MAD_TO_SIGMA, tukey_weights
 from stages.stage import Stage, parameter
 
@@ -114,15 +114,18 @@ class CheckTilt(Stage):
         return TiltHealth(motion.stamp, turn, slope, len(state.kept), judged.fault, judged.sentence)
 
     def finding(self, state: TiltMemory) -> Finding:
-        """The verdict of the whole run, including the frames after the last judgement; a fault is a warning."""
+        """The verdict of the whole run, including the frames after the last judgement.
+
+        If only the ground contradicts the tilt, that is a warning, because it may be steep.
+        """
         verdict = state.verdict
         if state.since:
             verdict = verdict.and_then(_diagnosis(state))
         if verdict.fault is None:
             judged = _reported(verdict, state)
-            return Finding(judged.sentence, Severity.WARNING if judged.fault else Severity.NOTE)
+            return _finding(judged)
         where = "" if verdict.faults == verdict.clear else f" ({verdict.faults} of {verdict.clear} judgements)"
-        return Finding(verdict.fault.sentence + where, Severity.WARNING)
+        return _finding(verdict.fault, where)
 
     def _keep(self, sample: _TiltSample, state: TiltMemory) -> None:
         """Keep the frame if the rover has moved, and judge again at intervals."""
@@ -140,6 +143,13 @@ class CheckTilt(Stage):
         state.since += 1
         if state.since >= JUDGEMENT_INTERVAL:
             state.verdict, state.since = state.verdict.and_then(_diagnosis(state)), 0
+
+
+def _finding(judged: Diagnosis, where: str = "") -> Finding:
+    severity = Severity.FAULT if judged.fault else Severity.NOTE
+    if judged.fault == OFF_GROUND:
+        severity = Severity.WARNING
+    return Finding(judged.sentence + where, severity, about="tilt")
 
 
 def _diagnosis(state: TiltMemory) -> Diagnosis:

@@ -6,7 +6,7 @@ import pytest
 
 from flow.cli.report import headline, report
 from flow.contracts import Finding, Severity
-from flow.runtime.findings import checked
+from flow.runtime.findings import checked, explained
 from flow.runtime.run import run
 from tests.flow.toys import Log, graph, replayed, traverse
 
@@ -25,6 +25,22 @@ def test_a_note_is_one_of_the_lines_and_a_warning_the_last(tmp_path, capsys):
     verdict, *more = printed(tmp_path, 6, capsys)
     assert verdict.startswith("COMPLETE: 6 of 6 frames complete")
     assert more == ["WARNING: total: the sum is 30.0"]
+
+
+def test_a_fault_makes_the_verdict_incomplete_and_is_printed_last(tmp_path, capsys):
+    verdict, *more = printed(tmp_path, 7, capsys)
+    assert verdict.startswith("INCOMPLETE: 7 frames complete, fault reported by total")
+    assert more == ["FAULT: total: the sum is 42.0"]
+
+
+def test_a_warning_that_assumes_what_has_a_fault_becomes_a_note():
+    fault = Finding("The mount is wrong.", Severity.FAULT, about="tilt")
+    blamed, other = (Finding("The pose leans.", Severity.WARNING, assumes=assumed) for assumed in ("tilt", ""))
+    found = explained({"pose": blamed, "wheels": other, "health": fault})
+    assert found["pose"].severity is Severity.NOTE
+    assert found["pose"].sentence == "The pose leans. The fault that health reports may be the cause."
+    assert (found["wheels"], found["health"]) == (other, fault)
+    assert explained({"pose": blamed}) == {"pose": blamed}
 
 
 def verdict_line(**changes):
@@ -76,5 +92,5 @@ def test_a_finding_of_another_type_becomes_a_warning():
 
 @pytest.mark.parametrize("found", [Finding("warning", "the mount is loose"), Finding("the mount is loose", "warn")])
 def test_a_finding_of_unknown_severity_becomes_a_warning(found):
-    wrong = f"(a Finding's severity must be note or warning, not '{found.severity}')"
+    wrong = f"(a Finding's severity must be one of note, warning, fault, not '{found.severity}')"
     assert checked(found) == Finding(f"{found.sentence} {wrong}", Severity.WARNING)

@@ -58,7 +58,7 @@ def test_a_flipped_sign_is_found_within_30_frames_and_reported_at_the_end():
     first = next(count for count, health in enumerate(found) if health.fault)
     assert first < 30
     assert "The sign of pitch is flipped" in stage.finding().sentence
-    assert stage.finding().severity is Severity.WARNING
+    assert stage.finding().severity is Severity.FAULT
     assert stage.finding() == stage.finding()  # asking changes nothing
 
 
