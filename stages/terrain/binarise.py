@@ -54,6 +54,10 @@ class Binarise(Stage):
         0.1, "depth of hidden ground below its surroundings from which it may be a drop; of a ditch only a part "
         "of the depth is measurable", unit="m", low=0.0,
     )  # fmt: skip
+    min_rise: float = parameter(
+        0.05, "height above the ground at the edge of view from which an obstacle may go on out of view; of a step "
+        "twice as much", unit="m", low=0.0,
+    )  # fmt: skip
     steepness_error: float = parameter(0.25, "relative error of the difference between steepness and slope", low=0.0)
     min_points: int = parameter(1, "points of a free cell, if the map counts them", low=1)
 
@@ -103,6 +107,7 @@ class Binarise(Stage):
         if "variance" in elevation.layers:
             known &= elevation.layers["variance"] <= self.max_sigma**2
         known &= steepness + self.steepness_error * (steepness - slope) <= limit
+        known &= ~self._cut(elevation, observed, above, step)
         known &= ~self._brink(elevation) & ~_dilated(high | belly, RIM / elevation.resolution)
         reason = np.where(known, CellReason.CLEAR, CellReason.UNSURE)
         reason[_dilated(high | belly, self.hazard_margin / elevation.resolution)] = CellReason.BESIDE
@@ -111,6 +116,21 @@ class Binarise(Stage):
         reason[belly] = CellReason.CLEARANCE
         reason[high] = CellReason.STEP
         return reason
+
+    def _cut(self, elevation: ElevationMap, observed: Array, above: Array, step: Array) -> Array:
+        """Cells (rows, cols) bool of obstacles that the edge of view may cut, and those within half a wheel of the cut.
+
+        above: height above the ground, m. A step counts from twice `min_rise`, because slopes and noise add to it.
+        """
+        if "occluded" not in elevation.layers:
+            return np.zeros(elevation.shape, bool)
+        out_of_view = ~observed & ~(elevation.layers["occluded"] == 1)
+        raised = observed & ((above >= self.min_rise) | (step >= 2 * self.min_rise))
+        cut = raised & _dilated(out_of_view, 1)
+        if not cut.any():
+            return cut
+        near = _dilated(cut, np.ceil(self.rover.wheel / 2 / elevation.resolution - 1e-6))
+        return near | binary_dilation(cut, np.ones((3, 3)), iterations=-1, mask=raised)
 
     def _brink(self, elevation: ElevationMap) -> Array:
         """Cells within half a wheel of hidden ground that falls away, (rows, cols) bool."""

@@ -388,3 +388,18 @@ def test_a_cell_without_a_steepness_is_not_free() -> None:
     height[40:43, 40:43] = 0.25
     navigation = decided(map_of(height), rover=Rover(max_step=0.4, ground_clearance=0.5))
     assert (navigation.cells[40:43, 40:43] == Cell.UNKNOWN).all()
+
+
+@pytest.mark.parametrize(("cut", "free"), [(True, 0.0), (False, 1.0)])
+def test_a_low_flank_is_free_only_if_its_top_is_in_view(cut: bool, free: float) -> None:
+    x, y = grid()
+    top, slope = (0.3, 0.6) if cut else (0.09, 0.2)
+    height = np.maximum(top - slope * np.hypot(x - 2, y - 2), 0)
+    seen = x < 1.65 if cut else x < 3
+    terrain = map_of(np.where(seen, height, np.nan), occluded=np.where(seen, 0.0, np.nan).astype(np.float32))
+    result = decided(terrain)
+    assert np.nanmax(terrain.layers["elevation"]) < 0.1
+    flank = seen & (height > 0.05)
+    assert flank.sum() > 5
+    assert (result.cells[flank] == Cell.FREE).mean() == free
+    assert (result.cells[seen & (np.hypot(x - 2, y - 2) > 0.9)] == Cell.FREE).mean() > 0.9
