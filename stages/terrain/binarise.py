@@ -130,7 +130,7 @@ class Binarise(Stage):
         if not cut.any():
             return cut
         near = _dilated(cut, np.ceil(self.rover.wheel / 2 / elevation.resolution - 1e-6))
-        return near | binary_dilation(cut, np.ones((3, 3)), iterations=-1, mask=raised)
+        return np.asarray(near | binary_dilation(cut, np.ones((3, 3)), iterations=-1, mask=raised))
 
     def _brink(self, elevation: ElevationMap) -> Array:
         """Cells within half a wheel of hidden ground that falls away, (rows, cols) bool."""
