@@ -153,6 +153,9 @@ def speed() -> None:
                     pipeline, frame, DISPARITIES, threads, "rectified"
                 )
             )
+    contestants["rover without support, 1 threads"] = lambda: stereo_part(
+        "rover", frame, DISPARITIES, 1, "rectified", changes={"support": False}
+    )
     seconds = medians(contestants, ROUNDS)
     print(f"{'1280x960, 192 disparities, median of ' + str(ROUNDS):48} {'ms':>8}")
     for name, value in seconds.items():
@@ -160,6 +163,8 @@ def speed() -> None:
     opencv, their_slic, our_slic, their_planes, our_planes, *_ = seconds.values()
     print(f"SLIC over scikit-image's                        {our_slic / their_slic:8.3f}")
     print(f"planes over scikit-image's, extrapolated        {our_planes / (their_planes * count / SAMPLE):8.4f}")
+    support = seconds["rover, match and refine, 1 threads"] - seconds["rover without support, 1 threads"]
+    print(f"support over MODE_HH, on one core               {support / opencv:8.3f}")
     for pipeline in ("rover", "fast"):
         whole = seconds[f"{pipeline}, match and refine, 2 threads"]
         print(f"{pipeline} over MODE_HH and scikit-image's SLIC alone {whole / (opencv + their_slic):8.3f}")
