@@ -55,7 +55,7 @@ def simulated(width: int = 640, height: int = 480) -> list[Case]:
     """Frames of simulated traverses, of the ground within the search range."""
     cases = []
     for seed, abundance in zip(SEEDS, ABUNDANCES, strict=True):
-        simulation = Simulation(scene="gravel", frames=4, width=width, height=height, seed=seed, abundance=abundance)
+        simulation = Simulation(frames=4, width=width, height=height, seed=seed, abundance=abundance)
         camera, found = simulation.camera, simulation.frame(1)
         truth = (camera.fx * camera.baseline / found.depth).astype(np.float32)
         disparities = 192 * width // 1280
