@@ -47,6 +47,7 @@ REASON_LEGEND: Legend = {
     CellReason.BESIDE: ("beside", (250, 205, 130)),
     CellReason.OCCLUDED: ("occluded", (96, 84, 110)),
     CellReason.UNSURE: ("unsure", (120, 130, 128)),
+    CellReason.UNMATCHED: ("unmatched", (110, 120, 170)),
 }
 
 _SUN = np.array([1.0, 1.0, np.sqrt(2.0)]) / 2.0  # from ahead on the left, 45 degrees high: the upper left of the map

@@ -13,7 +13,7 @@ from stages.data.arrays import Array
 from stages.data.camera import CameraImage, CameraModel, ImageNoise, StereoCamera, StereoFrame
 from stages.data.cloud import PointCloud, VoxelMap
 from stages.data.disparity import Disparity, MatchHealth
-from stages.data.maps import LEVEL_FRAME, Cell, CellReason, ElevationMap, NavigationMap
+from stages.data.maps import LEVEL_FRAME, Cell, CellReason, ElevationMap, MatchFailure, NavigationMap
 from stages.data.motion import CameraMotion, Mount, Pose, Tilt, TiltHealth, Transform
 from stages.data.pixel_validity import PixelOrigin, known
 from stages.data.rover import Rover
@@ -30,6 +30,7 @@ __all__ = [
     "Disparity",
     "ElevationMap",
     "ImageNoise",
+    "MatchFailure",
     "MatchHealth",
     "Mount",
     "NavigationMap",

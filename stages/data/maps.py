@@ -35,8 +35,18 @@ class CellReason(IntEnum):
     ROUGHNESS = 5
     CLEARANCE = 6  # it would touch the rover's belly
     BESIDE = 7  # next to an obstacle, closer than its outline is known
-    OCCLUDED = 8  # unknown: hidden from the cameras or not matched, between or behind measured ground
+    OCCLUDED = 8  # unknown: hidden from the cameras, between or behind measured ground
     UNSURE = 9  # unknown: measured, but on too little evidence
+    UNMATCHED = 10  # unknown: in the image, but its pixels were not matched
+
+
+class MatchFailure(IntEnum):
+    """Why the pixels of a cell were not matched: the codes of the layer `unmatched`."""
+
+    DARK = 1
+    BURNT_OUT = 2
+    BARE = 3  # without contrast
+    OTHER = 4  # seen by one camera, repetitive, reflecting
 
 
 @dataclass(frozen=True, eq=False)

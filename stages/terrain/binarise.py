@@ -18,7 +18,7 @@ from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, Ro
 from stages.stage import Stage, parameter
 
 LAYERS = ("ground", "step", "slope", "steepness", "roughness", "support")  # of TerrainFeatures
-UNKNOWN = (CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNSURE)
+UNKNOWN = (CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNMATCHED, CellReason.UNSURE)
 RIM = 0.1  # m; cells this near to an obstacle are not free
 MIN_SUPPORT = 0.3  # share of the cells within a wheel's reach that are known, for a free cell
 MAX_DROP_DISTANCE = 1.0  # m through hidden cells, from where hidden ground is low to where it may begin to fall
@@ -82,7 +82,9 @@ class Binarise(Stage):
         if "count" in elevation.layers:
             reason[(reason == CellReason.CLEAR) & (elevation.layers["count"] < self.min_points)] = CellReason.UNSURE
         hidden = elevation.layers.get("occluded", np.zeros_like(height)) == 1
+        seen = np.isfinite(elevation.layers.get("unmatched", np.full_like(height, np.nan)))
         reason[~observed] = np.where(hidden, CellReason.OCCLUDED, CellReason.UNOBSERVED)[~observed]
+        reason[~observed & seen] = CellReason.UNMATCHED
         cells = np.full(reason.shape, Cell.HAZARD, np.int8)
         cells[reason == CellReason.CLEAR] = Cell.FREE
         cells[np.isin(reason, UNKNOWN)] = Cell.UNKNOWN

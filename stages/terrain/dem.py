@@ -19,6 +19,7 @@ from stages.terrain.kernels.grid import FIGURES, Grid, cell_percentile, cell_sta
 from stages.terrain.kernels.occlusion import occlusion_ceiling
 from stages.terrain.kernels.splat_along_ray import splat_along_ray
 from stages.terrain.kernels.staying_points import staying_points
+from stages.terrain.match_failure import match_failure
 
 MIN_SPLAT_CELLS = 0.5  # points with a shorter reach are not splatted
 MIN_SPLATS = 2  # in a cell without a point of its own
@@ -33,8 +34,8 @@ class Voxelise(Stage):
     """Averages a levelled cloud over the cells of a grid.
 
     Adds the layers elevation, minimum, maximum, count, variance and common_variance; interpolated, occluded and ceiling
-    if the camera is known; filled if the cloud contains points that were not measured; percentile_P for each of
-    `percentiles`.
+    if the camera is known; filled and unmatched if the cloud contains points that were not measured; percentile_P for
+    each of `percentiles`.
     docs/terrain.md defines the layers and the model of variance.
 
     Examples
@@ -98,6 +99,7 @@ class Voxelise(Stage):
             figures = _statistics(guessed, grid)
             with np.errstate(invalid="ignore", divide="ignore"):
                 layers["filled"] = np.where(layers["count"] > 0, np.nan, figures[:, :, 1] / figures[:, :, 0])
+            layers["unmatched"] = np.where(layers["count"] > 0, np.nan, match_failure(guessed, grid))
         for value in self.percentiles:
             layers[f"percentile_{value:g}"] = cell_percentile(measured.points, value, grid)
         layers = {name: layer.astype(np.float32) for name, layer in layers.items()}

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import binary_dilation
 
-from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, Rover
+from stages.data import Array, Cell, CellReason, ElevationMap, MatchFailure, NavigationMap, Rover
 from stages.terrain.binarise import Binarise
 from stages.terrain.features import TerrainFeatures
 from tests.stages.terrain.terrain_scene import Terrain, map_of, rolling_terrain
@@ -219,14 +219,18 @@ def test_cells_within_the_hazard_margin_of_an_obstacle_are_hazards() -> None:
         np.testing.assert_array_equal(result.reason == CellReason.BESIDE, around)
 
 
-def test_empty_cells_are_occluded_or_unobserved_and_lone_ones_unsure() -> None:
+def test_empty_cells_are_unmatched_occluded_or_unobserved() -> None:
     flat, occluded = np.zeros((80, 80)), np.zeros((80, 80))
     flat[20:40, 20:40] = np.nan
     occluded[20:40, 20:30], occluded[20:40, 30:40] = 1, np.nan
     flat[30, 31] = 0.0
     occluded[30, 31] = 0
-    result = decided(map_of(flat, occluded=occluded))
-    assert (result.reason[occluded == 1] == CellReason.OCCLUDED).all()
+    unmatched = np.full((80, 80), np.nan)
+    unmatched[20:40, 20:23] = MatchFailure.DARK
+    seen = np.isfinite(unmatched)
+    result = decided(map_of(flat, occluded=occluded, unmatched=unmatched))
+    assert (result.reason[seen] == CellReason.UNMATCHED).all()
+    assert (result.reason[(occluded == 1) & ~seen] == CellReason.OCCLUDED).all()
     assert (result.reason[np.isnan(occluded)] == CellReason.UNOBSERVED).all()
     assert result.reason[30, 31] == CellReason.UNSURE
     assert (result.cells[20:40, 20:40] == Cell.UNKNOWN).all()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stages.cloud.clean import Clean
 from stages.cloud.level import Level
 from stages.cloud.reproject import Reproject
-from stages.data import LEVEL_FRAME, Array, PixelOrigin, PointCloud, Tilt, Transform
+from stages.data import LEVEL_FRAME, Array, MatchFailure, PixelOrigin, PointCloud, Tilt, Transform
 from stages.terrain.dem import Voxelise
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature, gradient_and_curvature_reference
 from stages.terrain.kernels.grid import Grid, cell_statistics, cell_statistics_reference
@@ -122,6 +122,20 @@ def test_filled_points_are_a_layer_of_their_own_unless_counted(filled: PixelOrig
     assert counted.layers["elevation"][np.isfinite(counted.layers["elevation"])] == pytest.approx([0.5, 0.5])
     assert "filled" not in counted.layers
     assert "filled" not in Voxelise()(cloud_of(points)).layers
+
+
+def test_cells_of_filled_pixels_have_the_cause_of_the_failed_match() -> None:
+    textured = np.tile([60, 140], 5)
+    shades = {MatchFailure.DARK: 5, MatchFailure.BURNT_OUT: 255, MatchFailure.BARE: 120, MatchFailure.OTHER: textured}
+    x = np.arange(2.02, 2.5, 0.1)[:5]
+    points = np.column_stack([x.repeat(10), np.full(50, 0.01), np.zeros(50)])
+    gray = np.concatenate([np.broadcast_to(shade, 10) for shade in (*shades.values(), 90)])
+    source = np.repeat([PixelOrigin.FILLED] * 4 + [PixelOrigin.MEASURED], 10).astype(np.uint8)
+    cloud = replace(cloud_of(points), source=source, colors=gray.astype(np.uint8)[:, None].repeat(3, axis=1))
+    cells = Voxelise()(cloud)
+    codes = cells.layers["unmatched"][160, 200:210:2]
+    np.testing.assert_array_equal(codes, [*shades, np.nan])
+    assert np.isfinite(cells.layers["unmatched"]).sum() == 4
 
 
 def test_cells_behind_a_rock_are_occluded_and_cells_out_of_view_are_not() -> None:
