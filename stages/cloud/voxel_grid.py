@@ -29,7 +29,9 @@ class VoxelGrid(Stage):
     """
 
     resolution: float = parameter(0.05, "edge of a voxel", unit="m", low=0.005, high=2.0)
-    max_range: float = parameter(8.0, "horizontal range from the level frame's origin", unit="m", low=0.1, high=200.0)
+    max_range: float = parameter(
+        8.0, "horizontal range from the level frame's origin (base_link)", unit="m", low=0.1, high=200.0
+    )
     min_points: int = parameter(1, "voxels with fewer points are left out", low=1)
 
     def __post_init__(self) -> None:

@@ -49,7 +49,7 @@ class Voxelise(Stage):
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
     max_range: float = parameter(
-        8.0, "horizontal range from the level frame's origin kept in the map", unit="m", low=0.1, high=200.0
+        8.0, "horizontal range from the level frame's origin (base_link) kept in the map", unit="m", low=0.1, high=200.0
     )
     correlated_points: float = parameter(4.0, "neighbouring points that share one matching error", low=1.0)
     systematic_share: float = parameter(
