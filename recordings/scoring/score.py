@@ -35,6 +35,7 @@ TRUTHS = (
     "/truth/disparity", "/truth/occlusion", "/truth/terrain_class", "/truth/elevation_map", "/truth/navigation_map",
     "/truth/rocks", "/truth/tilt", "/truth/pose",
 )  # fmt: skip
+SCORED_LAYERS = {"elevation", "variance", "common_variance", "interpolated"}
 CAMERA_RTOL = 1e-3  # of focal length and baseline; cameras that differ by less are the same
 
 
@@ -317,7 +318,7 @@ class _Tally:
 def _layers(message: Any, onto: ElevationMap) -> dict[str, Array]:
     """The scored layers of a GridMap, on the cells of `onto`. Raises ValueError if it does not fit."""
     grid = ros2.read_grid_map(message)
-    wanted = sorted(grid.layers.keys() & {"elevation", "variance", "common_variance"})
+    wanted = sorted(grid.layers.keys() & SCORED_LAYERS)
     return {name: _fitted(grid, grid.layers[name], onto, np.nan) for name in wanted}
 
 

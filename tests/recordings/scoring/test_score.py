@@ -89,7 +89,9 @@ class Run:
         return {
             "/nav/disparity": ros2.disparity_image(disparity),
             "/nav/elevation_map": ros2.grid_map(
-                ElevationMap(stamp, {"elevation": layer}, self.resolution, origin, "level")
+                ElevationMap(
+                    stamp, {"elevation": layer, "interpolated": np.ones_like(layer)}, self.resolution, origin, "level"
+                )
             ),
             "/nav/navigation_map": ros2.occupancy_grid(
                 NavigationMap(stamp, cells, reason, self.navigation or self.resolution, origin, "level")
@@ -204,6 +206,7 @@ def test_values_where_no_camera_sees_the_ground_are_hallucinated(tmp_path, truth
     in_view = [ground_truth.truth_maps(SMALL, 0, frame)[0].layers["in_view"][near] > 0.5 for frame in frames]
     found = scored(tmp_path, truth, frames).terrain["hallucinated"]
     assert found["of_values"] == pytest.approx(1 - np.mean(in_view))
+    assert found["claimed"] == 0 < found["unseen"]  # the map marks all cells as interpolated
 
 
 def test_a_smaller_map_is_compared_by_place_and_loses_completeness(tmp_path, truth, frames):
