@@ -10,17 +10,20 @@ from scipy.spatial.transform import Rotation
 from stages.data import Array
 from tests.conftest import edit_of, rewrite
 
-# The part of the default pipeline that the tilt check and visual odometry need.
+# The part of the default pipeline that the tilt check, visual odometry and the regional map need.
 PIPELINE = """
 source: {use: recordings.McapSource}
 streams:
   stereo:    {use: flow.align.pair, left: left, right: right, slop: 5 ms}
   tilt:      {use: flow.align.interpolate, stream: inclinometer, at: stereo, smooth: 100 ms}
+  logged:    {use: flow.align.interpolate, stream: odometry, at: stereo, max_gap: 1 s}
   mounting:  {use: flow.align.latest, stream: mount, at: stereo}
   matched:   {use: stages.Match, frame: stereo, disparities: 64, max_speckle_size: 100}
   cloud:     {use: stages.Reproject, frame: stereo, disparity: matched}
   motion:    {use: stages.VisualOdometry, frame: stereo, disparity: matched}
   pose:      {use: stages.PoseFilter, motion: motion, tilt: tilt, mount: mounting}
+  level:     {use: stages.Level, cloud: cloud, tilt: tilt, mount: mounting}
+  region:    {use: stages.Fuse, cloud: level, pose: logged, mount: mounting}
   health:    {use: stages.CheckTilt, motion: motion, tilt: tilt, mount: mounting, cloud: cloud}
 sinks:
   - {use: recordings.McapSink, results: [pose]}

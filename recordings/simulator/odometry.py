@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from recordings.simulator.traverse import level_pose
 from stages.data import Array, Pose, Transform
 
-MIN_POSITION_SIGMA, MIN_HEADING_SIGMA = 1e-3, 3e-3  # m and rad, in the covariance of an exact odometry
+# In the covariance of an exact odometry, m and rad. Roll and pitch never have an error.
+MIN_POSITION_SIGMA, MIN_HEADING_SIGMA, ATTITUDE_SIGMA = 1e-3, 3e-3, 5e-4
 
 
 def dead_reckoning(
@@ -54,4 +55,4 @@ def _covariance(distance: float, scale: float, turn: float) -> Array:
     """(6, 6) of position, m, and rotation, rad, after a straight drive of `distance`, m."""
     place = (scale * distance) ** 2 + turn**2 * distance**3 / 3 + MIN_POSITION_SIGMA**2
     heading = turn**2 * distance + MIN_HEADING_SIGMA**2
-    return np.diag([place, place, place, MIN_HEADING_SIGMA**2, MIN_HEADING_SIGMA**2, heading])
+    return np.diag([place, place, place, ATTITUDE_SIGMA**2, ATTITUDE_SIGMA**2, heading])

@@ -5,6 +5,8 @@ placed by pose and tilt alone, and for frames placed by `stages.Fuse` (the trans
 The truth is the mean height of the exact surface over each cell that a frame changed. It is moved into the pose's frame
 with that frame's own pose, so errors of odometry do not count. A plane per frame, the error of the tilt, is removed.
 The last line covers the cells of all traverses.
+
+A second table shows the lean and the height of the last map of longer drives with exact odometry and noisy tilts.
 """
 
 from __future__ import annotations
@@ -27,9 +29,13 @@ from recordings.ros2.from_msg import transform_of
 from recordings.scoring.metrics import without_plane
 from recordings.simulator import Simulation, raycast, traverse, write_log
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Pose, Transform
+from stages.terrain.height_alignment import fit_plane
 
 RUNS = ((11, 0.05), (12, 0.15), (13, 0.15))
 FRAMES = 8
+DRIVES = (("gravel", 1), ("gravel", 2), ("gravel", 3), ("mixed", 1))
+DRIVE_FRAMES, PART = 50, 1.0  # PART: m, length of a part of a drive whose height is compared with the truth
+MIN_CELLS = 300  # of a part
 CELL, REACH, FINE = 0.05, 8.0, 3  # FINE: points along a cell's side that its true mean is of
 COLUMNS = (
     ("seed", 5), ("rocks k", 8), ("seam cm: placed", 16), ("worst", 6), ("fused", 6), ("worst", 6), ("RMSE cm", 8),
@@ -69,6 +75,12 @@ def main() -> None:
         cells = [str(seed), f"{abundance:g}", *regions[-1].row()]
         print(" ".join(f"{cell:>{width}}" for cell, (_, width) in zip(cells, COLUMNS, strict=True)), flush=True)
     print(f"within 1, 2 sigma, all cells: {within(regions)} %")
+    print(f"\nlast map of {DRIVE_FRAMES} frames of 640x480 against exact odometry, inclinometer noise 0.2 degrees")
+    for scene, seed in DRIVES:
+        with tempfile.TemporaryDirectory() as folder:
+            lean, height, worst = drift(drive_of(scene, seed), Path(folder))
+        heights = f"height {100 * height:+.2f} cm, of the worst metre {100 * worst:+.2f} cm"
+        print(f"{scene} {seed}: lean {np.degrees(lean):.3f} degrees, {heights}", flush=True)
 
 
 def traverse_of(seed: int, abundance: float) -> Simulation:
@@ -78,15 +90,51 @@ def traverse_of(seed: int, abundance: float) -> Simulation:
     )  # fmt: skip
 
 
+def drive_of(scene: str, seed: int) -> Simulation:
+    """A drive with exact odometry."""
+    return Simulation(
+        frames=DRIVE_FRAMES, width=640, height=480, seed=seed, scene=scene, tilt_noise=np.radians(0.2),
+        odometry_scale=0.0, odometry_turn=0.0,
+    )  # fmt: skip
+
+
+def drift(simulation: Simulation, folder: Path) -> tuple[float, float, float]:
+    """The lean, rad, of the last map; its height, m, less the truth; and the same of the worst metre of the drive."""
+    out = _run(simulation, folder)
+    terrain = list(_frames(out).values())[-1]["/nav/regional_map"]
+    assert isinstance(terrain, ElevationMap)
+    known = np.isfinite(terrain.layers["elevation"])
+    x, y = ((np.arange(n) + 0.5) * CELL + at for n, at in zip(terrain.shape[::-1], terrain.origin, strict=True))
+    odom = traverse.level_pose(simulation.base_at(simulation.odometry[0].stamp))
+    error = terrain.layers["elevation"][known] - _surface(simulation, odom, x, y, known) + odom.translation[2]
+    east, north = (middle[known] for middle in np.meshgrid(x, y))
+    centred, loose = (east - east.mean(), north - north.mean()), np.full(3, 10.0)
+    plane, _ = fit_plane(*centred, error, terrain.layers["variance"][known].astype(np.float64), loose, CELL)
+    track = np.array([pose.position for pose in simulation.odometry])
+    ends = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1)))
+    near = track[np.searchsorted(ends, np.arange(0.0, ends[-1] + REACH, PART)).clip(max=len(track) - 1)]
+    nearest = np.argmin(np.hypot(east[:, None] - near[:, 0], north[:, None] - near[:, 1]), axis=1)
+    parts = [error[nearest == part] for part in range(len(near))]
+    heights = [float(np.median(part)) for part in parts if len(part) >= MIN_CELLS]
+    return float(np.hypot(*plane[1:])), float(plane[0]), max(heights, key=abs)
+
+
 def region(simulation: Simulation, folder: Path) -> Region:
     """The regional map of a traverse, by the command line's default pipeline."""
+    log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
+    _run(simulation, folder)
+    frames = _frames(out)
+    errors = _errors(simulation, [frame["/nav/regional_map"] for frame in frames.values()])
+    return Region(_seams(simulation, log, frames), *errors, json.loads(summary.read_text())["seconds"])
+
+
+def _run(simulation: Simulation, folder: Path) -> Path:
+    """The result log of a simulation."""
     log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
     write_log(simulation, log)
     command = [sys.executable, "-m", "flow", "run", log, "-o", out, "--no-rrd", "--summary", summary]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    frames = _frames(out)
-    errors = _errors(simulation, [frame["/nav/regional_map"] for frame in frames.values()])
-    return Region(_seams(simulation, log, frames), *errors, json.loads(summary.read_text())["seconds"])
+    return out
 
 
 def shares_within(regions: list[Region]) -> tuple[float, float]:

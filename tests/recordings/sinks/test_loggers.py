@@ -140,12 +140,12 @@ def test_the_tilt_check_is_plotted_and_its_fault_logged_once(rrd, tmp_path):
         tmp_path / "run.rrd", [Record(START, scene()), Record(START + STEP, scene(START + STEP))],
         {
             "verdict": "COMPLETE",
-            "findings": {"health": {"severity": "warning", "sentence": "the sign of pitch is flipped"}},
+            "findings": {"health": {"severity": "fault", "sentence": "the sign of pitch is flipped"}},
         },
     )  # fmt: skip
     assert [value for *_, value in rows(path, "/ledger/health", "TextLog:text")] == [["turn it round"]]
     assert rows(path, "/ledger", "TextLog:text")[-1][2] == ["health: the sign of pitch is flipped"]
-    assert rows(path, "/ledger", "TextLog:level")[-1][2] == ["WARN"]
+    assert rows(path, "/ledger", "TextLog:level")[-1][2] == ["ERROR"]
 
 
 def test_the_logs_own_pose_is_drawn_once(tmp_path):

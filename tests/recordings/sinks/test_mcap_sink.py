@@ -202,7 +202,8 @@ def test_tilt_health_and_findings_are_in_the_diagnostics(tmp_path):
     fault = TiltHealth(START, 0.05, float("nan"), 40, "the sign of pitch is flipped", "turn it round")
     sink.write(Record(START, {"health": fault}))
     found = {
-        "health": {"severity": "warning", "sentence": "turn it round"},
+        "health": {"severity": "fault", "sentence": "turn it round"},
+        "region": {"severity": "warning", "sentence": "reset"},
         "pose": {"severity": "note", "sentence": "visual"},
     }
     sink.close(SUMMARY | {"findings": found, "entries": []})
@@ -212,5 +213,5 @@ def test_tilt_health_and_findings_are_in_the_diagnostics(tmp_path):
     values = {value.key: value.value for value in frame[1].values}
     assert values == {"tilt off turn": "2.865 deg", "frames": "40", "fault": "the sign of pitch is flipped"}
     assert [(status.level, status.name, status.message) for status in end] == [
-        (1, "health", "turn it round"), (0, "pose", "visual"),
+        (2, "health", "turn it round"), (1, "region", "reset"), (0, "pose", "visual"),
     ]  # fmt: skip

@@ -12,7 +12,7 @@ from flow.contracts import Severity
 from stages import Fuse, Pose, Transform
 from stages.terrain.map_registration import register
 from tests.stages.running import Running
-from tests.stages.terrain.region_scene import MOUNT, START, drive, flat, part
+from tests.stages.terrain.region_scene import MOUNT, START, centres, drive, flat, part, rolling
 
 
 def heights(cloud, placed):
@@ -62,6 +62,21 @@ def test_the_tilt_error_of_a_frame_does_not_tilt_the_map_of_a_precise_pose(covar
     found, terrain = leans_of_the_map(covariance)
     assert np.abs(found[1:]).max() < 0.1
     assert np.nanmax(np.abs(terrain.layers["elevation"])) < 0.01
+
+
+def test_a_map_of_noisy_tilts_and_exact_poses_is_level_and_at_the_true_height():
+    tilts, fuse = np.radians(0.2) * np.random.default_rng(3).normal(size=(50, 2)), Running(Fuse())
+    for frame, tilt in enumerate(tilts):
+        cloud, pose = drive(frame, tilt=tuple(tilt), at=(0.3 * frame, 0.0, 0.0))
+        terrain = fuse(replace(part(cloud, np.s_[::20]), tilt_sigma=np.radians(0.2)), pose, MOUNT)
+    x, y = centres(terrain)
+    error = terrain.layers["elevation"] - rolling(x, y)
+    known = np.isfinite(error)
+    design = np.column_stack([x[known], y[known], np.ones(known.sum())])
+    slopes = np.linalg.lstsq(design, error[known], rcond=None)[0][:2]
+    assert np.degrees(np.hypot(*slopes)) < 0.05
+    for place in range(6, 22, 2):
+        assert abs(np.median(error[known & (np.abs(x - place) < 1)])) < 0.01
 
 
 def test_a_pose_of_the_camera_gives_the_map_of_a_pose_of_the_rover():
