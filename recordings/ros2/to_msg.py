@@ -76,16 +76,19 @@ def camera_info(stamp: int, frame_id: str, model: CameraModel) -> Any:
     )  # fmt: skip
 
 
-def disparity_image(disparity: Disparity) -> Any:
+def disparity_image(disparity: Disparity, step: float = 0.0) -> Any:
     """stereo_msgs/DisparityImage, 32FC1, NaN = unknown.
 
     As in stereo_image_proc the pixels are d + cx_right - cx, so Z = f * t / d holds. f and t are NaN for an unknown
-    camera; min_disparity and max_disparity are the image's own range, NaN if empty.
+    camera; min_disparity and max_disparity are the image's own range, NaN if empty. step: px, to multiples of which
+    the pixels are rounded, and delta_d; 0: exact.
     """
     camera = disparity.camera
     pixels, frame_id = disparity.pixels, _frame_of(disparity)
     if camera is not None and camera.cx_right != camera.cx:
         pixels = pixels + np.float32(camera.cx_right - camera.cx)
+    if step:
+        pixels = np.rint(pixels * np.float32(1 / step)) * np.float32(step)
     known = pixels[np.isfinite(pixels)]
     height, width = pixels.shape
     return make(
@@ -94,7 +97,7 @@ def disparity_image(disparity: Disparity) -> Any:
         f=camera.fx if camera is not None else np.nan, t=camera.baseline if camera is not None else np.nan,
         valid_window=_region(width, height),
         min_disparity=float(known.min()) if known.size else np.nan,
-        max_disparity=float(known.max()) if known.size else np.nan, delta_d=0.0,
+        max_disparity=float(known.max()) if known.size else np.nan, delta_d=step,
     )  # fmt: skip
 
 

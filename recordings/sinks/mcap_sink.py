@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -30,17 +30,10 @@ from recordings.ros2.to_msg import (
     transform_message,
 )
 from recordings.sinks.own_types import leaves, plain_type, refusal
+from recordings.sinks.thinning import thinned
 from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
 
-# Type -> its messages: topic below that of the stream -> builder. What a message has no room for goes beside it.
-_MESSAGES: dict[type, dict[str, Callable[[Any], Any]]] = {
-    Disparity: {"": disparity_image, "/source": source_image},
-    PointCloud: {"": point_cloud},
-    ElevationMap: {"": grid_map},
-    NavigationMap: {"": occupancy_grid, "/reason": reason_map},
-    Pose: {"": odometry},
-}
-_KNOWN = (*_MESSAGES, Transform)
+_KNOWN = (Disparity, PointCloud, ElevationMap, NavigationMap, Pose, Transform)
 _OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/DiagnosticStatus
 _COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
 
@@ -67,6 +60,13 @@ class McapSink:
         "streams to write; the run leaves no log if it makes none of them",
     )
     also: tuple[str, ...] = parameter((), "further streams to write")
+    disparity_step: float = parameter(
+        1 / 32, "what disparities are rounded to, which takes a third of the room; 0: exact", unit="px", low=0, high=1
+    )
+    point_spacing: float = parameter(
+        0.02, "side of the cubes of which each keeps one point, the first in the cloud; 0: all points", unit="m",
+        low=0, high=10,
+    )  # fmt: skip
     compression: str = parameter(
         "lz4", "of the log; zstd takes a fifth less room than lz4 and twice the time", choices=tuple(COMPRESSIONS)
     )
@@ -160,12 +160,8 @@ class McapSink:
         """Topic and message of each part of an item."""
         for path, leaf in leaves(item, self._kinds.get(stream, type(item)), _KNOWN):
             topic = "/".join(["/nav", stream, *map(_topic_part, path)])
-            builders = next((_MESSAGES[base] for base in type(leaf).__mro__ if base in _MESSAGES), None)
             try:
-                if builders is None:
-                    found = {"": message_of(leaf, stamp, str(getattr(item, "frame_id", "")))}
-                else:
-                    found = {below: build(leaf) for below, build in builders.items()}
+                found = self._built(leaf, stamp, str(getattr(item, "frame_id", "")))
             except ValueError as error:
                 raise LogError(f"McapSink cannot write '{'/'.join((stream, *path))}': {error}") from error
             for below, message in found.items():
@@ -174,6 +170,22 @@ class McapSink:
                     one, other = ("/".join(names) for names in (owner, (stream, *path)))
                     raise LogError(f"McapSink cannot write both '{one}' and '{other}' to {topic + below}; rename one")
                 yield topic + below, message
+
+    def _built(self, leaf: Any, stamp: int, frame_id: str) -> dict[str, Any]:
+        """The messages of a value, by the part of their topic below that of the stream."""
+        match leaf:
+            case Disparity():
+                return {"": disparity_image(leaf, self.disparity_step), "/source": source_image(leaf)}
+            case PointCloud():
+                return {"": point_cloud(thinned(leaf, self.point_spacing))}
+            case ElevationMap():
+                return {"": grid_map(leaf)}
+            case NavigationMap():  # an OccupancyGrid has no room for the reasons
+                return {"": occupancy_grid(leaf), "/reason": reason_map(leaf)}
+            case Pose():
+                return {"": odometry(leaf)}
+            case _:
+                return {"": message_of(leaf, stamp, frame_id)}
 
 
 def _topic_part(name: str) -> str:

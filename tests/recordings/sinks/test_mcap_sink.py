@@ -85,7 +85,8 @@ def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path):
     assert topics == [(t, 0) for t in frame] + [(t, 100) for t in second] + [("/nav/diagnostics", 100)]
     first = {topic: message for topic, stamp, message in read if stamp == START}
     sent = items(START)
-    np.testing.assert_array_equal(read_disparity(first["/nav/disparity"]), sent["disparity"].pixels)
+    np.testing.assert_allclose(read_disparity(first["/nav/disparity"]), sent["disparity"].pixels, rtol=0, atol=1 / 64)
+    assert first["/nav/disparity"].delta_d == 1 / 32
     source = first["/nav/disparity/source"]
     assert (source.encoding, stamp_of(source.header), source.header.frame_id) == ("mono8", START, "left_optical")
     np.testing.assert_array_equal(source.data.reshape(source.height, source.width), sent["disparity"].source)
