@@ -38,7 +38,7 @@ def test_a_result_log_contains_the_reason_of_every_cell(result, stream):
     assert len(grids) == len(reasons) == FRAMES
     expected = {
         Cell.FREE: {CellReason.CLEAR},
-        Cell.UNKNOWN: {CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNSURE},
+        Cell.UNKNOWN: {CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNSURE, CellReason.UNMATCHED},
     }
     expected[Cell.HAZARD] = set(CellReason) - expected[Cell.FREE] - expected[Cell.UNKNOWN] - {CellReason.ELEVATION}
     for grid, reason in zip(grids, reasons, strict=True):
