@@ -31,6 +31,7 @@ SHOWN = (
     CellReason.BESIDE,
     CellReason.SLOPE,
     CellReason.OCCLUDED,
+    CellReason.UNMATCHED,
     CellReason.UNSURE,
     CellReason.UNOBSERVED,
 )

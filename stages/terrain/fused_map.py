@@ -12,7 +12,7 @@ from stages.data.tiles import Tiles
 from stages.terrain.height_alignment import plane_height
 from stages.terrain.map_levelling import MapLevelling
 
-SHARED_SHARE = 0.5  # share of the smallest variance of a cell's frames that they have in common
+SHARED_SHARE = 0.2  # share of the smallest variance of a cell's frames that they have in common
 MAX_CONTRADICTION = 3.0  # standard deviations between two heights of a cell
 # 29 bytes a cell. weight: sum of 1 / variance over its frames; best: their smallest standard deviation; below, above:
 # from the height to the extremes; first, last: ms since the epoch; doubt: height difference to the newest frame while
