@@ -53,9 +53,9 @@ class Voxelise(Stage):
     )
     correlated_points: float = parameter(4.0, "neighbouring points that share one matching error", low=1.0)
     systematic_share: float = parameter(
-        0.95, "share of the points' variance that no averaging removes", low=0.0, high=1.0
+        0.9, "share of the points' variance that no averaging removes", low=0.0, high=1.0
     )
-    scatter_share: float = parameter(0.22, "share of the scatter beyond slope and noise in the variance", low=0.0)
+    scatter_share: float = parameter(0.2, "share of the scatter beyond slope and noise in the variance", low=0.0)
     curvature_share: float = parameter(0.38, "share of the squared curvature in the variance", low=0.0)
     rim_share: float = parameter(0.15, "share of the squared rise in the variance of a cell beside a hole", low=0.0)
     sight_share: float = parameter(
