@@ -266,6 +266,15 @@ def test_the_score_of_a_part_counts_that_part_alone(traverse, tmp_path, capsys):
     assert (found["compared"], found["beyond"], found["missing"]) == (FRAMES - 1, 1, {})
 
 
+def test_every_second_frame_is_run_scored_and_counted(traverse, tmp_path, capsys):
+    out, score_file = tmp_path / "part.mcap", tmp_path / "score.json"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--every", 2) == 0
+    assert f"{FRAMES // 2} frame{'s' * (FRAMES > 3)} left out by --every 2" in capsys.readouterr().out
+    assert roverflow("score", out, "--truth", traverse, "--json", score_file) == 0
+    found = json.loads(score_file.read_text())
+    assert (found["compared"], found["beyond"], found["missing"]) == (-(-FRAMES // 2), FRAMES // 2, {})
+
+
 def test_a_run_without_any_result_replaces_none(tmp_path, capsys):
     log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
     assert roverflow("simulate", log, "--frames", 1, "--size", "32x32") == 0

@@ -283,6 +283,8 @@ def test_a_link_to_itself_is_replaced_by_the_output(tmp_path):
     ("--workers", "0", "must be a whole number of at least 1, not '0'"),
     ("--workers", "9" * 20, "must be at most 1024"),
     ("--start", "1e300", "at most 9e+09"),
+    ("--every", "0", "must be a whole number of frames of at least 1, such as 2, or a length above 0 m, such as 0.5m"),
+    ("--every", "infm", "not 'infm'"),
     *(("--start", odd, "must be seconds after the log's first message") for odd in ("nan", "inf", "-1", "soon")),
 ])  # fmt: skip
 def test_an_impossible_number_is_refused(traverse, tmp_path, option, value, printed, capsys):

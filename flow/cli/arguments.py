@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
+from flow.runtime.frame_selection import Every
+
 _MAX_WORKERS = 1024
 _MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
 
@@ -39,6 +41,23 @@ def seconds(text: str) -> float:
             f"must be seconds after the log's first message, at most {_MAX_SECONDS:g}, not '{text}'"
         )
     return value
+
+
+def every(text: str) -> Every:
+    """Which frames to take: every n-th one ("2"), or one for each stretch driven ("0.5m")."""
+    number, metres = text.strip(), text.strip().endswith("m")
+    try:
+        value = float(number[:-1]) if metres else int(number)
+    except ValueError:
+        value = 0
+    if metres and 0 < value < math.inf:
+        return Every(metres=float(value))
+    if metres or value < 1:
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number of frames of at least 1, such as 2, or a length above 0 m, such as 0.5m, "
+            f"not '{text}'"
+        )
+    return Every(frames=int(value))
 
 
 def size(text: str) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.errors import UsageError
+from flow.runtime.frame_selection import Every
 from flow.runtime.graph import Graph
 
 
@@ -23,6 +24,7 @@ def replay(
     workers: int = 2,
     start: float | None = None,
     end: float | None = None,
+    every: Every | None = None,
 ) -> dict[str, Any]:
     """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary."""
     from tqdm import tqdm
@@ -42,11 +44,12 @@ def replay(
             "log": log.name,
             "start": "" if start is None else repr(float(start)),
             "end": "" if end is None else repr(float(end)),
+            "every": "" if every is None else str(every),
             **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
         }
         # A file name may hold bytes that are not UTF-8.
         about = {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}
-        with tqdm(total=opened.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
+        with tqdm(total=_frames(opened.frames, every), unit="frame", disable=not sys.stderr.isatty()) as bar:
             drops = 0
 
             def on_frame(complete: bool) -> None:
@@ -56,8 +59,16 @@ def replay(
                 bar.update()
 
             with interrupts(stop, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)):
-                summary = run(graph, opened, outputs, workers=workers, about=about, stop=stop, on_frame=on_frame)
+                settings: dict[str, Any] = {"workers": workers, "every": every}
+                summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame)
     return as_json(summary | {"overrides": list(overrides)})
+
+
+def _frames(of_log: int | None, every: Every | None) -> int | None:
+    """The number of frames to come, None if unknown."""
+    if of_log is None or every is None:
+        return of_log
+    return None if every.metres is not None else -(-of_log // every.frames)
 
 
 @contextmanager

@@ -55,6 +55,8 @@ def headline(summary: dict[str, Any]) -> str:
 def report(summary: dict[str, Any]) -> None:
     """Print the summary of a run."""
     say(headline(summary))
+    if summary["frames_left_out"]:
+        say(f"  {counted(summary['frames_left_out'], 'frame')} left out by --every {summary['every']}")
     found = [summary["surveys"], summary["findings"]]
     for line in [line for part in found for line in lines(part, Severity.NOTE)]:
         say(f"  {line}")

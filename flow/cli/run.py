@@ -8,7 +8,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from flow.cli.arguments import seconds, workers
+from flow.cli.arguments import every, seconds, workers
 from flow.cli.outputs import add_pipeline_options, check_outputs, write_text
 from flow.cli.replay import as_json, replay
 from flow.cli.report import exit_code, headline, report, say
@@ -27,6 +27,12 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
     sub.add_argument("--start", type=seconds, metavar="T", help="begin T seconds after the log's first message")
     sub.add_argument("--end", type=seconds, metavar="T", help="stop T seconds after the log's first message")
+    sub.add_argument(
+        "--every",
+        type=every,
+        metavar="N|LENGTH",
+        help="take every N-th stereo frame, or one for each LENGTH driven by the log's odometry, such as 0.5m (1)",
+    )
     sub.add_argument("--workers", type=workers, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
     sub.add_argument("--summary", type=Path, metavar="OUT.json", help="counts, losses, times and verdict as JSON")
 
@@ -37,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     rrd = None if options.no_rrd else options.rrd or out.parent / f"{out.stem}.rrd"
     outputs = {"result log": out, "recording": rrd, "summary": options.summary}
     check_outputs(outputs, [options.log, Path(options.pipeline)])
-    settings = {name: getattr(options, name) for name in ("workers", "start", "end")}
+    settings = {name: getattr(options, name) for name in ("workers", "start", "end", "every")}
     try:
         summary = replay(options.log, options.pipeline, out, rrd, overrides=options.set, **settings)
     except SinkError as error:

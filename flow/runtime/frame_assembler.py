@@ -15,6 +15,7 @@ from typing import Any
 
 from flow.align import Answers, Token
 from flow.contracts import Absent, Event, Loss, LossReason
+from flow.runtime.frame_selection import FrameSelection
 from flow.runtime.graph import Graph
 from flow.runtime.ledger import Ledger
 
@@ -117,16 +118,17 @@ def _checked(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:
 
 
 class FrameAssembler:
-    """Makes frames of one log with the aligners of a graph."""
+    """Makes frames of one log with the aligners of a graph. selection: the frames to take; None: all of them."""
 
-    def __init__(self, graph: Graph, ledger: Ledger) -> None:
-        self._ledger = ledger
+    def __init__(self, graph: Graph, ledger: Ledger, selection: FrameSelection | None = None) -> None:
+        self._ledger, self._selection, self._clock = ledger, selection, graph.clock
         self._aligners = {n.name: n.actor.start(n.name, dict(n.inputs)) for n in graph.aligners}
         self._ports: dict[str, list[tuple[str, str]]] = {}
         for node in graph.aligners:
             for port, stream in node.inputs.items():
                 self._ports.setdefault(stream, []).append((node.name, port))
-        self._wanted = graph.source_streams
+        self._odometry = selection.odometry if selection else None
+        self._wanted = graph.source_streams | ({self._odometry} if self._odometry else set())
         made = {node.name for node in graph.stages}
         self._entry_streams = [stream for stream in graph.frame_streams if stream not in made]
         self._waiting: dict[str, deque[Token]] = {stream: deque() for stream in self._entry_streams}
@@ -147,7 +149,10 @@ class FrameAssembler:
                 if message.fault:
                     self._lose(Loss(stream, item.stamp, "source", LossReason.OUT_OF_ORDER, message.fault))
                 else:
-                    self._take(stream, log_time, Token(item.stamp, item))
+                    if stream == self._odometry and self._selection:
+                        self._selection.note(item)
+                    if not self._leaves_out(stream, item.stamp):
+                        self._take(stream, log_time, Token(item.stamp, item))
             yield from self._ready()
         for name, aligner in self._aligners.items():
             self._answer(name, log_time, aligner.end())
@@ -176,10 +181,14 @@ class FrameAssembler:
         for answer in answers:
             if isinstance(answer, Loss):
                 self._lose(answer)
-            else:
+            elif not self._leaves_out(name, answer.stamp):
                 if isinstance(answer.value, Absent) and answer.value.cause.stage == name:
                     self._ledger.add(answer.value.cause)
                 self._take(name, log_time, answer)
+
+    def _leaves_out(self, stream: str, stamp: int) -> bool:
+        """Whether a stamp of `stream` begins a frame that is left out."""
+        return self._selection is not None and stream == self._clock and not self._selection.takes(stamp)
 
     def _lose(self, entry: Loss) -> None:
         self._entries.append(self._ledger.add(entry))

@@ -16,6 +16,7 @@ from flow.errors import PipelineError, SinkError, UsageError
 from flow.runtime.engine import Engine
 from flow.runtime.findings import as_dicts, findings, has_fault, warning
 from flow.runtime.frame_assembler import FrameAssembler
+from flow.runtime.frame_selection import Every, FrameSelection
 from flow.runtime.graph import Graph
 from flow.runtime.interrupts import Stop
 from flow.runtime.ledger import Ledger, failure
@@ -91,6 +92,7 @@ def run(
     outputs: Mapping[str, Path],
     *,
     workers: int = 2,
+    every: Every | None = None,
     about: Mapping[str, str] | None = None,
     stop: Stop | None = None,
     on_frame: Callable[[bool], None] = lambda complete: None,
@@ -106,6 +108,8 @@ def run(
         Sink class, as the pipeline names it -> the path it writes to. Sinks without a path are not used.
     workers
         Threads that run the stages.
+    every
+        The frames to take; the others are left out. Default: all.
     about
         What the sinks record about the run, such as versions.
     stop
@@ -122,11 +126,13 @@ def run(
     Raises
     ------
     UsageError
-        The log lacks a stream that the graph needs.
+        The log lacks a stream that the graph or `every` needs.
     SinkError
         An output could not be written. All outputs are closed by then.
     """
     graph = fitted(graph, log)
+    every = every or Every()
+    selection = FrameSelection(every, every.odometry(graph.source.streams, log.missing))
     stop, ledger = stop or Stop(), Ledger()
     wall, cpu = time.perf_counter(), time.process_time()
     prepared = Prepass(graph)
@@ -134,13 +140,14 @@ def run(
         prepared = prepass(graph, lambda *which: (_read(part, stop) for part in log.excerpts(*which)))
     graph = prepared.graph
     sinks = _Outputs.of(graph, outputs)
-    assembler, started, at_end = FrameAssembler(graph, ledger), 0.0, False
+    assembler, started, at_end = FrameAssembler(graph, ledger, selection), 0.0, False
+    streams = graph.source_streams | ({selection.odometry} if selection.odometry else set())
     engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
     try:
         surveys = "\n".join(f"{name}: {finding.sentence}" for name, finding in prepared.findings.items())
         if not stop.finishing() and sinks.open(graph.frame_streams, {**(about or {}), "surveys": surveys}):
             started = time.perf_counter() - wall
-            at_end = _feed(assembler, _read(log.events(graph.source_streams), stop), engine, stop)
+            at_end = _feed(assembler, _read(log.events(streams), stop), engine, stop)
     finally:
         engine.finish(stop.abandoning)
         sinks.errors += [engine.failure] if engine.failure else []
@@ -155,6 +162,8 @@ def run(
             "interrupted": stop.finishing(),
             "pipeline": graph.name,
             "log_begin": getattr(log, "begin", None),
+            "every": str(every),
+            "frames_left_out": selection.left_out,
             **_counts(assembler, engine, ledger, times),
             "surveys": as_dicts(prepared.findings),
             "fixed": prepared.fixed,

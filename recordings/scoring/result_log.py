@@ -44,6 +44,15 @@ def part_run(result: Path, log: Path) -> tuple[float | None, float | None]:
     return start, end
 
 
+def stamps_run(result: Path) -> set[int] | None:
+    """The stamps of the frames that a run of selected frames (`run --every`) took; None for a run of all frames."""
+    if not about_run(result).get("every"):
+        return None
+    with McapFile(result) as log:  # every frame has diagnostics, at its stamp as the log time
+        channels = {number for number in log.index.channels if log.index.channels[number].topic == "/nav/diagnostics"}
+        return set(log.times(channels).tolist())
+
+
 def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:
     """The error for a log without any of the result topics `wanted`; with the `remedy` if it has one of `instead`."""
     with McapFile(path) as log:

@@ -23,7 +23,7 @@ from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.scoring.metrics import aligned, angle_between
 from recordings.scoring.pose_metrics import PoseTally
-from recordings.scoring.result_log import part_run, without_results
+from recordings.scoring.result_log import part_run, stamps_run, without_results
 from recordings.scoring.side_by_side import Messages, frames
 from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
@@ -54,7 +54,7 @@ class Score:
     unmatched
         Result topic -> number of messages at stamps without truth.
     beyond
-        True frames outside the part that was run (`run --start`, `--end`), which are not scored.
+        True frames outside the part that was run (`run --start`, `--end`, `--every`), which are not scored.
     unscored
         Topic -> reason -> number of frames that have it and cannot be scored.
     lost
@@ -147,6 +147,7 @@ class _Tally:
             self.truths = {channels[number].topic for number in channels if log.count({number}) or log.index.lost}
             with McapFile(result):  # raises LogError for another file
                 self.part = part_of(log.start, *part_run(result, truth))
+        self.taken = stamps_run(result)
         self.outside: set[int] = set()  # stamps of the truth outside the part that was run
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
@@ -161,8 +162,10 @@ class _Tally:
             if topic == "/tf_static":
                 self.mounts |= {item.child_frame_id: item for item in message.transforms}
                 continue
-            if not is_within(ros2.stamp_of(message.header), time, *self.part):
-                self.outside.add(ros2.stamp_of(message.header))
+            stamp = ros2.stamp_of(message.header)
+            left_out = self.taken is not None and stamp not in self.taken
+            if left_out or not is_within(stamp, time, *self.part):
+                self.outside.add(stamp)
             yield topic, time, message
 
     def add(self, stamp: int, frame: dict[str, Any]) -> None:

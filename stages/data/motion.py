@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -142,6 +143,12 @@ class Pose:
             publish_vector(self, "covariance", (6, 6), finite=False)
         if not abs(float(np.linalg.norm(self.quaternion)) - 1.0) < 1e-3:
             raise StageError(f"Pose.quaternion must be a unit quaternion, not {self.quaternion.tolist()}")
+
+    def distance_to(self, other: Pose) -> float:
+        """The distance of the two positions, m; infinite where their frames differ."""
+        if self.frame_id != other.frame_id:
+            return math.inf
+        return float(np.linalg.norm(self.position - other.position))
 
     def interpolated(self, later: Pose, stamp: int) -> Pose:
         """The pose at `stamp`, ns, between this one and a later one of the same frames, with this covariance."""

@@ -38,6 +38,14 @@ class Number:
 
 
 @dataclass(frozen=True)
+class Place(Number):
+    """A pose on a line, its value in metres."""
+
+    def distance_to(self, other: Place) -> float:
+        return abs(self.value - other.value)
+
+
+@dataclass(frozen=True)
 class Text:
     stamp: int
     text: str
@@ -45,7 +53,13 @@ class Text:
 
 @dataclass(frozen=True)
 class Source:
-    streams: ClassVar[Mapping[str, type]] = {"left": Number, "right": Number, "level": Number, "words": Text}
+    streams: ClassVar[Mapping[str, type]] = {
+        "left": Number,
+        "right": Number,
+        "level": Number,
+        "words": Text,
+        "way": Place,
+    }
     gain: float = 1.0
 
     def open(self, path: Path, *, start: float | None, end: float | None) -> AbstractContextManager[Log]:
