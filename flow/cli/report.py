@@ -10,6 +10,7 @@ from typing import Any
 
 from flow.contracts import LossReason, Severity, Verdict, counted
 from flow.errors import COMPLETE, INCOMPLETE, INTERRUPTED
+from flow.runtime.bottleneck import bottleneck_line
 from flow.runtime.findings import lines
 
 MAX_OFFSET = 1e6  # s; stamps farther from the log's beginning are of another clock
@@ -35,7 +36,8 @@ def exit_code(summary: dict[str, Any]) -> int:
 def headline(summary: dict[str, Any]) -> str:
     """The verdict in one line: complete frames, losses by reason, and the rate.
 
-    Frames in flight at an interrupt are reported as abandoned, but are not counted as losses of the log.
+    The rate counts all frames that went through, also those with losses. Frames in flight at an interrupt are reported
+    as abandoned, but are not counted as losses of the log.
     """
     complete, total, drops = summary["frames_out"], summary["frames_in"], summary["drops"]
     of_total = summary["verdict"] == Verdict.COMPLETE or complete != total  # "18 of 18" would hide other losses
@@ -68,6 +70,8 @@ def report(summary: dict[str, Any]) -> None:
         say(f"  {path} was not written because the run produced no results. --summary FILE lists the losses.")
     for path in map(Path, summary["outputs"]):
         say(f"  wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    if line := bottleneck_line(summary["bottleneck"]):
+        say(f"  {line}")
     for line in [line for part in found for line in lines(part, Severity.WARNING)]:
         say(f"WARNING: {line}")
     for line in [line for part in found for line in lines(part, Severity.FAULT)]:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flow.contracts import Absent, FrameRecord, Loss, LossReason, Sink
+from flow.runtime.bottleneck import READING, bottleneck
 from flow.runtime.graph import Node, is_item, start
 from flow.runtime.ledger import Ledger, failure
 
@@ -94,6 +95,8 @@ class Engine:
         self.admitted = self.through = self.complete = 0
         self.late_entries: list[Loss] = []  # losses of the frames that did not get through
         self.seconds = dict.fromkeys((work.name for work in self._work), 0.0)
+        self.waiting = 0.0  # s that `admit` waited for room
+        self.reading = 0.0  # s that the caller took to read the frames, which it sets
         self._threads = [
             threading.Thread(target=self._work_loop, name=f"worker-{index}", daemon=True) for index in range(workers)
         ]
@@ -109,12 +112,14 @@ class Engine:
         """
         frame = _Frame(self.admitted, stamp, dict(values), list(entries), set(values))
         frame.entries += [value.cause for value in values.values() if isinstance(value, Absent)]
+        begun = time.perf_counter()
         with self._condition:
             first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
             while not self._has_room(first, frame):
                 if self.failure or stop():
                     return False
                 self._condition.wait(0.1)
+            self.waiting += time.perf_counter() - begun
             if self.failure:
                 return False
             self.admitted += 1
@@ -147,6 +152,12 @@ class Engine:
                 detail = "the run ended before the frame was through"
                 entry = self._ledger.add(Loss("frame", frame.stamp, "engine", LossReason.ABANDONED, detail))
                 self.late_entries += [*frame.entries, entry]
+
+    def bottleneck(self, cores: int) -> dict[str, Any]:
+        """What limits the rate of the run, on this number of cores (`flow.runtime.bottleneck`)."""
+        sinks = [work.name for work in self._work if work.output is None]
+        serial = {work.name: self.seconds[work.name] for work in self._work if work.ordered} | {READING: self.reading}
+        return bottleneck(self.seconds, sinks, serial, len(self._threads), self.through, cores)
 
     # -- scheduling: everything below, up to the work itself, runs under the lock --------------------------------
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from flow.contracts import Event, Finding, Log, Sink, Verdict
 from flow.errors import PipelineError, SinkError, UsageError
+from flow.runtime.bottleneck import usable_cores
 from flow.runtime.engine import Engine
 from flow.runtime.findings import as_dicts, findings, has_fault, warning
 from flow.runtime.frame_assembler import FrameAssembler
@@ -199,13 +200,17 @@ class _StoppedError(Exception):
 
 def _feed(assembler: FrameAssembler, events: Iterable[Event], engine: Engine, stop: Stop) -> bool:
     """Admit the frames of the log; False if the run was stopped, or an output failed, before the end of the log."""
-    with suppress(_StoppedError):
+    begun = time.perf_counter()
+    try:
         for frame in assembler.frames(events):
             if not engine.admit(frame.stamp, frame.values, frame.entries, stop.finishing):
                 assembler.give_back(frame)
                 return False
         return True
-    return False
+    except _StoppedError:
+        return False
+    finally:
+        engine.reading = time.perf_counter() - begun - engine.waiting
 
 
 def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
@@ -244,8 +249,10 @@ def _counts(assembler: FrameAssembler, engine: Engine, ledger: Ledger, times: di
         "drops": ledger.counts(),
         "messages": dict(sorted(assembler.messages.items())),
         "seconds": {name: round(value, 6) for name, value in engine.seconds.items()},
+        "reading_seconds": round(engine.reading, 6),
+        "bottleneck": engine.bottleneck(usable_cores()),
         **{name: round(value, 6) for name, value in times.items()},
-        "frames_per_second": round(engine.complete / times["wall_seconds"], 4),
+        "frames_per_second": round(engine.through / times["wall_seconds"], 4),
         "peak_memory_mb": _peak_memory_mb(),
         "ledger": [entry.as_dict() for entry in ledger.entries],
         "entries": [*engine.late_entries, *assembler.late_entries],

@@ -16,7 +16,7 @@ def printed(folder, frames, capsys):
     pipeline = graph(folder)
     ((use, _),) = pipeline.sinks
     summary = run(pipeline, Log(traverse(frames)), {use: Path("unused")})
-    report(summary | {"outputs": []})
+    report(summary | {"outputs": [], "bottleneck": {}})
     return capsys.readouterr().out.splitlines()
 
 
