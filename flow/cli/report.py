@@ -66,12 +66,12 @@ def report(summary: dict[str, Any]) -> None:
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
         place = f"{first['stream']} at {_moment(first['stamp'], summary.get('log_begin'))}"
         say(f"  {number} {reason}, first: {place}: {first['detail']}")
+    if line := bottleneck_line(summary["bottleneck"]):
+        say(f"  {line}")
     for path in summary["withheld"]:
         say(f"  {path} was not written because the run produced no results. --summary FILE lists the losses.")
     for path in map(Path, summary["outputs"]):
         say(f"  wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
-    if line := bottleneck_line(summary["bottleneck"]):
-        say(f"  {line}")
     for line in [line for part in found for line in lines(part, Severity.WARNING)]:
         say(f"WARNING: {line}")
     for line in [line for part in found for line in lines(part, Severity.FAULT)]:
