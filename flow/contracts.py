@@ -158,6 +158,9 @@ class Sink(Protocol):
 
     - `names_streams`: the parameters that name streams, so that a pipeline file can be checked;
     - `unwritable(stream, kind)`: why the sink cannot write a stream, or an empty str; asked when a pipeline is loaded;
+    - `prepare(stream, item)`: what `write` gets in place of an item, such as its encoded bytes. Any thread calls it as
+      soon as the item is there, frames in any order, so it must not depend on other calls. The engine does not keep the
+      item longer for this sink;
     - `discard()`: gives up the output and keeps an existing file, where no frame got through or another output failed;
     - `empty`: whether there is nothing worth keeping; the run then calls `discard`.
     """

@@ -6,7 +6,11 @@ and every admitted frame reaches every sink. An item is freed as soon as all sta
 
 Each stage has a bounded inbox: the frames whose inputs are there or being made. A stage starts only when the inboxes
 that take its output have room; only the oldest frame in flight may enter a full one. That frame waits for no other, so
-the engine cannot deadlock. Downstream work goes first, so few frames are in flight at a time.
+the engine cannot deadlock. Downstream work goes first, and few frames are in flight at a time.
+
+A stage that is `large` needs much memory while it works. At most every second worker is in one, so that the memory is
+needed fewer times; the others find other work. A sink may `prepare` items one by one, which any worker does as soon as
+an item is there. The engine then keeps what it returned in place of the item.
 """
 
 from __future__ import annotations
@@ -44,8 +48,9 @@ class _Frame:
 class _Work:
     """A stage, or a sink (`output` is then None).
 
-    inputs: the streams that must be there before it starts; reads: those of them whose items it uses; consumers: what
-    waits for its output; inbox: indices of frames; next: the frame that an ordered work takes next.
+    inputs: the streams that must be there before it starts; reads: those of them whose items it uses; sink: the name of
+    the sink that it belongs to; large: whether it needs much memory; consumers: what waits for its output; inbox:
+    indices of frames; next: the frame that an ordered work takes next; seconds: its time so far.
     """
 
     name: str
@@ -54,6 +59,9 @@ class _Work:
     output: str | None
     ordered: bool
     run: Callable[[_Frame], Any]
+    sink: str = ""
+    large: bool = False
+    seconds: float = 0.0
     consumers: list[_Work] = field(default_factory=list)
     inbox: set[int] = field(default_factory=set)
     next: int = 0
@@ -63,8 +71,8 @@ class Engine:
     """Runs stages and sinks over frames.
 
     stages: in topological order; sinks: name -> (sink, the streams it gets); ledger: gets an entry for every loss;
-    workers: threads; capacity: frames that an inbox holds; on_frame: called after every frame, with whether all of its
-    streams are there.
+    workers: threads; capacity: frames that an inbox holds; max_frames: in flight; on_frame: called
+    after every frame, with whether all of its streams are there.
     """
 
     def __init__(
@@ -74,14 +82,17 @@ class Engine:
         ledger: Ledger,
         workers: int = 2,
         capacity: int = 2,
+        max_frames: int = 1024,
         on_frame: Callable[[bool], None] = lambda complete: None,
     ) -> None:
-        self._ledger, self._capacity, self._on_frame = ledger, capacity, on_frame
+        self._ledger, self._on_frame = ledger, on_frame
+        self._capacity, self._max_frames, self._max_large = capacity, max_frames, max(1, workers // 2)
         self._condition = threading.Condition()
         self._frames: deque[_Frame] = deque()
         self.states = start(stages)  # stream -> state of its stage, of this run
         self._work = [self._stage_work(node) for node in stages]
-        self._work += [self._sink_work(name, sink, streams) for name, (sink, streams) in sinks.items()]
+        for name, (sink, streams) in sinks.items():
+            self._work += self._sink_work(name, sink, streams)
         for work in self._work:
             work.consumers = [other for other in self._work if work.output in other.inputs]
         self._readers: dict[str, list[_Work]] = {}
@@ -90,11 +101,11 @@ class Engine:
                 self._readers.setdefault(stream, []).append(work)
         self._closed = self._over = False
         self._writing = 0  # workers inside a sink
+        self._in_large = 0  # workers inside a large stage
         self._reporting = threading.Lock()
         self.failure: tuple[str, BaseException] | None = None
         self.admitted = self.through = self.complete = 0
         self.late_entries: list[Loss] = []  # losses of the frames that did not get through
-        self.seconds = dict.fromkeys((work.name for work in self._work), 0.0)
         self.waiting = 0.0  # s that `admit` waited for room
         self.reading = 0.0  # s that the caller took to read the frames, which it sets
         self._threads = [
@@ -115,7 +126,7 @@ class Engine:
         begun = time.perf_counter()
         with self._condition:
             first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
-            while not self._has_room(first, frame):
+            while len(self._frames) >= self._max_frames or not self._has_room(first, frame):
                 if self.failure or stop():
                     return False
                 self._condition.wait(0.1)
@@ -153,10 +164,18 @@ class Engine:
                 entry = self._ledger.add(Loss("frame", frame.stamp, "engine", LossReason.ABANDONED, detail))
                 self.late_entries += [*frame.entries, entry]
 
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Stage or sink -> its time so far, s. That of a sink includes what it prepared."""
+        seconds: dict[str, float] = {}
+        for work in self._work:
+            seconds[work.sink or work.name] = seconds.get(work.sink or work.name, 0.0) + work.seconds
+        return seconds
+
     def bottleneck(self, cores: int) -> dict[str, Any]:
         """What limits the rate of the run, on this number of cores (`flow.runtime.bottleneck`)."""
         sinks = [work.name for work in self._work if work.output is None]
-        serial = {work.name: self.seconds[work.name] for work in self._work if work.ordered} | {READING: self.reading}
+        serial = {work.name: work.seconds for work in self._work if work.ordered} | {READING: self.reading}
         return bottleneck(self.seconds, sinks, serial, len(self._threads), self.through, cores)
 
     # -- scheduling: everything below, up to the work itself, runs under the lock --------------------------------
@@ -183,8 +202,10 @@ class Engine:
                 retired: list[bool] = []
                 try:
                     self._writing -= work.output is None
-                    frame.seconds[work.name] = seconds
-                    self.seconds[work.name] += seconds
+                    self._in_large -= work.large
+                    work.seconds += seconds
+                    if not (work.sink and work.output):
+                        frame.seconds[work.name] = seconds
                     retired = self._deliver(work, frame, value)
                 except BaseException as error:  # a worker must not die silently
                     self.failure = self.failure or (work.name, error)
@@ -203,7 +224,7 @@ class Engine:
         if self._closed or self.failure:
             return None
         for work in reversed(self._work):
-            if work.inbox:
+            if work.inbox and not (work.large and self._in_large >= self._max_large):
                 for frame in self._frames:
                     if self._ready(work, frame) and self._has_room(work.consumers, frame):
                         self._begin(work, frame)
@@ -213,6 +234,7 @@ class Engine:
     def _begin(self, work: _Work, frame: _Frame) -> None:
         frame.begun.add(work)
         work.inbox.discard(frame.index)
+        self._in_large += work.large
         if work.output:
             frame.coming.add(work.output)
             self._expect(frame, work.consumers)
@@ -239,10 +261,10 @@ class Engine:
     def _deliver(self, work: _Work, frame: _Frame, value: Any) -> list[bool]:
         """Store the result of a work; returns for each frame that is now through whether it is complete."""
         if isinstance(value, BaseException):
-            if work.output is None:
-                self.failure = self.failure or (work.name, value)
-            stream = work.output or "frame"
-            entry = self._ledger.add(Loss(stream, frame.stamp, work.name, LossReason.FAILED, failure(value)))
+            if work.sink:
+                self.failure = self.failure or (work.sink, value)
+            stream, stage = ("frame", work.sink) if work.sink else (work.name, work.name)
+            entry = self._ledger.add(Loss(stream, frame.stamp, stage, LossReason.FAILED, failure(value)))
             frame.entries.append(entry)
             value = Absent(entry)
         if work.output:
@@ -300,19 +322,34 @@ class Engine:
                 raise TypeError(f"{node.use} returned {type(value).__name__}, not {node.output.__name__}")
             return value
 
-        return _Work(node.name, streams, streams, node.name, node.stateful, run)
+        large = bool(getattr(node.actor, "large", False))
+        return _Work(node.name, streams, streams, node.name, node.stateful, run, large=large)
 
-    def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> _Work:
+    def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> list[_Work]:
+        """The work of a sink: what it prepares, and the writing."""
+        stages = [work for work in self._work if not work.sink]
+        prepare = getattr(sink, "prepare", None)
+        given = {stream: stream if prepare is None else f"{name}: {stream}" for stream in streams}  # stream -> its key
+        prepared = [] if prepare is None else [self._preparing(name, prepare, *pair) for pair in given.items()]
         order = {work.name: index for index, work in enumerate(self._work)}
 
         def run(frame: _Frame) -> None:
-            items = {s: frame.values[s] for s in streams if not isinstance(frame.values[s], Absent)}
+            items = {s: frame.values[key] for s, key in given.items() if not isinstance(frame.values[key], Absent)}
             entries = tuple(sorted(frame.entries, key=lambda entry: (order.get(entry.stage, -1), entry.stamp)))
             with self._condition:
                 seconds = dict(frame.seconds)
-                queues = {work.name: len(work.inbox) for work in self._work if work.output}
+                queues = {work.name: len(work.inbox) for work in stages}
             sink.write(FrameRecord(frame.index, frame.stamp, items, entries, seconds, queues))
 
         # A sink waits for every stream of the frame, even those it does not get: only then are the entries complete.
-        every = tuple(dict.fromkeys([*streams, *(work.name for work in self._work if work.output)]))
-        return _Work(name, every, tuple(streams), None, True, run)
+        every = tuple(dict.fromkeys([*given.values(), *(work.name for work in stages)]))
+        return [*prepared, _Work(name, every, tuple(given.values()), None, True, run, sink=name)]
+
+    @staticmethod
+    def _preparing(sink: str, prepare: Callable[[str, Any], Any], stream: str, key: str) -> _Work:
+        """The work that prepares the items of one stream for a sink; it stores them under `key`."""
+
+        def run(frame: _Frame) -> Any:
+            return prepare(stream, frame.values[stream])
+
+        return _Work(key, (stream,), (stream,), key, False, run, sink=sink)

@@ -143,7 +143,7 @@ def run(
     sinks = _Outputs.of(graph, outputs)
     assembler, started, at_end = FrameAssembler(graph, ledger, selection), 0.0, False
     streams = graph.source_streams | ({selection.odometry} if selection.odometry else set())
-    engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, on_frame=on_frame)
+    engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, max_frames=workers + 1, on_frame=on_frame)
     try:
         surveys = "\n".join(f"{name}: {finding.sentence}" for name, finding in prepared.findings.items())
         if not stop.finishing() and sinks.open(graph.frame_streams, {**(about or {}), "surveys": surveys}):

@@ -13,14 +13,17 @@ from stages.data import Array
 
 
 class Workspace:
-    """Memory of one call, kept for the next."""
+    """Memory of one call, kept for the next. pool: where it may find a better fit."""
 
-    def __init__(self) -> None:
+    def __init__(self, pool: Workspaces | None = None) -> None:
+        self.pool = pool
         self.whole = np.empty(0, np.uint8)
         self.used = 0
 
     def reserve(self, size: int) -> None:
         """Reserve `size` bytes; arrays of earlier calls become invalid."""
+        if self.pool is not None:
+            self.pool.fit(self, size)
         if self.whole.size < size:
             self.whole = np.empty(0, np.uint8)  # frees the old memory before the new is taken
             self.whole = np.empty(size, np.uint8)
@@ -52,9 +55,19 @@ class Workspaces:
     def one(self) -> Iterator[Workspace]:
         """A workspace for one call; an idle one if there is any."""
         with self.lock:
-            space = self.idle.pop() if self.idle else Workspace()
+            space = self.idle.pop() if self.idle else Workspace(self)
         try:
             yield space
         finally:
             with self.lock:
                 self.idle.append(space)
+
+    def fit(self, space: Workspace, size: int) -> None:
+        """Exchange the memory of `space` for the smallest idle one of at least `size` bytes, if that fits better.
+
+        So small calls leave the large memory to large calls, and only concurrent large calls need it twice.
+        """
+        with self.lock:
+            fitting = [each for each in (space, *self.idle) if each.whole.size >= size]
+            best = min(fitting or self.idle, key=lambda each: each.whole.size, default=space)
+            space.whole, best.whole = best.whole, space.whole

@@ -123,6 +123,8 @@ class Match(Stage):
         unit="MB", low=1,
     )  # fmt: skip
 
+    large = True  # the sums of all paths take hundreds of MB
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.search_radius and self.band_height:
