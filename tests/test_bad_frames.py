@@ -12,10 +12,12 @@ import pytest
 from recordings.mcap.file import iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.ros2.cdr import make
+from recordings.scoring.metrics import aligned
 from tests.conftest import FRAMES, edit_of, rewrite, roverflow
 
 BAD = 1  # the frame that is made bad
 MAPS = ("/nav/elevation_map", "/nav/navigation_map", "/nav/regional_map")
+SETTINGS = ("--set", "disparities=64", "--set", "McapSink.regional_step=0")  # maps of every frame
 Change = Callable[[str, int, bytes], bytes | None]
 
 
@@ -87,7 +89,7 @@ def maps_of(out: Path) -> dict[str, dict[int, Any]]:
 def sound(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[int, Any]]:
     """The maps of the log as it is."""
     out = tmp_path_factory.mktemp("sound") / "out.mcap"
-    assert roverflow("run", traverse, "--set", "disparities=64", "-o", out, "--no-rrd") == 0
+    assert roverflow("run", traverse, *SETTINGS, "-o", out, "--no-rrd") == 0
     return maps_of(out)
 
 
@@ -97,7 +99,7 @@ def test_a_bad_frame_is_reported_and_the_map_stays_correct(case, traverse, sound
     stamps = sorted(sound["/nav/elevation_map"])
     log, out = rewrite(traverse, tmp_path / "log.mcap", make(stamps[BAD], traverse)), tmp_path / "out.mcap"
     capsys.readouterr()
-    assert roverflow("run", log, "--set", "disparities=64", "-o", out, "--no-rrd") == 3
+    assert roverflow("run", log, *SETTINGS, "-o", out, "--no-rrd") == 3
     output = capsys.readouterr()
     assert "INCOMPLETE" in output.out
     assert all(word in output.out for word in words)
@@ -112,7 +114,10 @@ def test_a_bad_frame_is_reported_and_the_map_stays_correct(case, traverse, sound
         np.testing.assert_allclose(mine[TILT_LAYER], whole[TILT_LAYER], rtol=0.3)
         mine, whole = (found["/nav/navigation_map"][stamp].cells for found in (maps, sound))
         np.testing.assert_array_equal(mine, whole)
-    regional, whole = (found["/nav/regional_map"][left[-1]].layers["elevation"] for found in (maps, sound))
+    regional, onto = (found["/nav/regional_map"][left[-1]] for found in (maps, sound))
+    whole = onto.layers["elevation"]
+    grid = onto.shape, onto.origin, onto.resolution
+    regional = aligned(regional.layers["elevation"], regional.origin, *grid, np.nan)
     both = np.isfinite(regional) & np.isfinite(whole)
     assert both.sum() > 5000
     assert np.median(np.abs(regional - whole)[both]) < 0.005

@@ -16,11 +16,16 @@ from tests.conftest import FRAMES, SMALL, rewrite, roverflow
 REGIONAL = {"/nav/regional_map", "/nav/regional_navigation_map"}
 
 
-def test_every_frame_has_the_regional_map_around_the_rover(result):
-    maps = {topic: [] for topic in REGIONAL}
-    for topic, _, message in iter_decoded(result, REGIONAL):
-        maps[topic].append(message)
-    assert [len(messages) for messages in maps.values()] == [FRAMES, FRAMES]
+def test_the_log_has_the_first_and_the_last_regional_map_around_the_rover(result):
+    maps, stamps = {topic: [] for topic in REGIONAL}, {}
+    for topic, stamp, message in iter_decoded(result, REGIONAL | {"/nav/pose"}):
+        stamps.setdefault(topic, []).append(stamp)
+        if topic in REGIONAL:
+            maps[topic].append(message)
+    written = stamps["/nav/regional_map"]
+    assert (written[0], written[-1]) == (stamps["/nav/pose"][0], stamps["/nav/pose"][-1])
+    assert stamps["/nav/regional_navigation_map"] == written
+    assert len(written) < FRAMES
     assert {message.header.frame_id for messages in maps.values() for message in messages} == {"odom"}
     terrain = ros2.read_grid_map(maps["/nav/regional_map"][-1])
     assert terrain.layers["frames"].max() == FRAMES
@@ -35,7 +40,7 @@ def test_a_result_log_contains_the_reason_of_every_cell(result, stream):
         [message for _, _, message in iter_decoded(result, [topic])]
         for topic in (f"/nav/{stream}", f"/nav/{stream}/reason")
     )
-    assert len(grids) == len(reasons) == FRAMES
+    assert 2 <= len(grids) == len(reasons) <= FRAMES
     expected = {
         Cell.FREE: {CellReason.CLEAR},
         Cell.UNKNOWN: {CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNSURE, CellReason.UNMATCHED},
@@ -54,7 +59,7 @@ def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tm
     rewrite(traverse, log, lambda topic, _, data: None if topic == "/odometry" else data)
     assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd") == 0
     regional = [message for _, _, message in iter_decoded(out, ["/nav/regional_map"])]
-    assert [message.header.frame_id for message in regional] == ["visual_odom"] * FRAMES
+    assert {message.header.frame_id for message in regional} == {"visual_odom"}
     assert ros2.read_grid_map(regional[-1]).layers["frames"].max() == FRAMES
 
 

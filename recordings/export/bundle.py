@@ -156,14 +156,17 @@ class _MapFiles:
             fills = dict.fromkeys(terrain.layers, np.float32(np.nan))
             self.elevation = self.elevation or Mosaic(terrain.resolution, terrain.frame_id, fills, self.rim)
             self.elevation.add(terrain.layers, np.isfinite(terrain.layers["elevation"]), terrain)
-            if POINTS in frame and "level" in frame:
-                points = _read(_fields_of, frame[POINTS], result)
-                add_colors(self.colors, points, frame["level"], terrain.resolution)
         if topics.navigation in frame:
             cells: NavigationMap = _read(ros2.read_occupancy_grid, frame[topics.navigation], result)
             fill = {"cells": np.int8(Cell.UNKNOWN)}
             self.navigation = self.navigation or Mosaic(cells.resolution, cells.frame_id, fill, self.rim)
             self.navigation.add({"cells": cells.cells}, cells.cells != Cell.UNKNOWN, cells)
+
+    def color(self, result: Path, frame: dict[str, Any]) -> None:
+        """Add the colours of a frame's points; also of a frame whose map was left out of the log."""
+        if self.elevation is not None and POINTS in frame:
+            points = _read(_fields_of, frame[POINTS], result)
+            add_colors(self.colors, points, frame["level"], self.elevation.resolution)
 
     def close(self) -> bool:
         """Whether any cell is known; the maps are cut to those, the navigation map as the elevation map."""
@@ -195,6 +198,8 @@ def _export_region(result: Path, out: Path, lost: Counter[str] | None, topics: M
         if leading in frame:
             frame_id = frame[leading].header.frame_id
             regions.setdefault(frame_id, _MapFiles(RIM_WIDTH)).add(result, topics, stamp, frame)
+        if "level" in frame and frame["level"].parent in regions:
+            regions[frame["level"].parent].color(result, frame)
     if not regions:
         _check_damage(result, lost)
         remedy = "add --frames to export the maps of every frame"

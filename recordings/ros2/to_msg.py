@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.ros2.cdr import make
+from recordings.ros2.rounding import rounded_layer, to_multiples, to_relative
 from stages.data import (
     Array,
     CameraModel,
@@ -87,8 +88,7 @@ def disparity_image(disparity: Disparity, step: float = 0.0) -> Any:
     pixels, frame_id = disparity.pixels, _frame_of(disparity)
     if camera is not None and camera.cx_right != camera.cx:
         pixels = pixels + np.float32(camera.cx_right - camera.cx)
-    if step:
-        pixels = np.rint(pixels * np.float32(1 / step)) * np.float32(step)
+    pixels = to_multiples(pixels, step)
     known = pixels[np.isfinite(pixels)]
     height, width = pixels.shape
     return make(
@@ -111,17 +111,18 @@ def _frame_of(disparity: Disparity) -> str:
     return disparity.camera.frame_id if disparity.camera is not None else "camera"
 
 
-def point_cloud(cloud: PointCloud) -> Any:
+def point_cloud(cloud: PointCloud, step: float = 0.0, precision: float = 0.0) -> Any:
     """sensor_msgs/PointCloud2 with the fields x, y, z, rgb (0x00RRGGBB in the bits of a float32, as in PCL) and sigma.
 
-    With points that are not measured also source (the codes of `PixelOrigin`).
+    With points that are not measured also source (the codes of `PixelOrigin`). step: m, to multiples of which
+    coordinates are rounded; precision: relative error by which sigmas are rounded; 0: exact.
     """
     names = ("x", "y", "z", "rgb", "sigma") + (() if cloud.source is None else ("source",))
     packed = np.zeros((len(cloud.points), len(names)), np.dtype("<f4"))
     for axis in range(3):  # numpy is faster by columns
-        packed[:, axis] = cloud.points[:, axis]
+        packed[:, axis] = to_multiples(cloud.points[:, axis], step)
         packed.view(np.uint8)[:, 4 * 3 + 2 - axis] = cloud.colors[:, axis]  # blue in the lowest byte
-    packed[:, 4] = cloud.sigma
+    packed[:, 4] = to_relative(cloud.sigma, precision)
     if cloud.source is not None:
         packed[:, 5] = cloud.source
     return float_cloud(cloud.stamp, cloud.frame_id, names, packed)
@@ -140,9 +141,14 @@ def float_cloud(stamp: int, frame_id: str, names: Sequence[str], points: Array) 
     )  # fmt: skip
 
 
-def grid_map(terrain: ElevationMap) -> Any:
-    """grid_map_msgs/GridMap: cell (0, 0) at the corner of largest x and y, first index along -x, column-major."""
-    return _grid_map(terrain, terrain.layers, ["elevation"])
+def grid_map(terrain: ElevationMap, step: float = 0.0, precision: float = 0.0) -> Any:
+    """grid_map_msgs/GridMap: cell (0, 0) at the corner of largest x and y, first index along -x, column-major.
+
+    Lengths are rounded to multiples of `step`, m; variances, slopes and roughness within the relative error
+    `precision`; 0: exact.
+    """
+    layers = {name: rounded_layer(name, layer, step, precision) for name, layer in terrain.layers.items()}
+    return _grid_map(terrain, layers, ["elevation"])
 
 
 def reason_map(navigation: NavigationMap) -> Any:

@@ -29,7 +29,9 @@ from recordings.ros2.to_msg import (
     source_image,
     transform_message,
 )
+from recordings.sinks.map_cropping import cropped
 from recordings.sinks.own_types import leaves, plain_type, refusal
+from recordings.sinks.regional_steps import RegionalSteps, regional_maps
 from recordings.sinks.thinning import thinned
 from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
 
@@ -67,6 +69,17 @@ class McapSink:
         0.02, "side of the cubes of which each keeps one point, the first in the cloud; 0: all points", unit="m",
         low=0, high=10,
     )  # fmt: skip
+    length_step: float = parameter(
+        1 / 1024, "what heights of maps and coordinates of points are rounded to; 0: exact", unit="m", low=0, high=1
+    )
+    precision: float = parameter(
+        0.01, "largest relative error by which variances, slopes, roughness and sigmas are rounded; 0: exact", low=0,
+        high=0.1,
+    )  # fmt: skip
+    regional_step: float = parameter(
+        1.0, "path of the rover, or of the place 4 m ahead of it, between the regional maps that are written; 0: one a "
+        "frame", unit="m", low=0, high=1.5,
+    )  # fmt: skip
     compression: str = parameter(
         "lz4", "of the log; zstd takes a fifth less room than lz4 and twice the time", choices=tuple(COMPRESSIONS)
     )
@@ -76,6 +89,7 @@ class McapSink:
     _writer: Ros2Writer = field(init=False, repr=False)
     _kinds: Mapping[str, Any] = field(default_factory=dict, init=False, repr=False)
     _owners: dict[str, tuple[str, ...]] = field(default_factory=dict, init=False, repr=False)
+    _steps: RegionalSteps = field(init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
     empty: bool = field(default=False, init=False, repr=False)  # whether none of the streams to write had an item
 
@@ -100,7 +114,7 @@ class McapSink:
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: facts of the run, kept as the metadata record "roverflow"."""
         self._last_stamp, self.empty = None, any(stream in streams for stream in self._written)
-        self._kinds, self._owners = dict(streams), {}
+        self._kinds, self._owners, self._steps = dict(streams), {}, RegionalSteps(self.regional_step)
         self._writer = Ros2Writer(Path(path), keep=True, compression=self.compression)
         try:
             self._writer.metadata("roverflow", about)
@@ -111,10 +125,11 @@ class McapSink:
     def write(self, record: FrameRecord) -> None:
         """Write a frame."""
         writer, stamp = self._writer, record.stamp
-        for stream in self._written:
-            for topic, message in self._messages(stream, record.items.get(stream), stamp):
-                self.empty = False
-                writer.write(topic, message, stamp)
+        regional = regional_maps(stamp, record.items, self._written)
+        for due in self._steps.due(regional) if regional.maps else ():
+            self._write_items(due.maps, due.stamp)
+        kept = {name: record.items[name] for name in self._written if name in record.items.keys() - regional.maps}
+        self._write_items(kept, stamp)
         transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)
@@ -132,6 +147,8 @@ class McapSink:
         writer = self._writer
         if writer.closed:  # a write failed and raised
             return
+        for due in self._steps.rest():
+            self._write_items(due.maps, due.stamp)
         entries = list(summary.get("entries", ()))
         found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
         findings = [_finding(stream, finding) for stream, finding in found]
@@ -156,6 +173,13 @@ class McapSink:
     def _written(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys((*self.results, *self.also)))
 
+    def _write_items(self, items: Mapping[str, Any], stamp: int) -> None:
+        """Write streams of a frame."""
+        for stream, item in cropped(items).items():
+            for topic, message in self._messages(stream, item, stamp):
+                self.empty = False
+                self._writer.write(topic, message, stamp)
+
     def _messages(self, stream: str, item: Any, stamp: int) -> Iterator[tuple[str, Any]]:
         """Topic and message of each part of an item."""
         for path, leaf in leaves(item, self._kinds.get(stream, type(item)), _KNOWN):
@@ -177,9 +201,9 @@ class McapSink:
             case Disparity():
                 return {"": disparity_image(leaf, self.disparity_step), "/source": source_image(leaf)}
             case PointCloud():
-                return {"": point_cloud(thinned(leaf, self.point_spacing))}
+                return {"": point_cloud(thinned(leaf, self.point_spacing), self.length_step, self.precision)}
             case ElevationMap():
-                return {"": grid_map(leaf)}
+                return {"": grid_map(leaf, self.length_step, self.precision)}
             case NavigationMap():  # an OccupancyGrid has no room for the reasons
                 return {"": occupancy_grid(leaf), "/reason": reason_map(leaf)}
             case Pose():

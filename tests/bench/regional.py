@@ -133,6 +133,7 @@ def _run(simulation: Simulation, folder: Path) -> Path:
     log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
     write_log(simulation, log)
     command = [sys.executable, "-m", "flow", "run", log, "-o", out, "--no-rrd", "--summary", summary]
+    command += ["--set", "McapSink.regional_step=0"]  # a map a frame
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return out
 

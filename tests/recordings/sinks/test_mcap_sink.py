@@ -11,7 +11,13 @@ from mcap.reader import make_reader
 
 from recordings import McapSink
 from recordings.mcap.file import iter_decoded
-from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid, stamp_of
+from recordings.ros2.from_msg import (
+    read_disparity,
+    read_grid_map,
+    read_occupancy_grid,
+    read_point_cloud,
+    stamp_of,
+)
 from stages import Fuse
 from stages.data import (
     Disparity,
@@ -91,7 +97,7 @@ def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path):
     assert (source.encoding, stamp_of(source.header), source.header.frame_id) == ("mono8", START, "left_optical")
     np.testing.assert_array_equal(source.data.reshape(source.height, source.width), sent["disparity"].source)
     elevation = read_grid_map(first["/nav/elevation_map"]).layers["elevation"]
-    np.testing.assert_array_equal(elevation, sent["elevation_map"].layers["elevation"])
+    np.testing.assert_allclose(elevation, sent["elevation_map"].layers["elevation"], rtol=0, atol=1 / 2048)
     navigation = read_occupancy_grid(first["/nav/navigation_map"], first["/nav/navigation_map/reason"])
     np.testing.assert_array_equal(navigation.cells, sent["navigation_map"].cells)
     np.testing.assert_array_equal(navigation.reason, sent["navigation_map"].reason)
@@ -216,3 +222,52 @@ def test_tilt_health_and_findings_are_in_the_diagnostics(tmp_path):
     assert [(status.level, status.name, status.message) for status in end] == [
         (2, "health", "turn it round"), (1, "region", "reset"), (0, "pose", "visual"),
     ]  # fmt: skip
+
+
+def drive_log(path: Path, frames: int, entries: tuple[Loss, ...] = (), **parameters: float) -> Path:
+    """The log of a drive whose rover moves by a quarter of a metre from frame to frame, ended after some frames."""
+    fuse, sink = Running(Fuse()), McapSink(**parameters)
+    sink.open(path, {"regional_map": ElevationMap}, ABOUT)
+    for frame in range(frames):
+        cloud, pose = drive(frame, at=(0.25 * frame, 0.0, 0.0))
+        sink.write(Record(cloud.stamp, {"regional_map": fuse(cloud, pose, MOUNT)}))
+    sink.close({"verdict": "INCOMPLETE", "interrupted": True, "entries": entries})
+    return path
+
+
+def regional_maps_of(path: Path) -> dict[int, ElevationMap]:
+    return {stamp: read_grid_map(message) for _, stamp, message in iter_decoded(path, ["/nav/regional_map"])}
+
+
+@pytest.mark.parametrize("frames", [1, 4, 6])
+def test_an_interrupted_run_ends_with_its_last_regional_map(tmp_path, frames):
+    every = regional_maps_of(drive_log(tmp_path / "every.mcap", frames, regional_step=0.0))
+    lost = (Loss("points", DRIVE + 99 * SECOND, "level", "abandoned", "the run was stopped"),)
+    path = drive_log(tmp_path / "out.mcap", frames, lost)
+    some = regional_maps_of(path)
+    assert len(every) == frames
+    assert max(some) == max(every)
+    assert len(some) < frames or frames == 1
+    for stamp, found in some.items():
+        assert (found.shape, found.origin) == (every[stamp].shape, every[stamp].origin)
+        np.testing.assert_array_equal(found.layers["elevation"], every[stamp].layers["elevation"])
+
+
+def test_equal_drives_give_equal_bytes(tmp_path):
+    one, other = (drive_log(tmp_path / name, 6).read_bytes() for name in ("a.mcap", "b.mcap"))
+    assert one == other
+
+
+def test_no_rounding_keeps_every_bit(tmp_path):
+    exact = {"disparity_step": 0.0, "point_spacing": 0.0, "length_step": 0.0, "precision": 0.0}
+    sink, sent = McapSink(**exact), items(START)
+    sink.open(tmp_path / "out.mcap", STREAMS, ABOUT)
+    sink.write(Record(START, sent))
+    sink.close({})
+    read = {topic: message for topic, _, message in iter_decoded(tmp_path / "out.mcap")}
+    np.testing.assert_array_equal(read_disparity(read["/nav/disparity"]), sent["disparity"].pixels)
+    points = read_point_cloud(read["/nav/points"])
+    np.testing.assert_array_equal(np.column_stack([points[axis] for axis in "xyz"]), sent["points"].points)
+    np.testing.assert_array_equal(points["sigma"], sent["points"].sigma)
+    elevation = read_grid_map(read["/nav/elevation_map"]).layers["elevation"]
+    np.testing.assert_array_equal(elevation, sent["elevation_map"].layers["elevation"])
