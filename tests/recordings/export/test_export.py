@@ -156,6 +156,20 @@ def test_each_cell_in_the_ply_has_the_colour_of_its_best_point(result, tmp_path)
     assert colours == {(1.05, 2.05): (10, 220, 30), (0.45, 2.05): (7, 8, 250)}
 
 
+def test_frames_without_a_regional_map_give_colours_too(tmp_path):
+    path = tmp_path / "out.mcap"
+    with Ros2Writer(path) as writer:
+        for frame in range(3):
+            sent = cloud(frame).only(np.array([frame]))  # each frame has another point
+            if frame != 1:
+                writer.write("/nav/regional_map", ros2.grid_map(window(frame, (-1.0, 1.0), (30, 40))[0]), sent.stamp)
+            writer.write("/nav/points", ros2.point_cloud(sent), sent.stamp)
+            writer.write("/tf", ros2.transform_message([(LEVEL, sent.stamp)]), sent.stamp)
+    export(path, tmp_path / "out")
+    vertices = plyfile.PlyData.read(tmp_path / "out" / "points.ply")["vertex"]
+    assert (10, 220, 30) in set(zip(vertices["red"], vertices["green"], vertices["blue"], strict=True))
+
+
 def test_the_hillshade_has_light_from_the_north_west_and_a_world_file(tmp_path):
     x, y = np.meshgrid((np.arange(60) + 0.5) * STEP, (np.arange(40) + 0.5) * STEP)
     mound = np.exp(-((x - 4) ** 2 + (y - 1) ** 2)).astype(np.float32)
