@@ -32,11 +32,12 @@ def replay(
     from flow.config import loader as pipelines
     from flow.runtime.interrupts import Stop, interrupts
     from flow.runtime.run import run
+    from stages.kernel_loading import loading_kernels
 
     graph = pipelines.load(pipeline, overrides)
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()
-    with graph.source.open(log, start=start, end=end) as opened, _one_thread_per_call():
+    with loading_kernels(), graph.source.open(log, start=start, end=end) as opened, _one_thread_per_call():
         about = {
             "roverflow": product_version(),
             "pipeline": graph.text,

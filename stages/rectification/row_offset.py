@@ -22,6 +22,8 @@ from stages.data import Array
 from stages.robust_weights import MAD_TO_SIGMA, tukey_weights
 
 MAX_ORB_FEATURES = 4000  # per image
+MIN_SHARE_OF_FEATURES = 0.95  # of them, for a threshold to do
+FAST_THRESHOLDS = 20, 5  # gray levels; the lower one only where the higher one leaves too few features
 MIN_SIDE = 32  # px, smallest side of an image with features
 MAX_HAMMING_BITS = 64  # largest Hamming distance of a pair, of 256 bits
 MAX_DISTANCE_RATIO = 0.8  # largest ratio of the distance to that of the next best (Lowe, 2004)
@@ -202,9 +204,7 @@ def _paired_features(left: Array, right: Array) -> tuple[Array, Array]:
     """Features of both images with an unambiguous partner, (N, 2) float32 px each."""
     if min(left.shape) < MIN_SIDE:
         return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
-    # Coarse scales place a feature within a pixel or two only.
-    detector = cv2.ORB.create(MAX_ORB_FEATURES, scaleFactor=1.5, nlevels=3, fastThreshold=5)
-    (points, codes), (partners, partner_codes) = (detector.detectAndCompute(image, None) for image in (left, right))
+    (points, codes), (partners, partner_codes) = _orb_features(left), _orb_features(right)
     if len(points) < 2 or len(partners) < 2:
         return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
     left_places, right_places = (np.array([point.pt for point in found], np.float32) for found in (points, partners))
@@ -212,6 +212,16 @@ def _paired_features(left: Array, right: Array) -> tuple[Array, Array]:
     here, there = left_places[chosen], right_places[matched]
     within = np.abs(here[:, 1] - there[:, 1]) <= MAX_OFFSET
     return here[within], there[within]
+
+
+def _orb_features(image: Array) -> tuple[Sequence[cv2.KeyPoint], Array]:
+    """The strongest features and their codes, of fine scales: coarse ones place a feature within a pixel or two."""
+    points: Sequence[cv2.KeyPoint] = ()
+    for threshold in FAST_THRESHOLDS:
+        if len(points) < MIN_SHARE_OF_FEATURES * MAX_ORB_FEATURES:
+            detector = cv2.ORB.create(MAX_ORB_FEATURES, scaleFactor=1.5, nlevels=3, fastThreshold=threshold)
+            points = detector.detect(image, None)
+    return detector.compute(image, points)
 
 
 def _tracked(image: Array, other: Array, points: Array, guesses: Array) -> tuple[Array, Array]:
@@ -254,8 +264,8 @@ def _robust_fit(place: Array, values: Array, count: int) -> tuple[Array, float, 
     columns = _columns(place, count)
     weights = np.ones(len(values))
     for _ in range(REWEIGHTINGS):
-        roots = np.sqrt(weights)
-        terms = np.linalg.lstsq(columns * roots[:, None], values * roots, rcond=None)[0]
+        weighted = columns * weights[:, None]
+        terms = np.linalg.pinv(weighted.T @ columns) @ (weighted.T @ values)
         residuals = values - columns @ terms
         scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), 0.02)
         weights = tukey_weights(residuals, scale)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from skimage.segmentation import slic
 
 from stages.data import Array, Disparity, PixelOrigin, StereoFrame, known
 from stages.matching.intensity import eight_bit, gray
@@ -88,6 +87,8 @@ class RefinePaper(Stage):
 
     def _segmented(self, image: Array) -> Array:
         """SLIC superpixels, labels from 0, (H, W) int32."""
+        from skimage.segmentation import slic  # takes long to import, and the other pipelines need none of it
+
         channels = None if image.ndim == 2 else -1
         labels: Array = slic(
             image, n_segments=self.superpixels, compactness=self.compactness, slic_zero=True, start_label=0,

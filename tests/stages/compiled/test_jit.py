@@ -39,6 +39,13 @@ for folder in ("stages/matching/kernels", "stages/terrain/kernels", "recordings/
 """
 
 
+LOADING = """
+from stages.kernel_loading import imported_kernels, load
+from stages.matching.kernels.census import _census
+print(_census in imported_kernels(), load(_census), len(_census.signatures))
+"""
+
+
 @pytest.fixture
 def run(tmp_path):
     for room in ("flow", "stages", "recordings"):
@@ -86,3 +93,12 @@ def test_a_change_in_the_simulator_keeps_the_kernels_of_the_stages(run, tmp_path
     again = run(DIGESTS)[0].split()
     assert again[:2] == [matching, terrain]
     assert again[2] != simulator
+
+
+def test_kernels_of_earlier_runs_are_loaded_before_their_first_call_and_no_others(run, tmp_path):
+    assert run(LOADING) == ("True 0 0\n", "")
+    run()
+    assert run(LOADING) == ("True 1 1\n", "")
+    layer = tmp_path / "stages" / "compiled" / "simd.py"
+    layer.write_text(f"{layer.read_text()}\n# changed\n")
+    assert run(LOADING) == ("True 0 0\n", "")

@@ -1,0 +1,51 @@
+"""Loads compiled kernels beside other work, because the first call of each would wait for its own."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from numba.core.dispatcher import Dispatcher
+
+
+@contextmanager
+def loading_kernels() -> Iterator[None]:
+    """Load the machine code of earlier runs in a thread, for all kernels of imported stages."""
+    ended = threading.Event()
+
+    def work() -> None:
+        for kernel in imported_kernels():
+            if ended.is_set():
+                return
+            with suppress(Exception):  # the first call loads or compiles it, and reports what is wrong
+                load(kernel)
+
+    thread = threading.Thread(target=work, name="kernels", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def imported_kernels() -> list[Any]:
+    """The kernels in all modules of stages that are imported, each once."""
+    modules = [module for name, module in sorted(sys.modules.items()) if name.startswith("stages.")]
+    values = [value for module in modules for value in vars(module).values()]
+    return list({id(value): value for value in values if isinstance(value, Dispatcher)}.values())
+
+
+def load(kernel: Any) -> int:
+    """Load what numba keeps of a kernel for this processor and its present source; returns the number of versions."""
+    cache = kernel._cache
+    if not hasattr(cache, "_cache_file"):  # a part of kernels, which has no code of its own
+        return 0
+    codegen = kernel.targetctx.codegen()
+    kept = [key[0] for key in cache._cache_file._load_index() if key == cache._index_key(key[0], codegen)]
+    for signature in kept:
+        kernel.compile(signature)
+    return len(kept)
