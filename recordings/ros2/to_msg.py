@@ -89,15 +89,14 @@ def disparity_image(disparity: Disparity, step: float = 0.0) -> Any:
     if camera is not None and camera.cx_right != camera.cx:
         pixels = pixels + np.float32(camera.cx_right - camera.cx)
     pixels = to_multiples(pixels, step)
-    known = pixels[np.isfinite(pixels)]
+    low, high = (extreme.reduce(pixels, axis=None, initial=np.nan) for extreme in (np.fmin, np.fmax))  # without NaN
     height, width = pixels.shape
     return make(
         "stereo_msgs/msg/DisparityImage", header=header(disparity.stamp, frame_id),
         image=image(disparity.stamp, frame_id, pixels),
         f=camera.fx if camera is not None else np.nan, t=camera.baseline if camera is not None else np.nan,
         valid_window=_region(width, height),
-        min_disparity=float(known.min()) if known.size else np.nan,
-        max_disparity=float(known.max()) if known.size else np.nan, delta_d=step,
+        min_disparity=float(low), max_disparity=float(high), delta_d=step,
     )  # fmt: skip
 
 
