@@ -6,6 +6,7 @@ coordinates of the map's frame at their edges.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,12 @@ from recordings.errors import LogError
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from recordings.sinks import colormaps
-from stages.data import Array, ElevationMap, NavigationMap
+from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
 
 MAX_MAP_PX = 900  # maps are enlarged by a whole factor up to that
 MARGIN_PX = 64  # around a picture, for its scales
 INK, PAPER = (38, 40, 46), (250, 250, 248)
+_MAX_OFFSET = 1e-3  # of a cell, by rounding
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -58,8 +60,8 @@ def elevation_page(terrain: ElevationMap) -> Array:
     """Shaded relief of a terrain as an RGB page with coordinates and a colour bar."""
     terrain = colormaps.terrain_ahead(terrain)
     low, high = colormaps.elevation_limits(terrain.layers["elevation"])
-    rgb = colormaps.elevation_colors(terrain, (low, high))
-    page = _map_page(rgb, terrain.resolution, terrain.origin, f"elevation, m ({terrain.frame_id})")
+    rgb, origin = _with_rover(colormaps.elevation_colors(terrain, (low, high)), terrain, colormaps.UNKNOWN_RGB)
+    page = _map_page(rgb, terrain.resolution, origin, f"elevation, m ({terrain.frame_id})")
     _bar(page, low, high, cv2.COLORMAP_VIRIDIS)
     return page
 
@@ -67,9 +69,12 @@ def elevation_page(terrain: ElevationMap) -> Array:
 def navigation_page(navigation: NavigationMap) -> Array:
     """A navigation map as an RGB page with coordinates and a legend."""
     navigation = colormaps.navigation_ahead(navigation)
-    rgb = colormaps.legend_colors(navigation.cells, colormaps.CELL_LEGEND)
-    title = f"navigation map ({navigation.frame_id})"
-    page = _map_page(rgb, navigation.resolution, navigation.origin, title)
+    colors, unknown = (
+        colormaps.legend_colors(navigation.cells, colormaps.CELL_LEGEND),
+        colormaps.CELL_LEGEND[Cell.UNKNOWN],
+    )
+    rgb, origin = _with_rover(colors, navigation, unknown[1])
+    page = _map_page(rgb, navigation.resolution, origin, f"navigation map ({navigation.frame_id})")
     _legend(page, colormaps.CELL_LEGEND)
     return page
 
@@ -88,6 +93,20 @@ def _page(picture: Array, title: str) -> Array:
     page[MARGIN_PX : MARGIN_PX + height, MARGIN_PX : MARGIN_PX + width] = picture
     _text(page, title, (MARGIN_PX, MARGIN_PX - 20), 0.8)
     return page
+
+
+def _with_rover(
+    rgb: Array, grid: ElevationMap | NavigationMap, unknown: tuple[int, int, int]
+) -> tuple[Array, tuple[float, float]]:
+    """A grid (rows, cols, 3) in frame `level`, extended by unknown cells to the rover at (0, 0); and its origin."""
+    if grid.frame_id != LEVEL_FRAME:
+        return rgb, grid.origin
+    (x, y), step = grid.origin, grid.resolution
+    first = [min(0, math.floor(-at / step + _MAX_OFFSET)) for at in (y, x)]
+    last = [max(size, math.ceil(-at / step - _MAX_OFFSET)) for at, size in zip((y, x), rgb.shape[:2], strict=True)]
+    extended = np.full((last[0] - first[0], last[1] - first[1], 3), unknown, np.uint8)
+    extended[-first[0] :, -first[1] :][: rgb.shape[0], : rgb.shape[1]] = rgb
+    return extended, (round(x + first[1] * step, 6), round(y + first[0] * step, 6))
 
 
 def _map_page(rgb: Array, resolution: float, origin: tuple[float, float], title: str) -> Array:

@@ -72,6 +72,16 @@ def test_ahead_is_up_and_left_is_left():
     np.testing.assert_array_equal(picture, expected)
 
 
+def test_a_cropped_map_is_drawn_at_its_place_beside_the_rover():
+    cells = np.full((2, COLS - 3), Cell.HAZARD, np.int8)
+    corner = (1.5 + 1e-9, 1.0 + 1e-9)  # as sums of floats are
+    cropped = NavigationMap(START, cells, np.zeros(cells.shape, np.uint8), 0.5, corner, LEVEL_FRAME)
+    whole = np.full((4, COLS), Cell.UNKNOWN, np.int8)  # from the rover's place on
+    whole[2:, 3:] = Cell.HAZARD
+    expected = NavigationMap(START, whole, np.zeros(whole.shape, np.uint8), 0.5, (0.0, 0.0), LEVEL_FRAME)
+    np.testing.assert_array_equal(navigation_page(cropped), navigation_page(expected))
+
+
 def test_terrain_brightens_with_height_and_holes_stay_holes():
     picture = cells_of(elevation_page(terrain())).astype(int)
     assert tuple(picture[COLS - 1 - 4, ROWS - 1 - 3]) == colormaps.UNKNOWN_RGB
