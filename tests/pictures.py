@@ -100,7 +100,7 @@ def devon_picture(data: Path) -> Array:
     for _, frame in devon(data):
         streams = stereo_part("rover", frame, DISPARITIES, threads=2, entry="rectified")
         disparity = streams["disparity"]
-        plain = replace(stage("rover", "disparity"), support=False)(frame, streams["disparity/second_checked"])
+        plain = replace(stage("rover", "disparity"), support=False)(frame, streams["disparity/full"])
         known = np.where(np.isfinite(disparity.pixels)[..., None], colormaps.disparity_colors(disparity.pixels), 0)
         origin = colormaps.legend_colors(disparity.source, colormaps.SOURCE_LEGEND)
         for pictures in ((known.astype(np.uint8), origin), (_shaded(plain.pixels), _shaded(disparity.pixels))):

@@ -73,15 +73,15 @@ def real(folder: Path) -> Iterator[Case]:
 
 
 def refined(stream: str, **parameters: Any) -> Chain:
-    """What the last refinement of `rover`, with these parameters, makes of one of its streams."""
-    refine: Refine = replace(stage("rover", "disparity"), **parameters)
+    """What the last refinement of `accurate`, with these parameters, makes of one of its streams."""
+    refine: Refine = replace(stage("accurate", "disparity"), **parameters)
     return lambda streams, case: refine(case.frame, streams[stream])
 
 
 def remade(streams: dict[str, Callable[[dict[str, Any], Case], Disparity]]) -> Chain:
-    """`rover` with these streams made otherwise, and with what follows from them."""
+    """`accurate` with these streams made otherwise, and with what follows from them."""
     return lambda found, case: stereo_part(
-        "rover", case.frame, case.disparities, entry="rectified",
+        "accurate", case.frame, case.disparities, entry="rectified",
         **{"disparity/right": found["disparity/right"], **{name: make(found, case) for name, make in streams.items()}},
     )["disparity"]  # fmt: skip
 
@@ -100,7 +100,7 @@ def blind(streams: dict[str, Any], case: Case) -> Disparity:
 
 
 def matched(prior: str = "", **parameters: Any) -> Chain:
-    """A match of the whole range at full size, near a stream of `rover` if one is named."""
+    """A match of the whole range at full size, near a stream of `accurate` if one is named."""
     return lambda streams, case: Match(disparities=case.disparities, **parameters)(
         case.frame, *([streams[prior]] if prior else [])
     )
@@ -108,18 +108,18 @@ def matched(prior: str = "", **parameters: Any) -> Chain:
 
 def full(**parameters: Any) -> Chain:
     """The match at full size near the coarse one, with these parameters."""
-    return lambda streams, case: replace(stage("rover", "disparity/full"), disparities=case.disparities, **parameters)(
+    return lambda streams, case: replace(stage("accurate", "disparity/full"), disparities=case.disparities, **parameters)(
         case.frame, streams["disparity/prior"]
     )
 
 
 def part_of_range(part: int) -> Chain:
-    """`rover` with one `part` of the search range; what is nearer is found in smaller images first."""
-    return lambda _, case: stereo_part("rover", case.frame, case.disparities // part, entry="rectified")["disparity"]
+    """`accurate` with one `part` of the search range; what is nearer is found in smaller images first."""
+    return lambda _, case: stereo_part("accurate", case.frame, case.disparities // part, entry="rectified")["disparity"]
 
 
 def by_rows(streams: dict[str, Any], case: Case) -> Disparity:
-    """`rover` with holes filled along their rows, from the farther end, without asking the image."""
+    """`accurate` with holes filled along their rows, from the farther end, without asking the image."""
     found = refined("disparity/second_checked", fill=False)(streams, case)
     return replace(found, pixels=rows_filled(found.pixels))
 
@@ -146,38 +146,39 @@ STEPS: dict[str, Chain] = {
     "+ planes of surfaces": refined("disparity/second_checked", **LAST),
     "+ bilateral filter": refined("disparity/second_checked", edge_radius=0, support=False),
     "+ edges as in the image": refined("disparity/second_checked", support=False),
-    "+ support of weak texture: rover": lambda streams, _: streams["disparity"],
+    "+ support of texture: accurate": lambda streams, _: streams["disparity"],
 }
 VARIANTS: dict[str, Chain] = {
-    "rover without the coarse match": remade({"disparity/full": matched()}),
-    "rover, coarse match not refined": remade({"disparity/half_refined": lambda streams, _: streams["disparity/half"]}),
-    "rover without the right view": remade({"disparity/right": blind}),
-    "rover, right view of whole range": remade(
+    "accurate without the coarse match": remade({"disparity/full": matched()}),
+    "accurate, coarse match not refined": remade({"disparity/half_refined": lambda streams, _: streams["disparity/half"]}),
+    "accurate without the right view": remade({"disparity/right": blind}),
+    "accurate, right of whole range": remade(
         {
             "disparity/right": lambda streams, case: Match(disparities=case.disparities, paths=4)(
                 streams["disparity/right/swapped"]
             )
         }
     ),
-    "rover, not matched again": refined("disparity/full_checked"),
-    "rover, all rows the whole range": remade({"disparity/full": full(band_height=0)}),
-    "rover, again the whole range": remade({"disparity/second": matched("disparity/full_filled", paths=4)}),
-    "rover, matched a third time": remade(
-        {"disparity/second": lambda streams, case: stage("rover", "disparity/second")(case.frame, streams["disparity"])}
+    "accurate, not matched again": refined("disparity/full_checked"),
+    "accurate, all rows the whole range": remade({"disparity/full": full(band_height=0)}),
+    "accurate, again the whole range": remade({"disparity/second": matched("disparity/full_filled", paths=4)}),
+    "accurate, matched a third time": remade(
+        {"disparity/second": lambda streams, case: stage("accurate", "disparity/second")(case.frame, streams["disparity"])}
     ),
-    "rover with half the range": part_of_range(2),
-    "rover with a third of the range": part_of_range(3),
-    "rover, fractions from matching": refined("disparity/second_checked", subpixel_radius=0),
-    "rover without planes": refined("disparity/second_checked", plane_weight=0, plane_fill=False, surface_size=0),
-    "rover without surfaces": refined("disparity/second_checked", surface_size=0),
-    "rover, planes draw more: 0.7": refined("disparity/second_checked", plane_weight=0.7),
-    "rover, planes draw less: 0.3": refined("disparity/second_checked", plane_weight=0.3),
-    "rover, holes filled along rows": by_rows,
-    "rover, bilateral radius 6": refined("disparity/second_checked", bilateral_radius=6),
-    "rover, edges of radius 5": refined("disparity/second_checked", edge_radius=5),
-    "rover, 64 planes tried": refined("disparity/second_checked", hypotheses=64),
-    "rover, weak texture as strong": remade({"disparity/full": full(weak_texture_gain=1.0)}),
-    "rover with 8 paths": remade({"disparity/full": full(paths=8)}),
+    "accurate with half the range": part_of_range(2),
+    "accurate with a third of the range": part_of_range(3),
+    "accurate, fractions from matching": refined("disparity/second_checked", subpixel_radius=0),
+    "accurate without planes": refined("disparity/second_checked", plane_weight=0, plane_fill=False, surface_size=0),
+    "accurate without surfaces": refined("disparity/second_checked", surface_size=0),
+    "accurate, planes draw more: 0.7": refined("disparity/second_checked", plane_weight=0.7),
+    "accurate, planes draw less: 0.3": refined("disparity/second_checked", plane_weight=0.3),
+    "accurate, holes filled along rows": by_rows,
+    "accurate, bilateral radius 6": refined("disparity/second_checked", bilateral_radius=6),
+    "accurate, edges of radius 5": refined("disparity/second_checked", edge_radius=5),
+    "accurate, 64 planes tried": refined("disparity/second_checked", hypotheses=64),
+    "accurate, weak texture as strong": remade({"disparity/full": full(weak_texture_gain=1.0)}),
+    "accurate with 8 paths": remade({"disparity/full": full(paths=8)}),
+    "rover": whole("rover"),
     "fast": whole("fast"),
     "paper": whole("paper"),
 }
@@ -196,7 +197,7 @@ def measure(cases: list[Case]) -> dict[str, Array]:
     """Mean errors of every step and variant, and bad-1 near edges and away from them, of what both cameras see."""
     rows: dict[str, list[Array]] = {}
     for case in cases:
-        streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
+        streams = stereo_part("accurate", case.frame, case.disparities, entry="rectified")
         edges = near_edges(case.truth)
         for name, chain in {**STEPS, **VARIANTS}.items():
             pixels = chain(streams, case).pixels
@@ -209,26 +210,26 @@ def measure(cases: list[Case]) -> dict[str, Array]:
 
 
 def print_fills(cases: list[Case]) -> None:
-    """Print how often filled pixels of `rover` are off by over 1 px: where both cameras see, and what only one sees."""
+    """Print how often filled pixels of `accurate` are off by over 1 px: where both cameras see, and what only one sees."""
     shares = []
     for case in cases:
-        disparity = stereo_part("rover", case.frame, case.disparities, entry="rectified")["disparity"]
+        disparity = stereo_part("accurate", case.frame, case.disparities, entry="rectified")["disparity"]
         filled = (disparity.source == PixelOrigin.FILLED) & np.isfinite(case.truth)
         filled[:, : case.disparities] = False
         wrong, seen = np.abs(disparity.pixels - case.truth) > 1, case.mask == 255
         shares.append([100 * wrong[filled & area].mean() for area in (seen, ~seen)])
     both, one = np.nanmean(shares, axis=0)
     print(
-        f"\nfilled by rover, off by over 1 px: {both:.0f} % of what both cameras see, {one:.0f} % of what only one sees"
+        f"\nfilled by accurate, off by over 1 px: {both:.0f} % of what both cameras see, {one:.0f} % of what only one sees"
     )
 
 
 def print_skies(cases: list[Case]) -> None:
-    """Print the shares of the sky and of the ground seen by both cameras that `rover` calls measured, and the same
+    """Print the shares of the sky and of the ground seen by both cameras that `accurate` calls measured, and the same
     without the limits of correlation and sigma."""
     shares: dict[str, list[tuple[float, float]]] = {}
     for case in cases:
-        streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
+        streams = stereo_part("accurate", case.frame, case.disparities, entry="rectified")
         for name, chain in (
             ("with", refined("disparity/second_checked")),
             ("without", refined("disparity/second_checked", min_correlation=0.0, max_sigma=1e3)),
@@ -242,7 +243,7 @@ def print_skies(cases: list[Case]) -> None:
 
 
 def print_worth(cases: list[Case]) -> None:
-    """Print what share of the pixels of an origin is right within 1 px, beside the confidence that `rover` states."""
+    """Print what share of the pixels of an origin is right within 1 px, beside the confidence that `accurate` states."""
     origins: dict[str, Callable[[Disparity], Array]] = {
         f"measured, {low} to {high}": lambda found, low=low, high=high: (
             (found.source == PixelOrigin.MEASURED) & (found.confidence >= low) & (found.confidence < high)
@@ -255,7 +256,7 @@ def print_worth(cases: list[Case]) -> None:
     assert len({*TRUST[2:]}) == 4, "origins of equal confidence cannot be distinguished"
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for case in cases:
-        found = stereo_part("rover", case.frame, case.disparities, entry="rectified")["disparity"]
+        found = stereo_part("accurate", case.frame, case.disparities, entry="rectified")["disparity"]
         scored = np.isfinite(case.truth) & np.isfinite(found.pixels)
         scored[:, : case.disparities] = False
         right = np.abs(found.pixels - case.truth) <= 1
@@ -350,18 +351,18 @@ def main(folder: Path) -> None:
         print_worth(cases)
         for name, frame in devon(data):
             ways = {
-                "without support": stereo_part("rover", frame, 192, changes={"support": False})["disparity"],
-                "rover": stereo_part("rover", frame, 192)["disparity"],
+                "without support": stereo_part("accurate", frame, 192, changes={"support": False})["disparity"],
+                "accurate": stereo_part("accurate", frame, 192)["disparity"],
             }
             print_scatter(name, frame, ways)
-            pictures(folder, name, frame, ways["rover"])
+            pictures(folder, name, frame, ways["accurate"])
     cases = simulated()
     print_table("simulated frames", measure(cases), None)
     print_fills(cases)
     print_skies(cases)
     print_worth(cases)
     for case in cases:
-        streams = stereo_part("rover", case.frame, case.disparities, entry="rectified")
+        streams = stereo_part("accurate", case.frame, case.disparities, entry="rectified")
         pictures(folder, case.name.replace(" ", "-"), case.frame, streams["disparity"])
     legend = ", ".join(_legend())
     print(f"\npictures in {folder}: image, disparity; {legend}; confidence; edges of disparity on the image")

@@ -459,7 +459,7 @@ def test_stages_lists_every_stage_and_describes_one_or_a_data_type(capsys):
     assert capsys.readouterr().err.endswith("did you mean 'Match'?\n")
 
 
-@pytest.mark.parametrize("name", ["rover", "fast", "paper"])
+@pytest.mark.parametrize("name", ["rover", "fast", "accurate", "paper"])
 def test_a_printed_pipeline_is_a_pipeline_to_start_from(name, tmp_path, capsys):
     assert roverflow("pipeline", name) == 0
     copy = tmp_path / "mine.yaml"

@@ -14,7 +14,7 @@ from recordings.sinks.overwrite import is_ours
 
 def add_pipeline_options(sub: argparse.ArgumentParser) -> None:
     """Add -p and --set."""
-    sub.add_argument("-p", "--pipeline", default="rover", help="rover, fast, paper, or a YAML file (rover)")
+    sub.add_argument("-p", "--pipeline", default="rover", help="rover, fast, accurate, paper, or a YAML file (rover)")
     sub.add_argument(
         "--set", action="append", default=[], metavar="STREAM.PARAM=VALUE", help="change a parameter of the pipeline"
     )

@@ -25,7 +25,7 @@ def main() -> None:
         for size, disparities in SIZES.items():
             log = Path(folder) / f"{size}.mcap"
             _roverflow("simulate", log, "--scene", "gravel", "--frames", FRAMES, "--size", size)
-            for pipeline in ("rover", "fast", "paper"):
+            for pipeline in ("rover", "fast", "accurate", "paper"):
                 _bench(log, pipeline, size, disparities, cores)
 
 

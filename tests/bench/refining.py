@@ -146,7 +146,7 @@ def speed() -> None:
             matched.pixels, labels, count, hypotheses=64, weights=matched.confidence, threads=2
         ),
     }
-    for pipeline in ("rover", "fast"):
+    for pipeline in ("accurate", "rover", "fast"):
         for threads in (1, 2):
             contestants[f"{pipeline}, match and refine, {threads} threads"] = (
                 lambda pipeline=pipeline, threads=threads: stereo_part(
@@ -165,7 +165,7 @@ def speed() -> None:
     print(f"planes over scikit-image's, extrapolated        {our_planes / (their_planes * count / SAMPLE):8.4f}")
     support = seconds["rover, match and refine, 1 threads"] - seconds["rover without support, 1 threads"]
     print(f"support over MODE_HH, on one core               {support / opencv:8.3f}")
-    for pipeline in ("rover", "fast"):
+    for pipeline in ("accurate", "rover", "fast"):
         whole = seconds[f"{pipeline}, match and refine, 2 threads"]
         print(f"{pipeline} over MODE_HH and scikit-image's SLIC alone {whole / (opencv + their_slic):8.3f}")
         print(f"{pipeline} over MODE_HH alone                         {whole / opencv:8.3f}")
@@ -174,7 +174,7 @@ def speed() -> None:
 def accuracy(folder: Path) -> None:
     """Print the errors of the pipelines, scene by scene, and their means over those of the released code."""
     released = np.array([RELEASED[name] for name, *_ in scenes(folder)])
-    for pipeline in ("rover", "fast", "paper"):
+    for pipeline in ("accurate", "rover", "fast", "paper"):
         rows = []
         print(f"\n{pipeline:12} {COLUMNS}  known %")
         for name, frame, truth, mask, levels in scenes(folder):

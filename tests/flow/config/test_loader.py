@@ -309,7 +309,7 @@ def test_numbers_are_written_in_the_unit_that_a_user_would_choose(value, unit, t
 
 def test_a_binary_pipeline_file_is_refused_with_the_valid_names(tmp_path):
     (tmp_path / "t.mcap").write_bytes(b"\x89MCAP0\r\n")
-    with pytest.raises(UsageError, match=r"t.mcap is no text; give fast, paper, rover or a YAML file"):
+    with pytest.raises(UsageError, match=r"t.mcap is no text; give accurate, fast, paper, rover or a YAML file"):
         load(str(tmp_path / "t.mcap"))
 
 

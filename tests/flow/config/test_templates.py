@@ -210,7 +210,7 @@ def test_the_shipped_pipelines_are_short():
     assert sum(lines.values()) <= 200 * len(lines) / 3
 
 
-@pytest.mark.parametrize("name", ["rover", "fast"])
+@pytest.mark.parametrize("name", ["rover", "fast", "accurate"])
 def test_one_rover_reaches_every_stage_that_needs_it(name):
     nodes = load(name, ["rover.max_step=40 cm", "rover.wheel=60cm"]).nodes
     rovers = [node.actor.rover for node in nodes if hasattr(node.actor, "rover")]

@@ -39,7 +39,7 @@ def test_of_a_camera_that_hangs_upside_down_the_nearest_ground_is_above(up, near
     assert Running(CheckMatches())(disparity_with(matched), tilt, Mount(0, np.eye(3))).near == near
 
 
-@pytest.mark.parametrize("pipeline", ["rover", "fast"])
+@pytest.mark.parametrize("pipeline", ["accurate", "rover", "fast"])
 def test_only_a_search_range_that_ends_short_of_the_ground_is_a_warning(pipeline):
     simulation = Simulation(frames=1, width=320, height=240, seed=1, abundance=0.1)
     frame = StereoFrame(1, *simulation.frame(0).images, simulation.camera)  # of ground up to 46 px near
