@@ -108,9 +108,9 @@ def matched(prior: str = "", **parameters: Any) -> Chain:
 
 def full(**parameters: Any) -> Chain:
     """The match at full size near the coarse one, with these parameters."""
-    return lambda streams, case: replace(stage("accurate", "disparity/full"), disparities=case.disparities, **parameters)(
-        case.frame, streams["disparity/prior"]
-    )
+    return lambda streams, case: replace(
+        stage("accurate", "disparity/full"), disparities=case.disparities, **parameters
+    )(case.frame, streams["disparity/prior"])
 
 
 def part_of_range(part: int) -> Chain:
@@ -150,7 +150,9 @@ STEPS: dict[str, Chain] = {
 }
 VARIANTS: dict[str, Chain] = {
     "accurate without the coarse match": remade({"disparity/full": matched()}),
-    "accurate, coarse match not refined": remade({"disparity/half_refined": lambda streams, _: streams["disparity/half"]}),
+    "accurate, coarse match not refined": remade(
+        {"disparity/half_refined": lambda streams, _: streams["disparity/half"]}
+    ),
     "accurate without the right view": remade({"disparity/right": blind}),
     "accurate, right of whole range": remade(
         {
@@ -163,7 +165,11 @@ VARIANTS: dict[str, Chain] = {
     "accurate, all rows the whole range": remade({"disparity/full": full(band_height=0)}),
     "accurate, again the whole range": remade({"disparity/second": matched("disparity/full_filled", paths=4)}),
     "accurate, matched a third time": remade(
-        {"disparity/second": lambda streams, case: stage("accurate", "disparity/second")(case.frame, streams["disparity"])}
+        {
+            "disparity/second": lambda streams, case: stage("accurate", "disparity/second")(
+                case.frame, streams["disparity"]
+            )
+        }
     ),
     "accurate with half the range": part_of_range(2),
     "accurate with a third of the range": part_of_range(3),
@@ -210,7 +216,7 @@ def measure(cases: list[Case]) -> dict[str, Array]:
 
 
 def print_fills(cases: list[Case]) -> None:
-    """Print how often filled pixels of `accurate` are off by over 1 px: where both cameras see, and what only one sees."""
+    """Print how often filled pixels of `accurate` are off by over 1 px, of what both cameras see, and of the rest."""
     shares = []
     for case in cases:
         disparity = stereo_part("accurate", case.frame, case.disparities, entry="rectified")["disparity"]
@@ -219,9 +225,7 @@ def print_fills(cases: list[Case]) -> None:
         wrong, seen = np.abs(disparity.pixels - case.truth) > 1, case.mask == 255
         shares.append([100 * wrong[filled & area].mean() for area in (seen, ~seen)])
     both, one = np.nanmean(shares, axis=0)
-    print(
-        f"\nfilled by accurate, off by over 1 px: {both:.0f} % of what both cameras see, {one:.0f} % of what only one sees"
-    )
+    print(f"\nfilled by accurate, off by over 1 px: {both:.0f} % of what both cameras see, {one:.0f} % of the rest")
 
 
 def print_skies(cases: list[Case]) -> None:
@@ -243,7 +247,7 @@ def print_skies(cases: list[Case]) -> None:
 
 
 def print_worth(cases: list[Case]) -> None:
-    """Print what share of the pixels of an origin is right within 1 px, beside the confidence that `accurate` states."""
+    """Print what share of the pixels of an origin is right within 1 px, beside the confidence stated."""
     origins: dict[str, Callable[[Disparity], Array]] = {
         f"measured, {low} to {high}": lambda found, low=low, high=high: (
             (found.source == PixelOrigin.MEASURED) & (found.confidence >= low) & (found.confidence < high)

@@ -11,7 +11,7 @@ HELP = "print the file of a pipeline or of one of its templates: roverflow pipel
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("name", metavar="NAME", help="rover, fast, accurate, paper, a template such as rover_disparity, or a file")
+    sub.add_argument("name", metavar="NAME", help="a pipeline, a template such as rover_disparity, or a file")
 
 
 def run(options: argparse.Namespace) -> int:
