@@ -38,6 +38,11 @@ class Canvas:
     recording: rr.RecordingStream
     jpeg_quality: int
     max_points: int
+    max_width: int
+    pictures: bool = True  # whether this frame's images, clouds and surfaces are drawn
+    full_size: frozenset[str] = frozenset()  # streams of disparities and images that are no intermediates
+    sized: frozenset[str] = frozenset()  # all streams of disparities and images
+    logged_bytes: int = 0  # so far, before compression
     views: dict[tuple[Panel, str], ViewSpec] = field(default_factory=dict)
     camera: StereoCamera | None = None
     _curves: dict[Panel, list[str]] = field(default_factory=dict)
@@ -51,6 +56,7 @@ class Canvas:
         """Log an entity at the frame's time; views: where the blueprint shows it."""
         self.recording.log(path, archetype)
         self._now[path] = type(archetype)
+        self.logged_bytes += sum(batch.as_arrow_array().nbytes for batch in archetype.as_component_batches())
         for view in views:
             self.add_view(view)
 
@@ -79,6 +85,17 @@ class Canvas:
         if self._texts.get(path) != text:
             self._texts[path] = text
             self.recording.log(f"{LEDGER}/{path}", rr.TextLog(text, level=level))
+
+    def width(self, stream: str) -> int:
+        """The widest picture of a stream of disparities or images, px: an intermediate is drawn smaller."""
+        intermediate = stream in self.sized and stream not in self.full_size
+        return max(1, self.max_width * 3 // 8) if intermediate else self.max_width
+
+    def log_exact(self, path: str, pixels: Array, view: ViewSpec) -> None:
+        """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as PNG."""
+        stored = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        _, png = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        self.log(path, rr.EncodedImage(contents=png, media_type="image/png"), view)
 
     def log_image(self, path: str, pixels: Array, view: ViewSpec) -> None:
         """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as JPEG."""

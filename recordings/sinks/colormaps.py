@@ -97,6 +97,40 @@ def disparity_colors(disparity: Array, limit: float | None = None) -> Array:
     return apply_palette(disparity, 0.0, disparity_limit(disparity) if limit is None else limit, cv2.COLORMAP_TURBO)
 
 
+def stride(width: int, max_width: int) -> int:
+    """The n of the n-th pixels that a picture of at most `max_width` px has."""
+    return max(1, -(-width // max_width))
+
+
+def every_nth(pixels: Array, max_width: int) -> Array:
+    """Every n-th row and column of an image (H, W), so that it is at most `max_width` px wide."""
+    step = stride(pixels.shape[1], max_width)
+    return pixels[step // 2 :: step, step // 2 :: step]
+
+
+def shrunk(image: Array, max_width: int) -> Array:
+    """An image, (H, W) or (H, W, 3), as the means of the squares whose first pixels `every_nth` counts."""
+    step = stride(image.shape[1], max_width)
+    if step == 1:
+        return image
+    size = tuple(len(range(step // 2, length, step)) for length in image.shape[1::-1])
+    mean: Array = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return mean
+
+
+def every_nth_cell(terrain: ElevationMap, max_cells: int) -> ElevationMap:
+    """The terrain at every n-th row and column, with about `max_cells` known elevations at most."""
+    elevation = terrain.layers["elevation"]
+    step = math.ceil(math.sqrt(max(1.0, np.count_nonzero(np.isfinite(elevation)) / max_cells)))
+    if step == 1:
+        return terrain
+    first, pitch = step // 2, step * terrain.resolution
+    shift = (first + 0.5 - 0.5 * step) * terrain.resolution  # a chosen cell is the centre of its coarse cell
+    origin = (terrain.origin[0] + shift, terrain.origin[1] + shift)
+    layers = {name: layer[first::step, first::step] for name, layer in terrain.layers.items()}
+    return replace(terrain, layers=layers, resolution=pitch, origin=origin)
+
+
 def segment_edges(labels: Array) -> Array:
     """Where a pixel's right or lower neighbour belongs to another superpixel: labels (H, W) -> bool (H, W)."""
     edges = np.zeros(labels.shape, bool)

@@ -37,7 +37,8 @@ from stages.data import (
     known,
 )
 
-DISPARITY_STEPS = 8  # disparities are stored to 1/8 px, in four fifths of the bytes that 1/16 px takes
+DISPARITY_STEPS = 4  # disparities are drawn to 1/4 px; the result log has them as they are
+MAX_CELLS = 4000  # known ones, of a surface and of the layers of a map; a relief has all
 HAZARD_LIFT = 0.03  # m above the ground at which hazards are drawn, so that the surface does not hide them
 LINE_SPACING = 2  # m, between the lines across a map
 CAMERA_RGB: Rgb = (255, 210, 60)
@@ -72,17 +73,48 @@ def log_stereo(canvas: Canvas, stream: str, frame: StereoFrame) -> None:
     canvas.camera = canvas.camera or frame.camera
     own = same_view(frame.camera, canvas.camera)
     panels = (Panel.LEFT, Panel.RIGHT) if own else (Panel.LEFT_DERIVED, Panel.RIGHT_DERIVED)
+    if not canvas.pictures:
+        return
     images = colormaps.top_eight_bits(frame.left, frame.right)
     for side, panel, pixels in zip(("left", "right"), panels, images, strict=True):
-        canvas.log_image(f"{stream}/{side}", pixels, ViewSpec(panel, stream, side, f"{stream}: {side}"))
+        width = canvas.width(stream)
+        canvas.log_image(
+            f"{stream}/{side}", colormaps.shrunk(pixels, width), ViewSpec(panel, stream, side, f"{stream}: {side}")
+        )
 
 
 @logger_for(Disparity)
 def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     """The disparities (hover reads them in px), the origin of each pixel, and the superpixels' edges."""
+    counts = cv2.calcHist([disparity.source], [0], None, [256], [0, 256]).ravel()
+    shares = {kind: 100.0 * counts[kind] / disparity.source.size for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
+    parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in shares.items() if share)
+    caption = f"{stream} {', '.join([f'{_percent(known(disparity.source)):.0f} % known', *parts])}"
+    if not canvas.pictures:
+        return caption
+    width = canvas.width(stream)
+    _log_pixels(canvas, stream, disparity.pixels, width)
+    if not {*np.flatnonzero(counts).tolist()} <= {PixelOrigin.UNKNOWN, PixelOrigin.MEASURED}:
+        view = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
+        canvas.log_labels(view, colormaps.every_nth(disparity.source, width), colormaps.SOURCE_LEGEND, beside=True)
+    if disparity.segments is not None:
+        # They lie over the left image. Edges of fewer pixels are denser, so they are fainter.
+        segments, step = disparity.segments, colormaps.stride(disparity.segments.shape[1], canvas.max_width)
+        segments = colormaps.every_nth(segments, canvas.max_width)
+        edges = colormaps.segment_edges(segments).astype(np.uint8) * 255
+        _, lines = cv2.imencode(".png", edges, [cv2.IMWRITE_PNG_BILEVEL, 1])
+        overlay = rr.EncodedImage(contents=lines, media_type="image/png", opacity=0.4 / step, draw_order=10.0)
+        view = ViewSpec(Panel.SUPERPIXELS, stream, "superpixels", f"{stream}: superpixels")
+        canvas.log(view.path, overlay, view)
+    return caption
+
+
+def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int) -> None:
+    """The disparities of every n-th pixel, with their scale."""
     # Rounded; NaN and negative values become 0.
-    steps: Array = cv2.multiply(disparity.pixels, DISPARITY_STEPS, dtype=cv2.CV_16U)  # type: ignore[call-overload]
-    limit = colormaps.disparity_limit(disparity.pixels)
+    thinned = np.ascontiguousarray(colormaps.every_nth(pixels, max_width))
+    steps: Array = cv2.multiply(thinned, DISPARITY_STEPS, dtype=cv2.CV_16U)  # type: ignore[call-overload]
+    limit = colormaps.disparity_limit(pixels)
     image = rr.EncodedDepthImage(
         png16(steps), media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
         depth_range=(0.0, limit * DISPARITY_STEPS),
@@ -90,29 +122,17 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     view = ViewSpec(Panel.DISPARITY, stream, "pixels", stream)
     canvas.log(view.path, image, view)
     canvas.log_scale(f"{view.path}/scale", steps.shape, 0.0, limit, "px", cv2.COLORMAP_TURBO)
-    codes = np.flatnonzero(np.bincount(disparity.source.ravel(), minlength=1))
-    if not {*codes.tolist()} <= {PixelOrigin.UNKNOWN, PixelOrigin.MEASURED}:
-        source = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
-        canvas.log_labels(source, disparity.source, colormaps.SOURCE_LEGEND, beside=True)
-    if disparity.segments is not None:
-        edges = colormaps.segment_edges(disparity.segments).astype(np.uint8) * 255
-        _, lines = cv2.imencode(".png", edges, [cv2.IMWRITE_PNG_BILEVEL, 1])
-        overlay = rr.EncodedImage(contents=lines, media_type="image/png", opacity=0.4, draw_order=10.0)
-        view = ViewSpec(Panel.SUPERPIXELS, stream, "superpixels", f"{stream}: superpixels")
-        canvas.log(view.path, overlay, view)
-    shares = {kind: _percent(disparity.source == kind) for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
-    parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in shares.items() if share)
-    return f"{stream} {', '.join([f'{_percent(known(disparity.source)):.0f} % known', *parts])}"
 
 
 @logger_for(PointCloud)
 def log_cloud(canvas: Canvas, stream: str, cloud: PointCloud) -> str:
     """Every n-th point, if the sensor's pose is known; a cloud in the camera's own frame is not drawn."""
     if cloud.sensor is not None:
-        some = slice(None, None, max(1, -(-len(cloud.points) // canvas.max_points)))
-        points = rr.Points3D(cloud.points[some], colors=cloud.colors[some], radii=rr.Radius.ui_points(1.5))
-        view = ViewSpec(Panel.CLOUD, stream, "points", stream, cloud.frame_id)
-        canvas.log(view.path, points, view)
+        if canvas.pictures:
+            some = slice(None, None, max(1, -(-len(cloud.points) // canvas.max_points)))
+            points = rr.Points3D(cloud.points[some], colors=cloud.colors[some], radii=rr.Radius.ui_points(2.0))
+            view = ViewSpec(Panel.CLOUD, stream, "points", stream, cloud.frame_id)
+            canvas.log(view.path, points, view)
         # An optical axis (z) below the horizon is pitch down; the image's right side (x) below it is roll right.
         for name, axis in (("camera pitch down", 2), ("camera roll right", 0)):
             _plot_angle(canvas, stream, name, -cloud.sensor.rotation[2, axis])
@@ -122,6 +142,9 @@ def log_cloud(canvas: Canvas, stream: str, cloud: PointCloud) -> str:
 @logger_for(VoxelMap)
 def log_voxels(canvas: Canvas, stream: str, voxels: VoxelMap) -> str:
     """Every n-th cube, in its mean colour."""
+    caption = f"{stream} {len(voxels.index)} voxels"
+    if not canvas.pictures:
+        return caption
     some = slice(None, None, max(1, -(-len(voxels.index) // canvas.max_points)))
     centres = (voxels.index[some] + np.float32(0.5)) * np.float32(voxels.resolution)
     half = np.full((1, 3), voxels.resolution / 2, np.float32)
@@ -129,7 +152,7 @@ def log_voxels(canvas: Canvas, stream: str, voxels: VoxelMap) -> str:
                        fill_mode=rr.components.FillMode.Solid)  # fmt: skip
     view = ViewSpec(Panel.VOXELS, stream, "voxels", stream, voxels.frame_id)
     canvas.log(view.path, boxes, view)
-    return f"{stream} {len(voxels.index)} voxels"
+    return caption
 
 
 @logger_for(Tilt)
@@ -184,19 +207,23 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     low, high = colormaps.elevation_limits(elevation)
     rgb = colormaps.elevation_colors(terrain, (low, high))
     relief = ViewSpec(Panel.RELIEF, stream, "relief", f"relief{suffix}")
-    canvas.log(relief.path, rr.Image(colormaps.birds_eye(rgb)), relief)
+    canvas.log_exact(relief.path, colormaps.birds_eye(rgb), relief)
     canvas.log_scale(f"{relief.path}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
     _log_distances(canvas, f"{relief.path}/lines", terrain.shape, terrain)
-    for name, layer in terrain.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
+    caption = f"{stream} {counted(int(np.count_nonzero(np.isfinite(elevation))), 'cell')}"
+    if not canvas.pictures:
+        return caption
+    coarse = colormaps.every_nth_cell(terrain, MAX_CELLS)
+    for name, layer in coarse.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
         view = ViewSpec(Panel.LAYER, stream, f"layers/{rr.escape_entity_path_part(name)}", f"{name}{suffix}")
         canvas.log_values(colormaps.birds_eye(layer.astype(np.float16)), colormaps.value_limits(layer), view)
-    vertices, triangles = colormaps.surface(terrain)
+    vertices, triangles = colormaps.surface(coarse)
     if len(triangles):
-        colors = rgb[np.isfinite(elevation)]
+        colors = colormaps.elevation_colors(coarse, (low, high))[np.isfinite(coarse.layers["elevation"])]
         mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_colors=colors)
         view = ViewSpec(Panel.TERRAIN, stream, "surface", stream, terrain.frame_id)
         canvas.log(view.path, mesh, view)
-    return f"{stream} {counted(len(vertices), 'cell')}"
+    return caption
 
 
 @logger_for(NavigationMap)
@@ -217,7 +244,7 @@ def log_navigation(canvas: Canvas, stream: str, navigation: NavigationMap) -> st
 def log_camera(canvas: Canvas, stream: str, frame: StereoFrame, cloud: PointCloud) -> None:
     """The left image, small, in the camera's frustum, and a plumb line from the camera to the ground plane."""
     camera, sensor = frame.camera, cloud.sensor
-    if sensor is None:
+    if sensor is None or not canvas.pictures:
         return
     left, scale = colormaps.top_eight_bits(frame.left, frame.right)[0], THUMBNAIL_SCALE
     small = cv2.resize(left, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -45,6 +45,8 @@ def log_own(canvas: Canvas, stream: str, item: Any) -> str:
 
 
 def _log_array(canvas: Canvas, spec: ViewSpec, array: Array) -> None:
+    if array.ndim > 1 and not canvas.pictures:
+        return
     if is_points(array):
         some = slice(None, None, max(1, -(-len(array) // canvas.max_points)))
         points = rr.Points3D(array[some].astype(np.float32), radii=rr.Radius.ui_points(1.5))
@@ -67,8 +69,7 @@ def _log_image(canvas: Canvas, spec: ViewSpec, pixels: Array) -> None:
         canvas.log_image(spec.path, pixels, spec)
         return
     if pixels.dtype == np.uint8:  # masks and labels stay exact
-        _, png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        canvas.log(spec.path, rr.EncodedImage(contents=png, media_type="image/png"), spec)
+        canvas.log_exact(spec.path, pixels, spec)
         return
     values = pixels.astype(np.float32)
     limits = value_limits(values)

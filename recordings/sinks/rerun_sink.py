@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
+from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
 from resource import RLIM_INFINITY, RLIMIT_FSIZE, getrlimit
@@ -28,10 +29,12 @@ from recordings.sinks.canvas import Canvas
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import NUMBERS, plain_type
-from stages.data import Array, ElevationMap, Mount, Pose, StereoFrame
+from stages.data import Array, Disparity, ElevationMap, Mount, Pose, StereoFrame
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
+BATCH_BYTES = 4 << 20  # of some frames; each stored chunk takes 3 kB besides its content
+BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
 STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
 FOOTER_MAGIC = b"RRF2FOOT"  # at the end of a whole recording, before a checksum of 4 bytes
@@ -52,8 +55,16 @@ class RerunSink:
     """
 
     application_id: str = parameter("roverflow", "recordings of one application share the layout that the viewer saves")
-    max_points: int = parameter(50_000, "most points drawn of a cloud; the cloud in the result log is whole", low=1)
-    jpeg_quality: int = parameter(80, "of the camera images", low=1, high=100)
+    max_points: int = parameter(12_000, "most points drawn of a cloud", low=1)
+    max_width: int = parameter(640, "widest picture; an intermediate has three eighths of it", low=8, unit="px")
+    jpeg_quality: int = parameter(75, "of the camera images", low=1, high=100)
+    every: int = parameter(1, "images, clouds and surfaces of each n-th frame are drawn", low=1)
+    max_megabytes: int = parameter(
+        0, "room of the recording before its compression; 0: no limit. Images, clouds and surfaces are drawn half as "
+        "often each time that half of the remaining room is used",
+        low=0, unit="MB",
+    )  # fmt: skip
+    without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
 
     suffix = ".rrd"
 
@@ -63,6 +74,8 @@ class RerunSink:
 
     def wants(self, stream: str, kind: Any) -> bool:
         """Whether items of type `kind` can be drawn."""
+        if any(fnmatchcase(stream, pattern) for pattern in self.without):
+            return False
         plain = plain_type(kind)
         if not isinstance(plain, type) or issubclass(plain, Mount):
             return False
@@ -87,7 +100,13 @@ class RerunSink:
         except BaseException:
             self._partial.unlink(missing_ok=True)
             raise
-        self._canvas = Canvas(self._recording, self.jpeg_quality, self.max_points)
+        sized = [name for name, kind in streams.items() if _is(kind, Disparity) or _is(kind, StereoFrame)]
+        self._last_disparity = [name for name in sized if _is(streams[name], Disparity)][-1:]
+        self._canvas = Canvas(
+            self._recording, self.jpeg_quality, self.max_points, self.max_width, sized=frozenset(sized)
+        )
+        self._interval, self._rest = self.every, 1e6 * self.max_megabytes
+        self._drawn = 0  # frames with images
         self._closed = False
 
     def _check_room(self) -> None:
@@ -97,7 +116,8 @@ class RerunSink:
 
     def _begin(self) -> None:
         self._check_room()
-        self._recording = rr.RecordingStream(self.application_id)
+        batches = rr.ChunkBatcherConfig(flush_tick=BATCH_SECONDS, flush_num_bytes=BATCH_BYTES)
+        self._recording = rr.RecordingStream(self.application_id, batcher_config=batches)
         self._recording.set_log_time_enabled(False)
         self._recording.set_sinks(rr.FileSink(str(self._partial)))
         self._recording.send_recording_name(self._about.get("log", self._path.stem))
@@ -111,6 +131,7 @@ class RerunSink:
         self._check_room()
         with catch_and_log_exceptions(strict=True):
             self._set_clocks(record.stamp, self._frames)
+            self._choose_pictures(record.items)
             captions = self._draw(record.items)
             self._plot(record)
             self._canvas.clear_missing()
@@ -159,7 +180,12 @@ class RerunSink:
         facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
         for key in {"surveys", "findings"} & facts.keys():
             facts[key] = {name: f"{one['severity']}: {one['sentence']}" for name, one in summary[key].items()}
-        self._recording.log(SUMMARY, _document(verdict, self._about, facts), static=True)
+        pictures = {"frames with images and clouds": f"{self._drawn} of {self._frames}"}
+        if self._interval > 1:
+            pictures["thinned"] = f"at the end each {self._interval}th frame has images, clouds and surfaces"
+        if self.without:
+            pictures["not drawn"] = ", ".join(self.without)
+        self._recording.log(SUMMARY, _document(verdict, self._about, facts, pictures), static=True)
         self._send_blueprint()
 
     def _publish(self) -> None:
@@ -178,6 +204,18 @@ class RerunSink:
         self._stamp = max(stamp, self._stamp)
         self._recording.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
         self._recording.set_time(FRAME, sequence=frame)
+
+    def _choose_pictures(self, items: Mapping[str, Any]) -> None:
+        """Decide whether this frame's images, clouds and surfaces are drawn, and which streams are no intermediates.
+
+        Counted bytes, and not the file's size, decide, so that a recording does not depend on the speed of writing.
+        """
+        canvas, room = self._canvas, 1e6 * self.max_megabytes
+        while room and room - canvas.logged_bytes < self._rest / 2 and self._rest > 1:
+            self._rest, self._interval = self._rest / 2, 2 * self._interval
+        canvas.pictures = self._frames % self._interval == 0
+        self._drawn += canvas.pictures
+        canvas.full_size = frozenset([*self._last_disparity, *_last_of(StereoFrame, items)])
 
     def _draw(self, items: Mapping[str, Any]) -> list[str]:
         """Log the items of a frame; returns their captions."""
@@ -234,6 +272,11 @@ class RerunSink:
         if len(self._canvas.views) != self._views:
             self._views = len(self._canvas.views)
             self._recording.send_blueprint(blueprint(self._canvas.views.values()))
+
+
+def _is(kind: Any, wanted: type) -> bool:
+    plain = plain_type(kind)
+    return isinstance(plain, type) and issubclass(plain, wanted)
 
 
 def _clocks(stamps: Sequence[int], frames: Sequence[int]) -> list[rr.TimeColumn]:

@@ -23,12 +23,12 @@ from tests.recordings.sinks.recorded_scene import (
 )
 
 
-def test_disparities_are_stored_to_an_eighth_of_a_px_unknown_as_0(rrd):
+def test_disparities_are_stored_to_a_quarter_px_unknown_as_0(rrd):
     blob = rows(rrd, "/disparity/pixels", "EncodedDepthImage:blob")[0][2][0]
-    stored = decoded(blob, cv2.IMREAD_UNCHANGED) / 8.0
+    stored = decoded(blob, cv2.IMREAD_UNCHANGED) / 4.0
     truth = scene()["disparity"].pixels
     known = np.isfinite(truth)
-    assert np.abs(stored[known] - truth[known]).max() <= 1 / 16
+    assert np.abs(stored[known] - truth[known]).max() <= 1 / 8
     assert (stored[~known] == 0).all()
 
 

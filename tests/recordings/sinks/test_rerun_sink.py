@@ -5,15 +5,30 @@ import resource
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 import rerun as rr
 
 from recordings.errors import LogError
 from recordings.sinks.blueprint import CLOCK, FRAME
 from recordings.sinks.rerun_sink import PLOT_BATCH, RESERVED_BYTES, RerunSink
-from stages.data import Mount
-from tests.recordings.sinks.recorded_scene import START, STEP, STREAMS, Loss, Record, entities, record_of, rows, scene
+from stages.data import Disparity, Mount
+from tests.recordings.sinks.recorded_scene import (
+    START,
+    STEP,
+    STREAMS,
+    WIDTH,
+    Loss,
+    Record,
+    decoded,
+    entities,
+    record_of,
+    rows,
+    scene,
+)
 
 
 def opened(path):
@@ -58,7 +73,7 @@ def test_entities_that_a_frame_lacks_are_cleared_at_that_frame(tmp_path):
     second = {name: item for name, item in scene(START + STEP).items() if name not in lost}
     frames = [scene(), second, scene(START + 2 * STEP)]
     path = record_of(tmp_path / "lost.rrd", [Record(START + n * STEP, items) for n, items in enumerate(frames)])
-    for entity in ("/points/points", "/elevation_map/surface", "/elevation_map/relief", "/navigation_map/hazards"):
+    for entity in ("/points/points", "/elevation_map/surface", "/navigation_map/hazards"):
         cleared = [clock for clock, _, value in rows(path, entity, "Clear:is_recursive") if value is not None]
         assert cleared == [START + STEP], entity
     assert not rows(path, "/matched/source/labels", "Clear:is_recursive")
@@ -69,7 +84,8 @@ def test_entities_that_a_frame_lacks_are_cleared_at_that_frame(tmp_path):
     # An encoded image is emptied instead, because the viewer ignores its clearing.
     for entity, kind in (
         ("/rectified/left", "EncodedImage"), ("/rectified/camera/image", "EncodedImage"),
-        ("/disparity/superpixels", "EncodedImage"), ("/disparity/pixels", "EncodedDepthImage"),
+        ("/disparity/superpixels", "EncodedImage"), ("/elevation_map/relief", "EncodedImage"),
+        ("/disparity/pixels", "EncodedDepthImage"),
     ):  # fmt: skip
         blobs = [value for *_, value in rows(path, entity, f"{kind}:blob")]
         assert [bool(blob) for blob in blobs] == [True, False, True], entity
@@ -235,3 +251,59 @@ def test_two_sinks_on_one_path_do_not_mix(tmp_path):
         sink.close({"verdict": "COMPLETE"})
         assert b"RRF2FOOT" in path.read_bytes()[-20:]
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_intermediates_are_drawn_smaller_than_results(tmp_path):
+    path = record_of(tmp_path / "small.rrd", [Record(START, scene())], max_width=32)
+    shapes = {}
+    for stream in ("matched", "disparity"):
+        blob = rows(path, f"/{stream}/pixels", "EncodedDepthImage:blob")[0][2][0]
+        stored = decoded(blob, cv2.IMREAD_UNCHANGED) / 4.0
+        shapes[stream] = stored.shape
+        step = -(-WIDTH // stored.shape[1])
+        truth = np.nan_to_num(scene()[stream].pixels[step // 2 :: step, step // 2 :: step])
+        assert np.abs(stored - truth).max() <= 1 / 8, stream  # px of the full size
+    assert shapes == {"matched": (8, 11), "disparity": (24, 32)}
+    left = rows(path, "/rectified/left", "EncodedImage:blob")[0][2][0]
+    edges = rows(path, "/disparity/superpixels", "EncodedImage:blob")[0][2][0]
+    assert decoded(left, cv2.IMREAD_GRAYSCALE).shape == decoded(edges, cv2.IMREAD_GRAYSCALE).shape == (24, 32)
+
+
+def test_images_of_every_nth_frame_are_drawn_and_maps_of_all(tmp_path):
+    records = [Record(START + n * STEP, scene(START + n * STEP)) for n in range(4)]
+    path = record_of(tmp_path / "every.rrd", records, every=2)
+    for entity, component in (
+        ("/rectified/left", "EncodedImage:blob"), ("/disparity/pixels", "EncodedDepthImage:blob"),
+        ("/points/points", "Points3D:positions"), ("/elevation_map/surface", "Mesh3D:vertex_positions"),
+    ):  # fmt: skip
+        assert [frame for _, frame, value in rows(path, entity, component) if value] == [0, 2], entity
+    for entity, component in (
+        ("/elevation_map/relief", "EncodedImage:blob"), ("/navigation_map/cells/labels", "SegmentationImage:buffer"),
+        ("/motion/features", "Scalars:scalars"),
+    ):  # fmt: skip
+        assert [frame for _, frame, value in rows(path, entity, component) if value] == [0, 1, 2, 3], entity
+    assert "2 of 4" in rows(path, "/summary", "TextDocument:text")[-1][2][0]
+
+
+def test_a_budget_thins_images_more_and_more_and_is_kept(tmp_path):
+    records = []
+    for n in range(40):
+        items = scene(START + n * STEP)
+        points = np.resize(items["points"].points, (10_000, 3))
+        of = {"colors": np.zeros((10_000, 3), np.uint8), "sigma": np.ones(10_000, np.float32)}
+        items["points"] = replace(items["points"], points=points, pixel=np.zeros(10_000, np.int32), **of)
+        records.append(Record(items["points"].stamp, items))
+    path = record_of(tmp_path / "budget.rrd", records, max_megabytes=2)
+    clouds = [frame for _, frame, value in rows(path, "/points/points", "Points3D:positions") if value]
+    gaps = np.diff(clouds)
+    assert gaps[0] == 1
+    assert (np.diff(gaps) >= 0).all()
+    assert gaps[-1] >= 4
+    assert 3 < len(clouds) < 2e6 / 160_000
+    assert len(rows(path, "/elevation_map/relief", "EncodedImage:blob")) == 40
+
+
+def test_streams_may_be_left_out_by_patterns():
+    sink = RerunSink(without=("disparity/*", "voxels"))
+    wanted = {name: sink.wants(name, Disparity) for name in ("disparity", "disparity/half/full", "voxels")}
+    assert wanted == {"disparity": True, "disparity/half/full": False, "voxels": False}
