@@ -42,6 +42,7 @@ class Canvas:
     pictures: bool = True  # whether this frame's images, clouds and surfaces are drawn
     full_size: frozenset[str] = frozenset()  # streams of disparities and images that are no intermediates
     sized: frozenset[str] = frozenset()  # all streams of disparities and images
+    counts_bytes: bool = False
     logged_bytes: int = 0  # so far, before compression
     views: dict[tuple[Panel, str], ViewSpec] = field(default_factory=dict)
     camera: StereoCamera | None = None
@@ -56,7 +57,8 @@ class Canvas:
         """Log an entity at the frame's time; views: where the blueprint shows it."""
         self.recording.log(path, archetype)
         self._now[path] = type(archetype)
-        self.logged_bytes += sum(batch.as_arrow_array().nbytes for batch in archetype.as_component_batches())
+        if self.counts_bytes:
+            self.logged_bytes += sum(batch.as_arrow_array().nbytes for batch in archetype.as_component_batches())
         for view in views:
             self.add_view(view)
 

@@ -104,17 +104,19 @@ def stride(width: int, max_width: int) -> int:
 
 def every_nth(pixels: Array, max_width: int) -> Array:
     """Every n-th row and column of an image (H, W), so that it is at most `max_width` px wide."""
-    step = stride(pixels.shape[1], max_width)
-    return pixels[step // 2 :: step, step // 2 :: step]
+    step = min(stride(pixels.shape[1], max_width), len(pixels))
+    rows, cols = (length // step * step for length in pixels.shape)
+    return pixels[step // 2 : rows : step, step // 2 : cols : step]
 
 
 def shrunk(image: Array, max_width: int) -> Array:
-    """An image, (H, W) or (H, W, 3), as the means of the squares whose first pixels `every_nth` counts."""
-    step = stride(image.shape[1], max_width)
+    """An image, (H, W) or (H, W, 3), as the means of the squares around the pixels that `every_nth` takes."""
+    step = min(stride(image.shape[1], max_width), len(image))
+    rows, cols = (length // step for length in image.shape[:2])
     if step == 1:
         return image
-    size = tuple(len(range(step // 2, length, step)) for length in image.shape[1::-1])
-    mean: Array = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    whole = image[: rows * step, : cols * step]  # whole squares: a size that OpenCV averages fast
+    mean: Array = cv2.resize(whole, (cols, rows), interpolation=cv2.INTER_AREA)
     return mean
 
 

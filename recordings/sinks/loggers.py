@@ -38,6 +38,7 @@ from stages.data import (
 )
 
 DISPARITY_STEPS = 4  # disparities are drawn to 1/4 px; the result log has them as they are
+ALL_CODES = np.arange(256, dtype=np.uint8)
 MAX_CELLS = 4000  # known ones, of a surface and of the layers of a map; a relief has all
 HAZARD_LIFT = 0.03  # m above the ground at which hazards are drawn, so that the surface does not hide them
 LINE_SPACING = 2  # m, between the lines across a map
@@ -89,7 +90,8 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     counts = cv2.calcHist([disparity.source], [0], None, [256], [0, 256]).ravel()
     shares = {kind: 100.0 * counts[kind] / disparity.source.size for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
     parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in shares.items() if share)
-    caption = f"{stream} {', '.join([f'{_percent(known(disparity.source)):.0f} % known', *parts])}"
+    share = 100.0 * counts[known(ALL_CODES)].sum() / disparity.source.size
+    caption = f"{stream} {', '.join([f'{share:.0f} % known', *parts])}"
     if not canvas.pictures:
         return caption
     width = canvas.width(stream)
@@ -284,10 +286,6 @@ def _plot_angle(canvas: Canvas, stream: str, name: str, sine: float) -> None:
     angle = float(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
     path = f"{stream}/{rr.escape_entity_path_part(name)}"
     canvas.plot(path, angle, ViewSpec(Panel.ANGLE, stream, "", stream))
-
-
-def _percent(mask: Array) -> float:
-    return 100.0 * np.count_nonzero(mask) / mask.size
 
 
 def _frame_suffix(frame_id: str) -> str:

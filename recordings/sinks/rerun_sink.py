@@ -103,7 +103,12 @@ class RerunSink:
         sized = [name for name, kind in streams.items() if _is(kind, Disparity) or _is(kind, StereoFrame)]
         self._last_disparity = [name for name in sized if _is(streams[name], Disparity)][-1:]
         self._canvas = Canvas(
-            self._recording, self.jpeg_quality, self.max_points, self.max_width, sized=frozenset(sized)
+            self._recording,
+            self.jpeg_quality,
+            self.max_points,
+            self.max_width,
+            sized=frozenset(sized),
+            counts_bytes=self.max_megabytes > 0,
         )
         self._interval, self._rest = self.every, 1e6 * self.max_megabytes
         self._drawn = 0  # frames with images
