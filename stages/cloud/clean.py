@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from flow.contracts import StageError
 from stages.cloud.kernels.depth_order import out_of_order
 from stages.cloud.kernels.outliers import SupportRule, median_slope, supported
-from stages.cloud.kernels.patches import connected_patches, depth_images
+from stages.cloud.kernels.patches import connected_patches, depth_images, patch_sizes
 from stages.data import Array, PointCloud
 from stages.stage import Stage, parameter
 
@@ -70,33 +70,31 @@ class Clean(Stage):
         """Indices of the points kept by their neighbours in the image; points not measured are only cropped."""
         if cloud.shape is None:
             raise StageError("Clean: the cloud has no image shape; set it, or use method: knn")
-        measured = np.flatnonzero(cloud.measured)
-        square = np.einsum("ij,ij->i", cloud.points, cloud.points)
-        kept = ~cloud.measured & (cloud.points[:, 2] > 0) & (square <= self._crop**2)
-        kept[measured[self._supported(cloud.only(measured), cloud.shape)]] = True
-        return np.flatnonzero(kept)
+        if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < cloud.shape[0] * cloud.shape[1]:
+            raise StageError(f"Clean: the cloud has pixel indices outside its image of shape {cloud.shape}")
+        kept = self._supported(cloud, cloud.measured, cloud.shape)
+        others = np.flatnonzero(~cloud.measured)
+        if len(others):
+            points = cloud.points.take(others, axis=0)
+            near = (points[:, 2] > 0) & (np.einsum("ij,ij->i", points, points) <= self._crop**2)
+            kept = np.sort(np.concatenate([kept, others[near]]))
+        return kept
 
-    def _supported(self, cloud: PointCloud, shape: tuple[int, int]) -> Array:
-        """Indices of the points kept from a cloud of measured points."""
-        if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < shape[0] * shape[1]:
-            raise StageError(f"Clean: the cloud has pixel indices outside its image of shape {shape}")
-        rule = SupportRule(self._crop, MAX_DEVIATIONS, MAX_SLOPE_RATIO, MIN_AGREEING_SHARE, MIN_NEIGHBOURS)
-        kept = np.flatnonzero(supported(cloud.points, cloud.sigma, cloud.pixel, shape, rule))
-        return kept[self._in_good_patch(cloud, kept, shape)]
+    def _supported(self, cloud: PointCloud, measured: Array, shape: tuple[int, int]) -> Array:
+        """Indices of the points kept of the measured ones.
 
-    def _in_good_patch(self, cloud: PointCloud, kept: Array, shape: tuple[int, int]) -> Array:
-        """Which of the `kept` points lie in a large enough patch in depth order, (len(kept),) bool.
-
-        Points beyond the crop count here, because the sky begins above them.
+        Points beyond the crop count in the order of depth, because the sky begins above them.
         """
-        far = np.flatnonzero(cloud.points[:, 2] > self._crop)
+        rule = SupportRule(self._crop, MAX_DEVIATIONS, MAX_SLOPE_RATIO, MIN_AGREEING_SHARE, MIN_NEIGHBOURS)
+        kept = supported(cloud.points, cloud.sigma, cloud.pixel, np.flatnonzero(measured), shape, rule)
+        far = np.flatnonzero(measured & (cloud.points[:, 2] > self._crop))
         used = np.concatenate([kept, far])
         inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, used, shape, MAX_DEVIATIONS)
         patch = connected_patches(inverse, tolerance, MAX_SLOPE_RATIO * median_slope(inverse))
-        sizes = np.bincount(patch.ravel() + 1, minlength=patch.size + 1)
+        sizes = patch_sizes(patch)
         pixel = cloud.pixel.take(kept)
-        large = sizes.take(patch.ravel().take(pixel) + 1) >= self.min_patch_share * len(kept)
-        return np.asarray(large & ~out_of_order(inverse, patch).ravel().take(pixel))
+        large = sizes.take(patch.ravel().take(pixel)) >= self.min_patch_share * len(kept)
+        return np.asarray(kept[large & ~out_of_order(inverse, patch, sizes).ravel().take(pixel)])
 
     def _knn(self, cloud: PointCloud) -> Array:
         """Indices of the points kept by the mean distance to their nearest neighbours in space."""

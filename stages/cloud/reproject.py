@@ -35,6 +35,11 @@ class Reproject(Stage):
 
     max_depth: float = parameter(20.0, "points deeper than this are left out", unit="m", low=0.1)
     include_filled: bool = parameter(False, "whether filled disparities, which no camera measured, become points")
+    max_spacing: float = parameter(
+        0.0,
+        "where every 2nd or 4th row and column is no farther apart than this, across the ray, the rest is left out; 0: none",
+        unit="m", low=0.0, high=1.0,
+    )  # fmt: skip
     sigma_best: float = parameter(0.086, "disparity standard deviation at confidence 1", unit="px", low=1e-3)
     sigma_worst: float = parameter(42.0, "disparity standard deviation at confidence 0", unit="px", low=1e-3)
     sigma_plane: float = parameter(0.75, "disparity standard deviation of a PLANE pixel", unit="px", low=0.0)
@@ -53,7 +58,9 @@ class Reproject(Stage):
         check_joined(self, frame, disparity)
         sigma_d = DisparitySigma(self.sigma_best, self.sigma_worst, self.sigma_plane, self.sigma_filled)
         colors = eight_bit(frame.left)[0]
-        points, rgb, sigma, pixel = triangulate(disparity, colors, camera, sigma_d, self.max_depth, self.include_filled)
+        points, rgb, sigma, pixel = triangulate(
+            disparity, colors, camera, sigma_d, self.max_depth, self.include_filled, self.max_spacing
+        )
         height, width = disparity.pixels.shape
         source = disparity.source.ravel().take(pixel)
         return PointCloud(frame.stamp, points, rgb, sigma, pixel, camera.frame_id, (height, width), source=source)

@@ -18,14 +18,13 @@ MIN_DEPTH_RATIO = 1.1  # between two depths in the wrong order
 ROUNDS = 3  # an outlier may hide another one
 
 
-def out_of_order(inverse: Array, patch: Array) -> Array:
+def out_of_order(inverse: Array, patch: Array, sizes: Array) -> Array:
     """Pixels of the patches that are out of order in most of the columns where they meet another, (H, W) bool.
 
-    inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; patch: (H, W) int32, labels of `connected_patches`.
-    Rows run from the sky down.
+    inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; patch: (H, W) int32, labels of `connected_patches`;
+    sizes: (H * W,) int32, points of each patch. Rows run from the sky down.
     """
     patch = patch.copy()
-    sizes = np.bincount(patch.ravel() + 1, minlength=patch.size + 1)[1:]
     for _ in range(ROUNDS):
         votes = np.zeros(patch.size, np.int32)
         _vote(inverse, patch, sizes, np.float32(MIN_DEPTH_RATIO), votes)
@@ -61,10 +60,9 @@ def _drop(patch, votes):
             patch[i] = -1
 
 
-def out_of_order_reference(inverse: Array, patch: Array) -> Array:
+def out_of_order_reference(inverse: Array, patch: Array, sizes: Array) -> Array:
     """The same as `out_of_order`, one column at a time, in plain numpy."""
     patch = patch.copy()
-    sizes = np.bincount(patch[patch >= 0], minlength=patch.size)
     for _ in range(ROUNDS):
         votes = np.zeros(patch.size, np.int64)
         for column, numbers in zip(inverse.T, patch.T, strict=True):

@@ -86,6 +86,20 @@ def _connected_patches(inverse, tolerance, slope):
     return parent.reshape(height, width)
 
 
+def patch_sizes(patch: Array) -> Array:
+    """The number of points of each patch, (H * W,) int32; patch: (H, W) int32, labels of `connected_patches`."""
+    sizes = np.zeros(patch.size, np.int32)
+    _count(patch.reshape(-1), sizes)
+    return sizes
+
+
+@kernel
+def _count(patch, sizes):
+    for label in patch:
+        if label >= 0:
+            sizes[label] += 1
+
+
 def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
     """The same as `connected_patches`: scipy's connected components of the graph of links."""
     present = inverse > 0

@@ -28,11 +28,13 @@ class DisparitySigma(NamedTuple):
 
 
 def triangulate(
-    disparity: Disparity, colors: Array, camera: StereoCamera, sigma: DisparitySigma, max_depth: float, filled: bool
+    disparity: Disparity, colors: Array, camera: StereoCamera, sigma: DisparitySigma, max_depth: float, filled: bool,
+    max_spacing: float = 0.0,
 ) -> tuple[Array, Array, Array, Array]:
     """The points of a disparity image, in the left optical frame, in raster order.
 
-    colors: (H, W) or (H, W, 3) uint8; max_depth: m; filled: whether pixels of origin FILLED become points.
+    colors: (H, W) or (H, W, 3) uint8; max_depth: m; filled: whether pixels of origin FILLED become points; max_spacing:
+    m, only every 2nd or 4th row and column is used where these are no farther apart, across the ray; 0: all.
 
     Returns points (N, 3) float32 m, colors (N, 3) uint8, depth standard deviation (N,) float32 m, pixel (N,) int32.
     """
@@ -45,9 +47,16 @@ def triangulate(
         (camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline, camera.cx_right - camera.cx),
         float(max_depth),
         bool(filled),
+        _dense_limits(camera, max_spacing),
         (float(np.log(sigma.best)), float(np.log(sigma.worst)), float(sigma.plane), float(sigma.filled)),
         np.empty(0, np.float32) if disparity.sigma is None else np.ascontiguousarray(disparity.sigma).ravel(),
     )
+
+
+def _dense_limits(camera: StereoCamera, max_spacing: float) -> tuple[float, float, float, float]:
+    """The disparity, px, from which a pixel is left out, by the last two bits of its row or its column."""
+    every_2nd = 2 * camera.baseline / max_spacing if max_spacing > 0 else np.inf
+    return np.inf, every_2nd, 2 * every_2nd, every_2nd
 
 
 @kernel
@@ -61,12 +70,14 @@ def _depth(disparity, source, shift, focal_baseline, max_depth, filled):
 
 
 @kernel
-def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, sigmas, own):
+def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, dense, sigmas, own):
     fx, fy, cx, cy, focal_baseline, shift = camera
     log_best, log_worst, sigma_plane, sigma_filled = sigmas
     count = 0
     for i in range(disparity.size):
-        if _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled) > 0.0:
+        if disparity[i] + shift < dense[(i // width | i % width) & 3] and (
+            _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled) > 0.0
+        ):
             count += 1
     points = np.empty((count, 3), np.float32)
     rgb = np.empty((count, 3), np.uint8)
@@ -75,7 +86,9 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
     green, blue = (1, 2) if colors.shape[1] == 3 else (0, 0)
     n = 0
     for i in range(disparity.size):
-        z = _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled)
+        z = 0.0
+        if disparity[i] + shift < dense[(i // width | i % width) & 3]:
+            z = _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled)
         if z > 0.0:
             points[n, 0] = (i % width - cx) * z / fx
             points[n, 1] = (i // width - cy) * z / fy
@@ -97,13 +110,16 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
 
 
 def triangulate_reference(
-    disparity: Disparity, colors: Array, camera: StereoCamera, sigma: DisparitySigma, max_depth: float, filled: bool
+    disparity: Disparity, colors: Array, camera: StereoCamera, sigma: DisparitySigma, max_depth: float, filled: bool,
+    max_spacing: float = 0.0,
 ) -> tuple[Array, Array, Array, Array]:
     """The same as `triangulate`, in plain numpy."""
     source, confidence = disparity.source, disparity.confidence
     effective = disparity.pixels.astype(np.float64) + camera.cx_right - camera.cx
     wanted = np.isfinite(effective) & (source != PixelOrigin.UNKNOWN) & (filled | (source != PixelOrigin.FILLED))
     wanted &= np.where(wanted, effective, 0) * max_depth >= camera.fx * camera.baseline
+    rows, columns = np.indices(wanted.shape)
+    wanted &= effective < np.array(_dense_limits(camera, max_spacing))[(rows | columns) & 3]
     v, u = np.nonzero(wanted)
     z = camera.fx * camera.baseline / effective[v, u]
     points = np.column_stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z])
