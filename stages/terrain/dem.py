@@ -17,7 +17,7 @@ from stages.stage import Stage, check_cells, check_level, parameter
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
 from stages.terrain.kernels.grid import FIGURES, Grid, cell_percentile, cell_statistics
 from stages.terrain.kernels.occlusion import occlusion_ceiling
-from stages.terrain.kernels.splat_along_ray import splat_along_ray
+from stages.terrain.kernels.splats import splat_statistics
 from stages.terrain.kernels.staying_points import staying_points
 from stages.terrain.match_failure import match_failure
 
@@ -118,11 +118,9 @@ class Voxelise(Stage):
         min_reach = MIN_SPLAT_CELLS * self.resolution
         if sensor is None or self.splat_sigmas == 0 or self.max_splat < min_reach:
             return figures
-        points, sigma = splat_along_ray(
-            cloud.points, cloud.sigma, sensor, self.splat_sigmas, min_reach, self.max_splat
-        )  # fmt: skip
-        splats = cell_statistics(points, sigma, grid)
-        reached = (figures[:, :, 0] == 0) & (splats[:, :, 0] >= MIN_SPLATS)
+        reach = self.splat_sigmas, min_reach, self.max_splat
+        splats = splat_statistics(cloud.points, cloud.sigma, sensor, reach, grid, figures[:, :, 0] == 0)
+        reached = splats[:, :, 0] >= MIN_SPLATS
         gained = splats[reached]
         gained[:, SUMS] *= SPLAT_COUNT / gained[:, :1]
         figures[reached] = gained

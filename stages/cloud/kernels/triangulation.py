@@ -28,7 +28,12 @@ class DisparitySigma(NamedTuple):
 
 
 def triangulate(
-    disparity: Disparity, colors: Array, camera: StereoCamera, sigma: DisparitySigma, max_depth: float, filled: bool,
+    disparity: Disparity,
+    colors: Array,
+    camera: StereoCamera,
+    sigma: DisparitySigma,
+    max_depth: float,
+    filled: bool,
     max_spacing: float = 0.0,
 ) -> tuple[Array, Array, Array, Array]:
     """The points of a disparity image, in the left optical frame, in raster order.
@@ -110,7 +115,12 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
 
 
 def triangulate_reference(
-    disparity: Disparity, colors: Array, camera: StereoCamera, sigma: DisparitySigma, max_depth: float, filled: bool,
+    disparity: Disparity,
+    colors: Array,
+    camera: StereoCamera,
+    sigma: DisparitySigma,
+    max_depth: float,
+    filled: bool,
     max_spacing: float = 0.0,
 ) -> tuple[Array, Array, Array, Array]:
     """The same as `triangulate`, in plain numpy."""

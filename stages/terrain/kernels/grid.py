@@ -34,16 +34,33 @@ def cell_statistics(points: Array, sigma: Array, grid: Grid) -> Array:
     Cells without points contain 0, 0, 0, inf, -inf, 0.
     """
     resolution, (x0, y0), size, max_range = grid
-    return _cell_statistics(  # type: ignore[no-any-return]
-        np.ascontiguousarray(points), np.ascontiguousarray(sigma), 1.0 / resolution, x0, y0, size, max_range
-    )
+    cells, raster = no_figures(size), (1.0 / resolution, float(x0), float(y0), float(max_range))
+    _cell_statistics(np.ascontiguousarray(points), np.ascontiguousarray(sigma), raster, cells)
+    return cells
+
+
+def no_figures(size: int) -> Array:
+    """The figures of cells without points, (size, size, 6) float64."""
+    cells = np.zeros((size, size, 6))
+    cells[:, :, 3], cells[:, :, 4] = np.inf, -np.inf
+    return cells
 
 
 @kernel
-def _cell_statistics(points, sigma, cells_per_metre, x0, y0, size, max_range):
-    cells = np.zeros((size, size, 6), np.float64)
-    cells[:, :, 3] = np.inf
-    cells[:, :, 4] = -np.inf
+def add_point(cell, z, sigma):
+    """Add a point to the six figures of its cell."""
+    cell[0] += 1.0
+    cell[1] += z
+    cell[2] += z * z
+    cell[3] = min(cell[3], z)
+    cell[4] = max(cell[4], z)
+    cell[5] += sigma * sigma
+
+
+@kernel
+def _cell_statistics(points, sigma, raster, cells):
+    cells_per_metre, x0, y0, max_range = raster
+    size = cells.shape[0]
     for i in range(points.shape[0]):
         # numba's float() of a float32 stays a float32.
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
@@ -53,15 +70,7 @@ def _cell_statistics(points, sigma, cells_per_metre, x0, y0, size, max_range):
         row = int(np.floor((y - y0) * cells_per_metre))
         if row < 0 or row >= size or col < 0 or col >= size:
             continue
-        error = np.float64(sigma[i])
-        cell = cells[row, col]
-        cell[0] += 1.0
-        cell[1] += z
-        cell[2] += z * z
-        cell[3] = min(cell[3], z)
-        cell[4] = max(cell[4], z)
-        cell[5] += error * error
-    return cells
+        add_point(cells[row, col], z, np.float64(sigma[i]))
 
 
 def cell_statistics_reference(points: Array, sigma: Array, grid: Grid) -> Array:
@@ -69,8 +78,7 @@ def cell_statistics_reference(points: Array, sigma: Array, grid: Grid) -> Array:
     flat, inside = _cells_of(points, grid)
     z = points[inside, 2].astype(np.float64)
     total = grid.size * grid.size
-    cells = np.zeros((total, 6))
-    cells[:, 3], cells[:, 4] = np.inf, -np.inf
+    cells = no_figures(grid.size).reshape(total, 6)
     for figure, weight in ((0, np.ones(len(z))), (1, z), (2, z * z), (5, sigma[inside].astype(np.float64) ** 2)):
         cells[:, figure] = np.bincount(flat, weight, minlength=total)
     np.minimum.at(cells[:, 3], flat, z)

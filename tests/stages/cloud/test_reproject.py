@@ -45,10 +45,11 @@ def test_triangulation_kernel_equals_the_reference() -> None:
     disparity, sigma = Disparity(0, pixels, source, confidence), DisparitySigma(0.25, 1.0, 0.7, 3.0)
     for colors in (random.integers(0, 256, (12, 16, 3), np.uint8), random.integers(0, 256, (12, 16), np.uint8)):
         for filled in (False, True):
-            arguments = (disparity, colors, SMALL, sigma, 8.0, filled)
-            for got, want in zip(triangulate(*arguments), triangulate_reference(*arguments), strict=True):
-                assert got.dtype == want.dtype
-                np.testing.assert_allclose(got, want, rtol=1e-6)
+            for spacing in (0.0, 0.04):
+                arguments = (disparity, colors, SMALL, sigma, 8.0, filled, spacing)
+                for got, want in zip(triangulate(*arguments), triangulate_reference(*arguments), strict=True):
+                    assert got.dtype == want.dtype
+                    np.testing.assert_allclose(got, want, rtol=1e-6)
 
 
 def test_filled_pixels_become_points_on_request_and_planes_always() -> None:
@@ -85,6 +86,18 @@ def test_points_beyond_max_depth_are_left_out_and_a_cloud_may_be_empty() -> None
     none = Reproject()(blank_frame(), as_disparity(np.full((480, 640), np.nan)))
     assert none.points.shape == (0, 3)
     assert none.pixel.shape == none.sigma.shape == (0,)
+
+
+def test_near_points_are_thinned_as_far_as_their_spacing_allows() -> None:
+    disparity = as_disparity(seen_disparity())
+    every, some = (Reproject(max_spacing=spacing)(blank_frame(), disparity) for spacing in (0.0, 0.02))
+    assert 0.05 < len(some.points) / len(every.points) < 0.8
+    assert np.isin(some.pixel, every.pixel).all()
+    across = every.points[:, 2] / CAMERA.fx  # between neighbours
+    step = np.where(4 * across <= 0.02, 4, np.where(2 * across <= 0.02, 2, 1))
+    row, column = np.divmod(every.pixel, CAMERA.width)
+    kept = (row % step == 0) & (column % step == 0)
+    assert (np.isin(every.pixel, some.pixel) == kept).mean() > 0.9999
 
 
 def test_colours_come_from_the_left_image() -> None:

@@ -17,7 +17,7 @@ from stages.terrain.dem import Voxelise
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature, gradient_and_curvature_reference
 from stages.terrain.kernels.grid import Grid, cell_statistics, cell_statistics_reference
 from stages.terrain.kernels.occlusion import occlusion_ceiling, occlusion_ceiling_reference
-from stages.terrain.kernels.splat_along_ray import splat_along_ray, splat_along_ray_reference
+from stages.terrain.kernels.splats import splat_statistics, splat_statistics_reference
 from stages.terrain.kernels.staying_points import staying_points, staying_points_reference
 from tests.stages.terrain.terrain_scene import (
     CAMERA,
@@ -253,21 +253,17 @@ def test_an_unlevelled_cloud_is_refused() -> None:
         Voxelise()(cloud)
 
 
-def test_splat_kernel_equals_the_reference_and_keeps_to_its_reach() -> None:
+def test_splat_kernel_equals_the_reference() -> None:
     random = np.random.default_rng(3)
     points = (SENSOR.translation + random.uniform(1, 8, (500, 1)) * SENSOR.rotation[:, 2]
               + random.normal(0, 0.3, (500, 3))).astype(np.float32)  # fmt: skip
     sigma = random.uniform(0, 0.1, 500).astype(np.float32)
-    copies, copied_sigma = splat_along_ray(points, sigma, SENSOR, 2.0, 0.05, 0.12)
-    expected, expected_sigma = splat_along_ray_reference(points, sigma, SENSOR, 2.0, 0.05, 0.12)
-    np.testing.assert_allclose(copies, expected, atol=2e-6)
-    np.testing.assert_array_equal(copied_sigma, expected_sigma)
-    assert 0 < len(copies) < 4 * len(points)
-    eye, axis = SENSOR.translation, SENSOR.rotation[:, 2]
-    far = points[sigma * np.float32(2) >= np.float32(0.05)]
-    moved = (copies.reshape(-1, 4, 3) - eye) @ axis - ((far - eye) @ axis)[:, None]
-    reach = np.minimum(2 * copied_sigma.reshape(-1, 4), 0.12)
-    np.testing.assert_allclose(moved, reach * np.array([-1, -0.5, 0.5, 1]), atol=1e-5)
+    empty = random.random((GRID.size, GRID.size)) < 0.5
+    arguments = points, sigma, SENSOR, (2.0, 0.05, 0.12), GRID, empty
+    got, want = splat_statistics(*arguments), splat_statistics_reference(*arguments)
+    assert 100 < want[:, :, 0].sum() < 4 * len(points)
+    assert (want[~empty][:, 0] == 0).all()
+    np.testing.assert_allclose(got, want, atol=1e-9)
 
 
 def rows_apart(sigma: float) -> PointCloud:
