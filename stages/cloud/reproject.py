@@ -37,7 +37,7 @@ class Reproject(Stage):
     include_filled: bool = parameter(False, "whether filled disparities, which no camera measured, become points")
     max_spacing: float = parameter(
         0.0,
-        "where every 2nd or 4th row and column is no farther apart than this, across the ray, the rest is left out; 0: none",
+        "near points are thinned to every 2nd or 4th row and column, no farther apart than this; 0: all points",
         unit="m", low=0.0, high=1.0,
     )  # fmt: skip
     sigma_best: float = parameter(0.086, "disparity standard deviation at confidence 1", unit="px", low=1e-3)

@@ -65,7 +65,8 @@ def pixel_rays(points: Array, pixel: Array, chosen: Array, width: int) -> Array:
     """The lines x/z = a + b * column and y/z = a + b * row on which a cloud's points lie, robust to gross errors.
 
     Theil-Sen: the median slope between points half a sample apart, over an evenly spaced sample of at most 4000 of the
-    `chosen` points. Returns (4,) float64, a and b of the columns, a and b of the rows; all NaN if the points do not determine them.
+    `chosen` points. Returns (4,) float64, a and b of the columns, a and b of the rows; all NaN if the points do not
+    determine them.
     """
     sample = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), 4000)).astype(np.int64)]
     sample = sample[points[sample, 2] > 0]
