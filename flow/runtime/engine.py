@@ -50,7 +50,7 @@ class _Work:
 
     inputs: the streams that must be there before it starts; reads: those of them whose items it uses; sink: the name of
     the sink that it belongs to; large: whether it needs much memory; consumers: what waits for its output; inbox:
-    indices of frames; next: the frame that an ordered work takes next; seconds: its time so far.
+    indices of frames; next: the frame that an ordered work takes next; seconds, cpu_seconds: its time so far.
     """
 
     name: str
@@ -62,6 +62,7 @@ class _Work:
     sink: str = ""
     large: bool = False
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     consumers: list[_Work] = field(default_factory=list)
     inbox: set[int] = field(default_factory=set)
     next: int = 0
@@ -167,9 +168,17 @@ class Engine:
     @property
     def seconds(self) -> dict[str, float]:
         """Stage or sink -> its time so far, s. That of a sink includes what it prepared."""
+        return self._by_name(lambda work: work.seconds)
+
+    @property
+    def cpu_seconds(self) -> dict[str, float]:
+        """Stage or sink -> the CPU time of its worker so far, s, without threads that it starts itself."""
+        return self._by_name(lambda work: work.cpu_seconds)
+
+    def _by_name(self, seconds_of: Callable[[_Work], float]) -> dict[str, float]:
         seconds: dict[str, float] = {}
         for work in self._work:
-            seconds[work.sink or work.name] = seconds.get(work.sink or work.name, 0.0) + work.seconds
+            seconds[work.sink or work.name] = seconds.get(work.sink or work.name, 0.0) + seconds_of(work)
         return seconds
 
     def bottleneck(self, cores: int) -> dict[str, Any]:
@@ -190,12 +199,12 @@ class Engine:
                     self._condition.wait()
                     task = self._next_task()
             work, frame = task
-            seconds = time.perf_counter()
+            seconds, cpu = time.perf_counter(), time.thread_time()
             try:
                 value = work.run(frame)
             except BaseException as error:
                 value = error
-            seconds = time.perf_counter() - seconds
+            seconds, cpu = time.perf_counter() - seconds, time.thread_time() - cpu
             with self._condition:
                 if self._over:  # the frame has been abandoned
                     return
@@ -204,6 +213,7 @@ class Engine:
                     self._writing -= work.output is None
                     self._in_large -= work.large
                     work.seconds += seconds
+                    work.cpu_seconds += cpu
                     if not (work.sink and work.output):
                         frame.seconds[work.name] = seconds
                     retired = self._deliver(work, frame, value)

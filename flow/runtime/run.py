@@ -249,6 +249,7 @@ def _counts(assembler: FrameAssembler, engine: Engine, ledger: Ledger, times: di
         "drops": ledger.counts(),
         "messages": dict(sorted(assembler.messages.items())),
         "seconds": {name: round(value, 6) for name, value in engine.seconds.items()},
+        "cpu_seconds_of": {name: round(value, 6) for name, value in engine.cpu_seconds.items()},
         "reading_seconds": round(engine.reading, 6),
         "bottleneck": engine.bottleneck(usable_cores()),
         **{name: round(value, 6) for name, value in times.items()},
