@@ -365,6 +365,15 @@ def test_an_interrupted_demo_reports_its_files_and_stops(traverse, tmp_path, cap
     assert json.loads((folder / "summary.json").read_text())["interrupted"]
 
 
+@pytest.mark.slow
+def test_the_demo_says_beforehand_how_much_it_writes(tmp_path, capsys):
+    folder = tmp_path / "demo"
+    assert roverflow("demo", "--out", folder, "--frames", 8) == 0
+    stated = re.fullmatch(r"The demo writes about (\d+) MB to .*", capsys.readouterr().out.splitlines()[0])
+    written = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
+    assert written == pytest.approx(int(stated[1]), rel=0.15)
+
+
 def test_an_interrupt_inside_compiled_code_is_an_interrupt(traverse, capsys, monkeypatch):
     def compiled(*arguments, **more):
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()

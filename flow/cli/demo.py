@@ -20,6 +20,8 @@ from recordings.sinks.overwrite import is_ours
 
 HELP = "simulate a short traverse, replay it and score it against ground truth"
 FIRST_FRAME = 0.6  # s of the traverse that contain one frame
+FRAME_MB = 15  # input log 10, result log 3.5, recording 1.5
+MAPS_MB = 3  # pictures and exported maps
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -42,6 +44,7 @@ def run(options: argparse.Namespace) -> int:
     log, out, rrd = folder / "traverse.mcap", folder / "result.mcap", folder / "result.rrd"
     outputs = {"input log": log, "result log": out, "recording": rrd, "summary": folder / "summary.json"}
     check_outputs(outputs)
+    say(f"The demo writes about {FRAME_MB * options.frames + MAPS_MB} MB to {folder}.")
     say("Simulating a traverse ...")
     simulate(log, frames=options.frames)
     say("Replaying it through the pipeline 'rover'. The first frame runs alone, because it compiles the kernels ...")
