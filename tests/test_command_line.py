@@ -20,8 +20,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
+from recordings.containers.container import RawMessage
 from recordings.mcap.file import McapFile, iter_decoded
-from recordings.mcap.index import RawMessage
 from recordings.ros2.from_msg import read_disparity, stamp_of
 from recordings.simulator import Simulation
 from recordings.simulator.traverse import level_pose
@@ -307,8 +307,8 @@ def test_a_full_disk_keeps_the_partial_and_the_previous_result(traverse, tmp_pat
     assert captured.out.startswith("INCOMPLETE: ")
     (kept,) = set(tmp_path.iterdir()) - {out}
     with McapFile(kept) as log:
-        held = [item for item in log.messages(set(log.index.channels)) if isinstance(item, RawMessage)]
-        topics = {log.channel(item.channel).topic for item in held}
+        held = [item for item in log.messages(set(log.channels)) if isinstance(item, RawMessage)]
+        topics = {log.channels[item.channel].topic for item in held}
     assert f"File too large (its first {len(held)} messages are in {kept}); " in captured.err
     assert captured.err.count("\n") == 1
     assert topics >= {"/nav/disparity", "/nav/points", "/nav/elevation_map"}

@@ -96,8 +96,8 @@ def export(
 def _topics_of(result: Path, maps: Collection[str]) -> MapTopics:
     """The topics of the streams `maps`."""
     with McapFile(result) as log:
-        channels = [log.channel(number) for number in log.index.channels if log.count({number})]
-        schemas = {channel.topic: getattr(log.schema(channel), "name", "") for channel in channels}
+        channels = [channel for number, channel in log.channels.items() if log.count({number})]
+        schemas = {channel.topic: getattr(channel.schema, "name", "") for channel in channels}
     reasons = {f"{topic}/reason" for topic in schemas}
     streams = {
         topic.removeprefix("/nav/"): schema

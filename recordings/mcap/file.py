@@ -20,10 +20,11 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Schema
+from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from flow.contracts import counted
+from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import MAX_CHUNK_BYTES, unpack_chunk
 from recordings.mcap.index import (
@@ -33,8 +34,6 @@ from recordings.mcap.index import (
     PARSE_ERRORS,
     RECORD,
     Clock,
-    LostMessage,
-    RawMessage,
     T,
     UnchunkedMessage,
     index_from_summary,
@@ -63,8 +62,12 @@ class McapFile:
     ----------
     start, end : int
         Log time of the first and the last message, ns.
+    channels : dict of int to Channel
+        The channels by number, each with its encoding and schema.
+    size : int
+        Bytes.
     index : Index
-        Channels, schemas and chunks. `index.walked` is true if the file has no valid summary and was read through.
+        Where chunks and messages are.
 
     Raises
     ------
@@ -94,23 +97,16 @@ class McapFile:
             for number in self.index.times.keys() - self.index.channels.keys():
                 unknown = counted(len(self.index.times[number]), "message")
                 self.index.note_damage(f"{unknown} of channel {number} cannot be read: the log does not define it")
+            self.channels = {number: self._channel(number) for number in self.index.channels}
             self.start, self.end = self._time_range()
         except BaseException:
             self._file.close()
             raise
 
-    def channel(self, number: int) -> Channel:
-        """The channel with this number."""
-        return self.index.channels[number]
-
-    def schema(self, channel: Channel) -> Schema | None:
-        """The schema of a channel's messages, if it has one."""
-        return self.index.schemas.get(channel.schema_id)
-
     def channels_of(self, topics: Iterable[str]) -> set[int]:
         """The channels of some topics; a topic may have several."""
         wanted = set(topics)
-        return {number for number, channel in self.index.channels.items() if channel.topic in wanted}
+        return {number for number, channel in self.channels.items() if channel.topic in wanted}
 
     def messages(
         self, channels: set[int], start: int | None = None, end: int | None = None, allow_unordered: bool = False
@@ -170,6 +166,21 @@ class McapFile:
             return sum(len(index.times.get(channel, ())) for channel in channels)
         return sum(index.stated_counts.get(channel, 0) for channel in channels)
 
+    @property
+    def profile(self) -> str:
+        """The profile in the file's header."""
+        return self.index.profile
+
+    @property
+    def indexed(self) -> bool:
+        """Whether the file has a valid summary; otherwise it was read through."""
+        return not self.index.walked
+
+    @property
+    def lost(self) -> list[LostMessage]:
+        """The damage found so far."""
+        return self.index.lost
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -179,6 +190,12 @@ class McapFile:
 
     def __exit__(self, *raised: object) -> None:
         self.close()
+
+    def _channel(self, number: int) -> Channel:
+        channel = self.index.channels[number]
+        schema = self.index.schemas.get(channel.schema_id)
+        described = MessageSchema(schema.name, schema.encoding, schema.data) if schema else None
+        return Channel(number, channel.topic, channel.message_encoding, described)
 
     def _queue(self, channels: set[int], ordered: set[int]) -> list[tuple[int, int, int, Any]]:
         """Chunks, messages and losses, as a heap of (log time, offset in the file, place in a chunk, item)."""
@@ -204,7 +221,7 @@ class McapFile:
         """Chunk offset -> the clock of each channel where the chunk begins; empty if no chunk begins in the past."""
         if self.index.walked:
             return self.index.clocks_before
-        chunks = [chunk for chunk in self._chunks(set(self.index.channels)) if chunk.message_end_time]
+        chunks = [chunk for chunk in self._chunks(set(self.channels)) if chunk.message_end_time]
         ends = accumulate((chunk.message_end_time for chunk in chunks), max)
         if all(end - chunk.message_start_time <= MAX_JITTER_NS for end, chunk in zip(ends, chunks[1:], strict=False)):
             return {}
@@ -332,15 +349,15 @@ def iter_decoded(
     wanted = None if topics is None else set(topics)
     with McapFile(Path(path)) as log:
         decoders: dict[int, Callable[[bytes | memoryview], Any]] = {}
-        for number, channel in log.index.channels.items():
-            schema = log.schema(channel)
+        for number, channel in log.channels.items():
+            schema = channel.schema
             if schema and channel.message_encoding == "cdr" and (wanted is None or channel.topic in wanted):
-                decoders[number] = decoder_for(schema.name, schema.encoding, schema.data)
+                decoders[number] = decoder_for(schema.name, schema.encoding, schema.text)
         for item in log.messages(set(decoders), allow_unordered=True):
             if isinstance(item, LostMessage):
                 lose(item.reason)
                 continue
-            topic = log.channel(item.channel).topic
+            topic = log.channels[item.channel].topic
             try:
                 message = decoders[item.channel](item.data)
             except Exception as error:  # foreign bytes may fail a codec in any way

@@ -23,6 +23,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
+from recordings.containers.container import LostMessage, RawMessage
 from recordings.errors import sentence_of
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -40,22 +41,6 @@ MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER_LENGTH = 20
 _MAX_SUMMARY_BYTES = 1 << 30  # of a summary or header that is read
 _TAIL = RECORD.size + _FOOTER_LENGTH + len(MAGIC)
-
-
-class RawMessage(NamedTuple):
-    """One message as stored. log_time: ns; data: its bytes, a view of its chunk."""
-
-    channel: int
-    log_time: int
-    data: memoryview
-
-
-class LostMessage(NamedTuple):
-    """One or more messages that cannot be read. channel: None if unknown; log_time: ns, of the first."""
-
-    channel: int | None
-    log_time: int
-    reason: str
 
 
 class UnchunkedMessage(NamedTuple):

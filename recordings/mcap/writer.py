@@ -118,7 +118,7 @@ class Ros2Writer:
                 self._file.close()
             if self._keep:
                 with suppress(LogError), McapFile(self._partial) as log:
-                    held = log.count(set(log.index.channels))
+                    held = log.count(set(log.channels))
             if not held:
                 self._partial.unlink(missing_ok=True)
             kept = f" (its first {counted(held, 'message')} are in {self._partial})" if held else ""

@@ -49,14 +49,14 @@ def stamps_run(result: Path) -> set[int] | None:
     if not about_run(result).get("every"):
         return None
     with McapFile(result) as log:  # every frame has diagnostics, at its stamp as the log time
-        channels = {number for number in log.index.channels if log.index.channels[number].topic == "/nav/diagnostics"}
+        channels = log.channels_of(["/nav/diagnostics"])
         return set(log.times(channels).tolist())
 
 
 def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:
     """The error for a log without any of the result topics `wanted`; with the `remedy` if it has one of `instead`."""
     with McapFile(path) as log:
-        topics = sorted({log.channel(n).topic for n in log.index.channels if log.count({n})})
+        topics = sorted({log.channels[n].topic for n in log.channels if log.count({n})})
     results = [topic for topic in topics if topic.startswith("/nav/")]
     if not results:
         return LogError(f"{path} is not a result log: it has no /nav topics; give the log that roverflow run wrote")

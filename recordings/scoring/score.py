@@ -143,8 +143,7 @@ class _Tally:
         self.left_out: set[str] = set()  # topics of the current frame
         self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
         with McapFile(truth) as log:  # without topics that have no message, unless messages were lost
-            channels = log.index.channels
-            self.truths = {channels[number].topic for number in channels if log.count({number}) or log.index.lost}
+            self.truths = {channel.topic for n, channel in log.channels.items() if log.count({n}) or log.lost}
             with McapFile(result):  # raises LogError for another file
                 self.part = part_of(log.start, *part_run(result, truth))
         self.taken = stamps_run(result)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.contracts import counted
-from recordings.mcap.index import LostMessage
+from recordings.containers.container import LostMessage
 from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.source.cameras import CAMERAS
 from recordings.source.log import McapLog
@@ -29,7 +29,7 @@ def describe(
     largest difference between the stamps of the two images of a frame, ns; max_gap_of: from the intervals of the tilts,
     ns, to the largest one around a frame; None: do not count frames with a tilt.
     """
-    resolution, lost = log.resolution, log.file.index.lost
+    resolution, lost = log.resolution, log.file.lost
     damage = sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems})
     stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
     stamps["inclinometer"] = _tilts(log, damage)
@@ -39,8 +39,8 @@ def describe(
         "path": str(log.path),
         "result": _run(log),
         "size_bytes": log.file.size,
-        "profile": log.file.index.profile,
-        "indexed": not log.file.index.walked,
+        "profile": log.file.profile,
+        "indexed": log.file.indexed,
         "start": log.file.start,
         "end": log.file.end,
         "duration_s": (log.file.end - log.file.start) / 1e9,
@@ -98,7 +98,7 @@ def format_description(description: dict[str, Any]) -> str:
 def _run(log: McapLog) -> str:
     """The run that wrote a result log, in words; empty for another log."""
     about = about_run(log.path)
-    pipeline = "unknown" if log.file.index.walked else pipeline_of(log.path)
+    pipeline = pipeline_of(log.path) if log.file.indexed else "unknown"
     return f"roverflow {about['roverflow']}: pipeline {pipeline}, run on {about['log']}" if about else ""
 
 
@@ -130,16 +130,15 @@ def _frame_line(frames: dict[str, Any]) -> str:
 
 
 def _topics(log: McapLog) -> list[dict[str, Any]]:
-    index, found = log.file.index, []
-    for channel in sorted(index.channels.values(), key=lambda channel: (channel.topic, channel.id)):
-        schema = index.schemas.get(channel.schema_id)
-        times = log.file.times({channel.id})
+    found = []
+    for channel in sorted(log.file.channels.values(), key=lambda channel: (channel.topic, channel.number)):
+        times = log.file.times({channel.number})
         gaps = np.diff(times)
         span = float(times[-1] - times[0]) / 1e9 if times.size > 1 else 0.0
         found.append(
             {
                 "topic": channel.topic,
-                "schema": schema.name if schema else "",
+                "schema": channel.schema.name if channel.schema else "",
                 "encoding": channel.message_encoding,
                 "messages": int(times.size),
                 "hz": (times.size - 1) / span if span > 0 else None,

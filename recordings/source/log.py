@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recordings.containers.container import LostMessage, RawMessage
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.file import McapFile
-from recordings.mcap.index import LostMessage, RawMessage
 from recordings.ros2.from_msg import camera_model, frame_of, pose_of, stamp_or
 from recordings.ros2.image_from_msg import pixels_of
 from recordings.ros2.tilt_from_msg import tilt_of

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from flow.contracts import counted
+from recordings.containers.container import Container
 from recordings.errors import LogError
-from recordings.mcap.file import McapFile
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of
 from recordings.ros2.tilt_from_msg import tilt_of
 from recordings.source.calibration import Camera, baseline_note, calibrated_pair
@@ -33,7 +33,7 @@ class SourceResolution:
     of the camera on the rover; problems: (stream, error) pairs for the ledger.
     """
 
-    def __init__(self, file: McapFile, source: LogSettings) -> None:
+    def __init__(self, file: Container, source: LogSettings) -> None:
         self.file, self.source, self.messages = file, source, DecodedTopics(file)
         self.static, self.problems = self._read_static()
         self.undecodable = self._undecodable_topics()
@@ -59,7 +59,7 @@ class SourceResolution:
     @property
     def missing(self) -> dict[str, str]:
         """`unavailable` as complete sentences; they mention lost messages and undecodable topics."""
-        lost = f"messages were lost: {self.file.index.lost[0].reason}" if self.file.index.lost else ""
+        lost = f"messages were lost: {self.file.lost[0].reason}" if self.file.lost else ""
         hint = "".join(f" ({what})" for what in (self.undecodable, lost) if what)
         return {name: why + hint if name in self._without_topic else why for name, why in self.unavailable.items()}
 
@@ -78,7 +78,7 @@ class SourceResolution:
     def _undecodable_topics(self) -> str:
         """A sentence that lists the topics that cannot be decoded; empty if there are none."""
         channels = self.messages.undecodable_channels.items()
-        reasons = {self.file.channel(n).topic: why for n, why in channels if self.file.count({n})}
+        reasons = {self.file.channels[n].topic: why for n, why in channels if self.file.count({n})}
         listed = [f"{topic}: {why}" for topic, why in sorted(reasons.items()) if topic not in self.messages.schemas]
         more = f", and {len(listed) - _MAX_LISTED} more" if len(listed) > _MAX_LISTED else ""
         return f"topics that cannot be decoded: {'; '.join(listed[:_MAX_LISTED])}{more}" if listed else ""
@@ -166,7 +166,7 @@ class SourceResolution:
         streams |= {info.topic: side for side, info in self.infos.items() if side in self.topics}
         lost = list[tuple[str, LogError]]()
         for number, why in sorted(self.messages.undecodable_channels.items()):
-            topic, count = self.file.channel(number).topic, self.file.count({number})
+            topic, count = self.file.channels[number].topic, self.file.count({number})
             if topic in streams and count:
                 what = f"{topic}: {counted(count, 'message')} of its channel {number} cannot be decoded: {why}"
                 lost.append((streams[topic], LogError(what)))

@@ -1,4 +1,4 @@
-"""The messages of an MCAP file by topic, decoded by the schemas in the file.
+"""The messages of a log by topic, decoded by the schemas in its files.
 
 A message may have any fields, whatever the name of its type. What cannot be converted becomes a LogError in its place;
 reading continues.
@@ -12,11 +12,10 @@ from itertools import islice
 from typing import Any, TypeVar
 
 import zstandard
-from mcap.records import Channel
 
+from recordings.containers.container import Channel, Container, LostMessage
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.file import CONVERT, McapFile
-from recordings.mcap.index import LostMessage
+from recordings.mcap.file import CONVERT
 from recordings.ros2.cdr import decoder_for, full_name, plain
 from recordings.ros2.from_msg import frame_of
 
@@ -38,12 +37,12 @@ class DecodedTopics:
     decoders: by channel; undecodable_channels: channel -> reason; schemas: decodable topic -> full ROS 2 type name.
     """
 
-    def __init__(self, file: McapFile) -> None:
+    def __init__(self, file: Container) -> None:
         self.file = file
         self.decoders: dict[int, Decoder] = {}
         self.undecodable_channels: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
-        for number, channel in file.index.channels.items():
+        for number, channel in file.channels.items():
             try:
                 self.decoders[number] = self._decoder(channel)
             except LogError as error:
@@ -92,13 +91,13 @@ class DecodedTopics:
         return "" if isinstance(frame, LogError) else frame
 
     def _decoder(self, channel: Channel) -> Decoder:
-        schema = self.file.schema(channel)
         if channel.message_encoding != "cdr":
             remedy = f"; convert the bag itself: {CONVERT}" if channel.message_encoding == "ros1" else ""
             raise LogError(f"its messages are in '{channel.message_encoding}', not in the 'cdr' of ROS 2{remedy}")
+        schema = channel.schema
         if schema is None:
             raise LogError("its messages have no schema")
-        decoder = decoder_for(schema.name, schema.encoding, schema.data)
+        decoder = decoder_for(schema.name, schema.encoding, schema.text)
         self.schemas[channel.topic] = full_name(schema.name)
         return decoder
 

@@ -21,10 +21,11 @@ from mcap.records import Statistics
 from mcap.writer import CompressionType, IndexType, Writer
 
 from recordings import McapSource
+from recordings.containers.container import LostMessage
 from recordings.errors import LogError
 from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
-from recordings.mcap.index import MAGIC, Index, LostMessage
+from recordings.mcap.index import MAGIC, Index
 from recordings.source.inventory import format_description
 from tests.conftest import rewrite
 from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, inventory_of, items_of
@@ -250,10 +251,10 @@ def test_bytes_after_the_end_of_a_log_are_reported(sample, whole, tmp_path, layo
 def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample, tmp_path):
     full = rewrite(sample, tmp_path / "full.mcap", chunk_size=500)
     with McapFile(full) as log:
-        good = len(list(log.messages(set(log.index.channels))))
+        good = len(list(log.messages(set(log.channels))))
         log.index.chunks[2].chunk_start_offset = (1 << 63) - 1
         log.index.chunks[3].chunk_start_offset = 1 << 63
-        items = list(log.messages(set(log.index.channels)))
+        items = list(log.messages(set(log.channels)))
     assert len([item for item in items if isinstance(item, LostMessage)]) >= 2
     assert good > len([item for item in items if not isinstance(item, LostMessage)]) > good / 2
 
@@ -296,7 +297,7 @@ def test_all_messages_of_the_conformance_suite_are_read():
         wanted = sum(record["type"] == "Message" for record in records)
         read: list[Any] = []
         with suppress(LogError), McapFile(path) as log:
-            read = list(log.messages(set(log.index.channels)))
+            read = list(log.messages(set(log.channels)))
         assert not [item for item in read if isinstance(item, LostMessage)], path
         assert len(read) == wanted, path
         checked += 1
