@@ -68,6 +68,8 @@ class Tilt:
         Unit vector against gravity, in the inclinometer's frame `frame_id`.
     sigma : float, optional
         Standard deviation, rad, about each horizontal axis; None if unknown.
+    filtered : bool
+        Whether a filter made it. Its error is then that of its neighbours, and no smoothing makes it smaller.
 
     Examples
     --------
@@ -80,6 +82,7 @@ class Tilt:
     up: Array
     frame_id: str = "inclinometer"
     sigma: float | None = None
+    filtered: bool = False
 
     def __post_init__(self) -> None:
         publish_stamp(self)
@@ -93,11 +96,17 @@ class Tilt:
         """The tilt at `stamp`, ns, between this one and a later one, along the great circle."""
         share = _fraction(self.stamp, later.stamp, stamp)
         sigma = _sigma_of([self, later], np.array([1 - share, share]))
-        return Tilt(stamp, _slerp(self.up, later.up, share), self.frame_id, sigma)
+        return Tilt(stamp, _slerp(self.up, later.up, share), self.frame_id, sigma, self.filtered)
 
     @staticmethod
     def smoothed(samples: Sequence[Tilt], stamp: int) -> Tilt:
-        """The tilt at `stamp`, ns, on the line fitted over time to three or more samples around it."""
+        """The tilt at `stamp`, ns, on the line fitted over time to three or more samples around it.
+
+        Samples of a filter are smooth already, so the tilt is interpolated between two of them.
+        """
+        if samples[0].filtered:
+            later = next(number for number in range(1, len(samples)) if samples[number].stamp >= stamp)
+            return samples[later - 1].interpolated(samples[later], stamp)
         seconds = (np.array([sample.stamp for sample in samples]) - stamp) / 1e9
         line = np.column_stack([np.ones_like(seconds), seconds])
         weights = np.linalg.pinv(line)[0]
@@ -278,9 +287,15 @@ def _fraction(first: int, last: int, stamp: int) -> float:
 
 
 def _sigma_of(tilts: Sequence[Tilt], weights: Array) -> float | None:
-    """Standard deviation, rad, of a weighted sum of tilts with independent errors; None if one of them is unknown."""
+    """Standard deviation, rad, of a weighted sum of tilts; None if one of them is unknown.
+
+    The errors are independent, but for those of a filter, which neighbours share.
+    """
     sigmas = [tilt.sigma for tilt in tilts]
-    return None if None in sigmas else float(np.linalg.norm(weights * np.array(sigmas, np.float64)))
+    if None in sigmas:
+        return None
+    weighted = weights * np.array(sigmas, np.float64)
+    return float(weighted.sum() if tilts[0].filtered else np.linalg.norm(weighted))
 
 
 def _slerp(start: Array, end: Array, share: float) -> Array:

@@ -1,0 +1,1 @@
+"""Up from accelerometer and gyroscope: samples, their integration in blocks, the filter, and the tilts."""

@@ -1,0 +1,177 @@
+"""A Kalman filter for gravity in the gyroscope's frame, with the biases of both sensors, and its smoother.
+
+The state is the force of gravity s, m/s^2, in the frame that the gyroscope integrates to, and the biases b of the
+gyroscope and a of the accelerometer, in the sensor's frame. With C the rotation from the sensor to that frame:
+
+    ds/dt = C (b - bias used) x s + noise        mean acceleration = s + mean C a + disturbance
+
+So the model is nearly linear and no heading is needed. The length of s is part of the state: gravity is measured.
+The smoother is that of Rauch, Tung and Striebel (1965).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recordings.inertial.blocks import BLOCK_NS, Blocks
+from stages.data import Array
+
+# Of common MEMS sensors; rates in rad/s, accelerations in m/s^2, densities for 1 Hz.
+GYROSCOPE_NOISE = 5e-4
+GYROSCOPE_SCALE = 0.005  # share of an angle
+GYROSCOPE_BIAS_SIGMA = 0.1
+GYROSCOPE_BIAS_WALK = 2e-5
+ACCELEROMETER_BIAS_WALK = 1e-4
+REST_RATE_SIGMA = 5e-4  # of a mean rate at rest: instability of the bias, and the planet's own rotation
+REST_SIGMA = 0.005  # of a mean acceleration at rest
+MIN_DISTURBANCE = 0.02**2  # (m/s^2)^2/Hz, of a sensor that moves
+START_SIGMA = 0.5  # of gravity before the first block
+GIVEN_GRAVITY_SIGMA = 0.02
+DISTURBANCE_BLOCKS = 100  # over which the disturbance is measured
+DISTURBANCE_SPANS = (1, 2, 4, 8, 16)  # blocks
+MAX_SURPRISE = 3.0  # sigmas; a block that is farther off counts less
+
+S, B, A = slice(0, 3), slice(3, 6), slice(6, 9)
+
+
+@dataclass(frozen=True)
+class GravityState:
+    """Mean (9,) and covariance (9, 9)."""
+
+    mean: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class FilterStep:
+    """One block: the transition (9, 9) to it, the state predicted, and the state with its measurements."""
+
+    transition: Array
+    predicted: GravityState
+    updated: GravityState
+
+
+def first_state(force: Array, bias: Array, accelerometer_bias: float, gravity: float | None) -> GravityState:
+    """The state before the first block; force: (3,) m/s^2 of the first accelerations; bias: (3,) rad/s; gravity: its
+    magnitude, if it is known."""
+    up = force / np.linalg.norm(force)
+    covariance = np.diag(
+        [START_SIGMA**2] * 3 + [GYROSCOPE_BIAS_SIGMA**2] * 3 + [accelerometer_bias**2] * 3,
+    ).astype(np.float64)
+    if gravity is not None:
+        covariance[S, S] -= (START_SIGMA**2 - GIVEN_GRAVITY_SIGMA**2) * np.outer(up, up)
+    return GravityState(np.concatenate([force if gravity is None else gravity * up, bias, np.zeros(3)]), covariance)
+
+
+def restarted(state: GravityState, force: Array, seconds: float) -> GravityState:
+    """The state after a gap: gravity is new in a new frame, the biases have drifted."""
+    first = first_state(force, state.mean[B], 0.0, None)
+    covariance = first.covariance
+    covariance[B, B] = state.covariance[B, B] + GYROSCOPE_BIAS_WALK**2 * seconds * np.eye(3)
+    covariance[A, A] = state.covariance[A, A] + ACCELEROMETER_BIAS_WALK**2 * seconds * np.eye(3)
+    return GravityState(np.concatenate([force, state.mean[3:]]), covariance)
+
+
+def disturbance(forces: Array) -> float:
+    """Density, (m/s^2)^2/Hz, of a white noise that disturbs means as much as the sensor's motion does.
+
+    forces: (n, 3) of blocks in motion. The variance of a mean of T seconds, times T, is that density where it is white;
+    slow accelerations show in the longer means. The largest counts. A drift of the gyroscope is a trend, left out.
+    """
+    number = len(forces)
+    if number < 2 * DISTURBANCE_SPANS[1]:
+        return MIN_DISTURBANCE
+    line = np.column_stack([np.ones(number), np.linspace(-1, 1, number)])
+    rest = forces - line @ np.linalg.lstsq(line, forces, rcond=None)[0]
+    densities = []
+    for span in DISTURBANCE_SPANS:
+        means = number // span
+        if means >= 4:
+            part = rest[: means * span].reshape(means, span, 3).mean(axis=1)
+            densities.append(float(part.var(axis=0, ddof=1).mean()) * span * BLOCK_NS / 1e9)
+    return max(*densities, MIN_DISTURBANCE)
+
+
+def is_rest(blocks: Blocks, at: int, state: GravityState) -> bool:
+    """Whether a block is at rest: it hardly varies, and its mean rate may be the gyroscope's bias."""
+    turning = float(np.linalg.norm(blocks.rate[at] - state.mean[B]))
+    doubt = float(np.sqrt(np.trace(state.covariance[B, B])))
+    return bool(blocks.still[at]) and turning < 3 * doubt + 6 * REST_RATE_SIGMA
+
+
+def advance(state: GravityState, blocks: Blocks, at: int, bias: Array, density: float) -> tuple[FilterStep, bool]:
+    """The step over block `at`, integrated with the gyroscope's bias `bias`, and whether it is at rest.
+
+    density: the disturbance in motion, (m/s^2)^2/Hz.
+    """
+    predicted, transition = _predicted(state, blocks, at, bias)
+    rest, updated = is_rest(blocks, at, predicted), predicted
+    if np.isfinite(blocks.force[at]).all():
+        model = np.hstack([np.eye(3), np.zeros((3, 3)), blocks.axes[at]])
+        if rest:
+            variance = REST_SIGMA**2 + blocks.shaking[at] ** 2 / 3 / blocks.samples[at]
+        else:
+            variance = density / max(blocks.seconds[at], 1e-3)
+        updated = _updated(updated, model, blocks.force[at], variance)
+    if rest:
+        model = np.hstack([np.zeros((3, 3)), np.eye(3), np.zeros((3, 3))])
+        updated = _updated(updated, model, blocks.rate[at], REST_RATE_SIGMA**2 + 1e-4 / 3 / blocks.samples[at])
+    return FilterStep(transition, predicted, updated), rest
+
+
+def smoothed(steps: list[FilterStep]) -> list[GravityState]:
+    """The states of consecutive blocks by all of their measurements."""
+    states = [steps[-1].updated]
+    for step, later in zip(reversed(steps[:-1]), reversed(steps[1:]), strict=True):
+        after, here = states[-1], step.updated
+        gain = np.linalg.solve(later.predicted.covariance, later.transition @ here.covariance).T
+        mean = here.mean + gain @ (after.mean - later.predicted.mean)
+        covariance = here.covariance + gain @ (after.covariance - later.predicted.covariance) @ gain.T
+        states.append(GravityState(mean, (covariance + covariance.T) / 2))
+    return states[::-1]
+
+
+def sigma_of(state: GravityState) -> float:
+    """Standard deviation of up, rad, about each horizontal axis."""
+    force = state.mean[S]
+    length = float(np.linalg.norm(force))
+    up = force / length
+    variance = np.trace(state.covariance[S, S]) - up @ state.covariance[S, S] @ up
+    return float(np.sqrt(max(variance, 0.0) / 2)) / length
+
+
+def _predicted(state: GravityState, blocks: Blocks, at: int, bias: Array) -> tuple[GravityState, Array]:
+    force, seconds = state.mean[S], blocks.seconds[at]
+    drift = blocks.turned[at] @ (state.mean[B] - bias)
+    transition = np.eye(9)
+    transition[S, S] += _cross(drift)
+    transition[S, B] = -_cross(force) @ blocks.turned[at]
+    mean = state.mean.copy()
+    mean[S] += np.cross(drift, force)
+    noise = np.zeros((9, 9))
+    across = float(force @ force) * np.eye(3) - np.outer(force, force)
+    noise[S, S] = (GYROSCOPE_NOISE**2 * seconds + (GYROSCOPE_SCALE * blocks.angle[at]) ** 2) * across
+    noise[B, B] = GYROSCOPE_BIAS_WALK**2 * seconds * np.eye(3)
+    noise[A, A] = ACCELEROMETER_BIAS_WALK**2 * seconds * np.eye(3)
+    noise += 1e-12 * np.eye(9)
+    return GravityState(mean, transition @ state.covariance @ transition.T + noise), transition
+
+
+def _updated(state: GravityState, model: Array, measured: Array, variance: float) -> GravityState:
+    """The state with one measurement (3,) of isotropic variance, which grows where the measurement is a surprise."""
+    off = measured - model @ state.mean
+    spread = model @ state.covariance @ model.T
+    surprise = float(off @ np.linalg.solve(spread + variance * np.eye(3), off)) / 3
+    noise = variance * max(surprise / MAX_SURPRISE**2, 1.0) * np.eye(3)
+    gain = np.linalg.solve(spread + noise, model @ state.covariance).T
+    rest = np.eye(9) - gain @ model
+    covariance = rest @ state.covariance @ rest.T + gain @ noise @ gain.T
+    return GravityState(state.mean + gain @ off, (covariance + covariance.T) / 2)
+
+
+def _cross(vector: Array) -> Array:
+    """The matrix of the cross product with a vector."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,0 +1,159 @@
+"""Tilts from the samples of an accelerometer and a gyroscope.
+
+Each tilt is estimated from all samples before it and those of the next ten seconds; the first ones of a sensor that
+moves, from those of the next thirty. Samples are kept only that long, so memory does not grow with the log.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from recordings.inertial.blocks import BLOCK_NS, Blocks, InertialSample, Knot, integrate
+from recordings.inertial.gravity_filter import (
+    DISTURBANCE_BLOCKS,
+    FilterStep,
+    GravityState,
+    advance,
+    disturbance,
+    first_state,
+    restarted,
+    sigma_of,
+    smoothed,
+)
+from stages.data import Array, Tilt
+
+BATCH_NS = 25 * BLOCK_NS  # integrated with one estimate of the gyroscope's bias
+LAG_BLOCKS = 50  # after a tilt that it is estimated from
+FIRST_LAG_BLOCKS = 150  # after the first tilt, unless the sensor is at rest at first
+LOOKAHEAD_NS = BATCH_NS + LAG_BLOCKS * BLOCK_NS
+MAX_GAP_NS = 500_000_000  # without a rate; the estimate begins anew after a longer time
+MIN_TILT_INTERVAL_NS = 9_000_000
+START_BLOCKS = 5  # whose mean acceleration is the first guess of gravity
+
+
+@dataclass
+class UpEstimator:
+    """Estimates up from samples in the order of stamps; `push` and `finish` return tilts as they become final.
+
+    accelerometer_bias: standard deviation of each axis, m/s^2; gravity: its magnitude, m/s^2, None if it is to be
+    measured. rest_seconds, seconds: time at rest, and in all; measured_gravity: mean magnitude of batches, m/s^2.
+    """
+
+    frame_id: str
+    accelerometer_bias: float
+    gravity: float | None = None
+    rest_seconds: float = 0.0
+    seconds: float = 0.0
+    measured_gravity: float = 0.0
+    _waiting: list[InertialSample] = field(default_factory=list)
+    _knot: Knot | None = None
+    _origin: int = 0
+    _state: GravityState | None = None
+    _steps: list[FilterStep] = field(default_factory=list)
+    _blocks: Blocks | None = None  # those without tilts yet; one step more than these
+    _forces: Array = field(default_factory=lambda: np.zeros((0, 3)))  # of the last blocks in motion
+    _first: bool = True  # no tilt has been made
+    _last: int = 0  # stamp of the last tilt
+
+    def push(self, sample: InertialSample) -> list[Tilt]:
+        """Add a sample. Its stamp must be later than that of the last one."""
+        made = list[Tilt]()
+        if sample.rate is not None:
+            last = self._last_rated()
+            if last is not None and sample.stamp - last > MAX_GAP_NS:
+                made = self.finish()
+            if self._waiting and sample.stamp - self._waiting[0].stamp > BATCH_NS and self._has_rate():
+                self._integrate()
+                made += self._tilts(LAG_BLOCKS)
+        self._waiting.append(sample)
+        return made
+
+    def finish(self) -> list[Tilt]:
+        """The tilts of all samples so far; the estimate then begins anew."""
+        if self._has_rate():
+            self._integrate()
+        made = self._tilts(0)
+        self._waiting, self._steps, self._blocks, self._knot = [], [], None, None
+        return made
+
+    def _has_rate(self) -> bool:
+        return any(sample.rate is not None for sample in self._waiting)
+
+    def _last_rated(self) -> int | None:
+        stamps = (sample.stamp for sample in reversed(self._waiting) if sample.rate is not None)
+        return next(stamps, None if self._knot is None else self._knot.stamp)
+
+    def _integrate(self) -> None:
+        """Filter the batch that waits."""
+        samples, self._waiting = self._waiting, []
+        bias = np.zeros(3) if self._state is None else self._state.mean[3:6]
+        if self._knot is None:
+            before, first = self._knot_before(samples), self._state
+            self._origin = before.stamp
+            blocks, _ = integrate(samples, before, bias, self._origin)
+            if first is None and blocks.still.any():
+                bias = blocks.rate[blocks.still].mean(axis=0)
+                blocks, _ = integrate(samples, before, bias, self._origin)
+            started = self._started(blocks, bias, first)
+            if started is None:
+                return
+            self._knot, self._state = before, started
+            self._steps = [FilterStep(np.eye(9), started, started)]
+        blocks, self._knot = integrate(samples, self._knot, bias, self._origin)
+        self._filter(blocks, bias)
+        self._blocks = blocks if self._blocks is None else self._blocks.then(blocks)
+
+    @staticmethod
+    def _knot_before(samples: list[InertialSample]) -> Knot:
+        """The beginning of the gyroscope's frame, just before the first sample."""
+        rate = next(sample.rate for sample in samples if sample.rate is not None)
+        return Knot(samples[0].stamp - 1, np.array(rate), np.eye(3))
+
+    def _started(self, blocks: Blocks, bias: Array, before: GravityState | None) -> GravityState | None:
+        """The state before the first batch; None where it has no accelerations. before: the state before a gap."""
+        forces = blocks.force[np.isfinite(blocks.force).all(axis=1)][:START_BLOCKS]
+        if not len(forces) or not np.linalg.norm(forces.mean(axis=0)) > 0:
+            return None
+        force = forces.mean(axis=0)
+        if before is not None:
+            return restarted(before, force, float(blocks.seconds.sum()))
+        return first_state(force, bias, self.accelerometer_bias, self.gravity)
+
+    def _filter(self, blocks: Blocks, bias: Array) -> None:
+        assert self._state is not None
+        moving = blocks.force[~blocks.still & np.isfinite(blocks.force).all(axis=1)]
+        self._forces = np.concatenate([self._forces, moving])[-DISTURBANCE_BLOCKS:]
+        density = disturbance(self._forces)
+        for at in range(len(blocks)):
+            step, rest = advance(self._state, blocks, at, bias, density)
+            self._state = step.updated
+            self._steps.append(step)
+            self.seconds += float(blocks.seconds[at])
+            self.rest_seconds += rest * float(blocks.seconds[at])
+        force = blocks.force[np.isfinite(blocks.force).all(axis=1)]
+        if len(force):
+            weight = float(blocks.seconds.sum()) / self.seconds
+            self.measured_gravity += weight * (float(np.linalg.norm(force.mean(axis=0))) - self.measured_gravity)
+
+    def _tilts(self, kept: int) -> list[Tilt]:
+        """The tilts of all blocks but the last `kept`, which wait for later samples."""
+        count = 0 if self._blocks is None else len(self._blocks) - kept
+        moving = kept and self._first and not self.rest_seconds
+        if self._blocks is None or count <= 0 or (moving and len(self._blocks) < FIRST_LAG_BLOCKS):
+            return []
+        self._first = False
+        states, blocks = smoothed(self._steps), self._blocks[:count]
+        self._steps, self._blocks = self._steps[count:], self._blocks[count:]
+        ends = blocks.stamps[np.searchsorted(blocks.block, np.arange(count), side="right") - 1]
+        made = []
+        for stamp, rotation, at in zip(blocks.stamps.tolist(), blocks.rotations, blocks.block.tolist(), strict=True):
+            if stamp - self._last < MIN_TILT_INTERVAL_NS:
+                continue
+            length = blocks.seconds[at] * 1e9
+            share = 1 - (ends[at] - stamp) / length if length > 0 else 1.0
+            up = rotation.T @ ((1 - share) * states[at].mean[:3] + share * states[at + 1].mean[:3])
+            made.append(Tilt(stamp, up / np.linalg.norm(up), self.frame_id, sigma_of(states[at + 1]), filtered=True))
+            self._last = stamp
+        return made

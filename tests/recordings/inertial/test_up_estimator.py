@@ -1,0 +1,112 @@
+"""Up from accelerations and rates: as right as its sigma says, from the first sample on, on any planet."""
+
+import csv
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recordings.inertial.blocks import InertialSample
+from recordings.inertial.up_estimator import UpEstimator
+from stages.data import Tilt
+from tests.recordings.inertial.drive import drive, estimated
+from tests.recordings.sample_log import data_folder
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize(
+    ("changes", "largest", "first"),
+    [
+        ({}, 0.2, 0.12),
+        ({"rest": 0}, 0.3, 0.55),
+        ({"rest": 0, "gyroscope_bias": 0.05}, 0.5, 0.85),
+        ({"speed": 1.5}, 0.32, 0.12),
+        ({"vibration": 2.0}, 0.37, 0.12),
+        ({"rate": 400, "accelerometer_bias": 0.03}, 0.35, 0.45),
+        ({"gravity": 3.71}, 0.45, 0.14),
+        ({"gravity": 1.62}, 0.75, 0.18),
+    ],
+)
+def test_up_is_right_at_rest_and_while_driving(changes, largest, first):
+    errors, judged = [], []
+    for seed in (1, 2, 3):
+        driven = drive(seed=seed, **changes)
+        tilts, estimator = estimated(driven.samples())
+        found = driven.errors(tilts)
+        assert tilts[0].stamp == driven.stamps[0]
+        assert tilts[-1].stamp > driven.stamps[-1] - 10_000_000
+        assert estimator.measured_gravity == pytest.approx(changes.get("gravity", 9.81), rel=0.02)
+        errors.append((rms(found), rms(found[: len(found) // 6])))
+        judged.append(rms(found / np.sqrt(2) / np.degrees([tilt.sigma for tilt in tilts])))
+    whole, begin = np.mean(errors, axis=0)
+    assert whole < largest
+    assert begin < first
+    assert 0.2 < rms(judged) < 1.2  # of the stated sigma
+
+
+def test_a_known_gravity_shows_the_bias_along_it():
+    driven = drive(rest=60.0)
+    driven.forces[:] += [0.0, 0.0, 0.05]
+    _, estimator = estimated(driven.samples(), gravity=9.81)
+    assert estimator._state.mean[8] == pytest.approx(0.05, abs=0.03)
+
+
+def test_accelerations_and_rates_may_have_stamps_of_their_own():
+    driven = drive(rate=200)
+    whole, parts = driven.samples(), []
+    for number, sample in enumerate(whole):
+        parts.append(InertialSample(sample.stamp, sample.rate, None))
+        if number % 3 == 0:
+            parts.append(InertialSample(sample.stamp + 1_000_000, None, sample.acceleration))
+    one, other = (estimated(samples)[0] for samples in (whole, parts))
+    assert [tilt.stamp for tilt in one] == [tilt.stamp for tilt in other]
+    assert rms(driven.errors(other)) < 0.2
+
+
+def test_a_gap_begins_the_estimate_anew_and_keeps_the_biases():
+    driven = drive(seconds=80)
+    samples = driven.samples()
+    tilts, _ = estimated(samples[:4000] + samples[4500:])
+    assert not any(samples[4000].stamp <= tilt.stamp < samples[4500].stamp for tilt in tilts)
+    after = driven.errors(tilts)[4000:]
+    assert rms(after) < 0.3
+
+
+def test_memory_does_not_grow_with_the_log():
+    estimator, most = UpEstimator("imu", 0.03), 0
+    for sample in drive(seconds=200, rate=50, rest=0).samples():
+        estimator.push(sample)
+        waiting = 0 if estimator._blocks is None else len(estimator._blocks.stamps)
+        most = max(most, waiting + len(estimator._waiting))
+    assert most < 50 * 40
+
+
+def test_samples_without_accelerations_give_no_tilt():
+    assert estimated([InertialSample(stamp, (0.0, 0.0, 0.0), None) for stamp in range(0, 10**10, 10**7)])[0] == []
+
+
+def test_the_error_of_a_filter_is_that_of_its_neighbours():
+    tilts = [Tilt(stamp, [np.sin(stamp / 50), 0, np.cos(stamp / 50)], sigma=0.01, filtered=True) for stamp in range(5)]
+    between = Tilt.smoothed(tilts, 2)
+    assert between.sigma == pytest.approx(0.01)
+    np.testing.assert_allclose(between.up, tilts[2].up, atol=1e-12)
+
+
+def test_up_in_a_frame_of_euroc():
+    folder = data_folder("euroc") / "mav0"
+    with (folder / "imu0" / "data.csv").open() as file:
+        rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    samples = [
+        InertialSample(int(row[0]), *(tuple(map(float, row[first : first + 3])) for first in (1, 4))) for row in rows
+    ]
+    tilts, estimator = estimated(samples)
+    numbers = (folder / "cam0" / "sensor.yaml").read_text().split("data: [")[1].split("]")[0].split(",")
+    body_from_camera = Rotation.from_matrix(np.array(numbers, float).reshape(4, 4)[:3, :3])
+    up = body_from_camera.inv().apply([tilt.up for tilt in tilts])
+    expected = np.array([0.036, -0.927, -0.372])
+    first = up[[tilt.stamp < tilts[0].stamp + 10**9 for tilt in tilts]]
+    assert np.degrees(np.arccos(first @ (expected / np.linalg.norm(expected)))).max() < 1
+    assert estimator.measured_gravity == pytest.approx(9.78, abs=0.02)
