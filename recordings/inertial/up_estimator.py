@@ -28,7 +28,7 @@ BATCH_NS = 25 * BLOCK_NS  # integrated with one estimate of the gyroscope's bias
 LAG_BLOCKS = 50  # after a tilt that it is estimated from
 FIRST_LAG_BLOCKS = 150  # after the first tilt, unless the sensor is at rest at first
 LOOKAHEAD_NS = BATCH_NS + LAG_BLOCKS * BLOCK_NS
-MAX_GAP_NS = 500_000_000  # without a rate; the estimate begins anew after a longer time
+MAX_GAP_NS = 500_000_000  # without a rate; a new estimate begins after a longer time
 MIN_TILT_INTERVAL_NS = 9_000_000
 START_BLOCKS = 5  # whose mean acceleration is the first guess of gravity
 
@@ -71,7 +71,7 @@ class UpEstimator:
         return made
 
     def finish(self) -> list[Tilt]:
-        """The tilts of all samples so far; the estimate then begins anew."""
+        """The tilts of all samples so far; a new estimate then begins."""
         if self._has_rate():
             self._integrate()
         made = self._tilts(0)

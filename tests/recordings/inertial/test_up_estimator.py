@@ -66,7 +66,7 @@ def test_accelerations_and_rates_may_have_stamps_of_their_own():
     assert rms(driven.errors(other)) < 0.2
 
 
-def test_a_gap_begins_the_estimate_anew_and_keeps_the_biases():
+def test_a_new_estimate_after_a_gap_keeps_the_biases():
     driven = drive(seconds=80)
     samples = driven.samples()
     tilts, _ = estimated(samples[:4000] + samples[4500:])
