@@ -1,17 +1,16 @@
 """What the source needs of a file with messages. A container says how messages are encoded; it does not decode them.
 
-To read another format, write a class with these members and name it in `recordings.containers.opening`.
+To read another format, write a class with the members of `Container` and name it in `opening.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+from recordings.containers.timeline import Timeline
 
 
 class RawMessage(NamedTuple):
@@ -54,9 +53,9 @@ class Channel:
 
 
 class Container(Protocol):
-    """A file, or several files as one, open for reading.
+    """A file open for reading.
 
-    path: the file or folder; size: bytes; start, end: log time of the first and the last message, ns.
+    path: the file; size: bytes; start, end: log time of the first and the last message, ns.
     """
 
     path: Path
@@ -80,19 +79,18 @@ class Container(Protocol):
     def indexed(self) -> bool:
         """Whether the file has a valid index; otherwise it was read through."""
 
-    def channels_of(self, topics: Iterable[str]) -> set[int]:
-        """The channels of some topics; a topic may have several."""
+    @property
+    def timeline(self) -> Timeline:
+        """Channel and log time of every message, in file order."""
 
     def messages(
-        self, channels: set[int], start: int | None = None, end: int | None = None, allow_unordered: bool = False
+        self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of `channels` with start <= log time < end, ns, in log-time order.
 
-        A `LostMessage` stands at the log time of lost messages; if that time is unknown, at the end.
+        A `LostMessage` stands at the log time of lost messages; if that time is unknown, at the end. places: of the
+        messages in the timeline; None: all.
         """
-
-    def times(self, channels: set[int]) -> NDArray[np.int64]:
-        """The sorted log times of some channels, ns."""
 
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""

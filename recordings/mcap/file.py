@@ -8,13 +8,11 @@ them, and reading continues.
 from __future__ import annotations
 
 import struct
-from array import array
-from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
 from heapq import heapify, heappop, heappush
-from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,23 +23,19 @@ from numpy.typing import NDArray
 
 from flow.contracts import counted
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
+from recordings.containers.timeline import MAX_LOG_TIME, Timeline
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import MAX_CHUNK_BYTES, unpack_chunk
 from recordings.mcap.index import (
     MAGIC,
-    MAX_JITTER_NS,
-    MAX_LOG_TIME,
     PARSE_ERRORS,
     RECORD,
-    Clock,
-    T,
     UnchunkedMessage,
     index_from_summary,
     iter_records,
     lost_chunk,
     parse_message,
     read_at,
-    reject_set_back,
 )
 from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for
@@ -94,10 +88,10 @@ class McapFile:
         try:
             self.size = self.path.stat().st_size
             self.index = index_from_summary(self._file, self.size) or walk(self._file, self.size)
-            for number in self.index.times.keys() - self.index.channels.keys():
-                unknown = counted(len(self.index.times[number]), "message")
-                self.index.note_damage(f"{unknown} of channel {number} cannot be read: the log does not define it")
             self.channels = {number: self._channel(number) for number in self.index.channels}
+            for number in sorted(set(self.index.counted_channels) - self.channels.keys()):
+                unknown = counted(self.index.counted_channels.count(number), "message")
+                self.index.note_damage(f"{unknown} of channel {number} cannot be read: the log does not define it")
             self.start, self.end = self._time_range()
         except BaseException:
             self._file.close()
@@ -109,24 +103,21 @@ class McapFile:
         return {number for number, channel in self.channels.items() if channel.topic in wanted}
 
     def messages(
-        self, channels: set[int], start: int | None = None, end: int | None = None, allow_unordered: bool = False
+        self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
     ) -> Iterator[RawMessage | LostMessage]:
         """Read the messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
 
-        A `LostMessage` stands at the log time of lost messages; if that time itself is damaged, at the end. After the
-        clock of a channel was set back, its messages are lost until 1 s beyond the old time. With `allow_unordered`
-        they are kept, because a log may also be written topic by topic.
+        A `LostMessage` stands at the log time of lost messages; if that time itself is damaged, at the end. places: of
+        the messages in the timeline; None: all.
         """
         low, high = (0 if start is None else start), (1 << 64 if end is None else end)
-        ordered = set[int]() if allow_unordered else channels
-        queue = self._queue(channels, ordered)
+        queue = self._queue(channels, places)
         found = dict.fromkeys(channels, 0)
         while queue and queue[0][0] < high:
-            log_time, offset, _, item = heappop(queue)
+            log_time, _, _, item = heappop(queue)
             if isinstance(item, ChunkIndex):
                 if item.message_end_time >= low:
-                    for place, inside in enumerate(self._chunk_or_lost(item, ordered)):
-                        heappush(queue, (inside.log_time, offset, place, inside))
+                    self._open_chunk(item, queue, places)
             elif item.channel is None or item.channel in channels:
                 if item.channel is not None:
                     found[item.channel] += 1
@@ -135,36 +126,34 @@ class McapFile:
                     yield LostMessage(item.channel, self.end, item.reason if isinstance(item, LostMessage) else damage)
                 elif log_time >= low:
                     yield self._read_unchunked(item) if isinstance(item, UnchunkedMessage) else item
-        if start is None and end is None:
+        if start is None and end is None and places is None:
             yield from self._unaccounted(found)
 
-    def times(self, channels: set[int]) -> NDArray[np.int64]:
-        """The sorted log times of some channels, ns; an indexed file is not decompressed for them.
+    @cached_property
+    def timeline(self) -> Timeline:
+        """Channel and log time of every message, in file order; an indexed file is not decompressed for them."""
+        index = self.index
+        if not index.walked:
+            for chunk in self._chunks(set(self.channels)):
+                first = len(index.counted_times)
+                channels, times = self._message_index(chunk)
+                index.counted_channels.frombytes(channels.tobytes())
+                index.counted_times.frombytes(times.tobytes())
+                for item in () if len(times) else self._chunk_or_lost(chunk):
+                    if item.channel is not None:
+                        index.count_message(item.channel, item.log_time)
+                index.places[chunk.chunk_start_offset] = range(first, len(index.counted_times))
+        return Timeline.of(index.counted_channels, index.counted_times)
 
-        Times that repeat because the clock was set back are left out.
-        """
-        found = defaultdict[int | None, list[int]](list)
-        if self.index.walked:
-            found.update((channel, self.index.times.get(channel, array("Q")).tolist()) for channel in channels)
-        else:
-            for chunk in self._chunks(channels):
-                for item in self._contents(chunk):
-                    found[item.channel].append(item.log_time)
-        kept = [np.zeros(0, np.int64)]
-        for channel in channels:
-            times = np.array([time for time in found[channel] if time <= MAX_LOG_TIME], np.int64)
-            if np.any(np.maximum.accumulate(times) - times > MAX_JITTER_NS):
-                clocks = accumulate(times.tolist(), Clock.advanced, initial=Clock())
-                times = times[[not clock.set_back for clock in clocks][1:]]
-            kept.append(times)
-        return np.sort(np.concatenate(kept))
+    def times(self, channels: set[int]) -> NDArray[np.int64]:
+        """The sorted log times of some channels, ns."""
+        return self.timeline.times_of(channels)
 
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels, from the file's statistics or the walk."""
-        index = self.index
-        if index.walked:
-            return sum(len(index.times.get(channel, ())) for channel in channels)
-        return sum(index.stated_counts.get(channel, 0) for channel in channels)
+        if self.index.walked:
+            return int(np.isin(self.timeline.channels, list(channels)).sum())
+        return sum(self.index.stated_counts.get(channel, 0) for channel in channels)
 
     @property
     def profile(self) -> str:
@@ -197,52 +186,48 @@ class McapFile:
         described = MessageSchema(schema.name, schema.encoding, schema.data) if schema else None
         return Channel(number, channel.topic, channel.message_encoding, described)
 
-    def _queue(self, channels: set[int], ordered: set[int]) -> list[tuple[int, int, int, Any]]:
+    def _queue(self, channels: set[int], places: range | None) -> list[tuple[int, int, int, Any]]:
         """Chunks, messages and losses, as a heap of (log time, offset in the file, place in a chunk, item)."""
-        index = self.index
+        index, kept = self.index, range(len(self.timeline)) if places is None else places
         queue: list[tuple[int, int, int, Any]] = []
-        queue += [(lost.log_time, self.size, number, lost) for number, lost in enumerate(index.lost)]
-        for number, (found, clock) in enumerate(index.rescued, -len(index.rescued)):
-            queue.append((found.log_time, self.size, number, reject_set_back(found, [clock] if ordered else ())))
-        unchunked = [item for item in index.unchunked if item.channel in channels]
-        for place, item in zip(unchunked, _reject_set_back(unchunked, {}, ordered), strict=True):
-            queue.append((item.log_time, place.offset, -1, item))
-        queue += [(chunk.message_start_time, chunk.chunk_start_offset, -1, chunk) for chunk in self._chunks(channels)]
+        if kept.stop >= len(self.timeline):
+            queue += [(lost.log_time, self.size, number, lost) for number, lost in enumerate(index.lost)]
+        queue += [(item.log_time, self.size, place - (1 << 62), item) for place, item in index.rescued if place in kept]
+        queue += [
+            (item.log_time, item.offset, -1, item)
+            for item in index.unchunked
+            if item.channel in channels and item.place in kept
+        ]
+        for chunk in self._chunks(channels):
+            inside = index.places[chunk.chunk_start_offset]
+            if places is None or (inside.start < places.stop and inside.stop > places.start):
+                queue.append((chunk.message_start_time, chunk.chunk_start_offset, -1, chunk))
         heapify(queue)
         return queue
+
+    def _open_chunk(self, chunk: ChunkIndex, queue: list[tuple[int, int, int, Any]], places: range | None) -> None:
+        """Add the messages of a chunk to the queue."""
+        first = self.index.places[chunk.chunk_start_offset].start
+        for number, item in enumerate(self._chunk_or_lost(chunk)):
+            if places is None or first + number in places:
+                heappush(queue, (item.log_time, chunk.chunk_start_offset, number, item))
 
     def _chunks(self, channels: set[int]) -> list[ChunkIndex]:
         """The chunks with messages of the channels (or of unknown channels), in file order."""
         chunks = sorted(self.index.chunks, key=lambda chunk: chunk.chunk_start_offset)
         return [c for c in chunks if not c.message_index_offsets or channels & c.message_index_offsets.keys()]
 
-    @cached_property
-    def _clocks_before(self) -> dict[int, dict[int | None, Clock]]:
-        """Chunk offset -> the clock of each channel where the chunk begins; empty if no chunk begins in the past."""
-        if self.index.walked:
-            return self.index.clocks_before
-        chunks = [chunk for chunk in self._chunks(set(self.channels)) if chunk.message_end_time]
-        ends = accumulate((chunk.message_end_time for chunk in chunks), max)
-        if all(end - chunk.message_start_time <= MAX_JITTER_NS for end, chunk in zip(ends, chunks[1:], strict=False)):
-            return {}
-        before, clocks = dict[int, dict[int | None, Clock]](), defaultdict[int | None, Clock](Clock)
-        for chunk in chunks:
-            before[chunk.chunk_start_offset] = clocks.copy()
-            for item in self._contents(chunk):
-                clocks[item.channel] = clocks[item.channel].advanced(item.log_time)
-        return before
-
-    def _chunk_or_lost(self, chunk: ChunkIndex, ordered: Collection[int] = ()) -> list[RawMessage | LostMessage]:
+    def _chunk_or_lost(self, chunk: ChunkIndex) -> Sequence[RawMessage | LostMessage]:
         """The messages of a chunk, or a `LostMessage` for each entry of its message index."""
         try:
-            before = self._clocks_before.get(chunk.chunk_start_offset, {}) if ordered else {}
-            return _reject_set_back(self._chunk_messages(chunk), before, ordered)
+            return self._chunk_messages(chunk)
         except PARSE_ERRORS as error:
             reason = lost_chunk(chunk.chunk_start_offset, error)
         channels = chunk.message_index_offsets
-        known = self._message_index(chunk) or [(number, chunk.message_start_time) for number in channels]
-        lost = [LostMessage(channel, log_time, reason) for channel, log_time in known]
-        return [*lost] or [LostMessage(None, chunk.message_start_time, reason)]
+        known = [column.tolist() for column in self._message_index(chunk)]
+        known = known if known[0] else [list(channels), [chunk.message_start_time] * len(channels)]
+        lost = [LostMessage(channel, log_time, reason) for channel, log_time in zip(*known, strict=True)]
+        return lost or [LostMessage(None, chunk.message_start_time, reason)]
 
     def _chunk_messages(self, chunk: ChunkIndex) -> list[RawMessage]:
         length = chunk.chunk_length - RECORD.size
@@ -256,24 +241,21 @@ class McapFile:
     def _read_unchunked(self, place: UnchunkedMessage) -> RawMessage:
         return RawMessage(place.channel, place.log_time, memoryview(read_at(self._file, place.offset, place.size)))
 
-    def _contents(self, chunk: ChunkIndex) -> list[RawMessage | LostMessage]:
-        """A chunk's messages, without data if there is a message index; those of one channel are in file order."""
-        known = self._message_index(chunk)
-        return [RawMessage(number, time, memoryview(b"")) for number, time in known] or self._chunk_or_lost(chunk)
-
-    def _message_index(self, chunk: ChunkIndex) -> list[tuple[int, int]]:
-        """(channel, log time) of each message by the message index, in file order per channel; empty if broken."""
-        found: list[tuple[int, int]] = []
+    def _message_index(self, chunk: ChunkIndex) -> tuple[NDArray[np.uint16], NDArray[np.uint64]]:
+        """Channel and log time of each message of a chunk, in file order; empty without a valid message index."""
+        channels, entries = [np.zeros(0, np.uint16)], [np.zeros((0, 2), np.uint64)]
         first = chunk.chunk_start_offset + chunk.chunk_length
         with suppress(*PARSE_ERRORS):
             section = read_at(self._file, first, min(chunk.message_index_length, MAX_CHUNK_BYTES))
             for opcode, content in iter_records(section):
                 if opcode == Opcode.MESSAGE_INDEX:
                     channel, size = struct.unpack_from("<HI", content)
-                    pairs = np.frombuffer(content, "<u8", size // 16 * 2, 6).reshape(-1, 2)
-                    found.extend((channel, time) for time in pairs[pairs[:, 1].argsort(kind="stable"), 0].tolist())
-            return found
-        return []
+                    entries.append(np.frombuffer(content, "<u8", size // 16 * 2, 6).reshape(-1, 2))
+                    channels.append(np.full(len(entries[-1]), channel, np.uint16))
+            times, offsets = np.concatenate(entries).T
+            order = np.argsort(offsets, kind="stable")
+            return np.concatenate(channels)[order], times[order]
+        return channels[0], entries[0][:, 0]
 
     def _unaccounted(self, found: dict[int, int]) -> Iterator[LostMessage]:
         """The messages that the file's statistics count but that were neither read nor reported as lost."""
@@ -287,11 +269,11 @@ class McapFile:
     def _time_range(self) -> tuple[int, int]:
         """Log time of the first and the last message, ns."""
         index = self.index
-        if not index.times and (index.walked or not any(index.stated_counts.values())):
+        if not index.counted_times and (index.walked or not any(index.stated_counts.values())):
             damage = f" that can be read: {index.lost[0].reason}" if index.lost else "; record it again"
             raise LogError(f"{self.path} contains no messages{damage}")
         if index.walked:
-            ends = [end for times in index.times.values() for end in (min(times), max(times))]
+            ends = [min(index.counted_times), max(index.counted_times)]
         else:
             filled = [chunk for chunk in index.chunks if chunk.message_end_time] or index.chunks
             ends = [end for chunk in filled for end in (chunk.message_start_time, chunk.message_end_time)]
@@ -300,20 +282,6 @@ class McapFile:
         if not ends:
             raise LogError(f"{self.path} contains no message with a valid log time; record it again")
         return min(ends), max(ends)
-
-
-def _reject_set_back(
-    messages: Iterable[T], clocks_before: Mapping[int | None, Clock], ordered: Collection[int]
-) -> list[T | LostMessage]:
-    """Replace each message that follows a set-back clock of a channel in `ordered` by a `LostMessage`."""
-    clocks, found = defaultdict[int | None, Clock](Clock, clocks_before), list[T | LostMessage]()
-    set_back = {channel for channel in ordered if channel in clocks and clocks[channel].set_back}
-    for message in messages:
-        clock = clocks[message.channel] = clocks[message.channel].advanced(message.log_time)
-        if message.channel in ordered:
-            (set_back.add if clock.set_back else set_back.discard)(message.channel)
-        found.append(reject_set_back(message, [clocks[channel] for channel in set_back]) if set_back else message)
-    return found
 
 
 def iter_decoded(
@@ -353,7 +321,7 @@ def iter_decoded(
             schema = channel.schema
             if schema and channel.message_encoding == "cdr" and (wanted is None or channel.topic in wanted):
                 decoders[number] = decoder_for(schema.name, schema.encoding, schema.text)
-        for item in log.messages(set(decoders), allow_unordered=True):
+        for item in log.messages(set(decoders)):
             if isinstance(item, LostMessage):
                 lose(item.reason)
                 continue

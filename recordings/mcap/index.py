@@ -9,12 +9,11 @@ from __future__ import annotations
 import os
 import struct
 from array import array
-from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import Any, BinaryIO, NamedTuple, TypeVar
+from typing import Any, BinaryIO, NamedTuple
 
 import zstandard
 from isal.isal_zlib import crc32
@@ -24,17 +23,13 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
 from recordings.containers.container import LostMessage, RawMessage
+from recordings.containers.timeline import MAX_LOG_TIME
 from recordings.errors import sentence_of
 
 MAGIC = b"\x89MCAP0\r\n"
 PARSE_ERRORS = (
     McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError, OSError,
 )  # fmt: skip
-
-MAX_LOG_TIME = (1 << 63) - 1  # ns; a later log time is damaged
-SETTLING_NS = 1_000_000_000  # after the clock was set back, messages are lost until it is this far beyond its old time
-MAX_LEAP_NS = 10_000_000_000  # a single message this far ahead of both its neighbours is damaged
-MAX_JITTER_NS = 100_000_000  # by so much, messages of a channel may be logged out of order
 
 RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -44,72 +39,47 @@ _TAIL = RECORD.size + _FOOTER_LENGTH + len(MAGIC)
 
 
 class UnchunkedMessage(NamedTuple):
-    """The place of a message outside any chunk: offset and size of its data, bytes."""
+    """A message outside any chunk. place: in the timeline; offset, size: of its data, bytes."""
 
+    place: int
     channel: int
     log_time: int
     offset: int
     size: int
 
 
-T = TypeVar("T", RawMessage, UnchunkedMessage)
-
-
-class Clock(NamedTuple):
-    """The recorder's clock by the messages of one channel up to some place in the file.
-
-    latest: the latest log time, ns; set_back: by how much the clock was set back, ns, 0 once it is `SETTLING_NS` beyond
-    `latest`; previous: `latest` before the last message.
-    """
-
-    latest: int = 0
-    set_back: int = 0
-    previous: int = 0
-
-    def advanced(self, log_time: int) -> Clock:
-        """The clock after the channel's next message."""
-        if log_time > MAX_LOG_TIME:
-            return self
-        fall = self.latest - log_time
-        if fall <= (-SETTLING_NS if self.set_back else MAX_JITTER_NS):
-            return Clock(max(self.latest, log_time), 0, self.latest)
-        last_was_damaged = self.previous < log_time and self.latest - self.previous > MAX_LEAP_NS
-        if last_was_damaged and not self.set_back:
-            return Clock(log_time, 0, self.previous)
-        return Clock(self.latest, max(self.set_back, fall), self.previous)
-
-
 @dataclass
 class Index:
     """The index of a file.
 
-    chunks: each with its channels (none listed: unknown); rescued: messages of a cut chunk, each with its clock; lost:
+    chunks: each with its channels (none listed: unknown); rescued: messages of a cut chunk, each with its place; lost:
     the damage found; stated_counts: messages by channel, stated_records: number of chunks, channels and schemas, both
-    from the file's statistics. Only with `walked`: times: log times by channel, in file order; clocks: by channel;
-    clocks_before: chunk offset -> the clocks where the chunk begins; latest: the last log time, ns.
+    from the file's statistics. Of the messages counted so far, all with `walked`: counted_channels and counted_times:
+    in file order; places: chunk offset -> the places of its messages; latest: the last log time, ns.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
     unchunked: list[UnchunkedMessage] = field(default_factory=list)
-    rescued: list[tuple[RawMessage, Clock]] = field(default_factory=list)
+    rescued: list[tuple[int, RawMessage]] = field(default_factory=list)
     lost: list[LostMessage] = field(default_factory=list)
-    times: dict[int, array[int]] = field(default_factory=dict)
-    clocks: dict[int | None, Clock] = field(default_factory=lambda: defaultdict(Clock))
-    clocks_before: dict[int, dict[int | None, Clock]] = field(default_factory=dict)
+    counted_channels: array[int] = field(default_factory=lambda: array("H"))
+    counted_times: array[int] = field(default_factory=lambda: array("Q"))
+    places: dict[int, range] = field(default_factory=dict)
     stated_counts: dict[int, int] = field(default_factory=dict)
     stated_records: tuple[int, int, int] | None = None
     profile: str = ""
     walked: bool = False
     latest: int = 0
 
-    def count_message(self, channel: int, log_time: int) -> Clock:
-        """Count one message; returns the clock of its channel."""
-        self.times.setdefault(channel, array("Q")).append(log_time)
-        clock = self.clocks[channel] = self.clocks[channel].advanced(log_time)
-        self.latest = max(self.latest, clock.latest)
-        return clock
+    def count_message(self, channel: int, log_time: int) -> int:
+        """Count the next message of the file; returns its place."""
+        self.counted_channels.append(channel)
+        self.counted_times.append(log_time)
+        if log_time <= MAX_LOG_TIME:
+            self.latest = max(self.latest, log_time)
+        return len(self.counted_times) - 1
 
     def define(self, opcode: int, content: bytes | memoryview) -> None:
         """Store a schema or a channel; other records are ignored."""
@@ -221,20 +191,6 @@ def parse_message(content: memoryview) -> RawMessage:
     """The message in a message record."""
     channel, _, log_time, _ = MESSAGE.unpack_from(content)
     return RawMessage(channel, log_time, content[MESSAGE.size :])
-
-
-def reject_set_back(message: T, clocks: Iterable[Clock]) -> T | LostMessage:
-    """The message, or a `LostMessage` if one of the clocks was set back and had shown the message's log time before."""
-    falls = (clock.set_back for clock in clocks if clock.set_back and message.log_time < clock.latest + SETTLING_NS)
-    fall = max(falls, default=0)
-    if not fall:
-        return message
-    return LostMessage(
-        message.channel,
-        message.log_time,
-        f"the log's clock was set back by at least {fall / 1e9:.3g} s and is not yet 1 s beyond its old time; "
-        "if the clock was right and the log is only written in another order, `mcap sort` repairs it",
-    )
 
 
 def lost_chunk(offset: int, error: Exception) -> str:

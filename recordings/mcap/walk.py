@@ -97,10 +97,8 @@ def _note(index: Index, opcode: int, content: bytes, length: int, position: int,
         _note_chunk(index, content, position)
     elif opcode == Opcode.MESSAGE:
         channel, _, log_time, _ = MESSAGE.unpack_from(content)
-        index.unchunked.append(
-            UnchunkedMessage(channel, log_time, position + RECORD.size + MESSAGE.size, length - MESSAGE.size)
-        )
-        index.count_message(channel, log_time)
+        place, data_at = index.count_message(channel, log_time), position + RECORD.size + MESSAGE.size
+        index.unchunked.append(UnchunkedMessage(place, channel, log_time, data_at, length - MESSAGE.size))
     elif opcode == Opcode.HEADER and before == 0:
         index.profile = profile_of(content)
     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -119,7 +117,7 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
     except PARSE_ERRORS as error:
         index.note_damage(lost_chunk(position, error), chunk_start_time(content))
         return
-    offsets, times, before = {}, [], index.clocks.copy()
+    offsets, times, first = {}, [], len(index.counted_times)
     for opcode, record in inside:
         if opcode == Opcode.MESSAGE:
             channel, _, log_time, _ = MESSAGE.unpack_from(record)
@@ -135,7 +133,7 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
             message_start_time=min(times), uncompressed_size=0,
         )  # fmt: skip
         index.chunks.append(chunk)
-        index.clocks_before[position] = before
+        index.places[position] = range(first, first + len(times))
 
 
 def _note_rest(index: Index, file: BinaryIO, position: int, size: int) -> None:
@@ -163,11 +161,11 @@ def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None,
             for opcode, content in iter_records(unpack_cut_chunk(record[RECORD.size :]), whole=False):
                 if opcode == Opcode.MESSAGE:
                     message = parse_message(content)
-                    index.rescued.append((message, index.count_message(message.channel, message.log_time)))
+                    index.rescued.append((index.count_message(message.channel, message.log_time), message))
                 else:
                     index.define(opcode, content)
     if found is None:
-        held = counted(sum(map(len, index.times.values())), "message")
+        held = counted(len(index.counted_times), "message")
         index.note_damage(f"the log is cut or damaged at byte {position} of {size}; before that it contains {held}")
     else:
         index.note_damage(f"the log is damaged from byte {position} to byte {found}; messages there may be lost")

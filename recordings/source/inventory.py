@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from flow.contracts import counted
 from recordings.containers.container import LostMessage
+from recordings.containers.header import peek_stamp
 from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.source.cameras import CAMERAS
 from recordings.source.log import McapLog
-from recordings.source.topics import peek_stamp
 from stages.data import StereoCamera, Tilt
 
 Stamps = NDArray[np.int64]

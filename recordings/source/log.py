@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
+from recordings.containers.header import peek_stamp
+from recordings.containers.recording import Recording
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.file import McapFile
 from recordings.ros2.from_msg import camera_model, frame_of, pose_of, stamp_or
@@ -29,7 +31,7 @@ from recordings.source.mount import pose_of_base
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_noise import TiltNoise
-from recordings.source.topics import Decoder, peek_stamp
+from recordings.source.topics import Decoder
 from stages.data import CameraImage, CameraModel, Pose, Tilt
 
 INTERPOLATION_LEAD_NS = 1_000_000_000  # tilt and pose are read this far beyond a range, for interpolation at its ends
@@ -127,7 +129,7 @@ class McapLog:
     _info_times: dict[str, NDArray[np.int64]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.file = McapFile(self.path)
+        self.file = Recording(self.path, [McapFile(self.path)])
         try:
             self._check_range()
             self.resolution = resolution = SourceResolution(self.file, self.source)

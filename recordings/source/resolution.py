@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from flow.contracts import counted
-from recordings.containers.container import Container
+from recordings.containers.recording import Recording
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of
 from recordings.ros2.tilt_from_msg import tilt_of
@@ -33,7 +33,7 @@ class SourceResolution:
     of the camera on the rover; problems: (stream, error) pairs for the ledger.
     """
 
-    def __init__(self, file: Container, source: LogSettings) -> None:
+    def __init__(self, file: Recording, source: LogSettings) -> None:
         self.file, self.source, self.messages = file, source, DecodedTopics(file)
         self.static, self.problems = self._read_static()
         self.undecodable = self._undecodable_topics()
@@ -68,7 +68,7 @@ class SourceResolution:
         tree, problems = TransformTree(), list[tuple[str, LogError]]()
         for topic, schema in sorted(self.messages.schemas.items()):
             if schema == TRANSFORMS and topic.endswith("tf_static"):
-                for transforms in self.messages.each(topic, lambda message: message.transforms, allow_unordered=True):
+                for transforms in self.messages.each(topic, lambda message: message.transforms, allow_repeats=True):
                     for item in [transforms] if isinstance(transforms, LogError) else transforms:
                         added = item if isinstance(item, LogError) else attempt(tree.add, item)
                         if isinstance(added, LogError):

@@ -6,22 +6,19 @@ reading continues.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Any, TypeVar
 
-import zstandard
-
-from recordings.containers.container import Channel, Container, LostMessage
+from recordings.containers.container import Channel, LostMessage
+from recordings.containers.recording import Recording
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.file import CONVERT
-from recordings.ros2.cdr import decoder_for, full_name, plain
+from recordings.ros2.cdr import decoder_for, full_name
 from recordings.ros2.from_msg import frame_of
 
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
-_STAMP_END = 12  # bytes of a message up to the end of its header's stamp
 
 Decoder = Callable[[bytes | memoryview], Any]
 T = TypeVar("T")
@@ -32,12 +29,12 @@ class _GoneError(LogError):
 
 
 class DecodedTopics:
-    """The messages of a file by topic, converted by a function `make`; a LogError where it fails.
+    """The messages of a log by topic, converted by a function `make`; a LogError where it fails.
 
     decoders: by channel; undecodable_channels: channel -> reason; schemas: decodable topic -> full ROS 2 type name.
     """
 
-    def __init__(self, file: Container) -> None:
+    def __init__(self, file: Recording) -> None:
         self.file = file
         self.decoders: dict[int, Decoder] = {}
         self.undecodable_channels: dict[int, str] = {}
@@ -57,10 +54,10 @@ class DecodedTopics:
         return self.file.count(self.channels_of(topic))
 
     def each(
-        self, topic: str, make: Callable[[Any], T], start: int | None = None, allow_unordered: bool = False
+        self, topic: str, make: Callable[[Any], T], start: int | None = None, allow_repeats: bool = False
     ) -> Iterator[T | LogError]:
         """Convert each message of a topic from the log time `start`, ns."""
-        for raw in self.file.messages(self.channels_of(topic), start, allow_unordered=allow_unordered):
+        for raw in self.file.messages(self.channels_of(topic), start, allow_repeats=allow_repeats):
             if not isinstance(raw, LostMessage):
                 yield attempt(lambda data, decoder: make(decoder(data)), raw.data, self.decoders[raw.channel])
             elif raw.channel is not None:
@@ -70,7 +67,7 @@ class DecodedTopics:
         """Convert some messages of a topic, spread over the log, without lost ones."""
         for place in range(_SAMPLE_PLACES):
             start = self.file.start + (self.file.end - self.file.start) * place // _SAMPLE_PLACES
-            made = self.each(topic, make, start, allow_unordered=True)
+            made = self.each(topic, make, start, allow_repeats=True)
             yield from islice((each for each in made if not isinstance(each, _GoneError)), _MAX_SAMPLES)
 
     def last(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
@@ -112,15 +109,3 @@ def attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:
         return LogError(f"its content does not match the name of its type ({sentence_of(error)})")
     except Exception as error:
         return LogError(sentence_of(error))
-
-
-def peek_stamp(data: memoryview) -> int:
-    """The stamp of a CDR message that begins with a std_msgs/Header, ns; 0 if it is too short. Does not decode it."""
-    try:
-        head = plain(data, _STAMP_END)
-    except zstandard.ZstdError:
-        return 0
-    if len(head) < _STAMP_END:
-        return 0
-    seconds, nanoseconds = struct.unpack_from("<iI" if head[1] else ">iI", head, 4)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)

@@ -1,0 +1,232 @@
+"""One log: the messages of one or several files, merged in the order of log time.
+
+Where the recorder's clock was set, a file is read as two parts, each with its own correction of the log times. Files
+and parts are opened when their time comes, so memory does not grow with their number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from heapq import heapify, heappop, heappush
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recordings.containers.clock import ClockStep, clock_steps, split
+from recordings.containers.container import Channel, Container, LostMessage, RawMessage
+from recordings.containers.header import begins_with_header, peek_stamp
+from recordings.containers.timeline import Timeline
+
+_MAX_CHANNELS = 1 << 32  # of a file
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A stretch of a file between two steps of the recorder's clock. places: in the file; base: of its channels."""
+
+    file: Container
+    base: int
+    places: range
+    step: ClockStep
+
+    @property
+    def whole(self) -> bool:
+        return len(self.places) == len(self.file.timeline)
+
+    @property
+    def start(self) -> int:
+        """No message of the part is earlier, ns."""
+        if self.whole:
+            return self.file.start + self.step.shift
+        times = self.file.timeline.log_times[self.places.start : self.places.stop]
+        return int(times[times >= 0].min(initial=self.file.end)) + self.step.shift
+
+    def times(self, channels: set[int], allow_repeats: bool) -> NDArray[np.int64]:
+        """The log times of some channels of the recording, ns, in any order."""
+        found = [np.zeros(0, np.int64)]
+        for channel, places in self.file.timeline.by_channel.items():
+            if channel + self.base in channels:
+                inside = places[(places >= self.places.start) & (places < self.places.stop)]
+                found.append(self.file.timeline.log_times[inside])
+        times = np.concatenate(found)
+        return times[times >= (0 if allow_repeats else self.step.repeats_until)] + self.step.shift
+
+    def messages(
+        self, channels: set[int], start: int | None, end: int | None, allow_repeats: bool
+    ) -> Iterator[RawMessage | LostMessage]:
+        """The messages of some channels of the recording, in log-time order."""
+        own = {channel - self.base for channel in channels if channel - self.base in self.file.channels}
+        low, high = (None if time is None else max(time - self.step.shift, 0) for time in (start, end))
+        for item in self.file.messages(own, low, high, None if self.whole else self.places):
+            channel = None if item.channel is None else item.channel + self.base
+            log_time = item.log_time + self.step.shift
+            if isinstance(item, LostMessage):
+                yield LostMessage(channel, log_time, item.reason)
+            elif item.log_time < self.step.repeats_until and not allow_repeats:
+                yield LostMessage(channel, log_time, _repeated(self.step))
+            elif channel is not None:
+                yield RawMessage(channel, log_time, item.data)
+
+
+def _repeated(step: ClockStep) -> str:
+    return (
+        f"the log's clock and the header stamps were set back by at least {step.fall / 1e9:.3g} s, and it is not yet "
+        "1 s beyond its old time: the times repeat"
+    )
+
+
+class Recording:
+    """The messages of one or several files as one log; use it as a context manager.
+
+    Parameters
+    ----------
+    path : Path
+        What the user gave: the file or the folder.
+    files : sequence of Container
+        The files in the order in which they were recorded. The recording closes them.
+
+    Attributes
+    ----------
+    channels : dict of int to Channel
+        The channels of all files by number; a topic may have several.
+    start, end : int
+        Log time of the first and the last message, ns.
+    """
+
+    def __init__(self, path: Path, files: Sequence[Container]) -> None:
+        self.path, self.files = path, files
+        self.size = sum(file.size for file in files)
+        self.channels = {
+            base + number: Channel(base + number, channel.topic, channel.message_encoding, channel.schema)
+            for base, file in self._based()
+            for number, channel in file.channels.items()
+        }
+        try:
+            self.start = min(part.start for part in self._parts)
+            self.end = max(part.file.end + part.step.shift for part in self._parts)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def lost(self) -> list[LostMessage]:
+        """The damage found so far."""
+        found = ((file, item) for file in self.files for item in file.lost)
+        return [LostMessage(None, item.log_time, self._named(file, item.reason)) for file, item in found]
+
+    @property
+    def profile(self) -> str:
+        """The profile that the files state."""
+        return self.files[0].profile
+
+    @property
+    def indexed(self) -> bool:
+        """Whether all files have a valid index."""
+        return all(file.indexed for file in self.files)
+
+    def channels_of(self, topics: Iterable[str]) -> set[int]:
+        """The channels of some topics."""
+        wanted = set(topics)
+        return {number for number, channel in self.channels.items() if channel.topic in wanted}
+
+    def messages(
+        self, channels: set[int], start: int | None = None, end: int | None = None, allow_repeats: bool = False
+    ) -> Iterator[RawMessage | LostMessage]:
+        """Read the messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
+
+        A `LostMessage` stands for lost messages, also for those whose times repeat because all clocks were set back;
+        with `allow_repeats` these are kept.
+        """
+        begun = list[Iterator[RawMessage | LostMessage] | None]([None] * len(self._parts))
+        queue: list[tuple[int, int, Any]] = [(part.start, number, None) for number, part in enumerate(self._parts)]
+        heapify(queue)
+        while queue:
+            log_time, number, item = heappop(queue)
+            if end is not None and log_time >= end and item is None:
+                continue
+            if item is not None:
+                yield item
+            items = begun[number]
+            if items is None:
+                items = begun[number] = self._read(self._parts[number], channels, start, end, allow_repeats)
+            if (following := next(items, None)) is not None:
+                heappush(queue, (following.log_time, number, following))
+
+    def times(self, channels: set[int], allow_repeats: bool = False) -> NDArray[np.int64]:
+        """The sorted log times of some channels, ns; by default without those that repeat."""
+        return np.sort(np.concatenate([part.times(channels, allow_repeats) for part in self._parts]))
+
+    def count(self, channels: set[int]) -> int:
+        """The number of messages in some channels."""
+        return sum(file.count({channel - base for channel in channels}) for base, file in self._based())
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self.files:
+            file.close()
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
+    def _based(self) -> Iterator[tuple[int, Container]]:
+        """Each file with the number to add to those of its channels."""
+        return ((number * _MAX_CHANNELS, file) for number, file in enumerate(self.files))
+
+    def _named(self, file: Container, reason: str) -> str:
+        return f"{file.path.name}: {reason}" if len(self.files) > 1 else reason
+
+    def _read(self, part: _Part, *which: Any) -> Iterator[RawMessage | LostMessage]:
+        for item in part.messages(*which):
+            if isinstance(item, LostMessage):
+                item = item._replace(reason=self._named(part.file, item.reason))
+            yield item
+
+    @cached_property
+    def _parts(self) -> list[_Part]:
+        """The parts of all files, in the order in which they were recorded."""
+        parts, first = list[_Part](), 0
+        steps = self._steps()
+        for base, file in self._based():
+            size = len(file.timeline)
+            for places, step in split(steps, first, size):
+                parts.append(_Part(file, base, places, step))
+            first += size
+        return parts
+
+    def _steps(self) -> list[ClockStep]:
+        """The steps of the recorder's clock over all files; their places are counted through the files."""
+        topics = {topic: number for number, topic in enumerate(sorted({c.topic for c in self.channels.values()}))}
+        channels, times, firsts = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [0]
+        for _, file in self._based():
+            numbers, inverse = np.unique(file.timeline.channels, return_inverse=True)
+            known = [topics[file.channels[n].topic] if n in file.channels else len(topics) for n in numbers.tolist()]
+            channels.append(np.array(known, np.int64)[inverse])
+            times.append(file.timeline.log_times)
+            firsts.append(firsts[-1] + len(file.timeline))
+        timeline = Timeline(np.concatenate(channels), np.concatenate(times))
+        stamped = {topics[channel.topic] for channel in self.channels.values() if begins_with_header(channel)}
+        return clock_steps(timeline, stamped, _StampReader(self.files, firsts))
+
+
+@dataclass(frozen=True)
+class _StampReader:
+    """Reads the header stamp of the message at a place. firsts: the place of the first message of each file."""
+
+    files: Sequence[Container]
+    firsts: Sequence[int]
+
+    def __call__(self, place: int) -> int:
+        number = int(np.searchsorted(self.firsts, place, side="right")) - 1
+        file, own = self.files[number], place - self.firsts[number]
+        channel = int(file.timeline.channels[own])
+        for item in file.messages({channel}, places=range(own, own + 1)):
+            if isinstance(item, RawMessage):
+                return peek_stamp(item.data, file.channels[channel].message_encoding)
+        return 0

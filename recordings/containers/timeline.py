@@ -1,0 +1,46 @@
+"""The log times of all messages of a file, in the order in which they are stored.
+
+Ten bytes a message: so the rates, the gaps and the recorder's clock are known without reading any message.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+MAX_LOG_TIME = (1 << 63) - 1  # ns; a later log time is damaged
+
+Places = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The channel and the log time, ns, of each message. The place of a message is its index here."""
+
+    channels: NDArray[np.int64]
+    log_times: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, channels: ArrayLike, log_times: ArrayLike) -> Timeline:
+        """The timeline of two lists; a damaged log time becomes -1."""
+        times = np.asarray(log_times, np.uint64)
+        return cls(np.asarray(channels, np.int64), np.where(times > MAX_LOG_TIME, -1, times.astype(np.int64)))
+
+    def __len__(self) -> int:
+        return len(self.log_times)
+
+    @cached_property
+    def by_channel(self) -> dict[int, Places]:
+        """Channel -> the places of its messages with a valid log time."""
+        order = np.argsort(self.channels, kind="stable")
+        order = order[self.log_times[order] >= 0]
+        numbers, first = np.unique(self.channels[order], return_index=True)
+        return dict(zip(numbers.tolist(), np.split(order, first[1:]), strict=True)) if len(order) else {}
+
+    def times_of(self, channels: set[int]) -> NDArray[np.int64]:
+        """The sorted log times of some channels, ns."""
+        places = [self.by_channel[channel] for channel in sorted(channels & self.by_channel.keys())]
+        return np.sort(self.log_times[np.concatenate(places)]) if places else np.zeros(0, np.int64)
