@@ -1,7 +1,7 @@
-"""Tilts from ROS 2 messages.
+"""Tilts from ROS 2 messages, and the accelerations and rates to estimate them from.
 
 A tilt is a direction, never angles. A quaternion turns the world's z axis into the sensor's frame; plain pitch and roll
-become a direction by the model in the pipeline file.
+become a direction by the model in the pipeline file; accelerations at rest are the direction.
 """
 
 from __future__ import annotations
@@ -13,9 +13,13 @@ import numpy as np
 
 from flow.parameters import check_parameters, parameter
 from recordings.errors import LogError
-from recordings.ros2.from_msg import frame_of, rotation_of, stamp_or
+from recordings.inertial.blocks import InertialSample
+from recordings.ros2.from_msg import frame_of, pose_of, rotation_of, stamp_or
 from stages.data import Array, Tilt
 
+Vector = tuple[float, float, float]
+
+MIN_ACCELERATION = 0.1  # m/s^2; less contains no gravity
 MAX_STATED_SIGMA = np.radians(20.0)  # beyond it a covariance says only that the driver does not know
 
 
@@ -31,6 +35,57 @@ def tilt_of(message: Any, log_time: int) -> Tilt:
     quaternion = next((q for name in ("orientation", "quaternion") if (q := getattr(message, name, None))), message)
     up = rotation_of(quaternion, "the inclinometer").as_matrix()[2]
     return _tilt(message, log_time, up, None if covariance is None else _stated_sigma(covariance))
+
+
+def tilt_of_acceleration(message: Any, log_time: int, acceleration: Vector | None) -> Tilt:
+    """The tilt by an acceleration of that message, m/s^2, if it is that of gravity alone."""
+    if acceleration is None or not np.linalg.norm(acceleration) > MIN_ACCELERATION:
+        raise LogError(f"the acceleration {acceleration} contains no gravity")
+    return _tilt(message, log_time, np.array(acceleration))
+
+
+def tilt_of_pose(message: Any, log_time: int, upright: str, base_frame: str) -> Tilt | None:
+    """The tilt by a pose in the frame `upright`, whose z axis points up; None where a TFMessage has none.
+
+    The messages are those of `pose_of`. The sigma is that of the covariance of roll and pitch.
+    """
+    pose = pose_of(message, log_time, base_frame)
+    if pose is None:
+        return None
+    if pose.frame_id != upright:
+        raise LogError(f"its frame is '{pose.frame_id}', but 'upright_frame' of the source is '{upright}'")
+    sigma = None if pose.covariance is None else _stated_sigma(pose.covariance[3:, 3:])
+    return Tilt(pose.stamp, pose.transform.rotation[2], pose.child_frame_id, sigma)
+
+
+def sample_of(message: Any, log_time: int, acceleration: Vector | None, rate: Vector | None) -> InertialSample:
+    """An acceleration, m/s^2, and a rate, rad/s, of that message, with its stamp."""
+    header = getattr(message, "header", None)
+    return InertialSample(stamp_or(header, log_time) if header is not None else log_time, rate, acceleration)
+
+
+def acceleration_of(message: Any) -> Vector | None:
+    """The accelerations of a sensor_msgs/Imu; None if it marks them as absent."""
+    return _measured(message, "linear_acceleration")
+
+
+def rate_of(message: Any) -> Vector | None:
+    """The rates of a sensor_msgs/Imu; None if it marks them as absent."""
+    return _measured(message, "angular_velocity")
+
+
+def _measured(message: Any, name: str) -> Vector | None:
+    if getattr(message, f"{name}_covariance")[0] == -1:
+        return None
+    vector = getattr(message, name)
+    return _finite_vector([vector.x, vector.y, vector.z], name)
+
+
+def _finite_vector(values: list[Any], name: str) -> Vector:
+    x, y, z = (float(value) for value in values)
+    if not abs(x) + abs(y) + abs(z) < np.inf:  # or NaN
+        raise LogError(f"'{name}' contains {[x, y, z]}")
+    return x, y, z
 
 
 def _tilt(message: Any, log_time: int, up: Array, sigma: float | None = None) -> Tilt:
@@ -69,17 +124,41 @@ class AngleField:
 
     def number(self, message: Any) -> float:
         """The number in the field, maybe NaN. Raises LogError if the message has no such field."""
-        value: Any = message
-        for name in self.field.split("."):
-            names = list(getattr(value, "__dataclass_fields__", ()))
-            if name not in names:
-                known = ", ".join(known for known in names if not known.startswith("_"))
-                where = f"{_kind(value)} (it has {known})" if known else _kind(value)
-                raise LogError(f"the message has no field '{self.field}': no '{name}' in its {where}")
-            value = getattr(value, name)
-        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-            raise LogError(f"field '{self.field}' contains a {_kind(value)}, which is not an angle")
-        return float(value)
+        return _number(message, self.field)
+
+
+@dataclass(frozen=True)
+class AccelerationField:
+    """Three accelerations in a message."""
+
+    field: str = parameter(MISSING, "path of the field with x, y and z, such as vector, or the paths of three numbers")
+    sign: int = parameter(1, "1: at rest the acceleration points up, as that of an Imu does; -1: down", choices=(1, -1))
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+        if len(self.field.split()) not in (1, 3):
+            raise ValueError(f"AccelerationField.field must be one path or three, not '{self.field}'")
+
+    def __call__(self, message: Any) -> Vector:
+        """The acceleration, up at rest."""
+        paths = self.field.split()
+        paths = [f"{self.field}.{axis}" for axis in "xyz"] if len(paths) == 1 else paths
+        return _finite_vector([self.sign * _number(message, path) for path in paths], self.field)
+
+
+def _number(message: Any, path: str) -> float:
+    """The number in a field of a message, maybe NaN. Raises LogError if there is none."""
+    value = message
+    for name in path.split("."):
+        names = list(getattr(value, "__dataclass_fields__", ()))
+        if name not in names:
+            known = ", ".join(known for known in names if not known.startswith("_"))
+            where = f"{_kind(value)} (it has {known})" if known else _kind(value)
+            raise LogError(f"the message has no field '{path}': no '{name}' in its {where}")
+        value = getattr(value, name)
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise LogError(f"field '{path}' contains a {_kind(value)}, which is not a number")
+    return float(value)
 
 
 def _kind(value: Any) -> str:

@@ -217,6 +217,17 @@ def imu(stamp: int, frame_id: str, attitude: Array, covariance: Array | None = N
     )  # fmt: skip
 
 
+def raw_imu(stamp: int, frame_id: str, rate: Array, acceleration: Array) -> Any:
+    """sensor_msgs/Imu with a rate (3,), rad/s, and an acceleration (3,), m/s^2, of unknown covariance; its orientation
+    is marked absent."""
+    return make(
+        "sensor_msgs/msg/Imu", header=header(stamp, frame_id), orientation=quaternion(np.array([0.0, 0.0, 0.0, 0.0])),
+        orientation_covariance=np.array([-1.0, *[0.0] * 8]),
+        angular_velocity=_vector(rate), angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=_vector(acceleration), linear_acceleration_covariance=np.zeros(9),
+    )  # fmt: skip
+
+
 def odometry(pose: Pose) -> Any:
     """nav_msgs/Odometry of a pose; its twist is marked unknown by a first covariance element of -1."""
     covariance = np.zeros(36) if pose.covariance is None else _flat(pose.covariance)

@@ -10,8 +10,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from itertools import takewhile
 
+from recordings.source.imu_content import ImuContent
 from recordings.source.settings import LogSettings
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -47,12 +49,24 @@ class Topic:
     messages: int
 
 
+class TiltKind(StrEnum):
+    """What a tilt is made of."""
+
+    ORIENTATION = "orientation"
+    ANGLES = "plain angles"
+    ACCELERATIONS = "accelerations"  # each by itself, as of an inclinometer
+    ESTIMATE = "estimate"  # from accelerations and rates
+    POSE = "pose"
+
+
 @dataclass
 class DiscoveredTopics:
-    """chosen: role (left, right, left_info, right_info, inclinometer, odometry) -> topic; missing: stream -> reason and
-    remedy; refused: setting that names a topic the log does not have -> reason."""
+    """chosen: role (left, right, left_info, right_info, inclinometer, gyroscope, odometry) -> topic; tilt: what the
+    messages of the inclinometer are; missing: stream -> reason and remedy; refused: setting that names a topic the log
+    does not have -> reason."""
 
     chosen: dict[str, str] = field(default_factory=dict)
+    tilt: TiltKind = TiltKind.ORIENTATION
     missing: dict[str, str] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
 
@@ -65,17 +79,17 @@ def discover(
     topics: Sequence[Topic],
     settings: LogSettings,
     frame_of: Callable[[str], str],
-    no_tilt_reason: Callable[[str], str | None],
+    content_of: Callable[[str], ImuContent],
     no_pose_reason: Callable[[str], str | None],
 ) -> DiscoveredTopics:
     """Find the topic of each role.
 
-    settings: the topics named by the user; frame_of: topic -> the frame_id of its messages; no_tilt_reason: Imu topic
-    -> why it has no orientation; no_pose_reason: topic of transforms -> why they are not the rover's pose.
+    settings: the topics named by the user; frame_of: topic -> the frame_id of its messages; content_of: Imu topic ->
+    what its messages contain; no_pose_reason: topic of transforms -> why they are not the rover's pose.
     """
     named = (
         settings.left, settings.right, settings.left_info, settings.right_info, settings.inclinometer,
-        settings.odometry,
+        settings.gyroscope, settings.odometry,
     )  # fmt: skip
     if not any(name.startswith(_TRUTH) for name in named if name is not None):
         topics = [topic for topic in topics if not topic.name.startswith(_TRUTH)]
@@ -84,7 +98,7 @@ def discover(
     for side in ("left", "right"):
         if side in found.chosen:
             _find_info(topics, settings, side, frame_of, found)
-    _find_tilt(topics, settings, no_tilt_reason, found)
+    _find_tilt(topics, settings, content_of, found)
     _find_pose(topics, settings, no_pose_reason, found)
     return found
 
@@ -193,44 +207,114 @@ def _find_info(
 
 
 def _find_tilt(
-    topics: Sequence[Topic], settings: LogSettings, no_tilt_reason: Callable[[str], str | None], found: DiscoveredTopics
+    topics: Sequence[Topic], settings: LogSettings, content_of: Callable[[str], ImuContent], found: DiscoveredTopics
 ) -> None:
-    given, bare_angles = settings.inclinometer, settings.angles() is not None
-    if given is not None:
-        topic = next((topic for topic in topics if topic.name == given and topic.messages), None)
-        if topic is None or topic.schema in (*IMAGES, INFO, TRANSFORMS, *(() if bare_angles else POSES)):
+    """Find the inclinometer, and for an estimate the gyroscope."""
+    topics = [topic for topic in topics if topic.messages]
+    found.tilt = _kind_set(settings)
+    given = settings.inclinometer
+    if given is None:
+        _search_tilt(topics, settings, content_of, found)
+    else:
+        topic = next((topic for topic in topics if topic.name == given), None)
+        if topic is None or topic.schema not in _schemas_of(found.tilt, topic.schema):
             candidates = [topic for topic in topics if topic.schema in (*TILTS, BARE_TILT)]
             found.refuse("inclinometer", "inclinometer", _not_there("inclinometer", given, "tilt", candidates))
-        elif not bare_angles and topic.schema not in TILTS:
+        elif found.tilt == TiltKind.ORIENTATION and topic.schema not in TILTS:
             found.refuse("inclinometer", "inclinometer", _undefined(topic))
         else:
             found.chosen["inclinometer"] = given
-        return
-    bare = [topic for topic in topics if topic.schema == BARE_TILT and topic.messages]
-    candidates = bare if bare_angles else [topic for topic in topics if topic.schema in TILTS and topic.messages]
-    useless = {topic.name: why for topic in candidates if topic.schema == IMU and (why := no_tilt_reason(topic.name))}
-    useful = [topic for topic in candidates if topic.name not in useless]
-    named = [topic for topic in useful if re.search("inclin|tilt", topic.name, re.IGNORECASE)]
-    choice = named or useful
+            content = content_of(given) if topic.schema == IMU and found.tilt == TiltKind.ORIENTATION else None
+            if content is not None and content.no_orientation and content.accelerations:
+                found.tilt = TiltKind.ACCELERATIONS
+    if "inclinometer" in found.chosen and (settings.gyroscope or found.tilt == TiltKind.ACCELERATIONS):
+        _find_gyroscope(topics, settings, content_of, found)
+
+
+def _kind_set(settings: LogSettings) -> TiltKind:
+    """What the settings make a tilt of."""
+    if settings.angles() is not None:
+        return TiltKind.ANGLES
+    if settings.upright_frame is not None:
+        return TiltKind.POSE
+    return TiltKind.ORIENTATION if settings.accelerations is None else TiltKind.ACCELERATIONS
+
+
+def _schemas_of(kind: TiltKind, schema: str) -> tuple[str, ...]:
+    """The schemas that a tilt of this kind may have: `schema`, unless such messages never contain one."""
+    if kind == TiltKind.POSE:
+        return (*POSES, TRANSFORMS)
+    never = (*IMAGES, INFO, TRANSFORMS, *(POSES if kind == TiltKind.ORIENTATION else ()))
+    return () if schema in never else (schema,)
+
+
+def _search_tilt(
+    topics: Sequence[Topic], settings: LogSettings, content_of: Callable[[str], ImuContent], found: DiscoveredTopics
+) -> None:
+    """Find the inclinometer without a setting of its topic."""
+    bare = [topic for topic in topics if topic.schema == BARE_TILT]
+    candidates = {
+        TiltKind.POSE: [topic for topic in topics if topic.schema in POSES and not topic.name.startswith(_RESULTS)],
+        TiltKind.ORIENTATION: [topic for topic in topics if topic.schema in TILTS],
+    }.get(found.tilt, bare)
+    choice, why = candidates, ""
+    if found.tilt == TiltKind.ORIENTATION:
+        contents = {topic.name: content_of(topic.name) for topic in candidates if topic.schema == IMU}
+        unoriented = {name: content.no_orientation for name, content in contents.items() if content.no_orientation}
+        choice = [topic for topic in candidates if topic.name not in unoriented]
+        why = next(iter(unoriented.values()), "")
+        if not choice and (forced := [topic for topic in candidates if contents[topic.name].accelerations]):
+            choice = [topic for topic in forced if contents[topic.name].rates] or forced
+            found.tilt = TiltKind.ACCELERATIONS
+    choice = [topic for topic in choice if re.search("inclin|tilt", topic.name, re.IGNORECASE)] or choice
     if len(choice) == 1:
         found.chosen["inclinometer"] = choice[0].name
-        return
-    if len(choice) > 1:
-        why = f"several topics could be the inclinometer ({_listed(choice)}); set 'inclinometer' of the source"
+    elif len(choice) > 1:
+        found.missing["inclinometer"] = (
+            f"several topics could be the inclinometer ({_listed(choice)}); set 'inclinometer' of the source"
+        )
     elif candidates:
-        reason = next(iter(useless.values()))
-        why = f"{_listed(candidates)} contains no orientation ({reason}); record one that does"
+        found.missing["inclinometer"] = (
+            f"{_listed(candidates)} contains no orientation ({why}) and no accelerations; record one of them"
+        )
     elif bare:
-        why = _undefined(bare[0])
+        found.missing["inclinometer"] = _undefined(bare[0])
     else:
-        why = "the log has no tilt (an Imu with orientation or a QuaternionStamped); set 'inclinometer' of the source"
-    found.missing["inclinometer"] = why
+        found.missing["inclinometer"] = (
+            "the log has no tilt (an Imu, or a QuaternionStamped); set 'inclinometer' of the source"
+        )
+
+
+def _find_gyroscope(
+    topics: Sequence[Topic], settings: LogSettings, content_of: Callable[[str], ImuContent], found: DiscoveredTopics
+) -> None:
+    """Find the rates that go with the accelerations; without any, up is that of each acceleration."""
+    imus, own = [topic for topic in topics if topic.schema == IMU], found.chosen["inclinometer"]
+    if settings.gyroscope is not None:
+        if settings.gyroscope not in {topic.name for topic in imus}:
+            found.refuse("inclinometer", "gyroscope", _not_there("gyroscope", settings.gyroscope, "Imu", imus))
+            return
+        rated = [settings.gyroscope]
+    elif settings.accelerations is not None:
+        return
+    else:
+        rated = [topic.name for topic in imus if content_of(topic.name).rates]
+        rated = [name for name in rated if name in (own, own.replace("accel", "gyro"))] or rated
+        rated = [own] if own in rated else rated
+    if len(rated) > 1:
+        del found.chosen["inclinometer"]
+        found.missing["inclinometer"] = (
+            f"several topics have rates that may go with the accelerations of {own} ({', '.join(rated)}); "
+            "set 'gyroscope' of the source"
+        )
+    elif rated:
+        found.tilt, found.chosen["gyroscope"] = TiltKind.ESTIMATE, rated[0]
 
 
 def _undefined(topic: Topic) -> str:
     return (
         f"{topic.name} is a {topic.schema}, whose numbers have no defined meaning; "
-        "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source"
+        "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source, or 'accelerations'"
     )
 
 

@@ -171,7 +171,9 @@ def _stamps(log: McapLog, stream: str, damage: list[str]) -> list[int]:
 
 
 def _tilts(log: McapLog, damage: list[str]) -> list[int]:
-    """The stamps of the tilts, ns; errors are added to `damage`."""
+    """The stamps of the tilts, ns; errors are added to `damage`. Nothing is estimated for them."""
+    if log.resolution.tilt is not None and log.resolution.tilt.gyroscope:
+        return _stamps(log, "inclinometer", damage)
     stamps = []
     for _, stream, item in log.events(("inclinometer",)):
         if isinstance(item, Tilt):

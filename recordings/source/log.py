@@ -10,6 +10,8 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from heapq import merge
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +22,10 @@ from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.header import peek_stamp
 from recordings.containers.recording import Recording
 from recordings.errors import LogError, sentence_of
+from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
 from recordings.mcap.file import McapFile
 from recordings.ros2.from_msg import camera_model, frame_of, pose_of, stamp_or
 from recordings.ros2.image_from_msg import pixels_of
-from recordings.ros2.tilt_from_msg import tilt_of
 from recordings.source.calibration import Camera
 from recordings.source.cameras import CAMERAS
 from recordings.source.discovery import BARE_TILT, IMAGES, POSES, TILTS
@@ -31,6 +33,7 @@ from recordings.source.mount import pose_of_base
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_noise import TiltNoise
+from recordings.source.tilt_reading import Sampled, TiltReading, estimated_tilts
 from recordings.source.topics import Decoder
 from stages.data import CameraImage, CameraModel, Pose, Tilt
 
@@ -126,6 +129,7 @@ class McapLog:
     missing: Mapping[str, str] = field(init=False)
     refused: Mapping[str, str] = field(init=False)
     topics: Mapping[str, str] = field(init=False)
+    _estimator: UpEstimator | None = field(init=False, default=None)  # the last one
     _info_times: dict[str, NDArray[np.int64]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -169,6 +173,30 @@ class McapLog:
             yield self._between(low, times[last] + INTERPOLATION_LEAD_NS, streams)
 
     def _between(self, low: int | None, high: int | None, streams: Collection[str]) -> Iterator[tuple[int, str, Any]]:
+        events = self._read(low, high, streams)
+        tilt = self.resolution.tilt
+        if "inclinometer" not in streams or "inclinometer" not in self.topics or tilt is None or not tilt.estimates:
+            return events
+        return merge(events, self._estimated(tilt, *_widen(low, high)), key=itemgetter(0))
+
+    def _estimated(self, tilt: TiltReading, low: int | None, high: int | None) -> Iterator[tuple[int, str, Any]]:
+        """The estimates of up from the log time `low` to `high`, ns, also from samples before and after."""
+        samplers = tilt.samplers(self.source)
+        readers = self._by_channel(self._reader("inclinometer", topic, made) for topic, made in samplers.items())
+        source, wide = self.source, (None if low is None else max(low - LOOKAHEAD_NS, 0), high and high + LOOKAHEAD_NS)
+        self._estimator = UpEstimator(self.resolution.tilt_frame, source.accelerometer_bias, source.gravity)
+        for log_time, item in estimated_tilts(self._samples(readers, *wide), self._estimator):
+            if (low is None or log_time >= low) and (high is None or log_time < high):
+                yield log_time, "inclinometer", item
+
+    def _samples(self, readers: dict[int, TopicReader], low: int | None, high: int | None) -> Iterator[Sampled]:
+        """What these readers read, without lost messages, which `_read` reports."""
+        for raw in self.file.messages(set(readers), low, high):
+            if isinstance(raw, RawMessage):
+                yield raw.log_time, readers[raw.channel](raw)
+
+    def _read(self, low: int | None, high: int | None, streams: Collection[str]) -> Iterator[tuple[int, str, Any]]:
+        """The events without estimates."""
         wide_low, wide_high = _widen(low, high)
         log_start = self.file.start if wide_low is None else max(wide_low, self.file.start)
         for stream, problem in self.resolution.problems:
@@ -212,6 +240,8 @@ class McapLog:
         notes = {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
         if "right" in self.topics and (note := self.resolution.baseline_note):
             notes["right"] = "; ".join((*filter(None, [notes.get("right")]), note))
+        if self.resolution.tilt is not None and (note := self.resolution.tilt.note(self._estimator, self.source)):
+            notes["inclinometer"] = "; ".join((*filter(None, [notes.get("inclinometer")]), note))
         if self.resolution.mount is not None and self.resolution.mount.base_from_camera is None:
             notes["mount"] = (
                 f"no static transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "
@@ -278,15 +308,31 @@ class McapLog:
     def _stream_readers(
         self, calibrations: dict[str, CalibrationHistory], streams: Collection[str]
     ) -> list[TopicReader]:
-        tilt, noise, base_frame = self.source.angles() or tilt_of, TiltNoise(), self.source.base_frame
+        base_frame = self.source.base_frame
         made: dict[str, Callable[[Any, int], Any]] = {
-            "inclinometer": lambda message, log_time: noise(self._checked_tilt(tilt(message, log_time))),
             "odometry": lambda message, log_time: self._rover_pose(pose_of(message, log_time, base_frame)),
         }
         for side, camera in zip(CAMERAS, self.resolution.cameras or (), strict=False):
             made[side] = _Images(camera, calibrations[side])
         chosen = [(stream, topic) for stream, topic in self.topics.items() if stream in made and stream in streams]
-        return [self._reader(stream, topic, made[stream]) for stream, topic in chosen]
+        readers = [self._reader(stream, topic, made[stream]) for stream, topic in chosen]
+        return [*readers, *self._tilt_readers()] if "inclinometer" in streams else readers
+
+    def _tilt_readers(self) -> list[TopicReader]:
+        """The readers of the inclinometer; those of an estimate only stand for lost messages."""
+        if "inclinometer" not in self.topics or self.resolution.tilt is None:
+            return []
+        reading, noise = self.resolution.tilt, TiltNoise()
+        if reading.estimates:
+            readers = [self._reader("inclinometer", topic, _nothing) for topic in reading.samplers(self.source)]
+            return [replace(reader, decoders=dict.fromkeys(reader.decoders, bytes)) for reader in readers]
+        tilt = reading.reader(self.source)
+
+        def checked(message: Any, log_time: int) -> Tilt | None:
+            made = tilt(message, log_time)
+            return None if made is None else noise(self._checked_tilt(made))
+
+        return [self._reader("inclinometer", reading.topic, checked)]
 
     def _checked_tilt(self, tilt: Tilt) -> Tilt:
         """The tilt, if it comes from the sensor of the mount."""
@@ -336,6 +382,10 @@ def _with_lookahead(
         while waiting[0][0].log_time < raw.log_time - MAX_CALIBRATION_LAG_NS:
             yield waiting.popleft()
     yield from waiting
+
+
+def _nothing(message: Any, log_time: int) -> None:
+    """No item."""
 
 
 def _widen(low: int | None, high: int | None) -> tuple[int | None, int | None]:

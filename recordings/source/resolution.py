@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from flow.contracts import counted
 from recordings.containers.recording import Recording
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of
-from recordings.ros2.tilt_from_msg import tilt_of
 from recordings.source.calibration import Camera, baseline_note, calibrated_pair
 from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_images, unreadable_images
-from recordings.source.discovery import TRANSFORMS, DiscoveredTopics, Topic, discover
+from recordings.source.discovery import IMU, TRANSFORMS, DiscoveredTopics, TiltKind, Topic, discover
+from recordings.source.imu_content import ImuContent, imu_content
 from recordings.source.mount import mount_of, pose_of_base
 from recordings.source.settings import LogSettings
+from recordings.source.tilt_reading import TiltReading
 from recordings.source.topics import DecodedTopics, attempt
 from recordings.source.transforms import TransformTree
 from stages.data import LEVEL_FRAME, Mount, Pose
@@ -29,8 +32,9 @@ class SourceResolution:
 
     messages: decoded by topic; topics: stream -> topic; unavailable: stream -> reason and remedy; refused: setting
     of the source that contradicts the log -> reason; undecodable: a sentence; static: the tf tree; infos: side -> its
-    first calibration; cameras: the calibrated pair, if complete; tilt_frame: of the first inclinometer message; mount:
-    of the camera on the rover; problems: (stream, error) pairs for the ledger.
+    first calibration; cameras: the calibrated pair, if complete; tilt: how it is read, if there is an inclinometer;
+    tilt_frame: of the first inclinometer message; mount: of the camera on the rover;
+    problems: (stream, error) pairs for the ledger.
     """
 
     def __init__(self, file: Recording, source: LogSettings) -> None:
@@ -42,6 +46,8 @@ class SourceResolution:
         self.infos, unread = first_calibrations(self.messages, found.chosen)
         self.cameras, self.baseline_note, unpaired = self._paired(found.chosen)
         unavailable = found.missing | unread | unpaired
+        self.tilt, unread = self._tilt_reading(found)
+        unavailable |= unread
         self.tilt_frame, self.mount, unmounted = self._mounted(found.chosen, unavailable)
         moving = self._moving_pose(found.chosen)
         self.refused = found.refused | (moving if self.source.odometry else {}) | self._unjoined_base()
@@ -87,12 +93,14 @@ class SourceResolution:
         """The topic of each role, and why other roles have none."""
         schemas, angles = self.messages.schemas, self.source.angles()
         topics = [Topic(name, schemas[name], self.messages.count(name)) for name in sorted(schemas)]
-        found = discover(topics, self.source, self.messages.frame_of, self._no_tilt_reason, self._no_pose_reason)
-        if angles is not None and (topic := found.chosen.get("inclinometer")):
-            checked = self.messages.first(topic, angles.check)
+        found = discover(topics, self.source, self.messages.frame_of, self._content_of, self._no_pose_reason)
+        check = self.source.accelerations if angles is None else angles.check
+        if check is not None and (topic := found.chosen.get("inclinometer")):
+            checked = self.messages.first(topic, check)
             if isinstance(checked, LogError):
                 del found.chosen["inclinometer"]
-                found.refuse("inclinometer", "pitch and roll", f"the plain angles of {topic}: {checked}")
+                names = "accelerations" if angles is None else "pitch and roll"
+                found.refuse("inclinometer", names, f"the {found.tilt} of {topic}: {checked}")
         return found
 
     def _paired(self, chosen: Mapping[str, str]) -> tuple[tuple[Camera, Camera] | None, str, dict[str, str]]:
@@ -115,7 +123,7 @@ class SourceResolution:
             return "", None, {"mount": f"the mount needs a calibrated pair of cameras: {why}"}
         if "inclinometer" in unavailable:
             return "", None, {"mount": f"the mount needs an inclinometer: {unavailable['inclinometer']}"}
-        frame = self.messages.frame_of(chosen["inclinometer"])
+        frame = self._inclinometer_frame(chosen["inclinometer"])
         given, base = self.source.camera_from_inclinometer, self.source.base_frame
         mount = attempt(mount_of, self.cameras[0], frame, base, self.static, given)
         if isinstance(mount, LogError):
@@ -172,14 +180,35 @@ class SourceResolution:
                 lost.append((streams[topic], LogError(what)))
         return lost
 
-    def _no_tilt_reason(self, topic: str) -> str | None:
-        """Why no sampled message of an Imu contains a tilt; None if one does."""
-        why = LogError("it has no messages")
-        for tilt in self.messages.sample(topic, lambda message: tilt_of(message, 0)):
-            if not isinstance(tilt, LogError):
-                return None
-            why = tilt
-        return str(why)
+    def _content_of(self, topic: str) -> ImuContent:
+        """What the messages of an Imu contain, by a sample."""
+        return imu_content(self.messages.sample(topic, lambda message: message))
+
+    def _tilt_reading(self, found: DiscoveredTopics) -> tuple[TiltReading | None, dict[str, str]]:
+        """How the tilt is read, and why it cannot be."""
+        topic, gyroscope = found.chosen.get("inclinometer"), found.chosen.get("gyroscope", "")
+        if topic is None:
+            return None, {}
+        turn, frames = np.eye(3), (self.messages.frame_of(topic), self.messages.frame_of(gyroscope or topic))
+        if frames[0] != frames[1]:
+            transform = self.static.between(*frames)
+            if transform is None:
+                why = (
+                    f"no static transform joins the accelerometer ('{frames[0]}', {topic}) and the gyroscope "
+                    f"('{frames[1]}', {gyroscope}); record /tf_static"
+                )
+                return None, {"inclinometer": why}
+            turn = transform.rotation
+        is_imu = self.messages.schemas[topic] == IMU and self.source.accelerations is None
+        why = self._content_of(topic).no_orientation if is_imu and found.tilt != TiltKind.ORIENTATION else ""
+        return TiltReading(found.tilt, topic, gyroscope, turn, why), {}
+
+    def _inclinometer_frame(self, topic: str) -> str:
+        """The frame that the tilt is in: that of its messages, or the one whose poses they are."""
+        if self.source.upright_frame is None:
+            return self.messages.frame_of(topic)
+        pose = self.messages.first(topic, lambda message: _pose_of(message, self.source.base_frame))
+        return "" if isinstance(pose, LogError) else pose.child_frame_id
 
     def _no_pose_reason(self, topic: str) -> str | None:
         """Why the transforms of a topic are not the pose of the base frame; None if they are."""

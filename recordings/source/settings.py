@@ -8,7 +8,7 @@ from typing import Any
 
 from flow.parameters import check_parameters, parameter
 from recordings.ros2.from_msg import frame_name
-from recordings.ros2.tilt_from_msg import AngleField, PlainAngles
+from recordings.ros2.tilt_from_msg import AccelerationField, AngleField, PlainAngles
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,26 @@ class LogSettings:
     left_info: str | None = parameter(None, "topic of the left camera's CameraInfo")
     right_info: str | None = parameter(None, "topic of the right camera's CameraInfo")
     inclinometer: str | None = parameter(
-        None, "topic of an Imu or QuaternionStamped; with pitch, roll and tilt_model, of any message"
+        None,
+        "topic of an Imu or QuaternionStamped; with pitch, roll and tilt_model, or with accelerations, of any message; "
+        "with upright_frame, of poses",
+    )
+    gyroscope: str | None = parameter(
+        None, "topic of the Imu with the rates; up is then estimated, even if there is an orientation"
+    )
+    accelerations: AccelerationField | None = parameter(
+        None, "field of the accelerations, for an inclinometer that is no Imu"
+    )
+    gravity: float | None = parameter(
+        None, "magnitude of gravity, for an estimate of up (Mars: 3.71, Moon: 1.62); none: measured",
+        unit="m/s^2", low=0.1, high=30.0,
+    )  # fmt: skip
+    accelerometer_bias: float = parameter(
+        0.05, "error of the accelerometer at rest, one sigma of each axis; 0.05 m/s^2 are 0.3 degrees of tilt on Earth",
+        unit="m/s^2", low=1e-4, high=5.0,
+    )  # fmt: skip
+    upright_frame: str | None = parameter(
+        None, "frame whose z axis points up, if the tilt is that of poses in it (Odometry, PoseStamped, TFMessage)"
     )
     odometry: str | None = parameter(
         None,
@@ -49,6 +68,8 @@ class LogSettings:
     def __post_init__(self) -> None:
         check_parameters(self)
         object.__setattr__(self, "base_frame", frame_name(self.base_frame))
+        if self.upright_frame is not None:
+            object.__setattr__(self, "upright_frame", frame_name(self.upright_frame))
         self.angles()
         given = self.camera_from_inclinometer
         if given is not None and not _is_unit_quaternion(given):

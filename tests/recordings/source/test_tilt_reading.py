@@ -1,0 +1,210 @@
+"""The tilt of a log without orientations: estimated, or read from accelerations or poses where a setting says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recordings import McapSource
+from recordings.mcap.writer import Ros2Writer
+from recordings.ros2.cdr import make
+from recordings.ros2.tilt_from_msg import AccelerationField
+from recordings.ros2.to_msg import camera_info, header, image, odometry, quaternion, raw_imu, transform_message
+from recordings.source.inventory import describe, format_description
+from stages.data import Pose, Tilt, Transform
+from tests.recordings.inertial.drive import Drive, drive
+from tests.recordings.sample_log import TRANSFORMS, model, picture
+
+IMU = "/imu0"
+Messages = Callable[[int, int, np.ndarray, np.ndarray], dict[str, Any]]  # number, stamp, rate, force -> by topic
+
+
+def kalibr(number: int, stamp: int, rate: np.ndarray, force: np.ndarray) -> dict[str, Any]:
+    """An Imu as kalibr's bags have it: the quaternion and its covariance are 0."""
+    message = raw_imu(stamp, "imu_link", rate, force)
+    message.orientation_covariance[0] = 0.0
+    return {IMU: message}
+
+
+def written(path: Path, driven: Drive, messages: Messages = kalibr, *transforms: Transform) -> Path:
+    """A log of a drive with five frames."""
+    with Ros2Writer(path) as writer:
+        start = int(driven.stamps[0])
+        writer.write("/tf_static", transform_message([(t, start) for t in (*TRANSFORMS, *transforms)]), start)
+        rows = zip(driven.stamps.tolist(), driven.rates, driven.forces, strict=True)
+        for number, (stamp, rate, force) in enumerate(rows):
+            for topic, message in messages(number, stamp, rate, force).items():
+                writer.write(topic, message, stamp)
+            if number % (len(driven.stamps) // 5) == 9:
+                for side in ("left", "right"):
+                    writer.write(f"/{side}/camera_info", camera_info(stamp, f"{side}_optical", model(side)), stamp)
+                    writer.write(f"/{side}/image_rect", image(stamp, f"{side}_optical", picture(number)), stamp)
+    return path
+
+
+def read(path: Path, source: McapSource | None = None, **bounds: float) -> tuple[list[Tilt], list[str], str]:
+    """The tilts of a log, the losses of the inclinometer, and the note about it."""
+    with (source or McapSource()).open(path, **bounds) as log:
+        assert "inclinometer" not in log.missing
+        events = list(log.events())
+        assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
+        items = [item for _, stream, item in events if stream == "inclinometer"]
+        note = log.notes().get("inclinometer", "")
+    return [i for i in items if isinstance(i, Tilt)], [str(i) for i in items if not isinstance(i, Tilt)], note
+
+
+def missing(path: Path, source: McapSource | None = None) -> str:
+    with (source or McapSource()).open(path) as log:
+        return log.missing["inclinometer"]
+
+
+def absent(number: int, stamp: int, rate: np.ndarray, force: np.ndarray) -> dict[str, Any]:
+    return {IMU: raw_imu(stamp, "imu_link", rate, force)}
+
+
+def default(number: int, stamp: int, rate: np.ndarray, force: np.ndarray) -> dict[str, Any]:
+    message = kalibr(number, stamp, rate, force)[IMU]
+    message.orientation = quaternion(np.array([0.0, 0.0, 0.0, 1.0]))
+    return {IMU: message}
+
+
+@pytest.mark.parametrize(
+    ("messages", "why"),
+    [
+        (kalibr, "is not a rotation: [0.0, 0.0, 0.0, 0.0]"),
+        (absent, "the Imu marks its orientation as absent"),
+        (default, "it is 1 in every message"),
+    ],
+)
+def test_up_is_estimated_where_an_imu_has_no_orientation(tmp_path, messages, why):
+    driven = drive(seconds=20)
+    path = written(tmp_path / "log.mcap", driven, messages)
+    tilts, lost, note = read(path)
+    assert (len(tilts), lost) == (len(driven.stamps), [])
+    assert np.sqrt(np.mean(driven.errors(tilts) ** 2)) < 0.3
+    assert all(0 < tilt.sigma < np.radians(1) and tilt.frame_id == "imu_link" for tilt in tilts)
+    assert note.startswith(f"up is estimated from the accelerations and rates on {IMU}, because its orientation is not")
+    assert why in note
+    assert "at rest for 4 of 20 s; gravity is 9.79 m/s2, as on Earth" in note
+    with McapSource().open(path) as log:
+        assert f"note: inclinometer: up is estimated from the accelerations and rates on {IMU}" in (
+            format_description(describe(log, max_gap_of=lambda intervals: 10**8))
+        )
+
+
+def test_a_part_of_a_log_has_tilts_as_good_as_the_whole(tmp_path):
+    driven = drive(seconds=40)
+    path = written(tmp_path / "log.mcap", driven)
+    tilts, _, _ = read(path, start=16, end=17)
+    times = (np.array([tilt.stamp for tilt in tilts]) - driven.stamps[0]) / 1e9
+    assert (times[0], times[-1]) == (pytest.approx(15, abs=0.02), pytest.approx(18, abs=0.02))
+    assert driven.errors(tilts).max() < 0.6
+
+
+def test_a_broken_sample_is_lost_alone_and_so_is_a_wrong_stamp(tmp_path):
+    driven = drive(seconds=12)
+
+    def broken(number, stamp, rate, force):
+        ahead = {300: 3600 * 10**9, 400: -(10**9)}.get(number, 0)
+        return kalibr(number, stamp + ahead, rate, force * (np.nan if number == 500 else 1))
+
+    tilts, lost, _ = read(written(tmp_path / "log.mcap", driven, broken))
+    assert len(tilts) == len(driven.stamps) - 3
+    assert ["'linear_acceleration' contains" in sentence for sentence in lost] == [False, False, True]
+    assert all("does not follow" in sentence for sentence in lost[:2])
+    assert driven.errors(tilts).max() < 0.6
+
+
+def split(number, stamp, rate, force):
+    """Accelerations and rates on two topics, of two frames, as of a RealSense."""
+    gyroscope = Rotation.from_euler("z", -90, degrees=True).apply(rate)
+    rates = raw_imu(stamp, "gyro_link", gyroscope, np.zeros(3))
+    accelerations = raw_imu(stamp + 2_000_000, "imu_link", np.zeros(3), force)
+    return {"/camera/gyro/sample": rates} | ({"/camera/accel/sample": accelerations} if number % 2 else {})
+
+
+GYRO = Transform("imu_link", "gyro_link", Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.zeros(3))
+
+
+def test_accelerations_and_rates_may_come_on_two_topics(tmp_path):
+    driven = drive(seconds=15)
+    path = written(tmp_path / "log.mcap", driven, split, GYRO)
+    tilts, lost, note = read(path)
+    assert lost == []
+    assert np.sqrt(np.mean(driven.errors(tilts) ** 2)) < 0.3
+    assert "the accelerations on /camera/accel/sample and the rates on /camera/gyro/sample" in note
+    assert "joins the accelerometer ('imu_link', /camera/accel/sample) and the gyroscope" in (
+        missing(written(tmp_path / "unjoined.mcap", driven, split))
+    )
+
+    def second(*sample):
+        return split(*sample) | {"/drill": raw_imu(sample[1], "drill", sample[2], np.zeros(3))}
+
+    named = written(tmp_path / "three.mcap", drive(seconds=2), second, GYRO)
+    assert read(named)[2].count("/camera/gyro/sample") == 1  # the one of the same name
+    assert "gyroscope' is set to /left/image_rect" in missing(named, McapSource(gyroscope="/left/image_rect"))
+
+
+def test_an_estimate_may_be_preferred_to_the_orientation(tmp_path):
+    driven = drive(seconds=8)
+
+    def oriented(number, stamp, rate, force):
+        message = kalibr(number, stamp, rate, force)[IMU]
+        message.orientation = quaternion(Rotation.from_euler("x", 40 + number % 2, degrees=True).as_quat())
+        return {IMU: message}
+
+    path = written(tmp_path / "log.mcap", driven, oriented)
+    assert driven.errors(read(path)[0]).mean() > 30
+    assert driven.errors(read(path, McapSource(gyroscope=IMU))[0]).mean() < 0.3
+
+
+@pytest.mark.parametrize(("field", "sign"), [("vector", -1), ("vector.x vector.y vector.z", -1)])
+def test_an_inclinometer_may_log_three_accelerations(tmp_path, field, sign):
+    driven = drive(seconds=6)
+
+    def accelerations(number, stamp, rate, force):
+        x, y, z = (sign * force).tolist()
+        vector = make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+        return {
+            "/inclinometer": make("geometry_msgs/msg/Vector3Stamped", header=header(stamp, "imu_link"), vector=vector)
+        }
+
+    path = written(tmp_path / "log.mcap", driven, accelerations)
+    assert "whose numbers have no defined meaning; set 'pitch', 'roll'" in missing(path)
+    tilts, _, note = read(path, McapSource(accelerations=AccelerationField(field, sign)))
+    assert driven.errors(tilts[:400]).max() < 0.5
+    assert "the direction of each acceleration on /inclinometer, right only at rest" in note
+    assert "has no field 'angles.x'" in missing(path, McapSource(accelerations=AccelerationField("angles")))
+
+
+def test_an_imu_without_rates_gives_the_direction_of_each_acceleration(tmp_path):
+    driven = drive(seconds=6)
+    path = written(tmp_path / "log.mcap", driven, lambda n, t, rate, force: kalibr(n, t, np.zeros(3), force))
+    tilts, _, note = read(path)
+    assert driven.errors(tilts[:400]).max() < 0.5
+    assert "right only at rest" in note
+
+
+def test_poses_in_an_upright_frame_are_tilts_where_a_setting_says_so(tmp_path):
+    driven = drive(seconds=3)
+    turn = Rotation.from_euler("ZYX", [80, 4, -7], degrees=True)
+
+    def poses(number, stamp, rate, force):
+        pose = Pose(stamp, [0, 0, 0], turn.as_quat(), "odom", "base_link")
+        at = Transform("odom", "base_link", turn.as_matrix(), np.zeros(3))
+        return {"/odom": odometry(pose), "/tf": transform_message([(at, stamp)])}
+
+    path = written(tmp_path / "log.mcap", driven, poses)
+    assert "the log has no tilt" in missing(path)
+    for source in (McapSource(upright_frame="odom"), McapSource(upright_frame="/odom", inclinometer="/tf")):
+        tilts, lost, note = read(path, source)
+        assert (len(tilts), lost) == (len(driven.stamps), [])
+        np.testing.assert_allclose(tilts[0].up, turn.inv().apply([0, 0, 1]), atol=1e-12)
+        assert "in 'odom' with z up" in note
+    _, lost, _ = read(path, McapSource(upright_frame="map"))
+    assert "its frame is 'odom', but 'upright_frame' of the source is 'map'" in lost[0]
