@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_erosion, find_objects
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Transform
 from stages.stage import Stage, check_cells, check_level, parameter
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
-from stages.terrain.kernels.grid import FIGURES, Grid, cell_percentile, cell_statistics
+from stages.terrain.kernels.grid import FIGURES, Grid, cell_percentile, cell_statistics, extent
 from stages.terrain.kernels.occlusion import occlusion_ceiling
 from stages.terrain.kernels.splats import splat_statistics
 from stages.terrain.kernels.staying_points import staying_points
@@ -86,24 +86,41 @@ class Voxelise(Stage):
         check_level(self, cloud)
         half = int(np.ceil(self.max_range / self.resolution - 1e-9))
         origin = (-half * self.resolution, -half * self.resolution)
-        grid = Grid(self.resolution, origin, 2 * half, self.max_range)
+        whole = Grid(self.resolution, origin, (2 * half, 2 * half), self.max_range)
         measured, guessed = self._split(cloud)
+        ceiling, sensor = None, cloud.sensor
+        if sensor is not None and cloud.shape is not None:
+            ceiling = occlusion_ceiling(measured.points, measured.pixel, cloud.shape[1], sensor.translation, whole)
+        grid = self._window(cloud, ceiling, whole)
+        within = tuple(slice(at, at + cells) for at, cells in zip(grid.first, grid.shape, strict=True))
         layers = self._layers(self._splatted(_statistics(measured, grid), measured, grid), measured, grid)
-        if cloud.sensor is not None and cloud.shape is not None:
-            ceiling = occlusion_ceiling(
-                measured.points, measured.pixel, cloud.shape[1], cloud.sensor.translation, grid
-            )  # fmt: skip
-            layers["ceiling"] = ceiling = np.where(layers["count"] > 0, np.nan, ceiling)
-            layers["occluded"] = np.where(layers["count"] > 0, 0.0, np.where(np.isfinite(ceiling), 1.0, np.nan))
+        empty = layers["count"] == 0
+        if ceiling is not None:
+            layers["ceiling"] = ceiling = np.where(empty, ceiling[within], np.nan)
+            layers["occluded"] = np.where(empty, np.where(np.isfinite(ceiling), 1.0, np.nan), 0.0)
         if guessed is not None:
             figures = _statistics(guessed, grid)
             with np.errstate(invalid="ignore", divide="ignore"):
-                layers["filled"] = np.where(layers["count"] > 0, np.nan, figures[:, :, 1] / figures[:, :, 0])
-            layers["unmatched"] = np.where(layers["count"] > 0, np.nan, match_failure(guessed, grid))
+                layers["filled"] = np.where(empty, figures[:, :, 1] / figures[:, :, 0], np.nan)
+            layers["unmatched"] = np.where(empty, match_failure(guessed, grid), np.nan)
         for value in self.percentiles:
             layers[f"percentile_{value:g}"] = cell_percentile(measured.points, value, grid)
-        layers = {name: layer.astype(np.float32) for name, layer in layers.items()}
-        return ElevationMap(cloud.stamp, layers, self.resolution, origin, LEVEL_FRAME)
+        placed = {}
+        for name, layer in layers.items():
+            placed[name] = np.full(whole.shape, 0 if name == "count" else np.nan, np.float32)
+            placed[name][within] = layer
+        return ElevationMap(cloud.stamp, placed, self.resolution, origin, LEVEL_FRAME)
+
+    def _window(self, cloud: PointCloud, ceiling: Array | None, whole: Grid) -> Grid:
+        """The part of the grid that contains the points, their splats and the lines of sight over empty cells."""
+        bounds = [extent(cloud.points, whole).tolist()]
+        if ceiling is not None:
+            seen = find_objects(np.isfinite(ceiling).astype(np.int8))
+            bounds += [[each.start for each in seen[0]] + [each.stop for each in seen[0]]] if seen else []
+        margin = 2 + int(2 * self.max_splat / self.resolution)
+        first = np.maximum(np.min(bounds, axis=0)[:2] - margin, 0)
+        stop = np.maximum(np.minimum(np.max(bounds, axis=0)[2:] + margin, whole.shape), first + 1)
+        return whole._replace(shape=tuple((stop - first).tolist()), first=tuple(first.tolist()))
 
     def _split(self, cloud: PointCloud) -> tuple[PointCloud, PointCloud | None]:
         """The points that count as measured, and the others if there are any."""
@@ -132,8 +149,7 @@ class Voxelise(Stage):
         n = np.where(empty, np.nan, count)
         mean = total / n
         scatter = np.maximum(squares / n - mean * mean, 0.0)
-        middle = np.arange(len(count)) + 0.5
-        x, y = middle[None, :] * self.resolution + grid.origin[0], middle[:, None] * self.resolution + grid.origin[1]
+        x, y = grid.middles
         variance = self._variance(n, mean, scatter, noise / n, cloud, x, y)
         more = {}
         if cloud.sensor is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.data import Array, MatchFailure, PointCloud
-from stages.terrain.kernels.grid import Grid, cell_statistics
+from stages.terrain.kernels.grid import Grid, shade_statistics
 
 MAX_DARK = 32.0  # gray levels, an eighth of the range; unlit ground is darker
 MIN_BURNT_OUT = 250.0  # gray levels
@@ -18,11 +18,9 @@ MIN_BARE_PIXELS = 4  # fewer have no contrast that could be measured
 
 
 def match_failure(cloud: PointCloud, grid: Grid) -> Array:
-    """Codes of `MatchFailure` of the cells that contain points of a cloud of filled pixels, (size, size) float64, else
+    """Codes of `MatchFailure` of the cells that contain points of a cloud of filled pixels, (rows, cols) float64, else
     NaN."""
-    gray = cloud.colors.mean(axis=1, dtype=np.float32)
-    shades = np.column_stack([cloud.points[:, :2], gray])
-    count, total, squares = np.moveaxis(cell_statistics(shades, cloud.sigma, grid)[:, :, :3], 2, 0)
+    count, total, squares = np.moveaxis(shade_statistics(cloud.points, cloud.colors, grid), 2, 0)
     n = np.where(count > 0, count, np.nan)
     mean = total / n
     contrast = np.sqrt(np.maximum(squares / n - mean * mean, 0.0))

@@ -17,12 +17,25 @@ FIGURES = ("count", "sum", "sum_of_squares", "minimum", "maximum", "noise")
 
 
 class Grid(NamedTuple):
-    """A square grid; points at a larger horizontal range from (0, 0) than `max_range`, m, are left out."""
+    """A window of a grid; points at a larger horizontal range from (0, 0) than `max_range`, m, are left out."""
 
     resolution: float  # m
-    origin: tuple[float, float]  # (x, y) of the corner of cell [0, 0], m
-    size: int  # rows and columns
+    origin: tuple[float, float]  # (x, y) of the corner of the whole grid, m
+    shape: tuple[int, int]  # rows and columns of the window
     max_range: float
+    first: tuple[int, int] = (0, 0)  # row and column of the window in the whole grid
+
+    @property
+    def raster(self) -> tuple[float, float, float, float, int, int, int, int]:
+        """The same as numbers, for `cell_of`."""
+        x0, y0 = map(float, self.origin)
+        return (1.0 / self.resolution, x0, y0, float(self.max_range), *self.first, *self.shape)
+
+    @property
+    def middles(self) -> tuple[Array, Array]:
+        """x and y of the cells' centres, (1, cols) and (rows, 1), m."""
+        row, col = (first + np.arange(cells) + 0.5 for first, cells in zip(self.first, self.shape, strict=True))
+        return col[None, :] * self.resolution + self.origin[0], row[:, None] * self.resolution + self.origin[1]
 
 
 def cell_statistics(points: Array, sigma: Array, grid: Grid) -> Array:
@@ -30,20 +43,51 @@ def cell_statistics(points: Array, sigma: Array, grid: Grid) -> Array:
 
     points: (N, 3) float32, m; sigma: (N,) float32, depth standard deviation of each point, m.
 
-    Returns (size, size, 6) float64, the figures named in `FIGURES`; `noise` is the sum of the squares of `sigma`.
+    Returns (rows, cols, 6) float64, the figures named in `FIGURES`; `noise` is the sum of the squares of `sigma`.
     Cells without points contain 0, 0, 0, inf, -inf, 0.
     """
-    resolution, (x0, y0), size, max_range = grid
-    cells, raster = no_figures(size), (1.0 / resolution, float(x0), float(y0), float(max_range))
-    _cell_statistics(np.ascontiguousarray(points), np.ascontiguousarray(sigma), raster, cells)
+    cells = no_figures(grid)
+    _cell_statistics(np.ascontiguousarray(points), np.ascontiguousarray(sigma), grid.raster, cells)
     return cells
 
 
-def no_figures(size: int) -> Array:
-    """The figures of cells without points, (size, size, 6) float64."""
-    cells = np.zeros((size, size, 6))
+def extent(points: Array, grid: Grid) -> Array:
+    """First row and column and end row and column of the cells with points, (4,) int64; of no cell if there are none.
+
+    points: (N, 3) float32, m.
+    """
+    bounds = np.array([*grid.shape, 0, 0])
+    _extent(np.ascontiguousarray(points), grid.raster, bounds)
+    return bounds
+
+
+@kernel
+def _extent(points, raster, bounds):
+    for i in range(points.shape[0]):
+        row, col = cell_of(np.float64(points[i, 0]), np.float64(points[i, 1]), raster)
+        if row >= 0:
+            bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
+            bounds[2], bounds[3] = max(bounds[2], row + 1), max(bounds[3], col + 1)
+
+
+def no_figures(grid: Grid) -> Array:
+    """The figures of cells without points, (rows, cols, 6) float64."""
+    cells = np.zeros((*grid.shape, 6))
     cells[:, :, 3], cells[:, :, 4] = np.inf, -np.inf
     return cells
+
+
+@kernel
+def cell_of(x, y, raster):
+    """Row and column of a point in the window of a grid; -1, -1 outside it or beyond the range."""
+    cells_per_metre, x0, y0, max_range, first_row, first_col, rows, cols = raster
+    if not x * x + y * y <= max_range * max_range:
+        return -1, -1
+    row = int(np.floor((y - y0) * cells_per_metre)) - first_row
+    col = int(np.floor((x - x0) * cells_per_metre)) - first_col
+    if row < 0 or row >= rows or col < 0 or col >= cols:
+        return -1, -1
+    return row, col
 
 
 @kernel
@@ -59,36 +103,57 @@ def add_point(cell, z, sigma):
 
 @kernel
 def _cell_statistics(points, sigma, raster, cells):
-    cells_per_metre, x0, y0, max_range = raster
-    size = cells.shape[0]
     for i in range(points.shape[0]):
         # numba's float() of a float32 stays a float32.
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if not (x * x + y * y <= max_range * max_range and np.isfinite(z)):
-            continue
-        col = int(np.floor((x - x0) * cells_per_metre))
-        row = int(np.floor((y - y0) * cells_per_metre))
-        if row < 0 or row >= size or col < 0 or col >= size:
-            continue
-        add_point(cells[row, col], z, np.float64(sigma[i]))
+        row, col = cell_of(np.float64(points[i, 0]), np.float64(points[i, 1]), raster)
+        z = np.float64(points[i, 2])
+        if row >= 0 and np.isfinite(z):
+            add_point(cells[row, col], z, np.float64(sigma[i]))
 
 
 def cell_statistics_reference(points: Array, sigma: Array, grid: Grid) -> Array:
     """The same as `cell_statistics`, in plain numpy."""
-    flat, inside = _cells_of(points, grid)
+    flat, inside = cells_of(points, grid)
     z = points[inside, 2].astype(np.float64)
-    total = grid.size * grid.size
-    cells = no_figures(grid.size).reshape(total, 6)
+    total = grid.shape[0] * grid.shape[1]
+    cells = no_figures(grid).reshape(total, 6)
     for figure, weight in ((0, np.ones(len(z))), (1, z), (2, z * z), (5, sigma[inside].astype(np.float64) ** 2)):
         cells[:, figure] = np.bincount(flat, weight, minlength=total)
     np.minimum.at(cells[:, 3], flat, z)
     np.maximum.at(cells[:, 4], flat, z)
-    return cells.reshape(grid.size, grid.size, 6)
+    return cells.reshape(*grid.shape, 6)
+
+
+def shade_statistics(points: Array, colors: Array, grid: Grid) -> Array:
+    """Number, sum and sum of squares of the gray values in each cell, (rows, cols, 3) float64.
+
+    points: (N, 3) float32, m; colors: (N, 3) uint8. The gray value is the mean of the three channels.
+    """
+    shades = np.zeros((*grid.shape, 3))
+    _shade_statistics(np.ascontiguousarray(points), np.ascontiguousarray(colors), grid.raster, shades)
+    return shades
+
+
+@kernel
+def _shade_statistics(points, colors, raster, shades):
+    for i in range(points.shape[0]):
+        row, col = cell_of(np.float64(points[i, 0]), np.float64(points[i, 1]), raster)
+        if row >= 0:
+            gray = (np.float64(colors[i, 0]) + np.float64(colors[i, 1]) + np.float64(colors[i, 2])) / 3.0
+            shades[row, col, 0] += 1.0
+            shades[row, col, 1] += gray
+            shades[row, col, 2] += gray * gray
+
+
+def shade_statistics_reference(points: Array, colors: Array, grid: Grid) -> Array:
+    """The same as `shade_statistics`, in plain numpy."""
+    gray = np.column_stack([points[:, :2], colors.mean(axis=1)])
+    return cell_statistics_reference(gray, np.zeros(len(points)), grid)[:, :, :3]
 
 
 def cell_percentile(points: Array, percentile: float, grid: Grid) -> Array:
-    """A percentile of each cell's heights, interpolated as numpy does, (size, size) float32, NaN without points."""
-    flat, inside = _cells_of(points, grid)
+    """A percentile of each cell's heights, interpolated as numpy does, (rows, cols) float32, NaN without points."""
+    flat, inside = cells_of(points, grid)
     z = points[inside, 2]
     order = np.lexsort((z, flat))
     flat, z = flat[order], z[order].astype(np.float64)
@@ -96,15 +161,17 @@ def cell_percentile(points: Array, percentile: float, grid: Grid) -> Array:
     rank = percentile / 100 * (count - 1)
     below = np.floor(rank).astype(np.int64)
     low, high = z[start + below], z[start + np.minimum(below + 1, count - 1)]
-    heights = np.full(grid.size * grid.size, np.nan, np.float32)
-    heights[cell] = low + (rank - below) * (high - low)
-    return heights.reshape(grid.size, grid.size)
+    heights = np.full(grid.shape, np.nan, np.float32)
+    heights.flat[cell] = low + (rank - below) * (high - low)
+    return heights
 
 
-def _cells_of(points: Array, grid: Grid) -> tuple[Array, Array]:
+def cells_of(points: Array, grid: Grid) -> tuple[Array, Array]:
     """Flat cell index of the points on the grid, and which points those are, (N,) bool."""
-    p = points.astype(np.float64)
-    col, row = (np.floor((p[:, axis] - grid.origin[axis]) * (1.0 / grid.resolution)) for axis in (0, 1))
+    p, rows, cols = points.astype(np.float64), *grid.shape
+    col, row = (
+        np.floor((p[:, axis] - grid.origin[axis]) * (1.0 / grid.resolution)) - grid.first[1 - axis] for axis in (0, 1)
+    )
     inside = (p[:, 0] ** 2 + p[:, 1] ** 2 <= grid.max_range**2) & np.isfinite(p[:, 2])
-    inside &= (row >= 0) & (row < grid.size) & (col >= 0) & (col < grid.size)
-    return (row[inside] * grid.size + col[inside]).astype(np.int64), inside
+    inside &= (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+    return (row[inside] * cols + col[inside]).astype(np.int64), inside

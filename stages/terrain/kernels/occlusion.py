@@ -11,20 +11,19 @@ import numpy as np
 
 from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.terrain.kernels.grid import Grid
+from stages.terrain.kernels.grid import Grid, cell_of, cells_of
 
 
 def occlusion_ceiling(points: Array, pixel: Array, width: int, camera: Array, grid: Grid) -> Array:
-    """Height, m, of the lowest line of sight that passes over each cell, (size, size) float64, NaN without one.
+    """Height, m, of the lowest line of sight that passes over each cell, (rows, cols) float64, NaN without one.
 
     points: (N, 3) float32 in the level frame, m; pixel: (N,) int32, ascending, index into an image of `width` columns;
     camera: (3,) position, m. Cells with points of other lines get a height too.
     """
-    resolution, (x0, y0), size, max_range = grid
-    ceiling = np.full((size, size), np.nan)
+    ceiling = np.full(grid.shape, np.nan)
     eye = (float(camera[0]), float(camera[1]), float(camera[2]))
-    raster = (1.0 / resolution, float(x0), float(y0), float(max_range))
-    _occlusion_ceiling(np.ascontiguousarray(points), np.ascontiguousarray(pixel), int(width), eye, raster, ceiling)
+    points, pixel = np.ascontiguousarray(points), np.ascontiguousarray(pixel)
+    _occlusion_ceiling(points, pixel, int(width), eye, grid.raster, ceiling)
     return ceiling
 
 
@@ -33,8 +32,7 @@ def _lower(ceiling, x, y, z, dx, dy, dz, length, raster):
     """Lower the ceiling to a line from (x, y, z) along (dx, dy, dz), where (dx, dy) is a unit vector.
 
     The line is sampled four times a cell, only within the range, however long it is."""
-    cells_per_metre, x0, y0, max_range = raster
-    size = ceiling.shape[0]
+    cells_per_metre, max_range = raster[0], raster[3]
     middle, aside, reach = -(x * dx + y * dy), x * dy - y * dx, max_range + 1.0 / cells_per_metre
     if not abs(aside) <= reach:
         return
@@ -43,12 +41,10 @@ def _lower(ceiling, x, y, z, dx, dy, dz, length, raster):
     last = int(min(middle + half, length) * cells_per_metre * 4.0)
     for k in range(max(first, 1), last + 1):
         way = k / (4.0 * cells_per_metre)
-        px, py = x + dx * way, y + dy * way
-        col, row = int(np.floor((px - x0) * cells_per_metre)), int(np.floor((py - y0) * cells_per_metre))
-        if 0 <= row < size and 0 <= col < size and px * px + py * py <= max_range * max_range:
-            height = z + dz * way
-            if not ceiling[row, col] <= height:
-                ceiling[row, col] = height
+        row, col = cell_of(x + dx * way, y + dy * way, raster)
+        height = z + dz * way
+        if row >= 0 and not ceiling[row, col] <= height:
+            ceiling[row, col] = height
 
 
 @kernel
@@ -79,8 +75,7 @@ def _occlusion_ceiling(points, pixel, width, eye, raster, ceiling):
 
 def occlusion_ceiling_reference(points: Array, pixel: Array, width: int, camera: Array, grid: Grid) -> Array:
     """The same as `occlusion_ceiling`, one image column at a time, in plain numpy."""
-    resolution, origin, size, max_range = grid
-    ceiling = np.full((size, size), np.inf)
+    resolution, max_range, ceiling = grid.resolution, grid.max_range, np.full(grid.shape, np.inf)
     for column in np.unique(pixel % width):
         line = points[pixel % width == column][::-1].astype(np.float64)
         for start, end in zip(line, [*line[1:], None], strict=True):
@@ -91,8 +86,6 @@ def occlusion_ceiling_reference(points: Array, pixel: Array, width: int, camera:
                 continue
             steps = np.arange(1, int(reach / resolution * 4) + 1) * resolution / 4
             samples = start + way / length * steps[:, None]
-            col, row = np.floor((samples[:, :2] - origin) / resolution).astype(int).T
-            on_grid = (np.minimum(col, row) >= 0) & (np.maximum(col, row) < size)
-            on_grid &= (samples[:, :2] ** 2).sum(axis=1) <= max_range**2
-            np.minimum.at(ceiling, (row[on_grid], col[on_grid]), samples[on_grid, 2])
+            cells, on_grid = cells_of(samples, grid)
+            np.minimum.at(ceiling.reshape(-1), cells, samples[on_grid, 2])
     return np.where(np.isfinite(ceiling), ceiling, np.nan)

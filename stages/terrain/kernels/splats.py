@@ -10,7 +10,7 @@ import numpy as np
 
 from stages.compiled.jit import kernel
 from stages.data import Array, Transform
-from stages.terrain.kernels.grid import Grid, add_point, cell_statistics_reference, no_figures
+from stages.terrain.kernels.grid import Grid, add_point, cell_of, cell_statistics_reference, no_figures
 
 OFFSETS = np.array([-1.0, -0.5, 0.5, 1.0])  # of the copies, as shares of the reach
 
@@ -22,16 +22,14 @@ def splat_statistics(
 
     points: (N, 3) float32, m; sigma: (N,) float32, depth standard deviation, m; sensor: the camera in the points'
     frame; reach: of the copies to either side, in standard deviations; the least that makes a copy, m of depth; the
-    largest, m; empty: (size, size) bool. Returns (size, size, 6) float64, as `cell_statistics` does.
+    largest, m; empty: (rows, cols) bool. Returns (rows, cols, 6) float64, as `cell_statistics` does.
     """
-    resolution, (x0, y0), size, max_range = grid
-    figures = no_figures(size)
+    figures = no_figures(grid)
     camera = sensor.translation, sensor.rotation[:, 2].copy()
-    raster = 1.0 / resolution, float(x0), float(y0), float(max_range)
     sigmas, least, most = reach
     reach = float(sigmas), float(np.float32(least)), float(most)
     points, sigma = np.ascontiguousarray(points), np.ascontiguousarray(sigma)
-    _splat(points, sigma, camera, reach, OFFSETS, raster, np.ascontiguousarray(empty), figures)
+    _splat(points, sigma, camera, reach, OFFSETS, grid.raster, np.ascontiguousarray(empty), figures)
     return figures
 
 
@@ -39,8 +37,6 @@ def splat_statistics(
 def _splat(points, sigma, camera, reach, offsets, raster, empty, figures):
     eye, axis = camera
     sigmas, least, most = reach
-    cells_per_metre, x0, y0, max_range = raster
-    size = figures.shape[0]
     factor = np.float32(sigmas)
     for i in range(points.shape[0]):
         if not sigma[i] * factor >= least:
@@ -49,11 +45,8 @@ def _splat(points, sigma, camera, reach, offsets, raster, empty, figures):
         per_depth = min(sigmas * sigma[i], most) / (x * axis[0] + y * axis[1] + z * axis[2])
         for n in range(offsets.size):
             stretch = offsets[n] * per_depth
-            px, py = points[i, 0] + stretch * x, points[i, 1] + stretch * y
-            if not px * px + py * py <= max_range * max_range:
-                continue
-            col, row = int(np.floor((px - x0) * cells_per_metre)), int(np.floor((py - y0) * cells_per_metre))
-            if 0 <= row < size and 0 <= col < size and empty[row, col]:
+            row, col = cell_of(points[i, 0] + stretch * x, points[i, 1] + stretch * y, raster)
+            if row >= 0 and empty[row, col]:
                 add_point(figures[row, col], points[i, 2] + stretch * z, np.float64(sigma[i]))
 
 
@@ -68,4 +61,4 @@ def splat_statistics_reference(
     stretch = (np.minimum(sigmas * sigma, most) / (ray @ sensor.rotation[:, 2]))[:, None] * OFFSETS
     copies = points[:, None] + stretch[:, :, None] * ray[:, None]
     figures = cell_statistics_reference(copies.reshape(-1, 3), sigma.repeat(len(OFFSETS)), grid)
-    return np.where(empty[:, :, None], figures, no_figures(grid.size))
+    return np.where(empty[:, :, None], figures, no_figures(grid))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import find_objects
 
 from stages.cloud.clean import Clean
 from stages.cloud.level import Level
@@ -15,7 +16,14 @@ from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, MatchFailure, PixelOrigin, PointCloud, Tilt, Transform
 from stages.terrain.dem import Voxelise
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature, gradient_and_curvature_reference
-from stages.terrain.kernels.grid import Grid, cell_statistics, cell_statistics_reference
+from stages.terrain.kernels.grid import (
+    Grid,
+    cell_statistics,
+    cell_statistics_reference,
+    extent,
+    shade_statistics,
+    shade_statistics_reference,
+)
 from stages.terrain.kernels.occlusion import occlusion_ceiling, occlusion_ceiling_reference
 from stages.terrain.kernels.splats import splat_statistics, splat_statistics_reference
 from stages.terrain.kernels.staying_points import staying_points, staying_points_reference
@@ -29,7 +37,7 @@ from tests.stages.terrain.terrain_scene import (
     seen_disparity,
 )
 
-GRID = Grid(0.1, (-8.0, -8.0), 160, 8.0)
+GRID = Grid(0.1, (-8.0, -8.0), (140, 150), 8.0, (13, 5))
 SENSOR = Transform(LEVEL_FRAME, "camera", level_from_camera(), np.array([0, 0, HEIGHT]))
 
 
@@ -214,6 +222,19 @@ def test_statistics_kernel_equals_the_reference() -> None:
     np.testing.assert_allclose(cell_statistics(*arguments), cell_statistics_reference(*arguments), rtol=1e-9)
 
 
+def test_shades_kernel_equals_the_reference() -> None:
+    colors = np.random.default_rng(1).integers(0, 256, (5000, 3), np.uint8)
+    arguments = (scattered(9, 5000).astype(np.float32), colors, GRID)
+    np.testing.assert_allclose(shade_statistics(*arguments), shade_statistics_reference(*arguments), rtol=1e-6)
+
+
+def test_extent_contains_all_points_and_no_more() -> None:
+    points = scattered(9, 50).astype(np.float32)
+    count = cell_statistics_reference(points, np.zeros(50), GRID)[:, :, 0]
+    rows, cols = find_objects((count > 0).astype(int))[0]
+    assert extent(points, GRID).tolist() == [rows.start, cols.start, rows.stop, cols.stop]
+
+
 def test_gradient_kernel_equals_the_reference() -> None:
     random = np.random.default_rng(2)
     heights = random.normal(0, 1, (20, 30))
@@ -258,7 +279,7 @@ def test_splat_kernel_equals_the_reference() -> None:
     points = (SENSOR.translation + random.uniform(1, 8, (500, 1)) * SENSOR.rotation[:, 2]
               + random.normal(0, 0.3, (500, 3))).astype(np.float32)  # fmt: skip
     sigma = random.uniform(0, 0.1, 500).astype(np.float32)
-    empty = random.random((GRID.size, GRID.size)) < 0.5
+    empty = random.random(GRID.shape) < 0.5
     arguments = points, sigma, SENSOR, (2.0, 0.05, 0.12), GRID, empty
     got, want = splat_statistics(*arguments), splat_statistics_reference(*arguments)
     assert 100 < want[:, :, 0].sum() < 4 * len(points)
