@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import find_objects
 from scipy.spatial.transform import Rotation
 
 from flow.contracts import StageError
@@ -18,6 +19,9 @@ from stages.terrain.dem import Voxelise
 
 # Between z of the pose's frame and up. Odometry without an inclinometer may differ by the slope of the ground.
 _MAX_LEAN = np.radians(30.0)
+
+
+HEIGHTS = {"elevation", "minimum", "maximum", "ceiling"}  # layers, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +99,24 @@ def frame_grid(cloud: PointCloud, level: Transform, resolution: float, max_range
     points = transform_points(cloud.points, rest.rotation, rest.translation)
     sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
     terrain = Voxelise(resolution=resolution, max_range=max_range)(replace(cloud, points=points, sensor=sensor))
-    col, row = (int(number) - extent // 2 for number, extent in zip(cell, terrain.shape[::-1], strict=True))
-    heights = [name for name in ("elevation", "minimum", "maximum", "ceiling") if name in terrain.layers]
-    lifted = {name: terrain.layers[name] + np.float32(level.translation[2]) for name in heights}
+    rows, cols = _seen(terrain)
+    row = int(cell[1]) - terrain.shape[0] // 2 + rows.start
+    col = int(cell[0]) - terrain.shape[1] // 2 + cols.start
+    layers = {name: layer[rows, cols] for name, layer in terrain.layers.items()}
+    for name in HEIGHTS & layers.keys():
+        layers[name] = layers[name] + np.float32(level.translation[2])
     origin = (col * resolution, row * resolution)
-    terrain = replace(terrain, layers={**terrain.layers, **lifted}, origin=origin, frame_id=level.parent)
-    return FrameGrid(level, terrain, row, col)
+    return FrameGrid(level, replace(terrain, layers=layers, origin=origin, frame_id=level.parent), row, col)
+
+
+def _seen(terrain: ElevationMap) -> tuple[slice, slice]:
+    """Rows and columns of the cells with a height or a ceiling and of their neighbours."""
+    seen = np.isfinite(terrain.layers["elevation"])
+    if "ceiling" in terrain.layers:
+        seen |= np.isfinite(terrain.layers["ceiling"])
+    found = find_objects(seen.astype(np.int8))
+    rows, cols = found[0] if found else (slice(0, 1), slice(0, 1))
+    return slice(max(rows.start - 1, 0), rows.stop + 1), slice(max(cols.start - 1, 0), cols.stop + 1)
 
 
 def with_plane(level: Transform, plane: Array) -> Transform:
