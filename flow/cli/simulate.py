@@ -48,6 +48,9 @@ OPTIONS: dict[str, tuple[str, type, float, str | None, str]] = {
     "exposure_time": ("exposure_time", float, MILLISECOND, "MS", "time of an exposure, for motion blur (0)"),
     "jpeg": ("jpeg", int, 1, "QUALITY", "write JPEG images of this quality, 1 to 100 (not compressed)"),
     "tilt_noise": ("tilt_noise", float, DEGREE, "DEG", "inclinometer noise, one sigma (0.1)"),
+    "imu": ("imu", str, 1, "KIND", "orientation, or raw: accelerations and rates of a MEMS sensor (orientation)"),
+    "vibration": ("vibration", float, 1, "M/S2", "vibration of a raw Imu while driving, RMS of each axis (0.5)"),
+    "rest": ("rest", float, 1, "S", "time that the rover stands still before it drives (0)"),
     "odometry_scale": (
         "odometry_scale", float, PERCENT, "PERCENT", "scale error of odometry (1); 0, with --odometry-turn 0, is exact",
     ),

@@ -52,7 +52,9 @@ def write_log(simulation: Simulation, out: Path, progress: Callable[[int, int], 
 def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], list[Logged]], int | None]]:
     """(log time, function that makes the messages, frame index or None), unordered."""
     yield simulation.begin, partial(static_transforms, simulation, simulation.begin), None
-    sensors = ((inclinometer, simulation.tilt_rate, 4_000_000), (odometry, simulation.odometry_rate, 9_000_000))
+    raw = simulation.imu == "raw"
+    tilt = (imu, simulation.imu_rate, 4_000_000) if raw else (inclinometer, simulation.tilt_rate, 4_000_000)
+    sensors = (tilt, (odometry, simulation.odometry_rate, 9_000_000))
     for make_messages, rate, latency in sensors:
         for number, stamp in enumerate(simulation.sensor_stamps(rate)):
             yield stamp + latency, partial(make_messages, simulation, number, stamp, stamp + latency), None
@@ -75,6 +77,12 @@ def inclinometer(simulation: Simulation, number: int, stamp: int, log_time: int)
     variance = max(simulation.tilt_noise, 1e-6) ** 2
     message = ros2.imu(stamp, traverse.INCLINOMETER_FRAME, reading, np.diag([variance, variance, np.pi**2 / 3]))
     return [(log_time, "/imu/inclinometer", message)]
+
+
+def imu(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:
+    """/imu/data_raw: accelerations and rates, without an orientation."""
+    rate, acceleration = simulation.inertial.rates[number], simulation.inertial.accelerations[number]
+    return [(log_time, "/imu/data_raw", ros2.raw_imu(stamp, traverse.INCLINOMETER_FRAME, rate, acceleration))]
 
 
 def odometry(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from flow.parameters import check_parameters, parameter
 from recordings.simulator import camera as cameras
-from recordings.simulator import raycast, shading, sunlight, texture, traverse
+from recordings.simulator import inertial, raycast, shading, sunlight, texture, traverse
 from recordings.simulator.odometry import dead_reckoning
 from recordings.simulator.scenes import DEFAULT_SCENE, SCENES, defaults_of
 from recordings.simulator.terrain import Terrain, make_terrain
@@ -118,6 +118,15 @@ class Simulation:
     jpeg: int | None = parameter(None, "quality of compressed images; None: not compressed", low=1, high=100)
     tilt_noise: float = parameter(_rad(0.1), "one sigma of a tilt sample", unit="rad", low=0, high=_rad(45))
     tilt_rate: float = parameter(20.0, "tilt samples per second", unit="Hz", low=1, high=1000)
+    imu: str = parameter(
+        "orientation", "what the inclinometer logs: its orientation; raw: accelerations and rates of a MEMS sensor",
+        choices=("orientation", "raw"),
+    )  # fmt: skip
+    imu_rate: float = parameter(100.0, "samples of a raw Imu per second", unit="Hz", low=10, high=1000)
+    vibration: float = parameter(
+        0.5, "vibration of a raw Imu while the rover drives, RMS of each axis", unit="m/s^2", low=0, high=50
+    )
+    rest: float = parameter(0.0, "time that the rover stands still before it drives", unit="s", low=0, high=3600)
     odometry_rate: float = parameter(10.0, "poses per second", unit="Hz", low=1, high=1000)
     odometry_scale: float = parameter(
         0.01, "share by which odometry overstates distances; exact for 0, with odometry_turn 0", unit="share",
@@ -213,7 +222,7 @@ class Simulation:
     @property
     def begin(self) -> int:
         """Time of the first sensor sample, ns."""
-        return self.start - SENSOR_MARGIN
+        return self.start - SENSOR_MARGIN - round(self.rest * SECOND)
 
     def sensor_stamps(self, rate: float) -> list[int]:
         """Stamps, ns, of a sensor of `rate` Hz, from before the first frame until after the last."""
@@ -221,8 +230,12 @@ class Simulation:
         return [self.begin + round(number / rate * SECOND) for number in range(int(np.ceil(length * rate)) + 1)]
 
     def distance(self, stamp: int) -> float:
-        """Metres driven since the nominal start, at a time, ns."""
-        return (stamp - self.start) / SECOND * self.speed
+        """Metres driven since the nominal start, at a time, ns. After a rest the rover speeds up before the start."""
+        since, ramp = (stamp - self.start) / SECOND, SENSOR_MARGIN / SECOND
+        if self.rest and since < 0:
+            since = max(since, -ramp)
+            since += since**2 / (2 * ramp)
+        return since * self.speed
 
     def base_at(self, stamp: int) -> Transform:
         """world <- base_link at a time, ns."""
@@ -235,6 +248,16 @@ class Simulation:
         distances = np.array([self.distance(stamp) for stamp in stamps])
         bases = [self.base_at(stamp) for stamp in stamps]
         return tuple(dead_reckoning(stamps, bases, distances, self.odometry_scale, self.odometry_turn, self._rng(5)))
+
+    @cached_property
+    def inertial(self) -> inertial.InertialDrive:
+        """What a raw Imu measures on the whole drive."""
+        stamps = np.array(self.sensor_stamps(self.imu_rate))
+        half = SECOND / self.imu_rate / 2
+        times = self.begin + np.round(np.arange(-inertial.STEPS, 2 * len(stamps) - 1 + inertial.STEPS) * half)
+        speeds = np.diff([self.distance(stamp) for stamp in (stamps[0], *stamps)]) * self.imu_rate
+        bodies = [self.base_at(int(time)) for time in times]
+        return inertial.measured(bodies, self.mounts[2], self.imu_rate, self.vibration, speeds, self._rng(7))
 
     def frame(self, index: int) -> FrameTruth:
         """Images and exact geometry of one frame."""
