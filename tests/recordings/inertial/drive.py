@@ -67,3 +67,12 @@ def estimated(samples, **parameters):
     estimator = UpEstimator("imu", **{"accelerometer_bias": 0.03, **parameters})
     tilts = [tilt for sample in samples for tilt in estimator.push(sample)]
     return [*tilts, *estimator.finish()], estimator
+
+
+def rms_of_estimate(simulation):
+    """RMS of the angles, deg, between the estimate and the truth, from the first frame of a simulated drive on."""
+    stamps, found = simulation.sensor_stamps(simulation.imu_rate), simulation.inertial
+    up = np.array([simulation.base_at(stamp).after(simulation.mounts[2]).rotation[2] for stamp in stamps])
+    driven = Drive(np.array(stamps), found.rates, found.accelerations, up)
+    tilts, _ = estimated(driven.samples())
+    return float(np.sqrt(np.mean(driven.errors([tilt for tilt in tilts if tilt.stamp >= simulation.start]) ** 2)))
