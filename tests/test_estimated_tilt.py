@@ -17,7 +17,9 @@ def scored(folder: Path, imu: str, seed: int) -> tuple[list[float], float, list[
         scene="gravel", frames=20, width=320, height=240, seed=seed, slope=float(np.radians(6)), imu=imu, rest=5.0
     )
     write_log(simulation, log)
-    assert main(["run", str(log), "-o", str(out), "--no-rrd", "--summary", str(summary), "--set", "disparities=64"]) == 0
+    assert (
+        main(["run", str(log), "-o", str(out), "--no-rrd", "--summary", str(summary), "--set", "disparities=64"]) == 0
+    )
     assert main(["score", str(out), "--truth", str(log), "--json", str(score)]) == 0
     found, findings = json.loads(score.read_text()), json.loads(summary.read_text())["findings"]
     tilts = [row["tilt"] for row in found["per_frame"]]
