@@ -358,7 +358,7 @@ def test_a_topic_that_is_set_but_absent_is_refused(traverse, tmp_path, capsys, k
     [
         ("orientation.xx", "no 'xx' in its geometry_msgs/msg/Quaternion (it has x, y, z, w)"),
         ("orientation", "field 'orientation' contains a geometry_msgs/msg/Quaternion, which is not a number"),
-        ("header.frame_id", "which is not an angle"),
+        ("header.frame_id", "which is not a number"),
     ],
 )
 def test_angles_of_an_absent_field_are_refused_before_the_run(traverse, tmp_path, capsys, field, words):
