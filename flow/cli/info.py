@@ -5,25 +5,26 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
-from flow.cli.outputs import add_pipeline_options
+from flow.cli.outputs import add_log, add_pipeline_options
 from flow.cli.report import say
 from flow.errors import COMPLETE, INCOMPLETE, UsageError
 from flow.runtime.graph import Graph
+from recordings.containers.finding import find_files
 
 HELP = "show what a log contains, and what is missing"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("log", type=Path, metavar="LOG.mcap")
+    add_log(sub)
     add_pipeline_options(sub)
     sub.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the description of a log."""
+    find_files(options.log)  # refuses a wrong name at once
     from flow.config.loader import load
     from flow.runtime.run import fitted
     from recordings import McapSource

@@ -1,4 +1,4 @@
-"""What commands share: checks of output paths, text outputs, and the options of a pipeline."""
+"""What commands share: the log, checks of output paths, text outputs, and the options of a pipeline."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 from flow.errors import UsageError
 from recordings.atomic_write import written
+from recordings.containers.finding import RESULT_ENDING
 from recordings.sinks.overwrite import is_ours
 
 
@@ -18,6 +19,19 @@ def add_pipeline_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--set", action="append", default=[], metavar="STREAM.PARAM=VALUE", help="change a parameter of the pipeline"
     )
+
+
+def add_log(sub: argparse.ArgumentParser) -> None:
+    """Add the log: files or a folder."""
+    sub.add_argument(
+        "log", nargs="+", type=Path, metavar="LOG", help="a .mcap, .db3 or .bag file, several of them, or their folder"
+    )
+
+
+def default_result(logs: Sequence[Path]) -> Path:
+    """The result log beside the first log."""
+    log = logs[0].absolute() if logs[0].is_dir() else logs[0]
+    return log.parent / f"{log.name if log.is_dir() else log.stem}{RESULT_ENDING}.mcap"
 
 
 def write_text(path: Path | None, text: str) -> None:

@@ -15,7 +15,7 @@ from flow.runtime.graph import Graph
 
 
 def replay(
-    log: Path,
+    log: Path | Sequence[Path],
     pipeline: str,
     out: Path,
     rrd: Path | None,
@@ -42,7 +42,7 @@ def replay(
             "roverflow": product_version(),
             "pipeline": graph.text,
             "overrides": "\n".join(overrides),
-            "log": log.name,
+            "log": ", ".join(path.name for path in ([log] if isinstance(log, Path) else log)),
             "start": "" if start is None else repr(float(start)),
             "end": "" if end is None else repr(float(end)),
             "every": "" if every is None else str(every),

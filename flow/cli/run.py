@@ -9,17 +9,18 @@ from contextlib import suppress
 from pathlib import Path
 
 from flow.cli.arguments import every, seconds, workers
-from flow.cli.outputs import add_pipeline_options, check_outputs, write_text
+from flow.cli.outputs import add_log, add_pipeline_options, check_outputs, default_result, write_text
 from flow.cli.replay import as_json, replay
 from flow.cli.report import exit_code, headline, report, say
 from flow.errors import SinkError
+from recordings.containers.finding import find_files
 from recordings.errors import UnwritableError
 
 HELP = "replay a log through a pipeline"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("log", type=Path, metavar="LOG.mcap")
+    add_log(sub)
     add_pipeline_options(sub)
     sub.add_argument("-o", "--out", type=Path, metavar="OUT.mcap", help="result log (LOG-nav.mcap)")
     recording = sub.add_mutually_exclusive_group()
@@ -39,10 +40,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the pipeline, print the verdict and write the summary."""
-    out = options.out or options.log.parent / f"{options.log.stem}-nav.mcap"
+    find_files(options.log)  # refuses a wrong name at once
+    out = options.out or default_result(options.log)
     rrd = None if options.no_rrd else options.rrd or out.parent / f"{out.stem}.rrd"
     outputs = {"result log": out, "recording": rrd, "summary": options.summary}
-    check_outputs(outputs, [options.log, Path(options.pipeline)])
+    check_outputs(outputs, [*options.log, Path(options.pipeline)])
     settings = {name: getattr(options, name) for name in ("workers", "start", "end", "every")}
     try:
         summary = replay(options.log, options.pipeline, out, rrd, overrides=options.set, **settings)

@@ -6,8 +6,8 @@ and parts are opened when their time comes, so memory does not grow with their n
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from pathlib import Path
@@ -21,15 +21,33 @@ from recordings.containers.container import Channel, Container, LostMessage, Raw
 from recordings.containers.header import begins_with_header, peek_stamp
 from recordings.containers.timeline import Timeline
 
-_MAX_CHANNELS = 1 << 32  # of a file
+
+def _merged_channels(files: Sequence[Container]) -> tuple[dict[int, Channel], list[dict[int, int]]]:
+    """The channels of all files, and for each file its channels -> theirs. Equal ones of several files are one."""
+    merged, numbers, known = dict[int, Channel](), list[dict[int, int]](), dict[Any, list[int]]()
+    for file in files:
+        own = dict[int, int]()
+        for number, channel in file.channels.items():
+            same = known.setdefault((channel.topic, channel.message_encoding, channel.schema), [])
+            free = next((other for other in same if other not in own.values()), None)
+            if free is None:
+                free = number if number not in merged else max(merged) + 1
+                merged[free] = replace(channel, number=free)
+                same.append(free)
+            own[number] = free
+        numbers.append(own)
+    return merged, numbers
 
 
 @dataclass(frozen=True)
 class _Part:
-    """A stretch of a file between two steps of the recorder's clock. places: in the file; base: of its channels."""
+    """A stretch of a file between two steps of the recorder's clock.
+
+    numbers: channel of the file -> channel of the recording; places: in the file.
+    """
 
     file: Container
-    base: int
+    numbers: Mapping[int, int]
     places: range
     step: ClockStep
 
@@ -49,7 +67,7 @@ class _Part:
         """The log times of some channels of the recording, ns, in any order."""
         found = [np.zeros(0, np.int64)]
         for channel, places in self.file.timeline.by_channel.items():
-            if channel + self.base in channels:
+            if self.numbers.get(channel) in channels:
                 inside = places[(places >= self.places.start) & (places < self.places.stop)]
                 found.append(self.file.timeline.log_times[inside])
         times = np.concatenate(found)
@@ -59,10 +77,10 @@ class _Part:
         self, channels: set[int], start: int | None, end: int | None, allow_repeats: bool
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of some channels of the recording, in log-time order."""
-        own = {channel - self.base for channel in channels if channel - self.base in self.file.channels}
+        own = {channel for channel, number in self.numbers.items() if number in channels}
         low, high = (None if time is None else max(time - self.step.shift, 0) for time in (start, end))
         for item in self.file.messages(own, low, high, None if self.whole else self.places):
-            channel = None if item.channel is None else item.channel + self.base
+            channel = None if item.channel is None else self.numbers[item.channel]
             log_time = item.log_time + self.step.shift
             if isinstance(item, LostMessage):
                 yield LostMessage(channel, log_time, item.reason)
@@ -87,7 +105,13 @@ class Recording:
     path : Path
         What the user gave: the file or the folder.
     files : sequence of Container
-        The files in the order in which they were recorded. The recording closes them.
+        The files in the order in which they were recorded.
+    missing : sequence of str
+        Sentences about files that are not there; their messages are lost.
+    part : str
+        A sentence if the path is only one of several files of a recording.
+    on_close : callable
+        Closes the files; by default their `close`.
 
     Attributes
     ----------
@@ -97,14 +121,18 @@ class Recording:
         Log time of the first and the last message, ns.
     """
 
-    def __init__(self, path: Path, files: Sequence[Container]) -> None:
-        self.path, self.files = path, files
+    def __init__(
+        self,
+        path: Path,
+        files: Sequence[Container],
+        missing: Sequence[str] = (),
+        part: str = "",
+        on_close: Callable[[], object] | None = None,
+    ) -> None:
+        self.path, self.files, self.part, self._missing = path, files, part, missing
+        self._on_close = on_close or self._close_files
         self.size = sum(file.size for file in files)
-        self.channels = {
-            base + number: Channel(base + number, channel.topic, channel.message_encoding, channel.schema)
-            for base, file in self._based()
-            for number, channel in file.channels.items()
-        }
+        self.channels, self._numbers = _merged_channels(files)
         try:
             self.start = min(part.start for part in self._parts)
             self.end = max(part.file.end + part.step.shift for part in self._parts)
@@ -116,7 +144,8 @@ class Recording:
     def lost(self) -> list[LostMessage]:
         """The damage found so far."""
         found = ((file, item) for file in self.files for item in file.lost)
-        return [LostMessage(None, item.log_time, self._named(file, item.reason)) for file, item in found]
+        gone = [LostMessage(None, self.end, why) for why in self._missing]
+        return gone + [LostMessage(None, item.log_time, self._named(file, item.reason)) for file, item in found]
 
     @property
     def profile(self) -> str:
@@ -155,6 +184,8 @@ class Recording:
                 items = begun[number] = self._read(self._parts[number], channels, start, end, allow_repeats)
             if (following := next(items, None)) is not None:
                 heappush(queue, (following.log_time, number, following))
+        if end is None:
+            yield from (LostMessage(None, self.end, why) for why in self._missing)
 
     def times(self, channels: set[int], allow_repeats: bool = False) -> NDArray[np.int64]:
         """The sorted log times of some channels, ns; by default without those that repeat."""
@@ -162,10 +193,14 @@ class Recording:
 
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
-        return sum(file.count({channel - base for channel in channels}) for base, file in self._based())
+        found = zip(self.files, self._numbers, strict=True)
+        return sum(file.count({n for n, number in numbers.items() if number in channels}) for file, numbers in found)
 
     def close(self) -> None:
         """Close the files."""
+        self._on_close()
+
+    def _close_files(self) -> None:
         for file in self.files:
             file.close()
 
@@ -174,10 +209,6 @@ class Recording:
 
     def __exit__(self, *raised: object) -> None:
         self.close()
-
-    def _based(self) -> Iterator[tuple[int, Container]]:
-        """Each file with the number to add to those of its channels."""
-        return ((number * _MAX_CHANNELS, file) for number, file in enumerate(self.files))
 
     def _named(self, file: Container, reason: str) -> str:
         return f"{file.path.name}: {reason}" if len(self.files) > 1 else reason
@@ -193,10 +224,10 @@ class Recording:
         """The parts of all files, in the order in which they were recorded."""
         parts, first = list[_Part](), 0
         steps = self._steps()
-        for base, file in self._based():
+        for file, numbers in zip(self.files, self._numbers, strict=True):
             size = len(file.timeline)
             for places, step in split(steps, first, size):
-                parts.append(_Part(file, base, places, step))
+                parts.append(_Part(file, numbers, places, step))
             first += size
         return parts
 
@@ -204,7 +235,7 @@ class Recording:
         """The steps of the recorder's clock over all files; their places are counted through the files."""
         topics = {topic: number for number, topic in enumerate(sorted({c.topic for c in self.channels.values()}))}
         channels, times, firsts = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [0]
-        for _, file in self._based():
+        for file in self.files:
             numbers, inverse = np.unique(file.timeline.channels, return_inverse=True)
             known = [topics[file.channels[n].topic] if n in file.channels else len(topics) for n in numbers.tolist()]
             channels.append(np.array(known, np.int64)[inverse])

@@ -350,8 +350,4 @@ def _opened(path: Path) -> BinaryIO:
     file.close()
     if not start:
         raise LogError(f"{path} is empty (0 bytes); record it again")
-    if start.startswith(b"#ROSBAG"):
-        raise LogError(f"{path} is a ROS 1 bag; convert it to OUT/OUT.mcap first: {CONVERT}")
-    if start.startswith(b"SQLite format 3"):
-        raise LogError(f"{path} is a rosbag2 SQLite bag; convert it to MCAP first: mcap convert IN.db3 OUT.mcap")
     raise LogError(f"{path} is not an MCAP log (its first bytes differ); give a .mcap file")

@@ -1,4 +1,4 @@
-"""Replays an MCAP log as the streams of a pipeline: two cameras, tilt, mount and pose.
+"""Replays a log as the streams of a pipeline: two cameras, tilt, mount and pose.
 
 Only the resolved topics are decoded. An exception is delivered in place of a broken message. Calibrations are read a
 little ahead of the images, so that no image is delivered with a calibration that was not in force.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from heapq import merge
 from operator import itemgetter
@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.header import peek_stamp
-from recordings.containers.recording import Recording
+from recordings.containers.opening import open_recording
 from recordings.errors import LogError, sentence_of
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
-from recordings.mcap.file import McapFile
 from recordings.ros2.from_msg import camera_model, frame_of, pose_of, stamp_or
 from recordings.ros2.image_from_msg import pixels_of
 from recordings.source.calibration import Camera
@@ -121,7 +120,7 @@ class McapLog:
     the log -> reason; topics: stream -> topic; resolution: the rest of what the log provides.
     """
 
-    path: Path
+    given: Path | Sequence[Path]
     source: LogSettings
     start: float | None = None
     end: float | None = None
@@ -133,8 +132,9 @@ class McapLog:
     _info_times: dict[str, NDArray[np.int64]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.file = Recording(self.path, [McapFile(self.path)])
+        self.file = open_recording(self.given)
         try:
+            self.path = self.file.path
             self._check_range()
             self.resolution = resolution = SourceResolution(self.file, self.source)
             self.missing, self.refused, self.topics = resolution.missing, resolution.refused, resolution.topics
@@ -242,6 +242,8 @@ class McapLog:
             notes["right"] = "; ".join((*filter(None, [notes.get("right")]), note))
         if self.resolution.tilt is not None and (note := self.resolution.tilt.note(self._estimator, self.source)):
             notes["inclinometer"] = "; ".join((*filter(None, [notes.get("inclinometer")]), note))
+        if self.file.part and "left" in self.topics:
+            notes["left"] = "; ".join((*filter(None, [notes.get("left")]), self.file.part))
         if self.resolution.mount is not None and self.resolution.mount.base_from_camera is None:
             notes["mount"] = (
                 f"no static transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "

@@ -1,9 +1,9 @@
-"""An MCAP log as a pipeline's source."""
+"""A log as a pipeline's source."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -16,7 +16,7 @@ from stages.data import CameraImage, Mount, Pose, Tilt
 
 @dataclass(frozen=True)
 class McapSource(LogSettings):
-    """The streams of an MCAP log: two cameras, tilt, pose, and the mount of the camera on the rover.
+    """The streams of a log: two cameras, tilt, pose, and the mount of the camera on the rover.
 
     `help(LogSettings)` describes the settings.
 
@@ -35,13 +35,13 @@ class McapSource(LogSettings):
         "odometry": Pose,
     }
 
-    def open(self, path: Path, start: float | None = None, end: float | None = None) -> McapLog:
+    def open(self, path: Path | Sequence[Path], start: float | None = None, end: float | None = None) -> McapLog:
         """Open a log; use the result as a context manager.
 
         Parameters
         ----------
-        path : Path
-            The MCAP file.
+        path : Path or sequence of Path
+            An MCAP file, a rosbag2 database, a ROS 1 bag, several of them, or the folder of a recording.
         start, end : float, optional
             The part to read, from `start` to before `end`, seconds after the first message.
 
@@ -58,4 +58,4 @@ class McapSource(LogSettings):
         for name, seconds in (("start", start), ("end", end)):
             if seconds is not None and not math.isfinite(seconds):
                 raise LogError(f"{name} must be in seconds after the log's first message, not {seconds}")
-        return McapLog(Path(path), self, start, end)
+        return McapLog(path, self, start, end)

@@ -67,7 +67,10 @@ class SourceResolution:
         """`unavailable` as complete sentences; they mention lost messages and undecodable topics."""
         lost = f"messages were lost: {self.file.lost[0].reason}" if self.file.lost else ""
         hint = "".join(f" ({what})" for what in (self.undecodable, lost) if what)
-        return {name: why + hint if name in self._without_topic else why for name, why in self.unavailable.items()}
+        part = f" ({self.file.part})" if self.file.part else ""
+        return {
+            name: why + (hint if name in self._without_topic else "") + part for name, why in self.unavailable.items()
+        }
 
     def _read_static(self) -> tuple[TransformTree, list[tuple[str, LogError]]]:
         """The static transforms, and the problems with those left out."""

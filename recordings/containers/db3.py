@@ -1,0 +1,147 @@
+"""Reads a rosbag2 SQLite file (.db3). It is opened as immutable, so nothing is written beside it.
+
+Messages are fetched one by one, so memory does not depend on the size of the file, and a broken row loses itself alone.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from array import array
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.contracts import counted
+from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
+from recordings.containers.timeline import Timeline
+from recordings.errors import LogError, sentence_of
+
+
+class Db3File:
+    """A rosbag2 SQLite file open for reading.
+
+    A file of ROS 2 Humble or earlier has no definitions of its types; their texts are empty then. Raises LogError for a
+    file without readable messages.
+    """
+
+    profile = "ros2"
+    indexed = True
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.size = path, path.stat().st_size
+        self.lost: list[LostMessage] = []
+        uri = f"{path.absolute().as_uri()}?immutable=1&mode=ro"
+        self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        try:
+            self._database.execute("PRAGMA writable_schema = ON")  # otherwise nothing of a cut file is read
+            self.channels = self._read_channels()
+            times = self.timeline.log_times[self.timeline.log_times >= 0]
+            if not times.size:
+                damage = f" that can be read: {self.lost[0].reason}" if self.lost else "; record it again"
+                raise LogError(f"{path} contains no messages{damage}")
+            self.start, self.end = int(times.min()), int(times.max())
+            self._note_unwritten()
+        except sqlite3.Error as error:
+            self.close()
+            raise LogError(f"{path} is no rosbag2 recording or is damaged ({sentence_of(error)})") from error
+        except BaseException:
+            self.close()
+            raise
+
+    @cached_property
+    def timeline(self) -> Timeline:
+        """Channel and log time of every message, in the order of recording."""
+        return Timeline(self._rows[1], np.where(self._rows[2] < 0, -1, self._rows[2]))
+
+    def messages(
+        self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
+    ) -> Iterator[RawMessage | LostMessage]:
+        """The messages of some channels in log-time order; see `Container`."""
+        timeline, kept = self.timeline, range(len(self.timeline)) if places is None else places
+        times = timeline.log_times[kept.start : kept.stop]
+        wanted = np.isin(timeline.channels[kept.start : kept.stop], sorted(channels)) & (times >= (start or 0))
+        wanted &= times < (end if end is not None else 1 << 62)
+        chosen = np.flatnonzero(wanted) + kept.start
+        for place in chosen[np.argsort(timeline.log_times[chosen], kind="stable")].tolist():
+            channel, log_time = int(timeline.channels[place]), int(timeline.log_times[place])
+            data = self._data_or_reason(int(self._rows[0][place]))
+            yield LostMessage(channel, log_time, data) if isinstance(data, str) else RawMessage(channel, log_time, data)
+        if end is None and kept.stop >= len(timeline):
+            damaged = np.isin(timeline.channels, sorted(channels)) & (timeline.log_times < 0)
+            for channel in timeline.channels[damaged].tolist():
+                yield LostMessage(channel, self.end, "the message is lost: its log time is damaged")
+            yield from self.lost
+
+    def count(self, channels: set[int]) -> int:
+        """The number of messages in some channels."""
+        return int(np.isin(self.timeline.channels, sorted(channels)).sum())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+
+    def _read_channels(self) -> dict[int, Channel]:
+        tables = {name for (name,) in self._database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not {"topics", "messages"} <= tables:
+            raise LogError(f"{self.path} is an SQLite file, but no rosbag2 recording: it has no table of messages")
+        schemas = dict[str, MessageSchema]()
+        if "message_definitions" in tables:  # from ROS 2 Iron on
+            columns = "topic_type, encoding, encoded_message_definition"
+            with suppress(sqlite3.DatabaseError):  # in a cut file; the standard types are known
+                for name, encoding, text in self._database.execute(f"SELECT {columns} FROM message_definitions"):
+                    schemas[str(name)] = MessageSchema(str(name), str(encoding), _bytes(text))
+        rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics")
+        return {
+            int(number): Channel(
+                int(number), str(topic), str(encoding), schemas.get(str(kind), MessageSchema(str(kind), "ros2msg", b""))
+            )
+            for number, topic, kind, encoding in rows
+        }
+
+    @cached_property
+    def _rows(self) -> tuple[NDArray[np.int64], ...]:
+        """Row, channel and log time, ns, of every message, in the order of recording."""
+        columns = array("q"), array("q"), array("q")
+        cursor = self._database.cursor()
+        try:
+            cursor.execute(
+                "SELECT rowid, CAST(topic_id AS INTEGER), CAST(timestamp AS INTEGER) FROM messages NOT INDEXED "
+                "WHERE topic_id IS NOT NULL AND timestamp IS NOT NULL ORDER BY rowid"
+            )
+            for row in cursor:  # one by one, so that an error loses none before it
+                for column, value in zip(columns, row, strict=True):
+                    column.append(value)
+        except sqlite3.Error as error:
+            held = counted(len(columns[0]), "message")
+            reason = f"the file is cut or damaged ({sentence_of(error)}); before that it contains {held}"
+            self.lost.append(LostMessage(None, max(columns[2], default=0), reason))
+        found = tuple(np.frombuffer(column, np.int64) for column in columns)
+        for number in sorted(set(found[1].tolist()) - self.channels.keys()):
+            unknown = counted(int((found[1] == number).sum()), "message")
+            reason = f"{unknown} of topic {number} cannot be read: the file does not define it"
+            self.lost.append(LostMessage(None, max(columns[2], default=0), reason))
+        return found
+
+    def _data_or_reason(self, row: int) -> memoryview | str:
+        """The bytes of the message in a row, or why it is lost."""
+        try:
+            ((data,),) = self._database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchall()
+        except (sqlite3.Error, ValueError) as error:
+            return f"row {row} of the file is broken ({sentence_of(error)})"
+        return memoryview(data) if isinstance(data, bytes) else f"row {row} of the file has no bytes"
+
+    def _note_unwritten(self) -> None:
+        """Note the messages that a stopped recorder left in a file of its own."""
+        waiting = self.path.with_name(f"{self.path.name}-wal")
+        if waiting.exists() and waiting.stat().st_size:
+            remedy = f"`sqlite3 {self.path.name} 'PRAGMA wal_checkpoint'` adds them"
+            reason = f"the recorder was stopped and {waiting.name} has messages that are not read; {remedy}"
+            self.lost.append(LostMessage(None, self.end, reason))
+
+
+def _bytes(value: object) -> bytes:
+    return value if isinstance(value, bytes) else str(value).encode()

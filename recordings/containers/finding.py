@@ -1,0 +1,133 @@
+"""Finds the files of a log: of those that the user names, and of folders.
+
+The files of a folder are those that metadata.yaml lists. Without it, as after a recorder that was stopped, they are
+NAME_0, NAME_1 and so on. Nothing is imported that takes time, so a wrong name is refused at once.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from recordings.errors import LogError
+
+METADATA = "metadata.yaml"
+SUFFIXES = (".mcap", ".db3", ".bag")
+ZSTD_SUFFIXES = (".zstd", ".zst")
+RESULT_ENDING = "-nav"  # of the name of a result log, which may be beside the log
+_MAX_METADATA_BYTES = 1 << 24
+_MAX_LISTED = 5  # names in a sentence
+
+
+@dataclass(frozen=True)
+class FoundFiles:
+    """The files of a log.
+
+    files: in the order of recording; missing: sentences about files that are not there; part: a sentence if the only
+    file is one of several of a recording.
+    """
+
+    files: Sequence[Path]
+    missing: Sequence[str] = ()
+    part: str = ""
+
+
+def find_files(given: Path | Sequence[Path]) -> FoundFiles:
+    """The files of a log. Raises LogError for a folder without a recording or with several."""
+    paths = [given] if isinstance(given, Path) else list(dict.fromkeys(given))
+    folders = {path: _files_of(path) for path in paths if path.is_dir()}
+    named = [path for path in paths if path not in folders]
+    for path in named:
+        if path.name == METADATA:
+            raise LogError(f"{path} only describes a recording; give its folder {path.absolute().parent}")
+        if path.name.endswith(ZSTD_SUFFIXES) and path.is_file():
+            raise LogError(
+                f"{path} is compressed as a whole; give the folder of the recording, or unpack it: zstd -d {path.name}"
+            )
+    files = [file for path in paths for file in (folders[path].files if path in folders else [path])]
+    missing = [sentence for folder in folders.values() for sentence in folder.missing]
+    return FoundFiles(files, missing, _split_of(files[0]) if len(files) == 1 and named else "")
+
+
+def _files_of(folder: Path) -> FoundFiles:
+    """The files of the recording in a folder."""
+    try:
+        present = sorted((path for path in folder.iterdir() if _is_recording(path)), key=_natural)
+    except OSError as error:
+        raise LogError(f"cannot read {folder}: {error.strerror or error}") from error
+    listed = _listed(folder / METADATA)
+    if listed:
+        names = [path.name for path in present]
+        there = [folder / name for name in listed if name in names]
+        if there:
+            gone = [name for name in listed if name not in names]
+            return FoundFiles(there, [f"{name} is missing in {folder}, although {METADATA} lists it" for name in gone])
+    if not present:
+        inside = sorted(path.parent.name for path in folder.glob(f"*/{METADATA}"))
+        hint = f"; its folders {_named(inside)} are recordings, give one" if inside else "; give a log or its folder"
+        raise LogError(f"{folder} contains no recording (no {', '.join(SUFFIXES)} file){hint}")
+    groups = {_group(path) for path in present}
+    if len(groups) > 1:
+        raise LogError(
+            f"{folder} contains several recordings ({_named([path.name for path in present])}); give the files of one"
+        )
+    return FoundFiles(present, [])
+
+
+def _listed(metadata: Path) -> list[str]:
+    """The names of the files that a metadata.yaml lists; none if it cannot be read."""
+    if not metadata.is_file():
+        return []
+    import yaml
+
+    try:
+        with metadata.open("rb") as file:
+            content = yaml.load(file.read(_MAX_METADATA_BYTES), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        names = content["rosbag2_bagfile_information"]["relative_file_paths"]
+        return [Path(str(name)).name for name in names]  # old versions put the folder's name before it
+    except (OSError, KeyError, TypeError, ValueError, RecursionError, yaml.YAMLError):
+        return []
+
+
+def _is_recording(path: Path) -> bool:
+    name = path.name.removesuffix(".zstd").removesuffix(".zst")
+    return name.endswith(SUFFIXES) and not Path(name).stem.endswith(RESULT_ENDING) and path.is_file()
+
+
+def _natural(path: Path) -> tuple[Any, ...]:
+    """A key that sorts _2 before _10."""
+    return tuple((int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name))
+
+
+def _group(path: Path) -> str:
+    """The name of a recording of several files without the number of the file."""
+    return re.sub(r"_\d+(?=\.)", "", path.name)
+
+
+def _split_of(path: Path) -> str:
+    """A sentence, if a file is one of several of a recording; else an empty string."""
+    siblings = [other for other in _neighbours(path) if _group(other) == _group(path) and _is_recording(other)]
+    listed = _listed(path.with_name(METADATA))
+    names = listed if path.name in listed else [other.name for other in sorted(siblings, key=_natural)]
+    starts_at_zero = re.search(r"_0\.", names[0]) if names else None
+    if len(names) < 2 or path.name not in names or not (path.name in listed or starts_at_zero):
+        return ""
+    return (
+        f"{path.name} is file {names.index(path.name) + 1} of {len(names)} of a recording ({names[0]} to {names[-1]}); "
+        f"give the folder {path.absolute().parent} to read all of them"
+    )
+
+
+def _neighbours(path: Path) -> list[Path]:
+    try:
+        return list(path.absolute().parent.iterdir())
+    except OSError:
+        return []
+
+
+def _named(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+    return ", ".join(names[:_MAX_LISTED]) + more

@@ -1,0 +1,145 @@
+"""Reads a ROS 1 bag (.bag, version 2.0). The index is read by rosbags, the chunks here.
+
+A chunk is unpacked when its first message is due and dropped after its last one, so memory holds only chunks that
+overlap in time. A broken chunk loses its own messages.
+"""
+
+from __future__ import annotations
+
+import bz2
+from collections import Counter
+from collections.abc import Iterator
+from functools import cached_property
+from io import BytesIO
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.rosbag1.reader import Compression, Header, RecordType, decompressors, read_bytes, read_uint32
+
+from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
+from recordings.containers.timeline import Timeline
+from recordings.errors import LogError, sentence_of
+
+_MAX_CHUNK_BYTES = 1 << 30
+_REINDEX = "`rosbag reindex` repairs a bag whose recorder was stopped"
+
+
+class Ros1Bag:
+    """A ROS 1 bag open for reading. Raises LogError for a bag without an index or without messages."""
+
+    profile = "ros1"
+    indexed = True
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.size = path, path.stat().st_size
+        self.lost: list[LostMessage] = []
+        self._bag = Reader(path)
+        try:
+            self._bag.open()
+        except Exception as error:  # foreign bytes may fail the reader in any way
+            raise LogError(f"{path} cannot be read ({sentence_of(error).rstrip('.')}); {_REINDEX}") from error
+        try:
+            self._numbers = {connection.id: number for number, connection in enumerate(self._bag.connections)}
+            self.channels = {
+                number: Channel(number, connection.topic, "ros1", _schema(connection))
+                for number, connection in enumerate(self._bag.connections)
+            }
+            if not len(self.timeline):
+                raise LogError(f"{path} contains no messages; record it again")
+            self.start, self.end = int(self.timeline.log_times.min()), int(self.timeline.log_times.max())
+        except BaseException:
+            self.close()
+            raise
+
+    @cached_property
+    def timeline(self) -> Timeline:
+        """Channel and log time of every message, in file order."""
+        return Timeline(self._entries[:, 2], self._entries[:, 3])
+
+    def messages(
+        self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
+    ) -> Iterator[RawMessage | LostMessage]:
+        """The messages of some channels in log-time order; see `Container`."""
+        kept = range(len(self.timeline)) if places is None else places
+        entries = self._entries[kept.start : kept.stop]
+        times = entries[:, 3]
+        entries = entries[np.isin(entries[:, 2], sorted(channels)) & (times >= (start or 0))]
+        entries = entries[entries[:, 3] < (end if end is not None else 1 << 62)]
+        waiting, chunks = Counter[int](entries[:, 0].tolist()), dict[int, bytes | str]()
+        for chunk, offset, channel, log_time in entries[np.argsort(entries[:, 3], kind="stable")].tolist():
+            if chunk not in chunks:
+                chunks[chunk] = self._unpacked(chunk)
+            found = _message_at(chunks[chunk], chunk, offset)
+            if isinstance(found, str):
+                yield LostMessage(channel, log_time, found)
+            else:
+                yield RawMessage(channel, log_time, found)
+            waiting[chunk] -= 1
+            if not waiting[chunk]:
+                del chunks[chunk]
+
+    def count(self, channels: set[int]) -> int:
+        """The number of messages in some channels."""
+        return int(np.isin(self.timeline.channels, sorted(channels)).sum())
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._bag.bio is not None:
+            self._bag.close()
+
+    @cached_property
+    def _entries(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+        """Chunk, offset in it, channel and log time, ns, of every message, in file order."""
+        rows = [
+            (entry.chunk_pos, entry.offset, self._numbers[connection], entry.time)
+            for connection, entries in self._bag.indexes.items()
+            if connection in self._numbers
+            for entry in entries
+        ]
+        self._bag.indexes.clear()
+        found = np.array(rows, np.int64).reshape(-1, 4)
+        return found[np.lexsort((found[:, 1], found[:, 0]))]
+
+    def _unpacked(self, position: int) -> bytes | str:
+        """The records of a chunk, or why it is broken."""
+        chunk = self._bag.chunks[position]
+        try:
+            assert self._bag.bio
+            self._bag.bio.seek(chunk.datapos)
+            packed = read_bytes(self._bag.bio, chunk.datasize)
+            if chunk.decompressor is decompressors[Compression.BZ2.value]:
+                packed = bz2.BZ2Decompressor().decompress(packed, _MAX_CHUNK_BYTES)
+            elif chunk.decompressor is decompressors[Compression.LZ4.value]:
+                packed = lz4.frame.LZ4FrameDecompressor().decompress(packed, _MAX_CHUNK_BYTES)
+            return packed
+        except Exception as error:  # foreign bytes may fail a codec in any way
+            return f"the chunk at byte {position} is broken and its messages are lost ({sentence_of(error)})"
+
+
+def _schema(connection: object) -> MessageSchema:
+    """The schema of a connection, named as ROS 1 does: sensor_msgs/Image."""
+    name, definition = connection.msgtype, connection.msgdef  # type: ignore[attr-defined]
+    return MessageSchema(name.replace("/msg/", "/"), "ros1msg", definition.data.encode())
+
+
+def _message_at(chunk: bytes | str, position: int, offset: int) -> memoryview | str:
+    """The bytes of the message at an offset of a chunk, or why it is lost."""
+    if isinstance(chunk, str):
+        return chunk
+    records = BytesIO(chunk)
+    records.seek(offset)
+    try:
+        header = Header.read(records)
+        while header.get_uint8("op") == RecordType.CONNECTION:
+            records.seek(read_uint32(records), 1)
+            header = Header.read(records)
+        if header.get_uint8("op") != RecordType.MSGDATA:
+            raise ReaderError("the index points to no message")
+        size, begin = read_uint32(records), records.tell()
+        if begin + size > len(chunk):
+            raise ReaderError(f"only {len(chunk) - begin} of {size} bytes are present")
+    except Exception as error:  # foreign bytes may fail the reader in any way
+        return f"the message at byte {offset} of the chunk at byte {position} is broken ({sentence_of(error)})"
+    return memoryview(chunk)[begin : begin + size]

@@ -1,0 +1,75 @@
+"""A log in other containers, written by the rosbags library."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mcap.reader import make_reader
+from rosbags.rosbag1 import Writer as Bag1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from recordings.ros2.cdr import TYPES
+
+Row = tuple[str, str, int, bytes]  # topic, type, log time, data
+
+
+def rows_of(log: Path) -> list[Row]:
+    """The messages of an MCAP log in the order of log time."""
+    with log.open("rb") as file:
+        return [
+            (channel.topic, schema.name, message.log_time, message.data)
+            for schema, channel, message in make_reader(file).iter_messages()
+            if schema
+        ]
+
+
+def write_rosbag2(
+    rows: list[Row],
+    folder: Path,
+    plugin: StoragePlugin = StoragePlugin.MCAP,
+    parts: int = 1,
+    mode: CompressionMode = CompressionMode.NONE,
+) -> Path:
+    """Write a rosbag2 folder of some parts, as `ros2 bag record --max-bag-size` splits it, with metadata.yaml."""
+    folder.mkdir()
+    names, information = [], dict[str, Any]()
+    for number, (low, high) in enumerate(pairwise(round(part * len(rows) / parts) for part in range(parts + 1))):
+        own = folder.parent / f"{folder.name}-{number}"
+        _write(own, rows[low:high], plugin, mode)
+        (file,) = (path for path in own.iterdir() if path.name != "metadata.yaml")
+        names.append(f"{folder.name}_{number}{''.join(file.suffixes)}")
+        file.rename(folder / names[-1])
+        information = yaml.safe_load((own / "metadata.yaml").read_text())
+    information["rosbag2_bagfile_information"]["relative_file_paths"] = names
+    (folder / "metadata.yaml").write_text(yaml.safe_dump(information))
+    return folder
+
+
+def _write(folder: Path, rows: list[Row], plugin: StoragePlugin, mode: CompressionMode) -> None:
+    writer, connections = Writer(folder, version=8, storage_plugin=plugin), dict[str, Any]()
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        for topic, kind, log_time, data in rows:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=TYPES)
+            writer.write(connections[topic], log_time, data)
+
+
+def write_bag(rows: list[Row], path: Path, compression: Bag1Writer.CompressionFormat | None = None) -> Path:
+    """Write a ROS 1 bag."""
+    writer, connections = Bag1Writer(path), dict[str, Any]()
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        for topic, kind, log_time, data in rows:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=TYPES)
+            writer.write(connections[topic], log_time, bytes(TYPES.cdr_to_ros1(data, kind)))
+    return path
+
+
+def read_rows(messages: Iterator[Any], topics: dict[int, str]) -> list[tuple[int, str, bytes]]:
+    """Log time, topic and data of messages, sorted; a lost message fails."""
+    return sorted((item.log_time, topics[item.channel], bytes(item.data)) for item in messages)

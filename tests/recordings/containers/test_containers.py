@@ -1,0 +1,130 @@
+"""rosbag2 databases and ROS 1 bags, sound and damaged: what can be read is read, the rest is reported."""
+
+import sqlite3
+
+import pytest
+from rosbags.rosbag1 import Writer as Bag1Writer
+from rosbags.rosbag2 import StoragePlugin
+
+from recordings.containers.container import LostMessage
+from recordings.containers.opening import open_recording
+from recordings.errors import LogError
+from tests.recordings.containers.forms import rows_of, write_bag, write_rosbag2
+from tests.recordings.sample_log import LEFT
+
+
+@pytest.fixture
+def database(sample, tmp_path):
+    folder = write_rosbag2(rows_of(sample), tmp_path / "bag", StoragePlugin.SQLITE3)
+    return folder / "bag_0.db3"
+
+
+def edit(database, *statements):
+    with sqlite3.connect(database) as connection:
+        for statement in statements:
+            connection.execute(statement)
+    connection.close()
+
+
+def read(path):
+    """The sound messages as (topic, log time, data), and the reasons of the lost ones."""
+    with open_recording(path) as log:
+        items = list(log.messages(set(log.channels)))
+        sound = [
+            (log.channels[item.channel].topic, item.log_time, bytes(item.data))
+            for item in items
+            if not isinstance(item, LostMessage)
+        ]
+        return sound, [item.reason for item in items if isinstance(item, LostMessage)]
+
+
+def test_a_database_is_not_written_to_and_keeps_its_definitions(database, sample):
+    before = sorted(database.parent.iterdir()), database.read_bytes()
+    with open_recording(database) as log:
+        schema = next(c.schema for c in log.channels.values() if c.topic == LEFT)
+    assert schema.name == "sensor_msgs/msg/Image"
+    assert schema.encoding == "ros2msg"
+    assert schema.text.startswith(b"std_msgs/Header header")
+    assert read(database) == ([(topic, time, data) for topic, _, time, data in rows_of(sample)], [])
+    assert (sorted(database.parent.iterdir()), database.read_bytes()) == before
+
+
+def test_a_broken_row_loses_itself(database, sample):
+    edit(database, "UPDATE messages SET data = 7 WHERE id = 3", "UPDATE messages SET timestamp = -5 WHERE id = 4")
+    rows = [(topic, time, data) for topic, _, time, data in rows_of(sample)]
+    sound, lost = read(database)
+    assert sound == [*rows[:2], *rows[4:]]
+    assert lost == ["row 3 of the file has no bytes", "the message is lost: its log time is damaged"]
+
+
+def test_a_cut_database_is_read_as_far_as_it_goes(sample, tmp_path):
+    written = [(row[0], row[1], row[2] + number, row[3]) for number in range(20) for row in rows_of(sample)]
+    database = write_rosbag2(written, tmp_path / "bag", StoragePlugin.SQLITE3) / "bag_0.db3"
+    rows = [(topic, time, data) for topic, _, time, data in written]
+    content = database.read_bytes()
+    database.write_bytes(content[: len(content) // 2])
+    sound, lost = read(database)
+    assert 0 < len(sound) < len(rows)
+    assert set(sound) < set(rows)
+    assert lost
+
+
+def test_messages_of_an_unknown_topic_and_in_a_journal_are_reported(database):
+    edit(database, "UPDATE messages SET topic_id = 99 WHERE id = 3")
+    database.with_name(f"{database.name}-wal").write_bytes(b"journal")
+    _, lost = read(database)
+    assert lost[0] == "1 message of topic 99 cannot be read: the file does not define it"
+    assert lost[1].startswith("the recorder was stopped and bag_0.db3-wal has messages that are not read; `sqlite3 ")
+
+
+@pytest.mark.parametrize(
+    ("statements", "sentence"),
+    [
+        (["DROP TABLE topics"], "is an SQLite file, but no rosbag2 recording: it has no table of messages"),
+        (["DELETE FROM messages"], "contains no messages; record it again"),
+        (["ALTER TABLE topics RENAME COLUMN type TO kind"], "is no rosbag2 recording or is damaged (no such column"),
+    ],
+)
+def test_a_database_without_messages_is_refused(database, statements, sentence):
+    edit(database, *statements)
+    with pytest.raises(LogError) as refused:
+        open_recording(database)
+    assert str(refused.value).startswith(f"{database} {sentence}")
+
+
+@pytest.mark.parametrize("compression", [None, *Bag1Writer.CompressionFormat])
+def test_a_bag_has_the_messages_and_schemas_that_were_written(sample, tmp_path, compression):
+    path = write_bag(rows_of(sample), tmp_path / "log.bag", compression)
+    sound, lost = read(path)
+    assert [(topic, time) for topic, time, _ in sound] == [(topic, time) for topic, _, time, _ in rows_of(sample)]
+    assert lost == []
+    with open_recording(path) as log:
+        (channel,) = (channel for channel in log.channels.values() if channel.topic == LEFT)
+    assert (channel.message_encoding, channel.schema.encoding, channel.schema.name) == (
+        "ros1", "ros1msg", "sensor_msgs/Image",
+    )  # fmt: skip
+    assert b"MSG: std_msgs/Header" in channel.schema.text
+
+
+def test_a_broken_chunk_of_a_bag_loses_its_messages(sample, tmp_path):
+    rows = rows_of(sample) * 100  # several chunks
+    rows = [(topic, kind, rows[0][2] + 1000 * number, data) for number, (topic, kind, _, data) in enumerate(rows)]
+    path = write_bag(rows, tmp_path / "log.bag", Bag1Writer.CompressionFormat.LZ4)
+    sound, _ = read(path)
+    content = bytearray(path.read_bytes())
+    place = content.index(b"\x04\x22\x4d\x18")  # the first bytes of the first chunk
+    content[place] ^= 0xFF
+    path.write_bytes(content)
+    kept, lost = read(path)
+    assert len(kept) + len(lost) == len(sound) == len(rows)
+    assert kept == sound[len(lost) :]
+    assert kept
+    assert lost
+    assert lost[0].startswith("the chunk at byte 4109 is broken and its messages are lost (")
+
+
+def test_a_bag_without_its_index_is_refused_with_the_remedy(sample, tmp_path):
+    path = write_bag(rows_of(sample), tmp_path / "log.bag")
+    path.write_bytes(path.read_bytes()[:6000])
+    with pytest.raises(LogError, match=r"log\.bag cannot be read \(.*\); `rosbag reindex` repairs a bag"):
+        open_recording(path)
