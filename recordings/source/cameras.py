@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.ros2.from_msg import camera_model, frame_of
+from recordings.ros2.from_msg import camera_model, frame_of, stamp_or
 from recordings.ros2.image_from_msg import pixels_of, unread_encoding
 from recordings.source.topics import DecodedTopics
 from stages.data import Array, CameraModel
@@ -23,6 +25,42 @@ class CalibrationTopic:
     topic: str
     model: CameraModel
     frame_id: str
+
+
+@dataclass
+class CalibrationHistory:
+    """A camera's calibrations by stamp. Only those equal to the first can be used, because the pair was made for it."""
+
+    first: CameraModel
+    stamps: list[int] = field(default_factory=list)
+    same: list[bool] = field(default_factory=list)
+
+    def note(self, message: Any, log_time: int) -> None:
+        """Add a CameraInfo."""
+        stamp, model = stamp_or(message.header, log_time), camera_model(message)
+        place = bisect_right(self.stamps, stamp)
+        self.stamps.insert(place, stamp)
+        self.same.insert(place, _equal(model, self.first))
+
+    def check(self, stamp: int) -> None:
+        """Raise LogError if the calibration at `stamp` is not the first one."""
+        place = bisect_right(self.stamps, stamp) - 1
+        if place >= 0 and not self.same[place]:
+            raise LogError(
+                "the calibration differs from the log's first one, so the image cannot be used; cut the log in two "
+                f"where it changes ({self._since(place)})"
+            )
+
+    def _since(self, place: int) -> str:
+        """The stamp from which the calibration at `place` differs."""
+        while place > 0 and not self.same[place - 1]:
+            place -= 1
+        return f"{'' if place else 'at or before '}{self.stamps[place]} ns"
+
+
+def _equal(one: CameraModel, other: CameraModel) -> bool:
+    numbers = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("k", "d", "r", "p"))
+    return numbers and (one.width, one.height, one.model) == (other.width, other.height, other.model)
 
 
 def first_calibrations(

@@ -6,10 +6,10 @@ little ahead of the images, so that no image is delivered with a calibration tha
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from heapq import merge
 from operator import itemgetter
 from pathlib import Path
@@ -23,61 +23,27 @@ from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError, sentence_of
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
-from recordings.ros2.from_msg import camera_model, frame_of, pose_of, stamp_or
+from recordings.ros2.from_msg import frame_of, pose_of, stamp_or
 from recordings.ros2.image_from_msg import pixels_of
 from recordings.source.calibration import Camera
-from recordings.source.cameras import CAMERAS
+from recordings.source.cameras import CAMERAS, CalibrationHistory
 from recordings.source.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.source.mount import pose_of_base
+from recordings.source.moving_mount import MovingMount
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_noise import TiltNoise
 from recordings.source.tilt_reading import Sampled, TiltReading, estimated_tilts
-from recordings.source.topics import Decoder
-from stages.data import CameraImage, CameraModel, Pose, Tilt
+from recordings.source.topics import Decoder, attempt
+from stages.data import CameraImage, Mount, Pose, Tilt
 
 INTERPOLATION_LEAD_NS = 1_000_000_000  # tilt and pose are read this far beyond a range, for interpolation at its ends
 MAX_CALIBRATION_LAG_NS = 100_000_000  # a calibration may be logged this much later than its image
+MAX_TRANSFORM_LAG_NS = 500_000_000  # the transforms of a moving camera may be this much later
 EXCERPT_FRAMES = 4  # so that an excerpt survives a broken frame
 STAMPED_SCHEMAS = {*IMAGES, *TILTS, *POSES, BARE_TILT} - {"geometry_msgs/msg/Quaternion"}  # begin with a header
 UNSTAMPED = "the header stamps are 0, so log times are used"
 STREAMS = (*CAMERAS, "inclinometer", "mount", "odometry")
-
-
-@dataclass
-class CalibrationHistory:
-    """A camera's calibrations by stamp. Only those equal to the first can be used, because the pair was made for it."""
-
-    first: CameraModel
-    stamps: list[int] = field(default_factory=list)
-    same: list[bool] = field(default_factory=list)
-
-    def note(self, message: Any, log_time: int) -> None:
-        """Add a CameraInfo."""
-        stamp, model = stamp_or(message.header, log_time), camera_model(message)
-        place = bisect_right(self.stamps, stamp)
-        self.stamps.insert(place, stamp)
-        self.same.insert(place, _equal(model, self.first))
-
-    def check(self, stamp: int) -> None:
-        """Raise LogError if the calibration at `stamp` is not the first one."""
-        place = bisect_right(self.stamps, stamp) - 1
-        if place >= 0 and not self.same[place]:
-            raise LogError(
-                "the calibration differs from the log's first one, so the image cannot be used; cut the log in two "
-                f"where it changes ({self._since(place)})"
-            )
-
-    def _since(self, place: int) -> str:
-        """The stamp from which the calibration at `place` differs."""
-        while place > 0 and not self.same[place - 1]:
-            place -= 1
-        return f"{'' if place else 'at or before '}{self.stamps[place]} ns"
-
-
-def _equal(one: CameraModel, other: CameraModel) -> bool:
-    numbers = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("k", "d", "r", "p"))
-    return numbers and (one.width, one.height, one.model) == (other.width, other.height, other.model)
 
 
 @dataclass
@@ -202,17 +168,20 @@ class McapLog:
         for stream, problem in self.resolution.problems:
             if stream in (*streams, "log"):
                 yield log_start, stream, problem
-        if self.resolution.mount is not None and "mount" in streams:
+        moving = self.resolution.moving.again() if self.resolution.moving and "mount" in streams else None
+        if self.resolution.mount is not None and "mount" in streams and moving is None:
             yield log_start, "mount", self.resolution.mount
         calibrations = {side: CalibrationHistory(info.model) for side, info in self.resolution.infos.items()}
         readers = self._calibration_readers(calibrations, streams)
         if log_start > self.file.start:
             for reader in readers:
                 self._note_last_before(log_start, reader)
-        infos = self._by_channel(readers)
-        items = self._by_channel(self._stream_readers(calibrations, streams))
+        infos, items = self._by_channel(readers), self._by_channel(self._stream_readers(calibrations, streams))
+        if moving is not None:
+            infos |= self._by_channel(self._transform_readers(moving, items))
+        lag = MAX_CALIBRATION_LAG_NS if moving is None else MAX_TRANSFORM_LAG_NS
         raws = self.file.messages(infos.keys() | items.keys(), wide_low, wide_high)
-        for raw, noted in _with_lookahead(raws, infos):
+        for raw, noted in _with_lookahead(raws, infos, lag):
             if raw.channel is None:
                 yield raw.log_time, "log", LogError(f"{self.path.name}: {raw.reason}")
                 continue
@@ -221,6 +190,10 @@ class McapLog:
                 yield raw.log_time, reader.stream, LogError(f"{reader.topic}: {raw.reason}")
             elif reader.stream not in CAMERAS or is_within(peek_stamp(raw.data), raw.log_time, low, high):
                 item = noted if raw.channel in infos else reader(raw)
+                if moving is not None and reader.stream == "left" and isinstance(item, CameraImage):
+                    mount = attempt(moving.at, item.stamp)
+                    item = mount if isinstance(mount, LogError) else item
+                    yield from [(raw.log_time, "mount", mount)] if isinstance(mount, Mount) else ()
                 if item is not None:
                     yield raw.log_time, reader.stream, item
 
@@ -249,6 +222,8 @@ class McapLog:
                 f"no static transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "
                 "`points.camera_height` (default 1 m) below the camera and x is its viewing direction"
             )
+        if self.resolution.moving is not None and self.resolution.mount is not None:
+            notes["mount"] = "; ".join((*filter(None, [notes.get("mount")]), self.resolution.moving.note))
         return notes
 
     def _is_unstamped(self, stream: str, topic: str) -> bool:
@@ -336,6 +311,15 @@ class McapLog:
 
         return [self._reader("inclinometer", reading.topic, checked)]
 
+    def _transform_readers(self, moving: MovingMount, items: dict[int, TopicReader]) -> Iterator[TopicReader]:
+        """The readers of the transforms that move the camera; the topic may also be that of the pose."""
+        for topic in moving.topics:
+            pose = next((reader for reader in items.values() if reader.topic == topic), None)
+            if pose is None:
+                yield self._reader("mount", topic, moving.add)
+            else:
+                yield replace(pose, item=partial(_both, moving.add, pose.item))
+
     def _checked_tilt(self, tilt: Tilt) -> Tilt:
         """The tilt, if it comes from the sensor of the mount."""
         known = self.resolution.tilt_frame
@@ -375,15 +359,20 @@ class _Images:
 
 
 def _with_lookahead(
-    raws: Iterable[RawMessage | LostMessage], early: dict[int, TopicReader]
+    raws: Iterable[RawMessage | LostMessage], early: dict[int, TopicReader], lag: int
 ) -> Iterator[tuple[RawMessage | LostMessage, Any]]:
-    """Each message with the result of its reader in `early`, which reads `MAX_CALIBRATION_LAG_NS` ahead."""
+    """Each message with the result of its reader in `early`, which reads `lag` ns ahead."""
     waiting: deque[tuple[RawMessage | LostMessage, Any]] = deque()
     for raw in raws:
         waiting.append((raw, early[raw.channel](raw) if isinstance(raw, RawMessage) and raw.channel in early else None))
-        while waiting[0][0].log_time < raw.log_time - MAX_CALIBRATION_LAG_NS:
+        while waiting[0][0].log_time < raw.log_time - lag:
             yield waiting.popleft()
     yield from waiting
+
+
+def _both(first: Callable[[Any, int], Any], then: Callable[[Any, int], Any], message: Any, log_time: int) -> Any:
+    first(message, log_time)
+    return then(message, log_time)
 
 
 def _nothing(message: Any, log_time: int) -> None:

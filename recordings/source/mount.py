@@ -15,7 +15,14 @@ from stages.data import Array, Mount, Pose
 STATIC_STAMP = 0  # ns; a mount holds for the whole log, whose frames may have stamps of another clock
 
 
-def mount_of(camera: Camera, inclinometer: str, base: str, tree: TransformTree, given: Sequence[float] | None) -> Mount:
+def mount_of(
+    camera: Camera,
+    inclinometer: str,
+    base: str,
+    tree: TransformTree,
+    given: Sequence[float] | None,
+    stamp: int = STATIC_STAMP,
+) -> Mount:
     """The mount of the left camera.
 
     inclinometer, base: their frames; given: the user's quaternion xyzw from inclinometer to left rectified camera
@@ -23,7 +30,7 @@ def mount_of(camera: Camera, inclinometer: str, base: str, tree: TransformTree, 
     """
     to_base = tree.between(base, camera.frame_id)
     base_from_camera = to_base.after(camera.image) if to_base is not None else None
-    return Mount(STATIC_STAMP, _camera_from_inclinometer(camera, inclinometer, tree, given), base_from_camera)
+    return Mount(stamp, _camera_from_inclinometer(camera, inclinometer, tree, given), base_from_camera)
 
 
 def pose_of_base(pose: Pose, camera: Camera, base: str, tree: TransformTree) -> Pose:
@@ -34,7 +41,7 @@ def pose_of_base(pose: Pose, camera: Camera, base: str, tree: TransformTree) -> 
     of = pose.child_frame_id
     if of in (base, camera.image_frame):
         return pose
-    if of != camera.frame_id and tree.between(base, camera.frame_id) is not None:
+    if of != camera.frame_id and tree.between(of, base) is not None:
         part = tree.between(of, base)
     else:
         to_camera = tree.between(of, camera.frame_id)
@@ -52,7 +59,8 @@ def _camera_from_inclinometer(
         raise LogError(
             f"no static transform joins the camera ({_quoted(camera.frame_id)}) and the inclinometer "
             f"({_quoted(inclinometer)}); "
-            "record /tf_static, or set 'camera_from_inclinometer' (quaternion x, y, z, w) of the source"
+            "record /tf_static (and /tf, if the camera moves on the rover), or set 'camera_from_inclinometer' "
+            "(quaternion x, y, z, w) of the source"
         )
     return np.asarray(camera.model.r @ transform.rotation)
 

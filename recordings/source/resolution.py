@@ -16,6 +16,7 @@ from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_im
 from recordings.source.discovery import IMU, TRANSFORMS, DiscoveredTopics, TiltKind, Topic, discover
 from recordings.source.imu_content import ImuContent, imu_content
 from recordings.source.mount import mount_of, pose_of_base
+from recordings.source.moving_mount import MovingMount, moving_mount
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_reading import TiltReading
 from recordings.source.topics import DecodedTopics, attempt
@@ -33,8 +34,8 @@ class SourceResolution:
     messages: decoded by topic; topics: stream -> topic; unavailable: stream -> reason and remedy; refused: setting
     of the source that contradicts the log -> reason; undecodable: a sentence; static: the tf tree; infos: side -> its
     first calibration; cameras: the calibrated pair, if complete; tilt: how it is read, if there is an inclinometer;
-    tilt_frame: of the first inclinometer message; mount: of the camera on the rover;
-    problems: (stream, error) pairs for the ledger.
+    tilt_frame: of the first inclinometer message; mount: of the camera on the rover, the first one if it moves; moving:
+    its mount at any time, if it moves; problems: (stream, error) pairs for the ledger.
     """
 
     def __init__(self, file: Recording, source: LogSettings) -> None:
@@ -48,9 +49,11 @@ class SourceResolution:
         unavailable = found.missing | unread | unpaired
         self.tilt, unread = self._tilt_reading(found)
         unavailable |= unread
+        self.moving: MovingMount | None = None
         self.tilt_frame, self.mount, unmounted = self._mounted(found.chosen, unavailable)
         moving = self._moving_pose(found.chosen)
         self.refused = found.refused | (moving if self.source.odometry else {}) | self._unjoined_base()
+        self.refused |= self._fixed_rotation()
         unavailable |= unmounted | moving
         there = [side for side in CAMERAS if side in found.chosen and side not in unavailable]
         unavailable |= unreadable_images(self.messages, found.chosen, there)
@@ -128,10 +131,23 @@ class SourceResolution:
             return "", None, {"mount": f"the mount needs an inclinometer: {unavailable['inclinometer']}"}
         frame = self._inclinometer_frame(chosen["inclinometer"])
         given, base = self.source.camera_from_inclinometer, self.source.base_frame
-        mount = attempt(mount_of, self.cameras[0], frame, base, self.static, given)
+        self.moving = moving_mount(self.messages, self.cameras[0], frame, base, self.static)
+        if self.moving is None:
+            mount = attempt(mount_of, self.cameras[0], frame, base, self.static, given)
+        else:
+            mount = attempt(self.moving.first)
         if isinstance(mount, LogError):
             return frame, None, {"mount": str(mount)}
         return frame, mount, {}
+
+    def _fixed_rotation(self) -> dict[str, str]:
+        """Why the source's 'camera_from_inclinometer' is wrong: the camera moves."""
+        if self.moving is None or self.source.camera_from_inclinometer is None:
+            return {}
+        return {
+            "camera_from_inclinometer": f"the source's 'camera_from_inclinometer' is a fixed rotation, but "
+            f"{self.moving.note}; remove the setting, and record the transform of the inclinometer"
+        }
 
     def _unjoined_base(self) -> dict[str, str]:
         """Why the source's 'base_frame' is wrong, if the camera is joined to other frames but not to it."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -52,8 +54,18 @@ class TransformTree:
 
     def between(self, parent: str, child: str) -> Transform | None:
         """The transform from frame `child` to `parent` by the shortest path; None if nothing connects them."""
-        if not parent or not child:
+        path = self.path(parent, child)
+        if not path:
             return None
+        whole = Transform(parent, parent, np.eye(3), np.zeros(3))
+        for above, below in pairwise(path):
+            whole = whole.after(self.edges[above][below])
+        return whole
+
+    def path(self, parent: str, child: str) -> list[str]:
+        """The frames of the shortest path from `parent` to `child`; empty if nothing connects them."""
+        if not parent or not child:
+            return []
         before, queue = {child: child}, deque([child] if parent in self.edges else [])
         while queue and parent not in before:
             frame = queue.popleft()
@@ -62,11 +74,19 @@ class TransformTree:
                     before[name] = frame
                     queue.append(name)
         if parent not in before:
-            return None
-        whole, frame = Transform(parent, parent, np.eye(3), np.zeros(3)), parent
-        while frame != child:
-            whole, frame = whole.after(self.edges[frame][before[frame]]), before[frame]
-        return whole
+            return []
+        path = [parent]
+        while path[-1] != child:
+            path.append(before[path[-1]])
+        return path
+
+    def joined(self, transforms: Iterable[Transform]) -> TransformTree:
+        """This tree with further transforms, which win where they differ."""
+        tree = TransformTree({frame: dict(edges) for frame, edges in self.edges.items()}, dict(self.parents))
+        for transform in transforms:
+            tree.edges.setdefault(transform.parent, {})[transform.child] = transform
+            tree.edges.setdefault(transform.child, {})[transform.parent] = transform.inverse()
+        return tree
 
     def listed(self) -> list[str]:
         """Each transform of the log as "parent <- child", sorted."""

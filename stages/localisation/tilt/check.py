@@ -135,8 +135,6 @@ class CheckTilt(Stage):
             turn = Rotation.from_matrix(step.rotation).magnitude()
             if np.linalg.norm(step.translation) < MIN_STEP and turn < MIN_TURN:
                 return
-        if before is not None and not np.array_equal(before.mount, sample.mount):
-            state.kept.clear()  # those frames are evidence about another mount
         state.kept.append(sample)
         if len(state.kept) > self.window:
             state.kept.popleft()
@@ -153,13 +151,21 @@ def _finding(judged: Diagnosis, where: str = "") -> Finding:
 
 
 def _diagnosis(state: TiltMemory) -> Diagnosis:
-    """The diagnosis of the frames kept."""
+    """The diagnosis of the frames kept, as if the camera stood still on the rover as it does in the last one."""
+    mount = state.kept[-1].mount
     stamps, segments, cameras, drift, ups, ground = (
         np.array(column)
-        for column in zip(*((s.stamp, s.segment, s.camera.rotation, s.drift, s.up, s.ground) for s in state.kept),
-                          strict=True)
-    )  # fmt: skip
-    return diagnose(Evidence(stamps, segments, cameras, drift, ups, state.kept[-1].mount, ground))
+        for column in zip(*((s.stamp, s.segment, *_as_mounted(s, mount)) for s in state.kept), strict=True)
+    )
+    return diagnose(Evidence(stamps, segments, cameras, drift, ups, mount, ground))
+
+
+def _as_mounted(sample: _TiltSample, mount: Array) -> tuple[Array, float, Array, Array]:
+    """The rotation of a camera with this mount, its drift, up, and the ground's normal in that camera."""
+    if np.array_equal(sample.mount, mount):
+        return sample.camera.rotation, sample.drift, sample.up, sample.ground
+    turn = sample.mount @ mount.T  # from that camera to the one of the sample
+    return sample.camera.rotation @ turn, sample.drift, sample.up, turn.T @ sample.ground
 
 
 def _reported(verdict: _Verdict, state: TiltMemory) -> Diagnosis:

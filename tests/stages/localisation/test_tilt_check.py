@@ -62,6 +62,24 @@ def test_a_flipped_sign_is_found_within_30_frames_and_reported_at_the_end():
     assert stage.finding() == stage.finding()  # asking changes nothing
 
 
+@pytest.mark.parametrize(("late", "fault"), [(0, ""), (5, "the mount of the inclinometer is wrong")])
+def test_a_camera_that_pans_is_judged_by_its_mount_in_each_frame(late, fault):
+    """late: frames by which the mounts lag behind the pan; at 0.2 rad a frame the camera is then elsewhere."""
+    pans = [Rotation.from_euler("y", np.sin(0.3 * count)).as_matrix() for count in range(-late, FRAMES)]
+    cameras = [
+        Transform(camera.parent, camera.child, camera.rotation @ pan, camera.translation)
+        for camera, pan in zip(DRIVE.cameras(), pans[late:], strict=True)
+    ]
+    stage = Running(CheckTilt())
+    for motion, up, pan in zip(motions(cameras, DRIVE.stamps()), DRIVE.ups(), pans, strict=False):
+        stage(motion, Tilt(motion.stamp, up), Mount(motion.stamp, pan.T @ DRIVE.mount))
+    finding = stage.finding()
+    if fault:
+        assert finding.severity is Severity.FAULT
+    else:
+        assert finding.sentence.startswith("Tilt and camera agree to 0.")
+
+
 def test_frames_of_a_standing_rover_are_not_kept():
     moving, halting = Running(CheckTilt()), Running(CheckTilt())
     checked(DRIVE.ups(), moving)

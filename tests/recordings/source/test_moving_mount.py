@@ -1,0 +1,139 @@
+"""A camera on a mast or a pan-tilt head: its mount is that of the time of each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from recordings import McapSource
+from recordings.mcap.writer import Ros2Writer
+from recordings.ros2.to_msg import camera_info, image, imu, odometry, transform_message
+from stages.data import CameraImage, Mount, Pose, Transform
+from tests.recordings.sample_log import START, TRANSFORMS, model, picture
+
+MS = 1_000_000
+FRAMES, PERIOD, JOINT = 6, 500 * MS, 40 * MS
+ON_MAST = Transform("mast", "left_optical", TRANSFORMS[0].rotation, [0.1, 0.0, 0.0])
+IMU = TRANSFORMS[1]
+
+
+def pan(stamp: int) -> Transform:
+    """base_link <- mast: it turns by 20 degrees a second, and rises."""
+    seconds = (stamp - START) / 1e9
+    turn = Rotation.from_euler("z", 20 * seconds, degrees=True).as_matrix()
+    return Transform("base_link", "mast", turn, [0.3, 0.0, 1.0 + 0.01 * seconds])
+
+
+Messages = Callable[[int], dict[str, Any] | None]
+
+
+def joints(stamp: int) -> dict[str, Any] | None:
+    """The transforms at a time: of the mast and of the rover, as tf has them."""
+    rover = Transform("odom", "base_link", np.eye(3), np.zeros(3))
+    return {"/tf": transform_message([(rover, stamp), (pan(stamp), stamp)])}
+
+
+def written(path: Path, messages: Messages = joints, static: tuple[Transform, ...] = (ON_MAST, IMU)) -> Path:
+    """A log with frames between the messages of the mast, which are logged 30 ms late."""
+    logged = [(START, "/tf_static", transform_message([(transform, START) for transform in static]))]
+    end = START + FRAMES * PERIOD
+    for stamp in range(START, end, JOINT):
+        found = messages(stamp) or {}
+        logged += [(stamp + 30 * MS, topic, message) for topic, message in found.items()]
+    for number in range(FRAMES):
+        stamp = START + number * PERIOD + 61 * MS
+        logged.append((stamp, "/imu/data", imu(stamp, "imu_link", np.array([0, 0, 0, 1.0]))))
+        pose = Pose(stamp, [0, 0, 0], [0, 0, 0, 1], "odom", "base_link")
+        logged.append((stamp, "/odom", odometry(pose)))
+        for side in ("left", "right"):
+            logged.append((stamp, f"/{side}/camera_info", camera_info(stamp, f"{side}_optical", model(side))))
+            logged.append((stamp, f"/{side}/image_rect", image(stamp, f"{side}_optical", picture(number))))
+    with Ros2Writer(path) as writer:
+        for log_time, topic, message in sorted(logged, key=lambda item: item[0]):
+            writer.write(topic, message, log_time)
+    return path
+
+
+def read(
+    path: Path, source: McapSource | None = None, **bounds: float
+) -> tuple[list[Mount], list[str], dict[str, str]]:
+    """The mounts before the left images, the losses, and the notes."""
+    with (source or McapSource()).open(path, **bounds) as log:
+        assert log.missing == log.refused == {}
+        events = list(log.events())
+        notes = log.notes()
+    mounts, last = [], None
+    for _, stream, item in events:
+        last = item if stream == "mount" else last
+        if stream == "left" and isinstance(item, CameraImage):
+            assert isinstance(last, Mount)
+            mounts.append(last)
+            assert last.stamp in (item.stamp, 0)
+    return mounts, [str(item) for _, _, item in events if isinstance(item, Exception)], notes
+
+
+def test_the_mount_is_interpolated_at_the_time_of_each_frame(tmp_path):
+    mounts, lost, notes = read(written(tmp_path / "log.mcap"))
+    assert (len(mounts), lost) == (FRAMES, [])
+    for mount in mounts:
+        exact = pan(mount.stamp).after(ON_MAST)
+        np.testing.assert_allclose(mount.base_from_camera.rotation, exact.rotation, atol=1e-9)
+        np.testing.assert_allclose(mount.base_from_camera.translation, exact.translation, atol=1e-9)
+        np.testing.assert_allclose(mount.camera_from_inclinometer, exact.rotation.T @ IMU.rotation, atol=1e-9)
+    assert notes["mount"] == (
+        "the camera moves on the rover: 'base_link' <- 'mast' on /tf is interpolated for each frame"
+    )
+    later = read(tmp_path / "log.mcap", start=1.5)[0]
+    assert [mount.stamp for mount in later] == [mount.stamp for mount in mounts[3:]]
+    np.testing.assert_array_equal(later[0].camera_from_inclinometer, mounts[3].camera_from_inclinometer)
+
+
+def test_the_topic_of_the_mast_may_be_that_of_the_pose(tmp_path):
+    path = written(tmp_path / "log.mcap")
+    mounts, lost, _ = read(path, McapSource(odometry="/tf"))
+    assert (len(mounts), lost) == (FRAMES, [])
+    with McapSource(odometry="/tf").open(path) as log:
+        poses = [item for _, stream, item in log.events() if stream == "odometry"]
+    assert len(poses) == FRAMES * PERIOD // JOINT
+
+
+def test_a_frame_without_the_transform_of_its_time_is_lost(tmp_path):
+    def broken(stamp):
+        return None if START + 900 * MS < stamp < START + 2300 * MS else joints(stamp)
+
+    mounts, lost, _ = read(written(tmp_path / "log.mcap", broken))
+    assert len(mounts) == FRAMES - 3
+    assert len(lost) == 3
+    assert all("the transform 'base_link' <- 'mast' moves, and" in sentence for sentence in lost)
+
+
+def test_a_mast_that_stands_still_may_be_logged_rarely(tmp_path):
+    def rarely(stamp):
+        return {"/tf": transform_message([(pan(START), stamp)])} if (stamp - START) % (10 * JOINT) == 0 else None
+
+    mounts, lost, _ = read(written(tmp_path / "log.mcap", rarely))
+    assert lost == []
+    assert len({mount.camera_from_inclinometer.tobytes() for mount in mounts}) == 1
+
+
+def test_static_transforms_are_preferred_and_the_pose_of_the_rover_is_no_mount(tmp_path):
+    fixed = written(tmp_path / "fixed.mcap", static=(*TRANSFORMS, Transform("base_link", "mast", np.eye(3), [0, 0, 1])))
+    mounts, lost, notes = read(fixed)
+    assert (lost, {mount.stamp for mount in mounts}, "mount" in notes) == ([], {0}, False)
+
+    def by_a_world(stamp):
+        camera = Transform("odom", "left_optical", ON_MAST.rotation, np.zeros(3))
+        rover = Transform("odom", "base_link", np.eye(3), np.zeros(3))
+        return {"/tf": transform_message([(rover, stamp), (camera, stamp)])}
+
+    with McapSource().open(written(tmp_path / "world.mcap", by_a_world, (IMU,))) as log:
+        assert "record /tf_static (and /tf, if the camera moves on the rover)" in log.missing["mount"]
+
+
+def test_a_fixed_rotation_of_a_camera_that_moves_is_refused(tmp_path):
+    with McapSource(camera_from_inclinometer=(0.0, 0.0, 0.0, 1.0)).open(written(tmp_path / "log.mcap")) as log:
+        assert "is a fixed rotation, but the camera moves on the rover" in log.refused["camera_from_inclinometer"]
