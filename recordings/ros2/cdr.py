@@ -96,6 +96,13 @@ def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable
         raise LogError(f"schema '{schema_name}' is in '{schema_encoding}', not a ROS 2 format (ros2msg, ros2idl)")
     if not text.strip() and name in TYPES.types:
         return lambda data: TYPES.deserialize_cdr(plain(data), name)
+    store = store_of(schema_name, schema_encoding, text)
+    return lambda data: store.deserialize_cdr(plain(data), name)
+
+
+def store_of(schema_name: str, schema_encoding: str, text: bytes) -> SharedTypestore:
+    """A store of the types in a schema ("ros2msg", "ros2idl" or "ros1msg"). Raises LogError if it cannot be parsed."""
+    name = full_name(schema_name)
     try:
         # Definitions may contain a byte order mark, Windows line ends, and comments that are not UTF-8.
         store = _store_of(name, schema_encoding, text.decode("utf-8-sig", "replace").replace("\r\n", "\n"))
@@ -103,7 +110,7 @@ def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable
     except Exception as error:  # a parser of foreign text may fail in any way
         why = shorten(f"{type(error).__name__}: {error}", _MAX_REASON, placeholder=" ...")
         raise LogError(f"schema '{schema_name}' cannot be parsed ({why})") from error
-    return lambda data: store.deserialize_cdr(plain(data), name)
+    return store
 
 
 def plain(data: bytes | memoryview, size: int = MAX_CHUNK_BYTES) -> bytes | memoryview:
@@ -128,21 +135,22 @@ def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
                     store.register(get_types_from_idl(body))
         else:
             store.register(get_types_from_msg(text, name))
-        _complete(store, name, [], set())
+        known = _typestore("ros1_noetic") if encoding == "ros1msg" else TYPES
+        _complete(store, known, name, [], set())
     return store
 
 
-def _complete(store: SharedTypestore, name: str, above: list[str], done: set[str]) -> None:
-    """Add the standard types in the fields of type `name`, recursively. above: the types that contain it."""
+def _complete(store: SharedTypestore, known: SharedTypestore, name: str, above: list[str], done: set[str]) -> None:
+    """Add the `known` types in the fields of type `name`, recursively. above: the types that contain it."""
     if name in above:
         raise ValueError(f"{name} contains itself")
     if name in done:
         return
     if name not in store.fielddefs:
-        store.fielddefs[name] = TYPES.fielddefs[name]
-        store.types[name] = TYPES.types[name]
+        store.fielddefs[name] = known.fielddefs[name]
+        store.types[name] = known.types[name]
     for part in sorted(_references(store.fielddefs[name][1])):
-        _complete(store, part, [*above, name], done)
+        _complete(store, known, part, [*above, name], done)
     done.add(name)
 
 

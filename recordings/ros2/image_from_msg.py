@@ -34,7 +34,14 @@ _BAYER = {
     "bayer_grbg": cv2.COLOR_BayerGRBG2RGB,
 }
 _MAX_PADDING_BYTES = 1024  # after the end of a compressed image
+# Of these only the brightness is read. Encoding -> (bytes of a pixel in a row, place of the first brightness)
+_LUMA = {
+    "uyvy": (2, 1), "yuv422": (2, 1), "UYVY": (2, 1),
+    "yuyv": (2, 0), "yuv422_yuy2": (2, 0), "YUYV": (2, 0),
+    "nv12": (1, 0), "NV12": (1, 0), "nv21": (1, 0), "NV21": (1, 0),
+}  # fmt: skip
 _ENCODINGS = _PLAIN | {f"{name}{bits}": (f"u{bits // 8}", 1, code) for name, code in _BAYER.items() for bits in (8, 16)}
+_ALL_ENCODINGS = (*_ENCODINGS, *_LUMA)
 
 
 def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
@@ -49,9 +56,9 @@ def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
 def unread_encoding(message: Any) -> str:
     """A sentence about an unsupported image encoding; empty for other messages."""
     encoding = getattr(message, "encoding", None)
-    if encoding is None or encoding in _ENCODINGS:
+    if encoding is None or encoding in _ALL_ENCODINGS:
         return ""
-    return f"the image encoding '{encoding}' is not supported, only {', '.join(_ENCODINGS)}"
+    return f"the image encoding '{encoding}' is not supported, only {', '.join(_ALL_ENCODINGS)}"
 
 
 def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
@@ -64,7 +71,8 @@ def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
 def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     if unread := unread_encoding(message):
         raise LogError(unread)
-    kind, channels, conversion = _ENCODINGS[message.encoding]
+    luma = _LUMA.get(message.encoding)
+    kind, channels, conversion = ("u1", luma[0], None) if luma else _ENCODINGS[message.encoding]
     height, width, data = int(message.height), int(message.width), np.asarray(message.data, np.uint8)
     row = width * channels * int(kind[1])
     step = int(message.step) or row
@@ -75,6 +83,8 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     if data.size < needed:
         raise LogError(f"the image is cut: it has {data.size} of {needed} bytes")
     rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
+    if luma is not None:
+        return np.ascontiguousarray(rows[:, luma[1] :: luma[0]])
     order = ">" if message.is_bigendian else "<"
     pixels = np.ascontiguousarray(rows).view(f"{order}{kind}").astype(kind, copy=False)
     pixels = pixels.reshape((height, width) if channels == 1 else (height, width, channels))

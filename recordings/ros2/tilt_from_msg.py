@@ -150,7 +150,7 @@ def _number(message: Any, path: str) -> float:
     """The number in a field of a message, maybe NaN. Raises LogError if there is none."""
     value = message
     for name in path.split("."):
-        names = list(getattr(value, "__dataclass_fields__", ()))
+        names = _field_names(value)
         if name not in names:
             known = ", ".join(known for known in names if not known.startswith("_"))
             where = f"{_kind(value)} (it has {known})" if known else _kind(value)
@@ -159,6 +159,14 @@ def _number(message: Any, path: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise LogError(f"field '{path}' contains a {_kind(value)}, which is not a number")
     return float(value)
+
+
+def _field_names(value: Any) -> list[str]:
+    """The names of a message's fields, in any encoding."""
+    if hasattr(value, "DESCRIPTOR"):  # protobuf
+        return [known.name for known in value.DESCRIPTOR.fields]
+    names: list[str] = [*(getattr(value, "__dataclass_fields__", None) or getattr(value, "__dict__", {}))]
+    return names
 
 
 def _kind(value: Any) -> str:

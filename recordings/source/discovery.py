@@ -196,8 +196,8 @@ def _find_info(
         if name in names:
             found.chosen[f"{side}_info"] = name
             return
-    pairs = [(left, right) for left in sorted(names) for right in partners(left) if right in names]
-    matching = [pair[side == "right"] for pair in pairs if frame_of(image) == frame_of(pair[side == "right"]) != ""]
+    frame = frame_of(image)  # Foxglove's calibrations belong to an image by their frame alone
+    matching = [name for name in sorted(names) if frame and frame_of(name) == frame]
     if len(matching) == 1:
         found.chosen[f"{side}_info"] = matching[0]
         return

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
+from recordings.encodings.decoding import Decoder
 from recordings.errors import LogError, sentence_of
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
-from recordings.ros2.from_msg import frame_of, pose_of, stamp_or
+from recordings.ros2.from_msg import frame_of, pose_of, stamp_of, stamp_or
 from recordings.ros2.image_from_msg import pixels_of
 from recordings.source.calibration import Camera
 from recordings.source.cameras import CAMERAS, CalibrationHistory
@@ -34,7 +35,7 @@ from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_noise import TiltNoise
 from recordings.source.tilt_reading import Sampled, TiltReading, estimated_tilts
-from recordings.source.topics import Decoder, attempt
+from recordings.source.topics import attempt
 from stages.data import CameraImage, Mount, Pose, Tilt
 
 INTERPOLATION_LEAD_NS = 1_000_000_000  # tilt and pose are read this far beyond a range, for interpolation at its ends
@@ -188,7 +189,7 @@ class McapLog:
             reader = (infos if raw.channel in infos else items)[raw.channel]
             if isinstance(raw, LostMessage):
                 yield raw.log_time, reader.stream, LogError(f"{reader.topic}: {raw.reason}")
-            elif reader.stream not in CAMERAS or is_within(peek_stamp(raw.data), raw.log_time, low, high):
+            elif reader.stream not in CAMERAS or is_within(self._stamp_of(raw), raw.log_time, low, high):
                 item = noted if raw.channel in infos else reader(raw)
                 if moving is not None and reader.stream == "left" and isinstance(item, CameraImage):
                     mount = attempt(moving.at, item.stamp)
@@ -229,7 +230,16 @@ class McapLog:
     def _is_unstamped(self, stream: str, topic: str) -> bool:
         raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, LostMessage))
         first = next(raws, None) if self.resolution.messages.schemas[topic] in STAMPED_SCHEMAS else None
-        return first is not None and len(first.data) >= 12 and not peek_stamp(first.data)
+        return first is not None and len(first.data) >= 12 and not self._stamp_of(first)
+
+    def _stamp_of(self, raw: RawMessage) -> int:
+        """The header stamp of a message, ns; 0 if there is none."""
+        encoding = self.file.channels[raw.channel].message_encoding
+        if encoding in ("cdr", "ros1"):
+            return peek_stamp(raw.data, encoding)
+        decoder = self.resolution.messages.decoders[raw.channel]
+        stamp = attempt(lambda: stamp_of(decoder(raw.data).header))
+        return 0 if isinstance(stamp, LogError) else stamp
 
     def channels(self, stream: str) -> set[int]:
         """The channels of a stream."""
@@ -260,7 +270,7 @@ class McapLog:
             return
         raws = self.file.messages(self.channels("left"), *_widen(low, high))
         if not any(
-            isinstance(raw, LostMessage) or is_within(peek_stamp(raw.data), raw.log_time, low, high) for raw in raws
+            isinstance(raw, LostMessage) or is_within(self._stamp_of(raw), raw.log_time, low, high) for raw in raws
         ):
             length = (self.file.end - self.file.start) / 1e9
             until = "its end" if self.end is None else f"{self.end:g} s"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from flow.contracts import counted
 from recordings.containers.recording import Recording
 from recordings.errors import LogError
-from recordings.ros2.from_msg import frame_name, frame_of, pose_of
+from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
 from recordings.source.calibration import Camera, baseline_note, calibrated_pair
 from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_images, unreadable_images
 from recordings.source.discovery import IMU, TRANSFORMS, DiscoveredTopics, TiltKind, Topic, discover
@@ -20,7 +20,7 @@ from recordings.source.moving_mount import MovingMount, moving_mount
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_reading import TiltReading
 from recordings.source.topics import DecodedTopics, attempt
-from recordings.source.transforms import TransformTree
+from recordings.source.transforms import TransformTree, are_same
 from stages.data import LEVEL_FRAME, Mount, Pose
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
@@ -79,13 +79,33 @@ class SourceResolution:
         """The static transforms, and the problems with those left out."""
         tree, problems = TransformTree(), list[tuple[str, LogError]]()
         for topic, schema in sorted(self.messages.schemas.items()):
-            if schema == TRANSFORMS and topic.endswith("tf_static"):
-                for transforms in self.messages.each(topic, lambda message: message.transforms, allow_repeats=True):
+            if schema == TRANSFORMS and (topic.endswith("tf_static") or self._is_foxglove(topic)):
+                for transforms in self._static_messages(topic):
                     for item in [transforms] if isinstance(transforms, LogError) else transforms:
                         added = item if isinstance(item, LogError) else attempt(tree.add, item)
                         if isinstance(added, LogError):
                             problems.append(("log", LogError(f"{topic}: {added}")))
         return tree, problems
+
+    def _is_foxglove(self, topic: str) -> bool:
+        """Whether a topic has Foxglove's transforms, which have no topic of their own for static ones."""
+        channels = (self.file.channels[number] for number in self.messages.channels_of(topic))
+        return any(channel.schema is not None and channel.schema.name.startswith("foxglove") for channel in channels)
+
+    def _static_messages(self, topic: str) -> Iterator[Any]:
+        """The lists of static transforms of a topic: of /tf_static all, of others those that never change."""
+        if topic.endswith("tf_static"):
+            yield from self.messages.each(topic, lambda message: message.transforms, allow_repeats=True)
+            return
+        found, moving = dict[tuple[str, str], Any](), set[tuple[str, str]]()
+        for transforms in self.messages.sample(topic, lambda message: message.transforms):
+            for item in [] if isinstance(transforms, LogError) else transforms:
+                name = (frame_of(item), frame_name(item.child_frame_id))
+                known, place = found.setdefault(name, item), attempt(transform_of, item)
+                first = attempt(transform_of, known)
+                if isinstance(place, LogError) or isinstance(first, LogError) or not are_same(first, place):
+                    moving.add(name)
+        yield [item for name, item in found.items() if name not in moving]
 
     def _undecodable_topics(self) -> str:
         """A sentence that lists the topics that cannot be decoded; empty if there are none."""

@@ -10,17 +10,15 @@ from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Any, TypeVar
 
-from recordings.containers.container import Channel, LostMessage
+from recordings.containers.container import LostMessage
 from recordings.containers.recording import Recording
+from recordings.encodings.decoding import Decoder, decoder_of
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.file import CONVERT
-from recordings.ros2.cdr import decoder_for, full_name
 from recordings.ros2.from_msg import frame_of
 
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
 
-Decoder = Callable[[bytes | memoryview], Any]
 T = TypeVar("T")
 
 
@@ -41,7 +39,7 @@ class DecodedTopics:
         self.schemas: dict[str, str] = {}
         for number, channel in file.channels.items():
             try:
-                self.decoders[number] = self._decoder(channel)
+                self.schemas[channel.topic], self.decoders[number] = decoder_of(channel)
             except LogError as error:
                 self.undecodable_channels[number] = str(error)
 
@@ -86,17 +84,6 @@ class DecodedTopics:
         """The frame_id of a topic's first message, or an empty string."""
         frame = self.first(topic, frame_of)
         return "" if isinstance(frame, LogError) else frame
-
-    def _decoder(self, channel: Channel) -> Decoder:
-        if channel.message_encoding != "cdr":
-            remedy = f"; convert the bag itself: {CONVERT}" if channel.message_encoding == "ros1" else ""
-            raise LogError(f"its messages are in '{channel.message_encoding}', not in the 'cdr' of ROS 2{remedy}")
-        schema = channel.schema
-        if schema is None:
-            raise LogError("its messages have no schema")
-        decoder = decoder_for(schema.name, schema.encoding, schema.text)
-        self.schemas[channel.topic] = full_name(schema.name)
-        return decoder
 
 
 def attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:

@@ -49,7 +49,7 @@ class TransformTree:
             self.edges.setdefault(parent, {})[child] = transform
             self.edges.setdefault(child, {})[parent] = transform.inverse()
             self.parents[child] = parent
-        elif not _are_same(known, transform):
+        elif not are_same(known, transform):
             raise LogError(f"the transform '{parent}' <- '{child}' contradicts an earlier one; the earlier one is used")
 
     def between(self, parent: str, child: str) -> Transform | None:
@@ -93,6 +93,7 @@ class TransformTree:
         return sorted(f"{parent} <- {child}" for child, parent in self.parents.items())
 
 
-def _are_same(one: Transform, other: Transform) -> bool:
+def are_same(one: Transform, other: Transform) -> bool:
+    """Whether two transforms differ by rounding only."""
     off = max(np.abs(one.rotation - other.rotation).max(), np.abs(one.translation - other.translation).max())
     return bool(off <= TRANSFORM_ATOL)

@@ -197,9 +197,9 @@ def test_a_missing_right_calibration_is_reported(tmp_path):
 
 
 def test_undecodable_topics_are_listed_once(tmp_path):
-    path = rewrite(write_sample(tmp_path / "log.mcap"), tmp_path / "odd.mcap", encode=lambda *of: ("protobuf", of[2]))
+    path = rewrite(write_sample(tmp_path / "log.mcap"), tmp_path / "odd.mcap", encode=lambda *of: ("cbor", of[2]))
     text = format_description(inventory_of(path))
-    assert text.count("cannot be decoded") == text.count(f"{LEFT}: its messages are in 'protobuf'") == 1
+    assert text.count("cannot be decoded") == text.count(f"{LEFT}: its messages are in 'cbor'") == 1
     assert "missing: left, right: the log has no camera image" in text
     with McapSource().open(path) as log:  # a refusal is complete without the others
         assert all(f"{LEFT}: its messages" in log.missing[stream] for stream in ("left", "inclinometer", "odometry"))

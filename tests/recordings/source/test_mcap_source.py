@@ -169,7 +169,7 @@ def test_a_bad_message_is_lost_alone(tmp_path):
         if topic == LEFT and number == 1:
             message.data = message.data[:-5]
         if topic == RIGHT and number == 2:
-            message.encoding = "yuv422"
+            message.encoding = "packed10"
         if topic == TILT and number == 3:
             message.orientation.x = 5.0
         if topic == "/odom" and number == 2:
@@ -179,17 +179,17 @@ def test_a_bad_message_is_lost_alone(tmp_path):
     events = items_of(write_sample(tmp_path / "log.mcap", edit))
     problems = {stream: str(item) for _, stream, item in events if isinstance(item, Exception)}
     assert f"the image is cut: it has {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in problems["left"]
-    assert "image encoding 'yuv422' is not supported" in problems["right"]
+    assert "image encoding 'packed10' is not supported" in problems["right"]
     assert "the quaternion of the inclinometer is not a rotation" in problems["inclinometer"]
     assert "its stamp is damaged (4294967295 ns beyond the second)" in problems["odometry"]
     assert len(events) == 4 * FRAMES + 1
 
 
 def test_an_unsupported_encoding_is_reported_before_the_run(tmp_path):
-    path = write_sample(tmp_path / "log.mcap", changed(RIGHT, {"encoding": "yuv422_yuy2"}))
+    path = write_sample(tmp_path / "log.mcap", changed(RIGHT, {"encoding": "packed10"}))
     with McapSource().open(path) as log:
         assert list(log.missing) == ["right"]
-        assert log.missing["right"].startswith(f"{RIGHT}: the image encoding 'yuv422_yuy2' is not supported")
+        assert log.missing["right"].startswith(f"{RIGHT}: the image encoding 'packed10' is not supported")
         assert "only mono8, 8UC1, " in log.missing["right"]
     described = inventory_of(path)
     assert (described["frames"]["pairs"], described["missing"]) == (0, log.missing)

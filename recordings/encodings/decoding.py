@@ -1,0 +1,53 @@
+"""Builds the decoder of a channel by its message encoding: CDR, ROS 1, protobuf or JSON.
+
+Every decoder returns messages with the fields of a ROS 2 type. Foxglove's messages become those of ROS 2; a message of
+another type keeps its own fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from recordings.containers.container import Channel, MessageSchema
+from recordings.encodings.foxglove import adapter_of, with_header
+from recordings.encodings.json_text import json_decoder
+from recordings.encodings.protobuf import protobuf_decoder
+from recordings.errors import LogError
+from recordings.ros1.codec import decoder_for as ros1_decoder
+from recordings.ros2.cdr import decoder_for as cdr_decoder
+from recordings.ros2.cdr import full_name
+
+MAX_SCHEMA_BYTES = 2_000_000  # the largest definitions in use have a tenth of it
+ENCODINGS = ("cdr", "ros1", "protobuf", "json")
+
+Decoder = Callable[[bytes | memoryview], Any]
+
+
+def decoder_of(channel: Channel) -> tuple[str, Decoder]:
+    """The full ROS 2 name of a channel's type, and its decoder. Raises LogError if there is none."""
+    schema, encoding = channel.schema, channel.message_encoding
+    if encoding not in ENCODINGS:
+        raise LogError(f"its messages are in '{encoding}', which cannot be read; {', '.join(ENCODINGS)} can")
+    if schema is None and encoding != "json":
+        raise LogError("its messages have no schema")
+    if schema is not None and len(schema.text) > MAX_SCHEMA_BYTES:
+        raise LogError(f"its schema has {len(schema.text)} bytes, which is more than {MAX_SCHEMA_BYTES}")
+    decode, name = _plain_decoder(encoding, schema), "" if schema is None else schema.name
+    adapted = adapter_of(name)
+    if adapted is not None:
+        ros_name, adapt = adapted
+        return ros_name, lambda data: adapt(decode(data))
+    if encoding in ("protobuf", "json"):
+        return full_name(name), lambda data: with_header(decode(data))
+    return full_name(name), decode
+
+
+def _plain_decoder(encoding: str, schema: MessageSchema | None) -> Decoder:
+    """A function from bytes to a message as it is encoded."""
+    if schema is None or encoding == "json":
+        return json_decoder
+    if encoding == "protobuf":
+        return protobuf_decoder(schema)
+    codec = ros1_decoder if encoding == "ros1" else cdr_decoder
+    return codec(schema.name, schema.encoding, schema.text)

@@ -1,0 +1,1 @@
+"""ROS 1 messages as those of ROS 2."""

@@ -1,0 +1,103 @@
+"""One log in every encoding that is read, and foreign content in each."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from recordings import McapSource
+from recordings.containers.container import Channel, MessageSchema
+from recordings.encodings.decoding import MAX_SCHEMA_BYTES, decoder_of
+from recordings.errors import LogError
+from recordings.ros2.image_from_msg import pixels_of
+from recordings.ros2.tilt_from_msg import AngleField
+from recordings.ros2.to_msg import image
+from stages.data import Tilt
+from tests.recordings.encodings.rewritten import WRITERS
+from tests.recordings.sample_log import essence, items_of
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_the_same_items_are_read_from_every_encoding(sample, whole, tmp_path, name):
+    log = WRITERS[name](sample, tmp_path / name)
+    assert [(time, stream, essence(item)) for time, stream, item in items_of(log)] == [
+        (time, stream, essence(item)) for time, stream, item in whole
+    ]
+
+
+def test_a_part_of_a_log_begins_at_the_same_frame_in_every_encoding(sample, tmp_path):
+    stamps = []
+    for log in (sample, *(make(sample, tmp_path / name) for name, make in WRITERS.items())):
+        stamps.append([item.stamp for _, stream, item in items_of(log, start=0.15) if stream == "left"])
+    assert len(stamps[0]) == 3
+    assert all(others == stamps[0] for others in stamps)
+
+
+def json_angles(path: Path, angles: list[dict[str, Any]], schema: bool) -> Path:
+    """A log of JSON messages with plain angles."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="")
+        number = writer.register_schema("Tilt", "jsonschema", b"{}") if schema else 0
+        channel = writer.register_channel("/tilt", "json", number)
+        for count, message in enumerate(angles):
+            writer.add_message(channel, 10**9 + count, json.dumps(message).encode(), 10**9)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("schema", [True, False])
+def test_plain_angles_in_json_are_a_tilt_at_their_own_time(tmp_path, schema):
+    angles = [{"timestamp": {"sec": 5, "nsec": 7}, "body": {"pitch": 2.0, "roll": 0.0}}]
+    log = json_angles(tmp_path / "log.mcap", angles, schema)
+    field = {"unit": "deg", "sign": 1}
+    source = McapSource(
+        inclinometer="/tilt", tilt_model="axis",
+        pitch=AngleField(field="body.pitch", **field), roll=AngleField(field="body.roll", **field),
+    )  # fmt: skip
+    (tilt,) = [item for _, _, item in items_of(log, source)]
+    assert isinstance(tilt, Tilt)
+    assert tilt.stamp == 5_000_000_007
+    assert np.degrees(np.arcsin(tilt.up[0])) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("data", [b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000])
+def test_foreign_json_is_an_error_in_one_sentence(data):
+    _, decode = decoder_of(Channel(1, "/image", "json", MessageSchema("foxglove.RawImage", "jsonschema", b"")))
+    with pytest.raises((LogError, AttributeError)):
+        decode(data)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "sentence"),
+    [
+        ("protobuf", MessageSchema("a.B", "protobuf", b"\xff\xff"), "schema 'a.B' cannot be used"),
+        ("protobuf", MessageSchema("a.B", "jsonschema", b"{}"), "is in 'jsonschema', not in 'protobuf'"),
+        ("ros1", MessageSchema("a/B", "ros1msg", b"Nothing nothing"), "schema 'a/B' cannot be parsed"),
+        ("ros1", None, "its messages have no schema"),
+        ("cdr", MessageSchema("a/B", "ros2msg", b" " * (MAX_SCHEMA_BYTES + 1)), "which is more than 2000000"),
+    ],
+)
+def test_a_schema_that_cannot_be_used_is_refused(encoding, schema, sentence):
+    with pytest.raises(LogError, match=sentence):
+        decoder_of(Channel(1, "/topic", encoding, schema))
+
+
+@pytest.mark.parametrize(("encoding", "place"), [("uyvy", 1), ("yuv422", 1), ("yuyv", 0), ("yuv422_yuy2", 0)])
+def test_the_brightness_of_yuv_images_is_read(encoding, place):
+    luma = np.random.default_rng(1).integers(0, 256, (4, 6), np.uint8)
+    packed = np.full((4, 12), 128, np.uint8)
+    packed[:, place::2] = luma
+    message = image(0, "camera", luma)
+    message.encoding, message.step, message.data = encoding, 12, packed.ravel()
+    np.testing.assert_array_equal(pixels_of(message), luma)
+
+
+def test_the_brightness_of_nv12_images_is_read():
+    luma = np.random.default_rng(1).integers(0, 256, (4, 6), np.uint8)
+    message = image(0, "camera", luma)
+    message.encoding, message.data = "nv12", np.concatenate([luma.ravel(), np.full(12, 128, np.uint8)])
+    np.testing.assert_array_equal(pixels_of(message), luma)
