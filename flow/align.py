@@ -64,7 +64,8 @@ class Pair:
     """
 
     slop: int = _duration(5_000_000, "largest difference between the two stamps")
-    patience: int = _duration(1_000_000_000, "log time to wait for a partner")
+    patience: int = _duration(3_000_000_000, "log time to wait for a partner")
+    max_waiting: int = parameter(50, "messages that wait for a partner at once, at most", low=1)
 
     ports = ("left", "right")
     clock = None  # pairs are a clock of their own
@@ -100,6 +101,9 @@ class PairState:
         """A message of `port` has arrived."""
         self.waiting[port].append((log_time, token))
         yield from self._match()
+        if len(self.waiting[port]) > self.config.max_waiting:
+            limit = f"{self.config.max_waiting} messages ({self.name}.max_waiting)"
+            yield self._unmatched(port, f"no partner among the next {limit}")
 
     def _match(self) -> Answers:
         lefts, rights = self.waiting["left"], self.waiting["right"]

@@ -6,6 +6,7 @@ and parts are opened when their time comes, so memory does not grow with their n
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from recordings.containers.clock import ClockStep, clock_steps, split
@@ -37,6 +39,9 @@ def _merged_channels(files: Sequence[Container]) -> tuple[dict[int, Channel], li
             own[number] = free
         numbers.append(own)
     return merged, numbers
+
+
+_MAX_REMEMBERED = 32  # messages of a topic, to leave out those that were recorded twice
 
 
 @dataclass(frozen=True)
@@ -133,6 +138,7 @@ class Recording:
         self._on_close = on_close or self._close_files
         self.size = sum(file.size for file in files)
         self.channels, self._numbers = _merged_channels(files)
+        self._stamped = {number for number, channel in self.channels.items() if begins_with_header(channel)}
         try:
             self.start = min(part.start for part in self._parts)
             self.end = max(part.file.end + part.step.shift for part in self._parts)
@@ -168,8 +174,23 @@ class Recording:
         """Read the messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
 
         A `LostMessage` stands for lost messages, also for those whose times repeat because all clocks were set back;
-        with `allow_repeats` these are kept.
+        with `allow_repeats` these are kept. A message that was recorded twice is read once.
         """
+        seen = defaultdict[str, deque[tuple[int, int]]](lambda: deque(maxlen=_MAX_REMEMBERED))
+        for item in self._merged(channels, start, end, allow_repeats):
+            if isinstance(item, RawMessage) and item.channel in self._stamped:
+                channel = self.channels[item.channel]
+                if stamp := peek_stamp(item.data, channel.message_encoding):
+                    known, this = seen[channel.topic], (stamp, crc32(item.data))
+                    if this in known:
+                        continue
+                    known.append(this)
+            yield item
+
+    def _merged(
+        self, channels: set[int], start: int | None, end: int | None, allow_repeats: bool
+    ) -> Iterator[RawMessage | LostMessage]:
+        """The messages of all parts, in log-time order."""
         begun = list[Iterator[RawMessage | LostMessage] | None]([None] * len(self._parts))
         queue: list[tuple[int, int, Any]] = [(part.start, number, None) for number, part in enumerate(self._parts)]
         heapify(queue)
@@ -242,7 +263,7 @@ class Recording:
             times.append(file.timeline.log_times)
             firsts.append(firsts[-1] + len(file.timeline))
         timeline = Timeline(np.concatenate(channels), np.concatenate(times))
-        stamped = {topics[channel.topic] for channel in self.channels.values() if begins_with_header(channel)}
+        stamped = {topics[self.channels[number].topic] for number in self._stamped}
         return clock_steps(timeline, stamped, _StampReader(self.files, firsts))
 
 

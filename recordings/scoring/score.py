@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recordings.containers.time_range import TimeRange
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
@@ -27,7 +28,6 @@ from recordings.scoring.result_log import part_run, stamps_run, without_results
 from recordings.scoring.side_by_side import Messages, frames
 from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
-from recordings.source.log import is_within, part_of
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")
@@ -145,7 +145,7 @@ class _Tally:
         with McapFile(truth) as log:  # without topics that have no message, unless messages were lost
             self.truths = {channel.topic for n, channel in log.channels.items() if log.count({n}) or log.lost}
             with McapFile(result):  # raises LogError for another file
-                self.part = part_of(log.start, *part_run(result, truth))
+                self.part = TimeRange.after(log.start, *part_run(result, truth))
         self.taken = stamps_run(result)
         self.outside: set[int] = set()  # stamps of the truth outside the part that was run
         self.seen_results: set[str] = set()
@@ -163,7 +163,7 @@ class _Tally:
                 continue
             stamp = ros2.stamp_of(message.header)
             left_out = self.taken is not None and stamp not in self.taken
-            if left_out or not is_within(stamp, time, *self.part):
+            if left_out or not self.part.has(stamp, time):
                 self.outside.add(stamp)
             yield topic, time, message
 

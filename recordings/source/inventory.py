@@ -164,7 +164,7 @@ def _stamps(log: McapLog, stream: str, damage: list[str]) -> list[int]:
     topic, stamps = log.topics[stream], []
     for raw in log.file.messages(log.channels(stream)):
         if not isinstance(raw, LostMessage):
-            stamps.append(peek_stamp(raw.data) or raw.log_time)
+            stamps.append(peek_stamp(raw.data, log.file.channels[raw.channel].message_encoding) or raw.log_time)
         elif raw.channel is not None:
             damage.append(f"{topic} at {raw.log_time} ns: {raw.reason}")
     return stamps

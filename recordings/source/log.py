@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
+from recordings.containers.time_range import EDGE_NS, MAX_LATENESS_NS, FramesInRange, TimeRange
 from recordings.encodings.decoding import Decoder
 from recordings.errors import LogError, sentence_of
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
@@ -64,21 +65,6 @@ class TopicReader:
             return LogError(f"{self.topic} at {raw.log_time} ns: {sentence_of(error)}")
 
 
-def part_of(first: int, start: float | None, end: float | None) -> tuple[int | None, int | None]:
-    """The log times, ns, from `start` to `end`, s after the first message at `first`; None for an open end."""
-    low, high = (None if after is None else first + round(after * 1e9) for after in (start, end))
-    return low, high
-
-
-def is_within(stamp: int, log_time: int, low: int | None, high: int | None) -> bool:
-    """Whether a message belongs to a part of a log.
-
-    This goes by its stamp, if that is of the log's clock: so both images of a frame are inside or outside.
-    """
-    when = stamp if stamp and abs(stamp - log_time) < INTERPOLATION_LEAD_NS else log_time
-    return (low is None or when >= low) and (high is None or when < high)
-
-
 @dataclass
 class McapLog:
     """An opened log.
@@ -120,15 +106,16 @@ class McapLog:
         """The number of left images in the range; None if the log has none."""
         if "left" not in self.topics:
             return None
-        low, high = self._range()
-        if low is None and high is None:
+        part = self._range()
+        if not part.edges:
             return self.file.count(self.channels("left"))
         times = self.file.times(self.channels("left"))
-        return int(np.sum((times >= (low or 0)) & (times < (high or 1 << 62))))
+        return int(np.sum((times >= (part.low or 0)) & (times < (part.high or 1 << 62))))
 
     def events(self, streams: Collection[str] = STREAMS) -> Iterator[tuple[int, str, Any]]:
         """(Log time in ns, stream, item) for each message of some streams; a lost item is an exception."""
-        return self._between(*self._range(), streams)
+        part = self._range()
+        return self._between(part, FramesInRange(part, self._lefts_around(part)), streams)
 
     def excerpts(self, count: int, streams: Collection[str]) -> Iterator[Iterator[tuple[int, str, Any]]]:
         """The events of a few frames at `count` places of the whole log, independent of the range that is read."""
@@ -137,35 +124,45 @@ class McapLog:
             last = min(first + EXCERPT_FRAMES, len(times)) - 1
             # Stamps precede log times, so begin after the previous image.
             low = times[first - 1] + 1 if first else self.file.start
-            yield self._between(low, times[last] + INTERPOLATION_LEAD_NS, streams)
+            part = TimeRange(low, times[last] + MAX_LATENESS_NS)
+            yield self._between(part, FramesInRange(part, ()), streams)
 
-    def _between(self, low: int | None, high: int | None, streams: Collection[str]) -> Iterator[tuple[int, str, Any]]:
-        events = self._read(low, high, streams)
+    def _lefts_around(self, part: TimeRange) -> Iterator[tuple[int, int]]:
+        """Stamp and log time, ns, of the left images around the edges of a part."""
+        for edge in part.edges if "left" in self.topics else ():
+            for raw in self.file.messages(self.channels("left"), edge - EDGE_NS // 10, edge + EDGE_NS):
+                if isinstance(raw, RawMessage):
+                    yield self._stamp_of(raw), raw.log_time
+
+    def _between(
+        self, part: TimeRange, frames: FramesInRange, streams: Collection[str]
+    ) -> Iterator[tuple[int, str, Any]]:
+        events = self._read(part, frames, streams)
         tilt = self.resolution.tilt
         if "inclinometer" not in streams or "inclinometer" not in self.topics or tilt is None or not tilt.estimates:
             return events
-        return merge(events, self._estimated(tilt, *_widen(low, high)), key=itemgetter(0))
+        return merge(events, self._estimated(tilt, part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
 
-    def _estimated(self, tilt: TiltReading, low: int | None, high: int | None) -> Iterator[tuple[int, str, Any]]:
-        """The estimates of up from the log time `low` to `high`, ns, also from samples before and after."""
+    def _estimated(self, tilt: TiltReading, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
+        """The estimates of up in a part of the log, also from samples before and after."""
         samplers = tilt.samplers(self.source)
         readers = self._by_channel(self._reader("inclinometer", topic, made) for topic, made in samplers.items())
-        source, wide = self.source, (None if low is None else max(low - LOOKAHEAD_NS, 0), high and high + LOOKAHEAD_NS)
+        source, wide = self.source, part.widened(LOOKAHEAD_NS)
         self._estimator = UpEstimator(self.resolution.tilt_frame, source.accelerometer_bias, source.gravity)
-        for log_time, item in estimated_tilts(self._samples(readers, *wide), self._estimator):
-            if (low is None or log_time >= low) and (high is None or log_time < high):
+        for log_time, item in estimated_tilts(self._samples(readers, wide), self._estimator):
+            if part.has(0, log_time):
                 yield log_time, "inclinometer", item
 
-    def _samples(self, readers: dict[int, TopicReader], low: int | None, high: int | None) -> Iterator[Sampled]:
+    def _samples(self, readers: dict[int, TopicReader], part: TimeRange) -> Iterator[Sampled]:
         """What these readers read, without lost messages, which `_read` reports."""
-        for raw in self.file.messages(set(readers), low, high):
+        for raw in self.file.messages(set(readers), part.low, part.high):
             if isinstance(raw, RawMessage):
                 yield raw.log_time, readers[raw.channel](raw)
 
-    def _read(self, low: int | None, high: int | None, streams: Collection[str]) -> Iterator[tuple[int, str, Any]]:
+    def _read(self, part: TimeRange, frames: FramesInRange, streams: Collection[str]) -> Iterator[tuple[int, str, Any]]:
         """The events without estimates."""
-        wide_low, wide_high = _widen(low, high)
-        log_start = self.file.start if wide_low is None else max(wide_low, self.file.start)
+        wide, near = part.widened(MAX_LATENESS_NS), part.widened(INTERPOLATION_LEAD_NS)
+        log_start = max(wide.low or 0, self.file.start)
         for stream, problem in self.resolution.problems:
             if stream in (*streams, "log"):
                 yield log_start, stream, problem
@@ -181,15 +178,21 @@ class McapLog:
         if moving is not None:
             infos |= self._by_channel(self._transform_readers(moving, items))
         lag = MAX_CALIBRATION_LAG_NS if moving is None else MAX_TRANSFORM_LAG_NS
-        raws = self.file.messages(infos.keys() | items.keys(), wide_low, wide_high)
+        raws = self.file.messages(infos.keys() | items.keys(), wide.low, wide.high)
         for raw, noted in _with_lookahead(raws, infos, lag):
+            if isinstance(raw, LostMessage) and not near.has(0, raw.log_time):
+                continue
             if raw.channel is None:
                 yield raw.log_time, "log", LogError(f"{self.path.name}: {raw.reason}")
                 continue
             reader = (infos if raw.channel in infos else items)[raw.channel]
             if isinstance(raw, LostMessage):
                 yield raw.log_time, reader.stream, LogError(f"{reader.topic}: {raw.reason}")
-            elif reader.stream not in CAMERAS or is_within(self._stamp_of(raw), raw.log_time, low, high):
+            elif not part.edges or (
+                frames.has(reader.stream, self._stamp_of(raw), raw.log_time)
+                if reader.stream in CAMERAS
+                else near.has(0, raw.log_time)
+            ):
                 item = noted if raw.channel in infos else reader(raw)
                 if moving is not None and reader.stream == "left" and isinstance(item, CameraImage):
                     mount = attempt(moving.at, item.stamp)
@@ -256,7 +259,7 @@ class McapLog:
         self.close()
 
     def _check_range(self) -> None:
-        low, high = self._range()
+        low, high = self._range().low, self._range().high
         length = (self.file.end - self.file.start) / 1e9
         if low is not None and low > self.file.end:
             raise LogError(f"{self.path} is {length:.3f} s long; start {self.start} s is after its end")
@@ -265,13 +268,12 @@ class McapLog:
 
     def _check_images(self) -> None:
         """Refuse a range without a left image."""
-        low, high = self._range()
-        if "left" not in self.topics or (low is None and high is None):
+        part = self._range()
+        if "left" not in self.topics or not part.edges:
             return
-        raws = self.file.messages(self.channels("left"), *_widen(low, high))
-        if not any(
-            isinstance(raw, LostMessage) or is_within(self._stamp_of(raw), raw.log_time, low, high) for raw in raws
-        ):
+        wide = part.widened(MAX_LATENESS_NS)
+        raws = self.file.messages(self.channels("left"), wide.low, wide.high)
+        if not any(isinstance(raw, LostMessage) or part.has(self._stamp_of(raw), raw.log_time) for raw in raws):
             length = (self.file.end - self.file.start) / 1e9
             until = "its end" if self.end is None else f"{self.end:g} s"
             raise LogError(
@@ -279,9 +281,9 @@ class McapLog:
                 f"{self.start or 0:g} s to {until}; choose a wider range"
             )
 
-    def _range(self) -> tuple[int | None, int | None]:
-        """The range in log time, ns."""
-        return part_of(self.file.start, self.start, self.end)
+    def _range(self) -> TimeRange:
+        """The part of the log to read."""
+        return TimeRange.after(self.file.start, self.start, self.end)
 
     def _calibration_readers(
         self, calibrations: dict[str, CalibrationHistory], streams: Collection[str]
@@ -387,10 +389,3 @@ def _both(first: Callable[[Any, int], Any], then: Callable[[Any, int], Any], mes
 
 def _nothing(message: Any, log_time: int) -> None:
     """No item."""
-
-
-def _widen(low: int | None, high: int | None) -> tuple[int | None, int | None]:
-    """The log times at which messages with stamps from `low` to `high`, ns, may be."""
-    low = None if low is None else max(low - INTERPOLATION_LEAD_NS, 0)
-    high = None if high is None else high + INTERPOLATION_LEAD_NS
-    return low, high

@@ -61,11 +61,24 @@ def test_a_missing_right_image_loses_only_its_left_image():
 
 
 def test_a_missing_partner_is_given_up_after_the_patience():
-    answers = pairing(("left", 0, 1.0, 0), ("left", 1, 1.0, 2000 * MS), slop=5)
+    answers = pairing(("left", 0, 1.0, 0), ("left", 1, 1.0, 4000 * MS), slop=5)
     first = answers[0]
     assert isinstance(first, Loss)
     assert first.stamp == 0
-    assert "1 s" in first.detail
+    assert "3 s" in first.detail
+
+
+def test_messages_that_wait_for_a_partner_are_bounded():
+    lefts = [("left", at * MS, 1.0) for at in range(8)]
+    answers = pairing(*lefts, max_waiting=5)
+    waited = "no partner among the next 5 messages (stereo.max_waiting)"
+    assert [answer.detail for answer in answers] == [waited] * 3 + ["the log ended before its partner came"] * 5
+
+
+def test_partners_logged_more_than_a_second_late_are_paired():
+    frames = [(side, at * MS, 1.0, (at + 1400 * (side == "right")) * MS) for at in range(0, 5000, 33)
+              for side in ("left", "right")]  # fmt: skip
+    assert len(values(pairing(*sorted(frames, key=lambda frame: frame[3])))) == len(frames) // 2
 
 
 def test_a_pair_too_far_apart_reports_the_distance_and_the_setting():
@@ -83,7 +96,7 @@ def test_a_partner_logged_too_late_reports_the_delay_and_the_setting():
     frames = [(side, at * MS, 1.0, (at + 1500 * (side == "right")) * MS) for at in range(0, 3000, 500)
               for side in ("left", "right")]  # fmt: skip
     frames.sort(key=lambda frame: frame[3])
-    details = {(entry.stream, entry.detail) for entry in pairing(*frames)}
+    details = {(entry.stream, entry.detail) for entry in pairing(*frames, patience=1000 * MS)}
     assert details == {
         ("left", "no partner within 1 s of log time (stereo.patience)"),
         ("right", "it was logged 1.5 s after its left, more than 1 s (stereo.patience)"),

@@ -29,7 +29,7 @@ def edit(database, *statements):
 def read(path):
     """The sound messages as (topic, log time, data), and the reasons of the lost ones."""
     with open_recording(path) as log:
-        items = list(log.messages(set(log.channels)))
+        items = list(log.files[0].messages(set(log.channels)))
         sound = [
             (log.channels[item.channel].topic, item.log_time, bytes(item.data))
             for item in items

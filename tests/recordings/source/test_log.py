@@ -77,7 +77,7 @@ def left_of(log: Any) -> tuple[list[int], list[str]]:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_calibration_change_before_the_range_is_known(tmp_path, layout):
     path = calibrated_once_more(tmp_path / "log.mcap", layout)
-    with McapSource().open(path, start=7) as log:
+    with McapSource().open(path, start=7.5) as log:
         read, lost = left_of(log.events())
         assert (read, len(lost)) == ([], 1)
         assert f"where it changes (at or before {START + 2 * PERIOD} ns)" in lost[0]
