@@ -40,9 +40,6 @@ from recordings.mcap.index import (
 from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for
 
-# Converts a ROS 1 bag to ROS 2 messages; `mcap convert` keeps it in ROS 1.
-CONVERT = "rosbags-convert --src IN.bag --dst OUT --dst-storage mcap"
-
 
 class McapFile:
     """An MCAP file open for reading; use it as a context manager.

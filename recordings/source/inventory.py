@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from flow.contracts import counted
 from recordings.containers.container import LostMessage
-from recordings.containers.header import peek_stamp
 from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.source.cameras import CAMERAS
 from recordings.source.log import McapLog
@@ -164,7 +163,7 @@ def _stamps(log: McapLog, stream: str, damage: list[str]) -> list[int]:
     topic, stamps = log.topics[stream], []
     for raw in log.file.messages(log.channels(stream)):
         if not isinstance(raw, LostMessage):
-            stamps.append(peek_stamp(raw.data, log.file.channels[raw.channel].message_encoding) or raw.log_time)
+            stamps.append(log.stamp_of(raw) or raw.log_time)
         elif raw.channel is not None:
             damage.append(f"{topic} at {raw.log_time} ns: {raw.reason}")
     return stamps

@@ -132,7 +132,7 @@ class McapLog:
         for edge in part.edges if "left" in self.topics else ():
             for raw in self.file.messages(self.channels("left"), edge - EDGE_NS // 10, edge + EDGE_NS):
                 if isinstance(raw, RawMessage):
-                    yield self._stamp_of(raw), raw.log_time
+                    yield self.stamp_of(raw), raw.log_time
 
     def _between(
         self, part: TimeRange, frames: FramesInRange, streams: Collection[str]
@@ -189,7 +189,7 @@ class McapLog:
             if isinstance(raw, LostMessage):
                 yield raw.log_time, reader.stream, LogError(f"{reader.topic}: {raw.reason}")
             elif not part.edges or (
-                frames.has(reader.stream, self._stamp_of(raw), raw.log_time)
+                frames.has(reader.stream, self.stamp_of(raw), raw.log_time)
                 if reader.stream in CAMERAS
                 else near.has(0, raw.log_time)
             ):
@@ -233,9 +233,9 @@ class McapLog:
     def _is_unstamped(self, stream: str, topic: str) -> bool:
         raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, LostMessage))
         first = next(raws, None) if self.resolution.messages.schemas[topic] in STAMPED_SCHEMAS else None
-        return first is not None and len(first.data) >= 12 and not self._stamp_of(first)
+        return first is not None and len(first.data) >= 12 and not self.stamp_of(first)
 
-    def _stamp_of(self, raw: RawMessage) -> int:
+    def stamp_of(self, raw: RawMessage) -> int:
         """The header stamp of a message, ns; 0 if there is none."""
         encoding = self.file.channels[raw.channel].message_encoding
         if encoding in ("cdr", "ros1"):
@@ -273,7 +273,7 @@ class McapLog:
             return
         wide = part.widened(MAX_LATENESS_NS)
         raws = self.file.messages(self.channels("left"), wide.low, wide.high)
-        if not any(isinstance(raw, LostMessage) or part.has(self._stamp_of(raw), raw.log_time) for raw in raws):
+        if not any(isinstance(raw, LostMessage) or part.has(self.stamp_of(raw), raw.log_time) for raw in raws):
             length = (self.file.end - self.file.start) / 1e9
             until = "its end" if self.end is None else f"{self.end:g} s"
             raise LogError(

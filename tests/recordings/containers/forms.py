@@ -1,6 +1,5 @@
 """A log in other containers, written by the rosbags library."""
 
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -9,8 +8,12 @@ import yaml
 from mcap.reader import make_reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from recordings.ros2.cdr import TYPES
+
+ROS1_TYPES = get_typestore(Stores.ROS1_NOETIC)
+ROS1_TYPES.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
 Row = tuple[str, str, int, bytes]  # topic, type, log time, data
 
@@ -65,11 +68,6 @@ def write_bag(rows: list[Row], path: Path, compression: Bag1Writer.CompressionFo
     with writer:
         for topic, kind, log_time, data in rows:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=TYPES)
-            writer.write(connections[topic], log_time, bytes(TYPES.cdr_to_ros1(data, kind)))
+                connections[topic] = writer.add_connection(topic, kind, typestore=ROS1_TYPES)
+            writer.write(connections[topic], log_time, bytes(ROS1_TYPES.cdr_to_ros1(data, kind)))
     return path
-
-
-def read_rows(messages: Iterator[Any], topics: dict[int, str]) -> list[tuple[int, str, bytes]]:
-    """Log time, topic and data of messages, sorted; a lost message fails."""
-    return sorted((item.log_time, topics[item.channel], bytes(item.data)) for item in messages)

@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from recordings import McapSource
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
-from tests.recordings.containers.forms import rows_of, write_rosbag2
+from tests.recordings.containers.forms import rows_of, write_bag, write_rosbag2
 from tests.recordings.sample_log import PERIOD, START, essence, inventory_of
 
 PLUGINS = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
@@ -36,6 +37,11 @@ def test_a_split_recording_is_the_same_log_as_one_file(sample, whole, tmp_path, 
     assert items_of(folder) == essences(whole)
     if mode != CompressionMode.FILE:
         assert set(items_of(sorted(folder.iterdir(), reverse=True))) == set(essences(whole))
+
+
+@pytest.mark.parametrize("compression", [None, *Bag1Writer.CompressionFormat])
+def test_a_ros_1_bag_is_the_same_log(sample, whole, tmp_path, compression):
+    assert items_of(write_bag(rows_of(sample), tmp_path / "log.bag", compression)) == essences(whole)
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)

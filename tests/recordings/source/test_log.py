@@ -1,17 +1,12 @@
 """Changes in the middle of a log and types with wrong fields lose their own messages and are reported."""
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from rosbags.rosbag1 import Writer as BagWriter
-from rosbags.typesys import Stores, get_typestore
 
 from recordings import McapSource
-from recordings.mcap.file import iter_decoded
 from tests.conftest import rewrite
 from tests.recordings.sample_log import (
     FRAMES,
@@ -167,22 +162,3 @@ def test_at_most_one_excerpt_begins_at_a_frame(tmp_path):
     with McapSource().open(write_sample(tmp_path / "log.mcap")) as log:
         assert len(list(log.excerpts(20, {"left", "right"}))) == FRAMES
         assert len(list(log.excerpts(3, {"left", "right"}))) == 3
-
-
-def test_a_ros_1_bag_is_read_after_the_converting_command(tmp_path):
-    store = get_typestore(Stores.ROS1_NOETIC)
-    kind, header, stamp, point = (
-        store.types[name] for name in (
-            "geometry_msgs/msg/PointStamped", "std_msgs/msg/Header", "builtin_interfaces/msg/Time",
-            "geometry_msgs/msg/Point",
-        )
-    )  # fmt: skip
-    with BagWriter(tmp_path / "IN.bag") as writer:
-        connection = writer.add_connection("/place", kind.__msgtype__, typestore=store)
-        message = kind(header(0, stamp(1, 0), "map"), point(1.0, 2.0, 3.0))
-        writer.write(connection, 10**9, store.serialize_ros1(message, kind.__msgtype__))
-    with McapSource().open(tmp_path / "IN.bag") as log:
-        command = log.resolution.undecodable.rpartition(": ")[2].split()
-    subprocess.run([Path(sys.executable).parent / command[0], *command[1:]], cwd=tmp_path, check=True)
-    ((_, _, read),) = iter_decoded(tmp_path / "OUT" / "OUT.mcap")
-    assert (read.point.x, read.point.y, read.point.z) == (1.0, 2.0, 3.0)
