@@ -8,12 +8,9 @@ import yaml
 from mcap.reader import make_reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from recordings.ros2.cdr import TYPES
-
-ROS1_TYPES = get_typestore(Stores.ROS1_NOETIC)
-ROS1_TYPES.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+from tests.recordings.encodings.rewritten import ROS1, as_ros1
 
 Row = tuple[str, str, int, bytes]  # topic, type, log time, data
 
@@ -68,6 +65,10 @@ def write_bag(rows: list[Row], path: Path, compression: Bag1Writer.CompressionFo
     with writer:
         for topic, kind, log_time, data in rows:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=ROS1_TYPES)
-            writer.write(connections[topic], log_time, bytes(ROS1_TYPES.cdr_to_ros1(data, kind)))
+                connections[topic] = writer.add_connection(topic, kind, typestore=ROS1)
+            writer.write(
+                connections[topic],
+                log_time,
+                bytes(ROS1.serialize_ros1(as_ros1(TYPES.deserialize_cdr(data, kind)), kind)),
+            )
     return path
