@@ -51,6 +51,7 @@ OPTIONS: dict[str, tuple[str, type, float, str | None, str]] = {
     "imu": ("imu", str, 1, "KIND", "orientation, or raw: accelerations and rates of a MEMS sensor (orientation)"),
     "vibration": ("vibration", float, 1, "M/S2", "vibration of a raw Imu while driving, RMS of each axis (0.5)"),
     "rest": ("rest", float, 1, "S", "time that the rover stands still before it drives (0)"),
+    "pan": ("pan", float, DEGREE, "DEG", "largest turn of the mast with the cameras; it swings once in 8 s (0)"),
     "odometry_scale": (
         "odometry_scale", float, PERCENT, "PERCENT", "scale error of odometry (1); 0, with --odometry-turn 0, is exact",
     ),

@@ -278,14 +278,17 @@ class _Tally:
     def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:
         item, true = frame.get("/tf"), frame["/truth/tilt"]
         mount = None if item is None else self.mounts.get(item.child_frame_id)
+        true_up = _rotation(true.quaternion)[2]  # in the axes of its header
         if item is None:
             why = f"the result has no /tf from '{LEVEL_FRAME}' at that stamp"
-        elif mount is None or mount.header.frame_id != true.header.frame_id:
+        elif item.child_frame_id != true.header.frame_id and (
+            mount is None or mount.header.frame_id != true.header.frame_id
+        ):
             why = f"the truth has no mount of '{item.child_frame_id}' on '{true.header.frame_id}'"
         else:
-            base_from_camera = _rotation(mount.transform.rotation)
+            if mount is not None and item.child_frame_id != true.header.frame_id:
+                true_up = true_up @ _rotation(mount.transform.rotation)
             # Gravity's opposite in camera axes is independent of the heading.
-            true_up = (_rotation(true.quaternion) @ base_from_camera)[2]
             self.tilts.append(angle_between(_rotation(item.transform.rotation)[2], true_up))
             return {"tilt": self.tilts[-1]}
         self.found.untilted[why] = self.found.untilted.get(why, 0) + 1

@@ -63,7 +63,7 @@ def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[E
 
 def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Array:
     """(count, count) float32: 1 where a pixel that both cameras see hits the cell within the region, else 0."""
-    mount = truth.level.inverse().after(truth.base.after(simulation.mounts[0]))
+    mount = truth.level.inverse().after(truth.base.after(truth.mounts[0]))
     a, b, known = _seen_within(simulation, truth)
     rows = slice(int(np.argmax(known.any(axis=1))), None)  # sky and far ground above them
     known, b, places = known[rows], b[rows], []
@@ -98,7 +98,7 @@ def rocks_in_view(simulation: Simulation, truth: FrameTruth) -> Array:
     a, b, seen = _seen_within(simulation, truth)
     row, col = np.nonzero(seen & (truth.surface >= 0))
     rock, depth = truth.surface[row, col], truth.depth[row, col]
-    up = truth.base.after(simulation.mounts[0]).rotation[2]
+    up = truth.base.after(truth.mounts[0]).rotation[2]
     height = depth * (up[0] * a[col] + up[1] * b[row, 0] + up[2])
     low, high = np.full(len(rocks), np.inf), np.full(len(rocks), -np.inf)
     np.minimum.at(low, rock, height)
@@ -152,7 +152,7 @@ def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, t
 
 def in_sight(simulation: Simulation, truth: FrameTruth, points: Array) -> Array:
     """Which points (N, 3) of the world, m, both cameras see within the region: (N,) bool."""
-    eyes = [truth.base.after(mount) for mount in simulation.mounts[:2]]
+    eyes = [truth.base.after(mount) for mount in truth.mounts]
     seen: Array = np.linalg.norm(points - eyes[0].translation, axis=1) <= simulation.region
     for eye in eyes:
         seen &= _within_image(simulation, (points - eye.translation) @ eye.rotation)
@@ -167,7 +167,7 @@ def _in_images(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, z:
     """Which points of the level frame, of any shape, lie within both images, with a margin of 20 px."""
     points = truth.level(np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1))
     inside = np.ones(len(points), bool)
-    for mount in simulation.mounts[:2]:
+    for mount in truth.mounts:
         eye = truth.base.after(mount)
         inside &= _within_image(simulation, (points - eye.translation) @ eye.rotation, 20.0)
     return inside.reshape(x.shape)

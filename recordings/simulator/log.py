@@ -54,7 +54,9 @@ def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], list[Lo
     yield simulation.begin, partial(static_transforms, simulation, simulation.begin), None
     raw = simulation.imu == "raw"
     tilt = (imu, simulation.imu_rate, 4_000_000) if raw else (inclinometer, simulation.tilt_rate, 4_000_000)
-    sensors = (tilt, (odometry, simulation.odometry_rate, 9_000_000))
+    sensors = [tilt, (odometry, simulation.odometry_rate, 9_000_000)]
+    if simulation.pan:
+        sensors.append((mast, simulation.mast_rate, 6_000_000))
     for make_messages, rate, latency in sensors:
         for number, stamp in enumerate(simulation.sensor_stamps(rate)):
             yield stamp + latency, partial(make_messages, simulation, number, stamp, stamp + latency), None
@@ -64,8 +66,18 @@ def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], list[Lo
 
 
 def static_transforms(simulation: Simulation, log_time: int) -> list[Logged]:
-    """/tf_static: the mounts of cameras and inclinometer."""
-    return [(log_time, "/tf_static", ros2.transform_message((mount, log_time) for mount in simulation.mounts))]
+    """/tf_static: the mounts of cameras and inclinometer; those of the cameras are on the mast if it turns."""
+    *cameras, sensor = simulation.mounts
+    if simulation.pan:
+        head = traverse.mast(simulation.camera_height, 0.0).inverse()
+        cameras = [head.after(camera) for camera in cameras]
+    return [(log_time, "/tf_static", ros2.transform_message((mount, log_time) for mount in (*cameras, sensor)))]
+
+
+def mast(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:
+    """/tf: the mast, which turns."""
+    head = traverse.mast(simulation.camera_height, simulation.pan_at(stamp))
+    return [(log_time, "/tf", ros2.transform_message([(head, stamp)]))]
 
 
 def inclinometer(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:
@@ -140,7 +152,7 @@ def _true_pose(stamp: int, truth: FrameTruth) -> Pose:
 
 
 def _tilt_message(stamp: int, truth: FrameTruth) -> Any:
-    """geometry_msgs/QuaternionStamped: level <- base_link, in the header of base_link."""
-    rotation = Rotation.from_matrix(truth.level.rotation.T @ truth.base.rotation)
+    """geometry_msgs/QuaternionStamped: level <- left camera, in the header of the camera."""
+    rotation = Rotation.from_matrix(truth.level.rotation.T @ truth.base.after(truth.mounts[0]).rotation)
     turn = ros2.quaternion(rotation.as_quat(canonical=True))
-    return make("geometry_msgs/msg/QuaternionStamped", header=ros2.header(stamp, "base_link"), quaternion=turn)
+    return make("geometry_msgs/msg/QuaternionStamped", header=ros2.header(stamp, traverse.LEFT_FRAME), quaternion=turn)

@@ -41,12 +41,14 @@ def _rad(degrees: float) -> float:
 class FrameTruth:
     """The exact geometry of one frame.
 
-    depth: (H, W) float64 m, inf = sky; surface: (H, W) int32 codes of the ray caster; seen: (H, W) uint8, 255 by both
-    cameras, 128 hidden from the right one, 0 no surface; images: left and right; terrain_class: (H, W) uint8, the
-    `TerrainClass` of each pixel; jpegs: the bytes of both images' files, if they are compressed.
+    mounts: base_link <- left camera, <- right; depth: (H, W) float64 m, inf = sky; surface: (H, W) int32 codes of
+    the ray caster; seen: (H, W) uint8, 255 by both cameras, 128 hidden from the right one, 0 no surface; images: left
+    and right; terrain_class: (H, W) uint8, the `TerrainClass` of each pixel; jpegs: the bytes of both images' files, if
+    they are compressed.
     """
 
     base: Transform
+    mounts: tuple[Transform, Transform]
     level: Transform
     depth: Array
     surface: Array
@@ -139,6 +141,11 @@ class Simulation:
     frame_offset: float = parameter(0.013, "time from a tilt sample to a frame", unit="s")
     map_half_width: float = parameter(8.0, "half the width of the truth maps", unit="m", low=0.5, high=100)
     map_resolution: float = parameter(0.05, "cells of the truth maps", unit="m", low=0.001, high=10)
+    pan: float = parameter(
+        0.0, "largest turn of the mast with the cameras, to the left and to the right", unit="rad", low=0, high=_rad(90)
+    )
+    pan_time: float = parameter(8.0, "time in which the mast turns to both sides and back", unit="s", low=0.1, high=1e4)
+    mast_rate: float = parameter(20.0, "transforms of a mast that turns, per second", unit="Hz", low=1, high=1000)
     region: float = parameter(8.0, "largest distance of a visible cell", unit="m")
     horizon: float = parameter(300.0, "distance beyond which is sky", unit="m")
     seed: int = parameter(1, "seed of the random numbers", low=0, high=10**15)
@@ -207,8 +214,17 @@ class Simulation:
 
     @cached_property
     def mounts(self) -> tuple[Transform, Transform, Transform]:
-        """base_link <- left camera, <- right camera, <- inclinometer."""
+        """base_link <- left camera, <- right camera, <- inclinometer; of a mast that looks straight ahead."""
         return traverse.mounts(self.baseline, self.camera_height, self.pitch_down)
+
+    def pan_at(self, stamp: int) -> float:
+        """The turn of the mast to the left, rad, at a time, ns."""
+        return self.pan * float(np.sin(2 * np.pi * (stamp - self.start) / SECOND / self.pan_time))
+
+    def cameras_at(self, stamp: int) -> tuple[Transform, Transform]:
+        """base_link <- left camera, <- right camera at a time, ns."""
+        left, right, _ = traverse.mounts(self.baseline, self.camera_height, self.pitch_down, self.pan_at(stamp))
+        return left, right
 
     @property
     def start(self) -> int:
@@ -261,8 +277,8 @@ class Simulation:
 
     def frame(self, index: int) -> FrameTruth:
         """Images and exact geometry of one frame."""
-        base = self.base_at(self.stamp(index))
-        left, right = (base.after(mount) for mount in self.mounts[:2])
+        base, mounts = self.base_at(self.stamp(index)), self.cameras_at(self.stamp(index))
+        left, right = (base.after(mount) for mount in mounts)
         gain = self.exposure_difference + 1 + 0.01 * float(self._rng(2).uniform(0.5, 1.0))
         with ThreadPoolExecutor(self.threads) as pool:
             depth, surface, kind, radiance = self._render(left, pool)
@@ -278,14 +294,14 @@ class Simulation:
             views = (0, radiance, depth, 1.0), (1, other, other_depth, gain)
             images, jpegs = zip(*pool.map(lambda view: self._picture(index, *view), views), strict=True)
         compressed = jpegs if self.jpeg is not None else None
-        return FrameTruth(base, traverse.level_pose(base), depth, surface, seen, images, kind, compressed)
+        return FrameTruth(base, mounts, traverse.level_pose(base), depth, surface, seen, images, kind, compressed)
 
     def _picture(self, index: int, side: int, light: Array, depth: Array, gain: float) -> tuple[Array, Array]:
         """The image of one camera and, if it is compressed, the bytes of its file."""
         if self.exposure_time > 0:
             half, stamp = round(self.exposure_time / 2 * SECOND), self.stamp(index)
             begin, middle, end = (
-                self.base_at(time).after(self.mounts[side]) for time in (stamp - half, stamp, stamp + half)
+                self.base_at(time).after(self.cameras_at(time)[side]) for time in (stamp - half, stamp, stamp + half)
             )  # fmt: skip
             light = cameras.moved(light, depth, self.camera, (begin, middle, end))
         rng = self._rng(3, index, side)

@@ -19,6 +19,7 @@ from stages.data import LEVEL_FRAME, Array, Transform
 BODY_LENGTH, BODY_WIDTH = 1.0, 0.8
 LEFT_FRAME, RIGHT_FRAME = "left_camera_optical", "right_camera_optical"
 INCLINOMETER_FRAME = "inclinometer_link"
+MAST_FRAME = "mast_head"
 MAST_FORWARD = 0.35  # m from the body's centre to the cameras
 
 
@@ -83,11 +84,19 @@ def level_pose(base: Transform) -> Transform:
     return Transform("world", LEVEL_FRAME, Rotation.from_euler("z", heading).as_matrix(), base.translation)
 
 
-def mounts(baseline: float, camera_height: float, pitch_down: float) -> tuple[Transform, Transform, Transform]:
+def mast(camera_height: float, pan: float) -> Transform:
+    """base_link <- the head of the mast, turned to the left by `pan`, rad."""
+    head = np.array([MAST_FORWARD, 0.0, camera_height])
+    return Transform("base_link", MAST_FRAME, Rotation.from_euler("z", pan).as_matrix(), head)
+
+
+def mounts(
+    baseline: float, camera_height: float, pitch_down: float, pan: float = 0.0
+) -> tuple[Transform, Transform, Transform]:
     """base_link <- left camera, <- right camera, <- inclinometer."""
-    looking = Rotation.from_euler("y", pitch_down).as_matrix() @ BODY_FROM_OPTICAL
+    looking, head = Rotation.from_euler("y", pitch_down).as_matrix() @ BODY_FROM_OPTICAL, mast(camera_height, pan)
     left, right = (
-        Transform("base_link", name, looking, np.array([MAST_FORWARD, side * baseline / 2, camera_height]))
+        head.after(Transform(MAST_FRAME, name, looking, np.array([0.0, side * baseline / 2, 0.0])))
         for name, side in ((LEFT_FRAME, 1), (RIGHT_FRAME, -1))
     )
     askew = Rotation.from_euler("xyz", [3.0, -4.0, 7.0], degrees=True).as_matrix()

@@ -276,7 +276,7 @@ def test_an_unscored_tilt_has_a_reason(tmp_path, truth, frames):
     assert found.untilted == {"the result has no /tf from 'level' at that stamp": 2}
     assert "not scored in 2 frames: the result has no /tf from 'level'" in format_score(found)
     other = scored(tmp_path, truth, frames, camera="mast_camera")
-    assert other.untilted == {"the truth has no mount of 'mast_camera' on 'base_link'": 2}
+    assert other.untilted == {"the truth has no mount of 'mast_camera' on 'left_camera_optical'": 2}
     partly = scored(tmp_path, truth, frames, skipped=(0,))
     assert (partly.tilt["frames"], sum(partly.untilted.values())) == (1, 1)
 

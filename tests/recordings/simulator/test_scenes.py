@@ -171,6 +171,6 @@ def test_an_unknown_scene_or_too_much_ground_is_refused(tmp_path, capsys):
 @pytest.mark.parametrize("option", OPTIONS)
 def test_every_option_sets_its_field(option):
     field, kind, unit, *_ = OPTIONS[option]
-    value = {"scene": "dusk", "frames": 3, "seed": 4, "jpeg": 50}.get(option, 0.4 * unit)
+    value = {"scene": "dusk", "frames": 3, "seed": 4, "jpeg": 50, "imu": "raw"}.get(option, 0.4 * unit)
     assert getattr(Simulation(**{field: value}), field) == value
     assert isinstance(value, kind)

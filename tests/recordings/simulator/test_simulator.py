@@ -269,7 +269,7 @@ def test_the_inclinometer_and_its_mount_give_the_true_tilt(logged):
     readings = {ros2.stamp_of(m.header): m for m in messages["/imu/inclinometer"]}
     for truth in messages["/truth/tilt"]:
         up_sensor = rotation(readings[ros2.stamp_of(truth.header)].orientation)[2]
-        up_base = rotation(truth.quaternion)[2]
+        up_base = SMALL.mounts[0].rotation @ rotation(truth.quaternion)[2]
         np.testing.assert_allclose(base_from_sensor @ up_sensor, up_base, atol=1e-7)
         assert 1e-3 < np.arccos(up_base[2]) < np.radians(25)
     assert np.degrees(np.arccos(base_from_sensor[2, 2])) > 3  # an ignored mount would show
@@ -405,3 +405,20 @@ def test_an_impossible_simulation_is_refused_with_the_parameters_name():
 
 def rotation(quaternion) -> np.ndarray:
     return Rotation.from_quat([quaternion.x, quaternion.y, quaternion.z, quaternion.w]).as_matrix()
+
+
+def test_a_mast_that_pans_sees_the_same_world():
+    panning = replace(SMALL, pan=float(np.radians(30)), pan_time=4.0)
+    seen, straight = panning.frame(1), SMALL.frame(1)
+    assert np.degrees(panning.pan_at(panning.stamp(1))) == pytest.approx(30)
+    assert (seen.base.translation == straight.base.translation).all()
+    right, ahead = (eye.rotation[:, 2] @ seen.mounts[0].rotation[:, 2] for eye in (seen.mounts[1], straight.mounts[0]))
+    assert right == pytest.approx(1)
+    assert ahead == pytest.approx(1 - np.cos(panning.pitch_down) ** 2 * (1 - np.cos(np.radians(30))))
+    elevation, _ = ground_truth.truth_maps(panning, 0, seen)
+    other, _ = ground_truth.truth_maps(SMALL, 0, straight)
+    np.testing.assert_array_equal(elevation.layers["elevation"], other.layers["elevation"])
+    shown = elevation.layers["in_view"] > 0
+    row, column = np.nonzero(shown)
+    left_of_rover = np.degrees(np.arctan2(row - shown.shape[0] / 2, column - shown.shape[1] / 2))
+    assert np.median(left_of_rover) == pytest.approx(30, abs=5)
