@@ -96,7 +96,7 @@ def discover(
     found = DiscoveredTopics()
     _find_images(topics, settings, found)
     for side in ("left", "right"):
-        if side in found.chosen:
+        if side in found.chosen and settings.calibration is None:
             _find_info(topics, settings, side, frame_of, found)
     _find_tilt(topics, settings, content_of, found)
     _find_pose(topics, settings, no_pose_reason, found)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from flow.contracts import counted
+from recordings.calibration.log_calibration import INCLINOMETER, calibrations_of_files
 from recordings.containers.recording import Recording
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
@@ -40,11 +41,13 @@ class SourceResolution:
 
     def __init__(self, file: Recording, source: LogSettings) -> None:
         self.file, self.source, self.messages = file, source, DecodedTopics(file)
-        self.static, self.problems = self._read_static()
         self.undecodable = self._undecodable_topics()
         found = self._discovered()
         self._without_topic = frozenset(found.missing)  # streams without a topic
-        self.infos, unread = first_calibrations(self.messages, found.chosen)
+        self.static, files = TransformTree(), source.calibration
+        of_files = calibrations_of_files(files, self.messages, found.chosen, self.static) if files else {}
+        self.problems = self._read_static()
+        self.infos, unread = (of_files, {}) if files else first_calibrations(self.messages, found.chosen)
         self.cameras, self.baseline_note, unpaired = self._paired(found.chosen)
         unavailable = found.missing | unread | unpaired
         self.tilt, unread = self._tilt_reading(found)
@@ -75,17 +78,17 @@ class SourceResolution:
             name: why + (hint if name in self._without_topic else "") + part for name, why in self.unavailable.items()
         }
 
-    def _read_static(self) -> tuple[TransformTree, list[tuple[str, LogError]]]:
-        """The static transforms, and the problems with those left out."""
-        tree, problems = TransformTree(), list[tuple[str, LogError]]()
+    def _read_static(self) -> list[tuple[str, LogError]]:
+        """Add the log's static transforms to the tree; returns the problems with those left out."""
+        problems = list[tuple[str, LogError]]()
         for topic, schema in sorted(self.messages.schemas.items()):
             if schema == TRANSFORMS and (topic.endswith("tf_static") or self._is_foxglove(topic)):
                 for transforms in self._static_messages(topic):
                     for item in [transforms] if isinstance(transforms, LogError) else transforms:
-                        added = item if isinstance(item, LogError) else attempt(tree.add, item)
+                        added = item if isinstance(item, LogError) else attempt(self.static.add, item)
                         if isinstance(added, LogError):
                             problems.append(("log", LogError(f"{topic}: {added}")))
-        return tree, problems
+        return problems
 
     def _is_foxglove(self, topic: str) -> bool:
         """Whether a topic has Foxglove's transforms, which have no topic of their own for static ones."""
@@ -138,6 +141,8 @@ class SourceResolution:
         cameras = attempt(calibrated_pair, models, names, (chosen["left"], chosen["right"]), self.static)
         if isinstance(cameras, LogError):
             return None, "", dict.fromkeys(CAMERAS, str(cameras))
+        if self.source.calibration is not None:
+            return cameras, f"the calibration is that of {self.infos['left'].topic}", {}
         return cameras, baseline_note(cameras, models, names, self.static), {}
 
     def _mounted(
@@ -245,7 +250,8 @@ class SourceResolution:
     def _inclinometer_frame(self, topic: str) -> str:
         """The frame that the tilt is in: that of its messages, or the one whose poses they are."""
         if self.source.upright_frame is None:
-            return self.messages.frame_of(topic)
+            own = INCLINOMETER if INCLINOMETER in self.static.parents else ""
+            return self.messages.frame_of(topic) or own
         pose = self.messages.first(topic, lambda message: _pose_of(message, self.source.base_frame))
         return "" if isinstance(pose, LogError) else pose.child_frame_id
 

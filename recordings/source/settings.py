@@ -25,6 +25,9 @@ class LogSettings:
     right: str | None = parameter(None, "topic of the right images")
     left_info: str | None = parameter(None, "topic of the left camera's CameraInfo")
     right_info: str | None = parameter(None, "topic of the right camera's CameraInfo")
+    calibration: str | tuple[str, ...] | None = parameter(
+        None, "calibration files instead of CameraInfo, by the working directory: of ROS, Kalibr, EuRoC or OpenCV"
+    )
     inclinometer: str | None = parameter(
         None,
         "topic of an Imu or QuaternionStamped; with pitch, roll and tilt_model, or with accelerations, of any message; "

@@ -40,7 +40,10 @@ class TransformTree:
 
     def add(self, message: Any) -> None:
         """Add a geometry_msgs/TransformStamped. Raises LogError if it contradicts those so far, which are kept."""
-        transform = transform_of(message)
+        self.join(transform_of(message))
+
+    def join(self, transform: Transform) -> None:
+        """Add a transform. Raises LogError if it contradicts those so far, which are kept."""
         parent, child = transform.parent, transform.child
         known = self.between(parent, child)
         if known is None:

@@ -1,0 +1,1 @@
+"""Calibrations from files: ROS camera_info, Kalibr, EuRoC (ASL) and OpenCV."""

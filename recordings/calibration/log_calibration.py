@@ -1,0 +1,66 @@
+"""The calibration of a log's cameras from files, in place of its CameraInfo messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from recordings.calibration.formats import StereoCalibration, read_calibration
+from recordings.errors import LogError
+from recordings.ros2.image_from_msg import pixels_of
+from recordings.source.cameras import CAMERAS, CalibrationTopic
+from recordings.source.topics import DecodedTopics
+from recordings.source.transforms import TransformTree
+from stages.data import Array, CameraModel, Transform
+
+INCLINOMETER = "inclinometer"  # the frame of a tilt whose messages name none
+
+
+def calibrations_of_files(
+    given: str | tuple[str, ...], messages: DecodedTopics, chosen: Mapping[str, str], tree: TransformTree
+) -> dict[str, CalibrationTopic]:
+    """Side -> its calibration in the files; their transforms become part of the tree.
+
+    given: paths; chosen: role (left, right, inclinometer) -> topic. Raises LogError for files that cannot be used.
+    """
+    paths = [Path(path) for path in ([given] if isinstance(given, str) else given)]
+    calibration = read_calibration(paths)
+    if any(side not in chosen for side in CAMERAS):
+        return {}
+    topics = tuple(chosen[side] for side in CAMERAS)
+    if calibration.topics == topics[::-1]:
+        calibration = calibration.exchanged()
+    frames = [messages.frame_of(topic) for topic in topics]
+    if not all(frames) or frames[0] == frames[1]:
+        frames = [f"{side}_camera" for side in CAMERAS]
+    _join(calibration, frames, messages.frame_of(chosen.get("inclinometer", "")) or INCLINOMETER, tree)
+    shown = " and ".join(map(str, paths))
+    models = (_sized(model, messages, topic) for model, topic in zip(calibration.models, topics, strict=True))
+    sides = zip(CAMERAS, models, frames, strict=True)
+    return {side: CalibrationTopic(shown, model, frame) for side, model, frame in sides}
+
+
+def _join(calibration: StereoCalibration, frames: list[str], inclinometer: str, tree: TransformTree) -> None:
+    """Add the transforms of the files to a tree."""
+    left, right = frames
+    if calibration.right_in_left is not None:
+        tree.join(_transform(left, right, calibration.right_in_left))
+    if calibration.camera_from_imu is not None:
+        tree.join(_transform(left, inclinometer, calibration.camera_from_imu))
+
+
+def _transform(parent: str, child: str, matrix: Array) -> Transform:
+    return Transform(parent, child, matrix[:3, :3], matrix[:3, 3])
+
+
+def _sized(model: CameraModel, messages: DecodedTopics, topic: str) -> CameraModel:
+    """The calibration, with the size of the images where its file has none."""
+    if model.width and model.height:
+        return model
+    first = messages.first(topic, lambda message: pixels_of(message).shape)
+    if isinstance(first, LogError):
+        raise LogError(f"the calibration has no size of the images, and no image of {topic} can be read: {first}")
+    return replace(model, width=int(first[1]), height=int(first[0]), k=np.array(model.k))
