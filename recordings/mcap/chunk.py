@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 
 from recordings.mcap.index import RECORD, read_at
 
-MAX_CHUNK_BYTES = 1 << 32
+MAX_CHUNK_BYTES = 1 << 28  # of a chunk or message, unpacked; recorders make chunks of a few MB
 CHUNK_HEAD_BYTES = 128  # of a chunk record; they contain its length
 
 _CHUNK = struct.Struct("<QQQII")  # start time, end time, size, CRC, length of the compression's name

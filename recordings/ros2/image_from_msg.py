@@ -34,6 +34,7 @@ _BAYER = {
     "bayer_grbg": cv2.COLOR_BayerGRBG2RGB,
 }
 _MAX_PADDING_BYTES = 1024  # after the end of a compressed image
+MAX_PIXELS = 64_000_000  # of an image; navigation cameras have a tenth of it
 # Of these only the brightness is read. Encoding -> (bytes of a pixel in a row, place of the first brightness)
 _LUMA = {
     "uyvy": (2, 1), "yuv422": (2, 1), "UYVY": (2, 1),
@@ -64,6 +65,8 @@ def unread_encoding(message: Any) -> str:
 def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
     if width == 0 or height == 0:
         raise LogError(f"the image is empty ({width}x{height})")
+    if width * height > MAX_PIXELS:
+        raise LogError(f"the image is {width}x{height}, which is more than {MAX_PIXELS / 1e6:.0f} million pixels")
     if size is not None and size != (width, height):
         raise LogError(f"the image is {width}x{height}, but its calibration is for {size[0]}x{size[1]}")
 

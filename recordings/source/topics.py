@@ -16,6 +16,7 @@ from recordings.encodings.decoding import Decoder, decoder_of
 from recordings.errors import LogError, sentence_of
 from recordings.ros2.from_msg import frame_of
 
+MAX_CHANNELS = 1000  # that are decoded; a rover has a tenth of it
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
 
@@ -37,7 +38,10 @@ class DecodedTopics:
         self.decoders: dict[int, Decoder] = {}
         self.undecodable_channels: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
-        for number, channel in file.channels.items():
+        for place, (number, channel) in enumerate(file.channels.items()):
+            if place >= MAX_CHANNELS:
+                self.undecodable_channels[number] = f"the log has more than {MAX_CHANNELS} channels"
+                continue
             try:
                 self.schemas[channel.topic], self.decoders[number] = decoder_of(channel)
             except LogError as error:

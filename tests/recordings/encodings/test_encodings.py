@@ -1,6 +1,7 @@
 """One log in every encoding that is read, and foreign content in each."""
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ from recordings import McapSource
 from recordings.containers.container import Channel, MessageSchema
 from recordings.encodings.decoding import MAX_SCHEMA_BYTES, decoder_of
 from recordings.errors import LogError
+from recordings.ros2.cdr import make
 from recordings.ros2.image_from_msg import pixels_of
 from recordings.ros2.tilt_from_msg import AngleField
 from recordings.ros2.to_msg import image
+from recordings.source.topics import MAX_CHANNELS
 from stages.data import Tilt
 from tests.recordings.encodings.rewritten import WRITERS
 from tests.recordings.sample_log import essence, items_of
@@ -30,7 +33,7 @@ def test_the_same_items_are_read_from_every_encoding(sample, whole, tmp_path, na
 
 def test_a_part_of_a_log_begins_at_the_same_frame_in_every_encoding(sample, tmp_path):
     stamps = []
-    for log in (sample, *(make(sample, tmp_path / name) for name, make in WRITERS.items())):
+    for log in (sample, *(write(sample, tmp_path / name) for name, make in WRITERS.items())):
         stamps.append([item.stamp for _, stream, item in items_of(log, start=0.15) if stream == "left"])
     assert len(stamps[0]) == 3
     assert all(others == stamps[0] for others in stamps)
@@ -101,3 +104,35 @@ def test_the_brightness_of_nv12_images_is_read():
     message = image(0, "camera", luma)
     message.encoding, message.data = "nv12", np.concatenate([luma.ravel(), np.full(12, 128, np.uint8)])
     np.testing.assert_array_equal(pixels_of(message), luma)
+
+
+def png_head(width: int, height: int) -> bytes:
+    """The beginning and the end of a PNG file, which is all that a check of its size may read."""
+    return b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", width, height) + b"\0" * 64 + b"IEND\xaeB`\x82"
+
+
+def test_an_image_bomb_is_refused_before_it_is_decoded():
+    message = image(0, "camera", np.zeros((4, 6), np.uint8))
+    message.height, message.width = 30_000, 30_000
+    with pytest.raises(LogError, match="the image is 30000x30000, which is more than 64 million pixels"):
+        pixels_of(message)
+    compressed = make(
+        "sensor_msgs/msg/CompressedImage", header=message.header, format="png",
+        data=np.frombuffer(png_head(30_000, 30_000), np.uint8),
+    )  # fmt: skip
+    with pytest.raises(LogError, match="the image is 30000x30000, which is more than 64 million pixels"):
+        pixels_of(compressed)
+
+
+def test_a_log_of_thousands_of_topics_opens_quickly(tmp_path):
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="")
+        for number in range(MAX_CHANNELS + 5):
+            schema = writer.register_schema(f"a/B{number}", "ros2msg", b"int32 x")
+            channel = writer.register_channel(f"/t{number}", "cdr", schema)
+        writer.add_message(channel, 10**9, b"\0\1\0\0\0\0\0\0", 10**9)
+        writer.finish()
+    with McapSource().open(tmp_path / "log.mcap") as log:
+        assert len(log.resolution.messages.decoders) == MAX_CHANNELS
+        assert "the log has more than 1000 channels" in log.missing["left"]
