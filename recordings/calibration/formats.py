@@ -79,9 +79,7 @@ def read_calibration(paths: Sequence[Path]) -> StereoCalibration:
     if made.right_in_left is not None:
         baseline = float(np.linalg.norm(made.right_in_left[:3, 3]))
         if not 0 < baseline <= MAX_BASELINE_M:
-            raise LogError(
-                f"the cameras of {where} are {baseline:g} m apart, which is no baseline; write it in metres"
-            )
+            raise LogError(f"the cameras of {where} are {baseline:g} m apart, which is no baseline; write it in metres")
     return made
 
 

@@ -33,7 +33,7 @@ def test_the_same_items_are_read_from_every_encoding(sample, whole, tmp_path, na
 
 def test_a_part_of_a_log_begins_at_the_same_frame_in_every_encoding(sample, tmp_path):
     stamps = []
-    for log in (sample, *(write(sample, tmp_path / name) for name, make in WRITERS.items())):
+    for log in (sample, *(write(sample, tmp_path / name) for name, write in WRITERS.items())):
         stamps.append([item.stamp for _, stream, item in items_of(log, start=0.15) if stream == "left"])
     assert len(stamps[0]) == 3
     assert all(others == stamps[0] for others in stamps)
