@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import takewhile
 
-from recordings.source.imu_content import ImuContent
+from recordings.inertial.imu_content import ImuContent
 from recordings.source.settings import LogSettings
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")

@@ -59,8 +59,8 @@ def _camera_from_inclinometer(
         raise LogError(
             f"no static transform joins the camera ({_quoted(camera.frame_id)}) and the inclinometer "
             f"({_quoted(inclinometer)}); "
-            "record /tf_static (and /tf, if the camera moves on the rover), or set 'camera_from_inclinometer' "
-            "(quaternion x, y, z, w) of the source"
+            "record /tf_static (and /tf if the camera moves on the rover, or set 'joints' of the source), or set "
+            "'camera_from_inclinometer' (quaternion x, y, z, w) of the source"
         )
     return np.asarray(camera.model.r @ transform.rotation)
 

@@ -1,12 +1,13 @@
 """A camera that moves on the rover, as on a mast or a pan-tilt head: its mount at the time of each frame.
 
-The transforms that move are messages of their own. Each is interpolated between two of them, as the tilt is.
+The transforms that move are messages of their own, or angles of joints. Each is interpolated between two of them, as
+the tilt is.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right, insort
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice, pairwise
 from operator import itemgetter
@@ -19,11 +20,13 @@ from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name, frame_of, stamp_or, transform_of
 from recordings.source.calibration import Camera
 from recordings.source.discovery import TRANSFORMS
+from recordings.source.joints import Joint
 from recordings.source.mount import mount_of
-from recordings.source.topics import DecodedTopics
+from recordings.source.topics import DecodedTopics, attempt
 from recordings.source.transforms import TRANSFORM_ATOL, TransformTree
 from stages.data import Mount, Transform
 
+JOINTS = "sensor_msgs/msg/JointState"
 MAX_GAP_NS = 1_000_000_000  # between two messages of a transform
 MAX_SAMPLES = 5000  # of a transform, so that memory does not grow
 MAX_LOOKED_AT = 200  # messages of each topic, to find the transforms
@@ -35,7 +38,8 @@ Link = tuple[str, str]  # parent and child
 class MovingMount:
     """The mount of a camera on the rover, while `samples` has its transforms.
 
-    inclinometer, base: their frames; static: the transforms that do not move; links: those that do; topics: theirs.
+    inclinometer, base: their frames; static: the transforms that do not move; links: those that do; topics: theirs;
+    joints: by name.
     """
 
     camera: Camera
@@ -44,6 +48,7 @@ class MovingMount:
     static: TransformTree
     links: Sequence[Link]
     topics: Sequence[str]
+    joints: Mapping[str, Joint]
     samples: dict[Link, list[tuple[int, Transform]]] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -60,12 +65,10 @@ class MovingMount:
         return f"the camera moves on the rover: {moving} on {', '.join(self.topics)} is interpolated for each frame"
 
     def add(self, message: Any, log_time: int) -> None:
-        """Add the transforms of a tf2_msgs/TFMessage."""
-        for item in message.transforms:
-            link = frame_of(item), frame_name(item.child_frame_id)
-            if link in self.samples:
-                insort(self.samples[link], (stamp_or(item.header, log_time), transform_of(item)), key=itemgetter(0))
-                del self.samples[link][:-MAX_SAMPLES]
+        """Add the transforms of a tf2_msgs/TFMessage or a sensor_msgs/JointState."""
+        for link, stamp, transform in _transforms_in(message, log_time, self.joints, self.samples):
+            insort(self.samples[link], (stamp, transform), key=itemgetter(0))
+            del self.samples[link][:-MAX_SAMPLES]
 
     def at(self, stamp: int) -> Mount:
         """The mount at `stamp`, ns. Raises LogError if a transform is unknown then."""
@@ -84,35 +87,55 @@ class MovingMount:
 
 
 def moving_mount(
-    messages: DecodedTopics, camera: Camera, inclinometer: str, base: str, static: TransformTree
+    messages: DecodedTopics,
+    camera: Camera,
+    inclinometer: str,
+    base: str,
+    static: TransformTree,
+    joints: Mapping[str, Joint],
 ) -> MovingMount | None:
     """The mount of a camera that no static transform joins to its inclinometer or to the rover's base, but moving ones;
     None if there are none. It has the first samples."""
     if all(static.between(frame, camera.frame_id) is not None for frame in (inclinometer, base)):
         return None
-    found, links = dict[str, list[Any]](), dict[Link, None]()
+    found, links = dict[str, list[Any]](), dict[str, set[Link]]()
     for topic, schema in sorted(messages.schemas.items()):
-        if schema == TRANSFORMS and not topic.endswith("tf_static"):
+        if (schema == TRANSFORMS and not topic.endswith("tf_static")) or (schema == JOINTS and joints):
             read = islice(messages.each(topic, lambda message: message), MAX_LOOKED_AT)
             found[topic] = [message for message in read if not isinstance(message, LogError)]
-            items = chain.from_iterable(message.transforms for message in found[topic])
-            links |= dict.fromkeys((frame_of(item), frame_name(item.child_frame_id)) for item in items)
-    needed = _needed(camera.frame_id, inclinometer, base, static, links)
-    topics = [
-        topic
-        for topic, read in found.items()
-        if any((frame_of(item), frame_name(item.child_frame_id)) in needed for m in read for item in m.transforms)
-    ]
+            links[topic] = {link for message in found[topic] for link in _links_in(message, joints)}
+    needed = _needed(camera.frame_id, inclinometer, base, static, set().union(*links.values()))
     if not needed:
         return None
-    mount = MovingMount(camera, inclinometer, base, static, needed, topics)
-    for topic in topics:
-        for message in found[topic]:
-            try:
-                mount.add(message, 0)
-            except LogError:
-                continue
+    topics = [topic for topic in found if links[topic] & {*needed}]
+    mount = MovingMount(camera, inclinometer, base, static, needed, topics, joints)
+    for message in chain.from_iterable(found[topic] for topic in topics):
+        attempt(mount.add, message, 0)
     return mount
+
+
+def _links_in(message: Any, joints: Mapping[str, Joint]) -> list[Link]:
+    """The transforms that a message has."""
+    if hasattr(message, "transforms"):
+        return [(frame_of(item), frame_name(item.child_frame_id)) for item in message.transforms]
+    origins = (joints[name].origin for name in message.name if name in joints)
+    return [(origin.parent, origin.child) for origin in origins]
+
+
+def _transforms_in(
+    message: Any, log_time: int, joints: Mapping[str, Joint], wanted: Collection[Link]
+) -> Iterator[tuple[Link, int, Transform]]:
+    """The wanted transforms of a message, with their stamps."""
+    if hasattr(message, "transforms"):
+        for link, item in zip(_links_in(message, joints), message.transforms, strict=True):
+            if link in wanted:
+                yield link, stamp_or(item.header, log_time), transform_of(item)
+        return
+    for name, angle in zip(message.name, message.position, strict=False):
+        if name in joints and (link := (joints[name].origin.parent, joints[name].origin.child)) in wanted:
+            if not np.isfinite(angle):
+                raise LogError(f"the angle of joint '{name}' is {angle}")
+            yield link, stamp_or(message.header, log_time), joints[name].at(float(angle))
 
 
 def _needed(
@@ -123,7 +146,8 @@ def _needed(
     What places the base itself is the rover's pose, and is not used.
     """
     still = np.eye(3), np.zeros(3)
-    known = {link: Transform(*link, *still) for link in links if base != link[1] and static.between(*link) is None}
+    moving = [link for link in sorted(links) if link[1] != base and static.between(*link) is None]
+    known = {link: Transform(*link, *still) for link in moving}
     tree, needed = static.joined(known.values()), dict[Link, None]()
     for frame in (inclinometer, base):
         if static.between(frame, camera) is None:

@@ -11,11 +11,12 @@ from flow.contracts import counted
 from recordings.calibration.log_calibration import INCLINOMETER, calibrations_of_files
 from recordings.containers.recording import Recording
 from recordings.errors import LogError
+from recordings.inertial.imu_content import ImuContent, imu_content
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
 from recordings.source.calibration import Camera, baseline_note, calibrated_pair
 from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_images, unreadable_images
 from recordings.source.discovery import IMU, TRANSFORMS, DiscoveredTopics, TiltKind, Topic, discover
-from recordings.source.imu_content import ImuContent, imu_content
+from recordings.source.joints import read_joints
 from recordings.source.mount import mount_of, pose_of_base
 from recordings.source.moving_mount import MovingMount, moving_mount
 from recordings.source.settings import LogSettings
@@ -53,9 +54,10 @@ class SourceResolution:
         self.tilt, unread = self._tilt_reading(found)
         unavailable |= unread
         self.moving: MovingMount | None = None
+        self.refused: dict[str, str] = {}
         self.tilt_frame, self.mount, unmounted = self._mounted(found.chosen, unavailable)
         moving = self._moving_pose(found.chosen)
-        self.refused = found.refused | (moving if self.source.odometry else {}) | self._unjoined_base()
+        self.refused |= found.refused | (moving if self.source.odometry else {}) | self._unjoined_base()
         self.refused |= self._fixed_rotation()
         unavailable |= unmounted | moving
         there = [side for side in CAMERAS if side in found.chosen and side not in unavailable]
@@ -156,7 +158,11 @@ class SourceResolution:
             return "", None, {"mount": f"the mount needs an inclinometer: {unavailable['inclinometer']}"}
         frame = self._inclinometer_frame(chosen["inclinometer"])
         given, base = self.source.camera_from_inclinometer, self.source.base_frame
-        self.moving = moving_mount(self.messages, self.cameras[0], frame, base, self.static)
+        joints = attempt(read_joints, self.source.joints) if self.source.joints is not None else {}
+        if isinstance(joints, LogError):
+            self.refused |= {"joints": str(joints)}
+            joints = {}
+        self.moving = moving_mount(self.messages, self.cameras[0], frame, base, self.static, joints)
         if self.moving is None:
             mount = attempt(mount_of, self.cameras[0], frame, base, self.static, given)
         else:

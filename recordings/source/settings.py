@@ -66,6 +66,9 @@ class LogSettings:
         "quaternion x, y, z, w from inclinometer to left camera (x right, y down, z forward), "
         "for a log without static transforms",
     )
+    joints: str | None = parameter(
+        None, "YAML file of the axes that move the camera on the rover, whose angles are in a JointState"
+    )
     base_frame: str = parameter("base_link", "the rover's frame")
 
     def __post_init__(self) -> None:

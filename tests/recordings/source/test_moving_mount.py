@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2.to_msg import camera_info, image, imu, odometry, transform_message
+from recordings.ros2.cdr import make
+from recordings.ros2.to_msg import camera_info, header, image, imu, odometry, transform_message
 from stages.data import CameraImage, Mount, Pose, Transform
 from tests.recordings.sample_log import START, TRANSFORMS, model, picture
 
@@ -131,9 +133,61 @@ def test_static_transforms_are_preferred_and_the_pose_of_the_rover_is_no_mount(t
         return {"/tf": transform_message([(rover, stamp), (camera, stamp)])}
 
     with McapSource().open(written(tmp_path / "world.mcap", by_a_world, (IMU,))) as log:
-        assert "record /tf_static (and /tf, if the camera moves on the rover)" in log.missing["mount"]
+        assert "record /tf_static (and /tf if the camera moves on the rover" in log.missing["mount"]
 
 
 def test_a_fixed_rotation_of_a_camera_that_moves_is_refused(tmp_path):
     with McapSource(camera_from_inclinometer=(0.0, 0.0, 0.0, 1.0)).open(written(tmp_path / "log.mcap")) as log:
         assert "is a fixed rotation, but the camera moves on the rover" in log.refused["camera_from_inclinometer"]
+
+
+MAST = """
+pan: {parent: base_link, child: mast, xyz: [0.3, 0, 1.0], axis: [0, 0, 1]}
+other: {parent: base_link, child: arm}
+"""
+
+
+def angles(stamp: int) -> dict[str, Any]:
+    turn = np.radians(20) * (stamp - START) / 1e9
+    fields = {"velocity": np.zeros(0), "effort": np.zeros(0)}
+    names, positions = ["wheel", "pan"], np.array([7.0, turn])
+    return {
+        "/joints": make(
+            "sensor_msgs/msg/JointState", header=header(stamp, ""), name=names, position=positions, **fields
+        )
+    }
+
+
+def test_the_angles_of_joints_move_the_camera(tmp_path):
+    path, file = written(tmp_path / "log.mcap", angles), tmp_path / "mast.yaml"
+    file.write_text(MAST)
+    mounts, lost, notes = read(path, McapSource(joints=str(file)))
+    assert (len(mounts), lost) == (FRAMES, [])
+    for mount in mounts:
+        exact = pan(mount.stamp).after(ON_MAST)
+        np.testing.assert_allclose(mount.base_from_camera.rotation, exact.rotation, atol=1e-9)
+        np.testing.assert_allclose(mount.base_from_camera.translation[:2], exact.translation[:2], atol=1e-9)
+    assert "'base_link' <- 'mast' on /joints is interpolated" in notes["mount"]
+    with McapSource().open(path) as log:
+        assert "set 'joints'" in log.missing["mount"]
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("", "has no joints; write one entry each"),
+        ("pan: [1, 2]", "joint 'pan' is no mapping"),
+        ("pan: {parent: a, child: b, angle: 3}", "joint 'pan' has the unknown key 'angle'"),
+        ("pan: {parent: a}", "joint 'pan' needs the name of its frame 'child'"),
+        ("pan: {parent: a, child: b, xyz: [1, 2, x]}", "joint 'pan' has xyz: [1, 2, 'x'], which are not three numbers"),
+        ("pan: {parent: a, child: b, axis: [0, 0, 0]}", "joint 'pan' has the axis 0"),
+        ("pan: {parent: a, child", "cannot be read as YAML"),
+    ],
+)
+def test_a_wrong_file_of_joints_is_refused(tmp_path, content, sentence):
+    file = tmp_path / "mast.yaml"
+    file.write_text(content)
+    with McapSource(joints=str(file)).open(written(tmp_path / "log.mcap", angles)) as log:
+        assert sentence in log.refused["joints"]
+    with McapSource(joints=str(tmp_path / "none.yaml")).open(tmp_path / "log.mcap") as log:
+        assert "none.yaml cannot be read as YAML" in log.refused["joints"]
