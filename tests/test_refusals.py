@@ -33,7 +33,7 @@ def drop(*parts: str):
         (drop("/right"), "only one image topic"),
         (drop("/tf_static"), "tf_static"),
         (drop("/"), "no messages"),
-        (lambda topic, index, data: data.replace(b"\0rgb8\0", b"\0uyvy\0"), "encoding 'uyvy' is not supported"),
+        (lambda topic, index, data: data.replace(b"\0rgb8\0", b"\0xyzw\0"), "encoding 'xyzw' is not supported"),
     ],
     ids=["no tilt", "no calibration", "one camera", "no mounting", "nothing", "an encoding nobody reads"],
 )

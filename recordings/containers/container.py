@@ -92,6 +92,9 @@ class Container(Protocol):
         messages in the timeline; None: all.
         """
 
+    def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
+        """At least the first bytes of the messages of `channels`, with their headers, in any order and not verified."""
+
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
 

@@ -76,6 +76,10 @@ class Db3File:
                 yield LostMessage(channel, self.end, "the message is lost: its log time is damaged")
             yield from self.lost
 
+    def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
+        """The messages of some channels; they have to be read as a whole."""
+        return self.messages(channels)
+
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
         return int(np.isin(self.timeline.channels, sorted(channels)).sum())

@@ -208,6 +208,19 @@ class Recording:
         if end is None:
             yield from (LostMessage(None, self.end, why) for why in self._missing)
 
+    def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
+        """At least the first bytes of some messages, with their headers, in any order and not verified.
+
+        Messages that do not begin with a header are read as a whole.
+        """
+        if not channels <= self._stamped:
+            yield from self.messages(channels)
+            return
+        for file, numbers in zip(self.files, self._numbers, strict=True):
+            own = {number for number in numbers if numbers[number] in channels}
+            for item in file.heads(own) if own else ():
+                yield item if item.channel is None else item._replace(channel=numbers[item.channel])
+
     def times(self, channels: set[int], allow_repeats: bool = False) -> NDArray[np.int64]:
         """The sorted log times of some channels, ns; by default without those that repeat."""
         return np.sort(np.concatenate([part.times(channels, allow_repeats) for part in self._parts]))

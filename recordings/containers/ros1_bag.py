@@ -80,6 +80,10 @@ class Ros1Bag:
             if not waiting[chunk]:
                 del chunks[chunk]
 
+    def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
+        """The messages of some channels; they have to be read as a whole."""
+        return self.messages(channels)
+
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
         return int(np.isin(self.timeline.channels, sorted(channels)).sum())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Iterator, Sequence
 from typing import BinaryIO
 
 import lz4.frame
@@ -58,7 +59,7 @@ def chunk_start_time(content: bytes) -> int:
     return int(_CHUNK.unpack_from(content)[0])
 
 
-def unpack_chunk(content: bytes) -> bytes:
+def unpack_chunk(content: bytes) -> bytes | memoryview:
     """The decompressed records of a chunk. Raises ValueError where the size or the CRC does not match."""
     _, _, size, checksum, _ = _CHUNK.unpack_from(content)
     compression, packed, length = _split_chunk(content)
@@ -73,18 +74,41 @@ def unpack_chunk(content: bytes) -> bytes:
     return data
 
 
-def unpack_cut_chunk(content: bytes) -> bytes:
+def chunk_heads(file: BinaryIO, position: int, offsets: Sequence[int], size: int) -> Iterator[bytes]:
+    """The first `size` bytes of the records at ascending offsets of a chunk, without checking its CRC.
+
+    Of a chunk that is not compressed, only these bytes are read. position: of the chunk record's content.
+    """
+    start = read_at(file, position, CHUNK_HEAD_BYTES)
+    name_end = _CHUNK.size + _CHUNK.unpack_from(start)[-1]
+    compression, content = str(start[_CHUNK.size : name_end], "utf-8"), position + name_end + 8
+    if not compression:
+        yield from (read_at(file, content + offset, size) for offset in offsets)
+    elif compression == "zstd":
+        file.seek(content)
+        stream, at = zstandard.ZstdDecompressor().stream_reader(file, closefd=False), 0
+        for offset in offsets:
+            while at < offset and (skipped := len(stream.read(min(offset - at, _BLOCK_BYTES)))):
+                at += skipped
+            found = stream.read(size)
+            yield found
+            at += len(found)
+    else:
+        raise ValueError(f"the start of a chunk in '{compression}' cannot be read alone")
+
+
+def unpack_cut_chunk(content: bytes) -> bytes | memoryview:
     """The part of a cut chunk that can still be decompressed. Its CRC cannot be checked."""
     compression, packed, _ = _split_chunk(content)
     return _decompress(compression, packed, _CHUNK.unpack_from(content)[2])
 
 
-def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
+def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memoryview:
     """At most size + 1 bytes of the decompressed content."""
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"it states an uncompressed size of {size} bytes; the limit is {MAX_CHUNK_BYTES}")
     if not compression:
-        return bytes(packed[: size + 1])
+        return packed[: size + 1]
     if not packed:
         return b""
     if compression == "zstd":

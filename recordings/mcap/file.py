@@ -24,10 +24,12 @@ from numpy.typing import NDArray
 from flow.contracts import counted
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
 from recordings.containers.timeline import MAX_LOG_TIME, Timeline
+from recordings.containers.unpacking import ZSTD_MAGIC
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.chunk import MAX_CHUNK_BYTES, unpack_chunk
+from recordings.mcap.chunk import MAX_CHUNK_BYTES, chunk_heads, unpack_chunk
 from recordings.mcap.index import (
     MAGIC,
+    MESSAGE,
     PARSE_ERRORS,
     RECORD,
     UnchunkedMessage,
@@ -39,6 +41,8 @@ from recordings.mcap.index import (
 )
 from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for
+
+HEAD_BYTES = 64  # of a message; they contain the stamp of its header
 
 
 class McapFile:
@@ -126,6 +130,36 @@ class McapFile:
         if start is None and end is None and places is None:
             yield from self._unaccounted(found)
 
+    def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
+        """The first bytes of the messages of some channels, in file order, without checking CRCs.
+
+        Chunks without a message index, and messages that are compressed one by one, are read as a whole.
+        """
+        for chunk in self._chunks(channels):
+            try:
+                yield from list(self._chunk_heads(chunk, channels))
+            except PARSE_ERRORS:
+                yield from (item for item in self._chunk_or_lost(chunk) if item.channel in channels)
+        for item in self.index.unchunked:
+            if item.channel in channels:
+                yield self._read_unchunked(item._replace(size=min(item.size, HEAD_BYTES)))
+        yield from (message for _, message in self.index.rescued if message.channel in channels)
+        yield from self.index.lost
+
+    def _chunk_heads(self, chunk: ChunkIndex, channels: set[int]) -> Iterator[RawMessage]:
+        numbers, times, offsets = self._message_index(chunk)
+        if not len(numbers):
+            raise ValueError("the chunk has no message index")
+        wanted = np.isin(numbers, sorted(channels))
+        place, size = chunk.chunk_start_offset + RECORD.size, RECORD.size + MESSAGE.size + HEAD_BYTES
+        records = chunk_heads(self._file, place, offsets[wanted].tolist(), size)
+        for number, time, record in zip(numbers[wanted].tolist(), times[wanted].tolist(), records, strict=True):
+            data = memoryview(record)[RECORD.size + MESSAGE.size :]
+            if record[:1] != bytes([Opcode.MESSAGE]) or data[:4] == ZSTD_MAGIC:
+                raise ValueError("there is no message of known start at the offset in the index")
+            length = RECORD.unpack_from(record)[1] - MESSAGE.size
+            yield RawMessage(number, time, data[:length])
+
     @cached_property
     def timeline(self) -> Timeline:
         """Channel and log time of every message, in file order; an indexed file is not decompressed for them."""
@@ -133,7 +167,7 @@ class McapFile:
         if not index.walked:
             for chunk in self._chunks(set(self.channels)):
                 first = len(index.counted_times)
-                channels, times = self._message_index(chunk)
+                channels, times, _ = self._message_index(chunk)
                 index.counted_channels.frombytes(channels.tobytes())
                 index.counted_times.frombytes(times.tobytes())
                 for item in () if len(times) else self._chunk_or_lost(chunk):
@@ -221,7 +255,7 @@ class McapFile:
         except PARSE_ERRORS as error:
             reason = lost_chunk(chunk.chunk_start_offset, error)
         channels = chunk.message_index_offsets
-        known = [column.tolist() for column in self._message_index(chunk)]
+        known = [column.tolist() for column in self._message_index(chunk)[:2]]
         known = known if known[0] else [list(channels), [chunk.message_start_time] * len(channels)]
         lost = [LostMessage(channel, log_time, reason) for channel, log_time in zip(*known, strict=True)]
         return lost or [LostMessage(None, chunk.message_start_time, reason)]
@@ -238,8 +272,8 @@ class McapFile:
     def _read_unchunked(self, place: UnchunkedMessage) -> RawMessage:
         return RawMessage(place.channel, place.log_time, memoryview(read_at(self._file, place.offset, place.size)))
 
-    def _message_index(self, chunk: ChunkIndex) -> tuple[NDArray[np.uint16], NDArray[np.uint64]]:
-        """Channel and log time of each message of a chunk, in file order; empty without a valid message index."""
+    def _message_index(self, chunk: ChunkIndex) -> tuple[NDArray[np.uint16], NDArray[np.uint64], NDArray[np.uint64]]:
+        """Channel, log time and offset of each message of a chunk, in file order; empty without a message index."""
         channels, entries = [np.zeros(0, np.uint16)], [np.zeros((0, 2), np.uint64)]
         first = chunk.chunk_start_offset + chunk.chunk_length
         with suppress(*PARSE_ERRORS):
@@ -251,8 +285,8 @@ class McapFile:
                     channels.append(np.full(len(entries[-1]), channel, np.uint16))
             times, offsets = np.concatenate(entries).T
             order = np.argsort(offsets, kind="stable")
-            return np.concatenate(channels)[order], times[order]
-        return channels[0], entries[0][:, 0]
+            return np.concatenate(channels)[order], times[order], offsets[order]
+        return channels[0], entries[0][:, 0], entries[0][:, 1]
 
     def _unaccounted(self, found: dict[int, int]) -> Iterator[LostMessage]:
         """The messages that the file's statistics count but that were neither read nor reported as lost."""

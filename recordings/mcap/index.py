@@ -173,7 +173,7 @@ def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
     return file.read(min(size, there))
 
 
-def iter_records(section: bytes, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
+def iter_records(section: bytes | memoryview, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
     """(opcode, content) of each record of a section. A cut record raises ValueError; without `whole` it is left out."""
     view, position = memoryview(section), 0
     while position < len(view):

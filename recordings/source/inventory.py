@@ -16,6 +16,7 @@ from recordings.source.cameras import CAMERAS
 from recordings.source.log import McapLog
 from stages.data import StereoCamera, Tilt
 
+MAX_VERIFIED_BYTES = 300_000_000  # of a log whose messages are all read; it takes a second
 Stamps = NDArray[np.int64]
 
 
@@ -31,7 +32,7 @@ def describe(
     resolution, lost = log.resolution, log.file.lost
     damage = sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems})
     stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
-    stamps["inclinometer"] = _tilts(log, damage)
+    stamps["inclinometer"] = (_tilts if _is_verified(log) else _tilt_stamps)(log, damage)
     left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
     max_gap = None if max_gap_of is None else max_gap_of(np.diff(tilts).tolist())
     return {
@@ -161,7 +162,7 @@ def _stamps(log: McapLog, stream: str, damage: list[str]) -> list[int]:
     if stream not in log.topics:
         return []
     topic, stamps = log.topics[stream], []
-    for raw in log.file.messages(log.channels(stream)):
+    for raw in (log.file.messages if _is_verified(log) else log.file.heads)(log.channels(stream)):
         if not isinstance(raw, LostMessage):
             stamps.append(log.stamp_of(raw) or raw.log_time)
         elif raw.channel is not None:
@@ -180,6 +181,16 @@ def _tilts(log: McapLog, damage: list[str]) -> list[int]:
         elif stream == "inclinometer":
             damage.append(str(item))
     return stamps
+
+
+def _tilt_stamps(log: McapLog, damage: list[str]) -> list[int]:
+    """The stamps of the tilts of a large log, ns, without decoding them."""
+    return _stamps(log, "inclinometer", damage)
+
+
+def _is_verified(log: McapLog) -> bool:
+    """Whether all messages of the streams are read and checked; of a large log only their stamps are read."""
+    return log.file.size <= MAX_VERIFIED_BYTES
 
 
 def _distinct(log: McapLog, stream: str, damage: list[str], stamps: list[int]) -> Stamps:

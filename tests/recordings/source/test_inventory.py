@@ -5,8 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType
 
 from recordings import McapSource
+from recordings.containers.header import peek_stamp
+from recordings.containers.opening import open_recording
+from recordings.mcap.file import HEAD_BYTES, McapFile
 from recordings.ros2.to_msg import transform_message
 from recordings.source.inventory import format_description
 from stages.data import Transform
@@ -14,6 +18,7 @@ from tests.conftest import rewrite
 from tests.recordings.sample_log import (
     BASELINE,
     FRAMES,
+    LAYOUTS,
     LEFT,
     PERIOD,
     RIGHT,
@@ -223,3 +228,25 @@ def test_damage_is_reported(tmp_path):
 def test_without_a_tilt_no_frame_has_one(tmp_path):
     edit = changed(TILT, {"orientation_covariance": np.full(9, -1.0)})
     assert inventory_of(write_sample(tmp_path / "log.mcap", edit))["frames"]["with_tilt"] == 0
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_large_log_is_described_by_the_starts_of_its_messages(sample, tmp_path, monkeypatch, layout):
+    path = rewrite(sample, tmp_path / "log.mcap", **LAYOUTS[layout])
+    whole = inventory_of(path)
+    monkeypatch.setattr("recordings.source.inventory.MAX_VERIFIED_BYTES", 0)
+    assert inventory_of(path) == whole
+
+
+def test_only_the_starts_of_the_images_of_a_large_log_are_read(sample, tmp_path, monkeypatch):
+    path = rewrite(sample, tmp_path / "log.mcap", compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    with McapFile(path) as log:
+        (image,) = (item for item in log.messages(log.channels_of([LEFT]), START, START + PERIOD // 2))
+    at = content.index(bytes(image.data))
+    content[at + len(image.data) // 2] ^= 0xFF  # the CRC of the only chunk does not match any more
+    path.write_bytes(content)
+    with open_recording(path) as log:
+        heads = list(log.heads(log.channels_of([LEFT, RIGHT])))
+    assert [peek_stamp(head.data) for head in heads] == [START + n // 2 * PERIOD for n in range(2 * FRAMES)]
+    assert {len(head.data) for head in heads} == {HEAD_BYTES}
