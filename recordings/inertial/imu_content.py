@@ -6,16 +6,22 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from recordings.errors import LogError
 from recordings.ros2.tilt_from_msg import acceleration_of, rate_of, tilt_of
 from recordings.source.topics import attempt
+from stages.data import Array
 
+MIN_GRAVITY = 0.3  # m/s^2, of a mean acceleration; less is a bias of the sensor
+MIN_COMMON_SHARE = 0.3  # of the size of accelerations, that their mean has
 _IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class ImuContent:
-    """no_orientation: why no message has one, empty if one does; accelerations, rates: whether some are not 0."""
+    """no_orientation: why no message has one, empty if one does; accelerations: whether they contain gravity; rates:
+    whether some are not 0."""
 
     no_orientation: str
     accelerations: bool
@@ -27,7 +33,7 @@ def imu_content(messages: Iterable[Any | LogError]) -> ImuContent:
 
     An orientation that is 1 in all of several messages with accelerations is a default of the driver.
     """
-    why, seen, accelerations, rates = "it has no messages", list[tuple[float, ...]](), False, False
+    why, seen, forces, rates = "it has no messages", list[tuple[float, ...]](), list[tuple[float, ...]](), False
     for message in messages:
         if isinstance(message, LogError):
             why = str(message)
@@ -37,12 +43,23 @@ def imu_content(messages: Iterable[Any | LogError]) -> ImuContent:
             why = str(tilt)
         else:
             seen.append(tuple(getattr(message.orientation, name) for name in "xyzw"))
-        accelerations |= _measures(attempt(acceleration_of, message))
-        rates |= _measures(attempt(rate_of, message))
-    if accelerations and len(seen) > 1 and set(seen) == {_IDENTITY}:
-        return ImuContent("it is 1 in every message, as of a driver that has none", accelerations, rates)
-    return ImuContent("" if seen else why, accelerations, rates)
+        forces += _measured(attempt(acceleration_of, message))
+        rates |= any(map(any, _measured(attempt(rate_of, message))))
+    gravity = _contain_gravity(np.array(forces, np.float64).reshape(-1, 3))
+    if np.any(forces) and not gravity:
+        return ImuContent("" if seen else f"{why}; its accelerations contain no gravity", gravity, rates)
+    if gravity and len(seen) > 1 and set(seen) == {_IDENTITY}:
+        return ImuContent("it is 1 in every message, as of a driver that has none", gravity, rates)
+    return ImuContent("" if seen else why, gravity, rates)
 
 
-def _measures(vector: tuple[float, ...] | LogError | None) -> bool:
-    return not isinstance(vector, LogError) and vector is not None and any(vector)
+def _measured(vector: tuple[float, ...] | LogError | None) -> list[tuple[float, ...]]:
+    return [] if isinstance(vector, LogError) or vector is None else [vector]
+
+
+def _contain_gravity(forces: Array) -> bool:
+    """Whether accelerations (n, 3), m/s^2, have a common direction; some drivers subtract gravity."""
+    if not len(forces):
+        return False
+    mean, size = float(np.linalg.norm(forces.mean(axis=0))), float(np.sqrt((forces**2).sum(axis=1).mean()))
+    return mean > MIN_GRAVITY and mean > MIN_COMMON_SHARE * size

@@ -294,6 +294,14 @@ def _find_gyroscope(
         if settings.gyroscope not in {topic.name for topic in imus}:
             found.refuse("inclinometer", "gyroscope", _not_there("gyroscope", settings.gyroscope, "Imu", imus))
             return
+        if settings.accelerations is None and not _accelerates(own, imus, content_of):
+            own = next((name for name in (settings.gyroscope,) if settings.inclinometer is None), own)
+            if not _accelerates(own, imus, content_of):
+                why = f"{own} has no accelerations to go with the rates; set 'inclinometer' to the Imu that has them"
+                found.refuse("inclinometer", "gyroscope", f"'gyroscope' of the source is set, but {why}")
+                del found.chosen["inclinometer"]
+                return
+            found.chosen["inclinometer"] = own
         rated = [settings.gyroscope]
     elif settings.accelerations is not None:
         return
@@ -309,6 +317,10 @@ def _find_gyroscope(
         )
     elif rated:
         found.tilt, found.chosen["gyroscope"] = TiltKind.ESTIMATE, rated[0]
+
+
+def _accelerates(name: str, imus: Sequence[Topic], content_of: Callable[[str], ImuContent]) -> bool:
+    return name in {topic.name for topic in imus} and content_of(name).accelerations
 
 
 def _undefined(topic: Topic) -> str:

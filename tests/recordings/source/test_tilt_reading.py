@@ -163,6 +163,28 @@ def test_an_estimate_may_be_preferred_to_the_orientation(tmp_path):
     assert driven.errors(read(path, McapSource(gyroscope=IMU))[0]).mean() < 0.3
 
 
+def test_accelerations_without_gravity_are_no_tilt(tmp_path):
+    driven = drive(seconds=4, rest=1)
+    driven.forces[:] -= 9.81 * driven.up
+    why = missing(written(tmp_path / "log.mcap", driven))
+    assert "/imu0 contains no orientation" in why
+    assert "its accelerations contain no gravity" in why
+
+
+def test_a_gyroscope_needs_accelerations(tmp_path):
+    turn = Rotation.from_euler("x", 10, degrees=True).as_quat()
+
+    def beside(number, stamp, rate, force):
+        """An inclinometer, and an Imu of rates only."""
+        fields = {"header": header(stamp, "imu_link"), "quaternion": quaternion(turn)}
+        tilt = make("geometry_msgs/msg/QuaternionStamped", **fields)
+        return {"/tilt": tilt, IMU: raw_imu(stamp, "imu_link", rate, 0 * force)}
+
+    path = written(tmp_path / "log.mcap", drive(seconds=2), beside)
+    assert read(path)[2] == ""
+    assert "/imu0 has no accelerations to go with the rates" in missing(path, McapSource(gyroscope=IMU))
+
+
 @pytest.mark.parametrize(("field", "sign"), [("vector", -1), ("vector.x vector.y vector.z", -1)])
 def test_an_inclinometer_may_log_three_accelerations(tmp_path, field, sign):
     driven = drive(seconds=6)
