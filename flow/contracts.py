@@ -131,7 +131,8 @@ class Log(Protocol):
     """An opened log.
 
     missing: stream -> why this log does not have it; refused: setting of the source -> why this log cannot be read with
-    it; frames: the number of frames, where it is known. Optional: `begin`, the log time of its first message, ns.
+    it; frames: the number of frames, where it is known. Optional: `begin`, the log time of its first message, ns;
+    `faults()`, stream -> a Finding about it, which the run asks for at its end.
     """
 
     missing: Mapping[str, str]

@@ -187,9 +187,11 @@ def fitted(graph: Graph, log: Log) -> Graph:
 
 
 def _notes(log: Log, graph: Graph) -> dict[str, Finding]:
-    """The log's notes about the streams that the graph reads."""
+    """The log's notes about the streams that the graph reads, and its faults."""
     try:
-        return {name: Finding(note) for name, note in log.notes().items() if name in graph.source_streams}
+        found = {name: Finding(note) for name, note in log.notes().items()}
+        found.update(getattr(log, "faults", dict)())
+        return {name: finding for name, finding in found.items() if name in graph.source_streams}
     except Exception as error:  # must not leave the outputs open
         return {"log": warning(failure(error))}
 

@@ -31,6 +31,10 @@ LOOKAHEAD_NS = BATCH_NS + LAG_BLOCKS * BLOCK_NS
 MAX_GAP_NS = 500_000_000  # without a rate; a new estimate begins after a longer time
 MIN_TILT_INTERVAL_NS = 9_000_000
 START_BLOCKS = 5  # whose mean acceleration is the first guess of gravity
+SPAN_BLOCKS = 5  # whose mean accelerations are compared with the rates
+MIN_COMPARED = 20  # of these spans
+MIN_TURNED = float(np.radians(1.0))  # RMS of the turns that the rates show within a batch
+MIN_EXPLAINED = 0.3  # share of these turns that accelerations confirm; near 1 for a sound sensor, else below 0
 
 
 @dataclass
@@ -47,6 +51,7 @@ class UpEstimator:
     rest_seconds: float = 0.0
     seconds: float = 0.0
     measured_gravity: float = 0.0
+    _compared: Array = field(default_factory=lambda: np.zeros(4))  # spans; variances: see `_compare`
     _waiting: list[InertialSample] = field(default_factory=list)
     _knot: Knot | None = None
     _origin: int = 0
@@ -69,6 +74,13 @@ class UpEstimator:
                 made += self._tilts(LAG_BLOCKS)
         self._waiting.append(sample)
         return made
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether accelerations and rates contradict each other, as of a gyroscope with wrong axes or a wrong unit."""
+        spans, own, turned, predicted = self._compared
+        clear = spans >= MIN_COMPARED and predicted > MIN_TURNED**2 * spans
+        return bool(clear and own - turned < MIN_EXPLAINED * predicted)
 
     def finish(self) -> list[Tilt]:
         """The tilts of all samples so far; a new estimate then begins."""
@@ -132,10 +144,24 @@ class UpEstimator:
             self._steps.append(step)
             self.seconds += float(blocks.seconds[at])
             self.rest_seconds += rest * float(blocks.seconds[at])
+        self._compare(blocks)
         force = blocks.force[np.isfinite(blocks.force).all(axis=1)]
         if len(force):
             weight = float(blocks.seconds.sum()) / self.seconds
             self.measured_gravity += weight * (float(np.linalg.norm(force.mean(axis=0))) - self.measured_gravity)
+
+    def _compare(self, blocks: Blocks) -> None:
+        """Add the variances of mean accelerations, over that of gravity: in the sensor's frame, in the gyroscope's, and
+        that of gravity in the sensor's frame by the rates alone. For a sound sensor the first is the sum of the others.
+        """
+        count = len(blocks) // SPAN_BLOCKS * SPAN_BLOCKS
+        force, axes = blocks.force[:count], np.swapaxes(blocks.axes[:count], 1, 2)
+        if count < 2 * SPAN_BLOCKS or not np.isfinite(force).all():
+            return
+        mean = force.mean(axis=0)
+        kinds = (axes @ force[:, :, None])[:, :, 0], force, axes @ mean
+        means = [kind.reshape(-1, SPAN_BLOCKS, 3).mean(axis=1) / np.linalg.norm(mean) for kind in kinds]
+        self._compared += [len(means[0]), *(float(((m - m.mean(axis=0)) ** 2).sum()) for m in means)]
 
     def _tilts(self, kept: int) -> list[Tilt]:
         """The tilts of all blocks but the last `kept`, which wait for later samples."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ import numpy as np
 from recordings.errors import LogError
 from recordings.ros2.from_msg import camera_model, frame_of, stamp_or
 from recordings.ros2.image_from_msg import pixels_of, unread_encoding
+from recordings.source.calibration import Camera
 from recordings.source.topics import DecodedTopics
-from stages.data import Array, CameraModel
+from stages.data import Array, CameraImage, CameraModel
 
 CAMERAS = ("left", "right")
 
@@ -61,6 +62,21 @@ class CalibrationHistory:
 def _equal(one: CameraModel, other: CameraModel) -> bool:
     numbers = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("k", "d", "r", "p"))
     return numbers and (one.width, one.height, one.model) == (other.width, other.height, other.model)
+
+
+@dataclass(frozen=True)
+class ImageReading:
+    """Reads the images of one camera, unless another calibration than the first was in force."""
+
+    camera: Camera
+    calibrations: CalibrationHistory
+
+    def __call__(self, message: Any, log_time: int) -> CameraImage:
+        model, stamp = self.camera.model, stamp_or(message.header, log_time)
+        self.calibrations.check(stamp)
+        camera = self.camera if self.camera.frame_id else replace(self.camera, frame_id=frame_of(message))
+        pixels = pixels_of(message, (model.width, model.height))
+        return CameraImage(stamp, pixels, model, camera.image_frame, camera.rectified)
 
 
 def first_calibrations(

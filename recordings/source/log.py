@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flow.contracts import Finding
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
@@ -25,10 +26,8 @@ from recordings.containers.time_range import EDGE_NS, MAX_LATENESS_NS, FramesInR
 from recordings.encodings.decoding import Decoder
 from recordings.errors import LogError, sentence_of
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
-from recordings.ros2.from_msg import frame_of, pose_of, stamp_of, stamp_or
-from recordings.ros2.image_from_msg import pixels_of
-from recordings.source.calibration import Camera
-from recordings.source.cameras import CAMERAS, CalibrationHistory
+from recordings.ros2.from_msg import pose_of, stamp_of
+from recordings.source.cameras import CAMERAS, CalibrationHistory, ImageReading
 from recordings.source.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.source.mount import pose_of_base
 from recordings.source.moving_mount import MovingMount
@@ -230,6 +229,13 @@ class McapLog:
             notes["mount"] = "; ".join((*filter(None, [notes.get("mount")]), self.resolution.moving.note))
         return notes
 
+    def faults(self) -> dict[str, Finding]:
+        """Stream -> what a run has shown to be wrong with it."""
+        if self._estimator is None or self.resolution.tilt is None:
+            return {}
+        fault = self.resolution.tilt.fault(self._estimator)
+        return {} if fault is None else {"inclinometer": fault}
+
     def _is_unstamped(self, stream: str, topic: str) -> bool:
         raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, LostMessage))
         first = next(raws, None) if self.resolution.messages.schemas[topic] in STAMPED_SCHEMAS else None
@@ -302,7 +308,7 @@ class McapLog:
             "odometry": lambda message, log_time: self._rover_pose(pose_of(message, log_time, base_frame)),
         }
         for side, camera in zip(CAMERAS, self.resolution.cameras or (), strict=False):
-            made[side] = _Images(camera, calibrations[side])
+            made[side] = ImageReading(camera, calibrations[side])
         chosen = [(stream, topic) for stream, topic in self.topics.items() if stream in made and stream in streams]
         readers = [self._reader(stream, topic, made[stream]) for stream, topic in chosen]
         return [*readers, *self._tilt_readers()] if "inclinometer" in streams else readers
@@ -353,21 +359,6 @@ class McapLog:
     @staticmethod
     def _by_channel(readers: Iterable[TopicReader]) -> dict[int, TopicReader]:
         return {channel: reader for reader in readers for channel in reader.decoders}
-
-
-@dataclass(frozen=True)
-class _Images:
-    """Decodes the images of one camera, unless another calibration than the first was in force."""
-
-    camera: Camera
-    calibrations: CalibrationHistory
-
-    def __call__(self, message: Any, log_time: int) -> CameraImage:
-        model, stamp = self.camera.model, stamp_or(message.header, log_time)
-        self.calibrations.check(stamp)
-        camera = self.camera if self.camera.frame_id else replace(self.camera, frame_id=frame_of(message))
-        pixels = pixels_of(message, (model.width, model.height))
-        return CameraImage(stamp, pixels, model, camera.image_frame, camera.rectified)
 
 
 def _with_lookahead(

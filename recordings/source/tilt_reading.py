@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from flow.contracts import Finding, Severity
 from recordings.errors import LogError
 from recordings.inertial.blocks import InertialSample
 from recordings.inertial.up_estimator import UpEstimator
@@ -98,6 +99,17 @@ class TiltReading:
         return (
             f"{said}; at rest for {estimator.rest_seconds:.0f} of {estimator.seconds:.0f} s; "
             f"{_gravity(estimator.measured_gravity, settings.gravity)}"
+        )
+
+    def fault(self, estimator: UpEstimator) -> Finding | None:
+        """A fault of the sensors that the samples show, after a run."""
+        if not estimator.contradicts:
+            return None
+        return Finding(
+            f"The rates on {self.gyroscope} contradict the accelerations on {self.topic}, so the estimate of up is "
+            "wrong. Check the axes, the signs and the unit (rad/s) of the gyroscope.",
+            Severity.FAULT,
+            about="tilt",
         )
 
 

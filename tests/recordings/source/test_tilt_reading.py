@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import Severity
 from recordings import McapSource
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
@@ -148,6 +149,29 @@ def test_accelerations_and_rates_may_come_on_two_topics(tmp_path):
     named = written(tmp_path / "three.mcap", drive(seconds=2), second, GYRO)
     assert read(named)[2].count("/camera/gyro/sample") == 1  # the one of the same name
     assert "gyroscope' is set to /left/image_rect" in missing(named, McapSource(gyroscope="/left/image_rect"))
+
+
+@pytest.mark.parametrize(
+    ("rates", "wrong"),
+    [
+        (lambda rate: rate, False),
+        (np.degrees, True),
+        (lambda rate: -rate, True),
+        (lambda rate: rate[[1, 0, 2]], True),
+        (lambda rate: rate * [1, -1, 1], True),
+    ],
+    ids=["sound", "degrees", "sign", "exchanged", "left-handed"],
+)
+def test_rates_that_contradict_the_accelerations_are_a_fault(tmp_path, rates, wrong):
+    path = written(tmp_path / "log.mcap", drive(seconds=40), lambda n, t, rate, force: kalibr(n, t, rates(rate), force))
+    with McapSource().open(path) as log:
+        assert log.faults() == {}
+        assert len(list(log.events(["inclinometer"]))) == 4000
+        found = log.faults()
+    assert bool(found) == wrong
+    if wrong:
+        assert (found["inclinometer"].severity, found["inclinometer"].about) == (Severity.FAULT, "tilt")
+        assert "Check the axes, the signs and the unit (rad/s)" in found["inclinometer"].sentence
 
 
 def test_an_estimate_may_be_preferred_to_the_orientation(tmp_path):
