@@ -267,17 +267,19 @@ class Recording:
 
     def _steps(self) -> list[ClockStep]:
         """The steps of the recorder's clock over all files; their places are counted through the files."""
+        timelines = [file.timeline for file in self.files]
+        stamps = _StampReader(self.files, [0, *np.cumsum([len(timeline) for timeline in timelines]).tolist()])
         topics = {topic: number for number, topic in enumerate(sorted({c.topic for c in self.channels.values()}))}
-        channels, times, firsts = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [0]
-        for file in self.files:
-            numbers, inverse = np.unique(file.timeline.channels, return_inverse=True)
-            known = [topics[file.channels[n].topic] if n in file.channels else len(topics) for n in numbers.tolist()]
-            channels.append(np.array(known, np.int64)[inverse])
-            times.append(file.timeline.log_times)
-            firsts.append(firsts[-1] + len(file.timeline))
-        timeline = Timeline(np.concatenate(channels), np.concatenate(times))
-        stamped = {topics[self.channels[number].topic] for number in self._stamped}
-        return clock_steps(timeline, stamped, _StampReader(self.files, firsts))
+        if len(self.files) == 1 and len(topics) == len(self.channels):
+            return clock_steps(timelines[0], self._stamped, stamps)
+        channels = list[NDArray[np.int32]]()
+        for file, timeline in zip(self.files, timelines, strict=True):
+            topic_of = np.full(timeline.channels.max(initial=0) + 1, len(topics), np.int32)
+            for number, channel in file.channels.items():
+                topic_of[number : number + 1] = topics[channel.topic]
+            channels.append(topic_of[timeline.channels])
+        merged = Timeline(np.concatenate(channels), np.concatenate([timeline.log_times for timeline in timelines]))
+        return clock_steps(merged, {topics[self.channels[number].topic] for number in self._stamped}, stamps)
 
 
 @dataclass(frozen=True)

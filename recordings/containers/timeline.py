@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,14 +21,15 @@ Places = NDArray[np.int64]
 class Timeline:
     """The channel and the log time, ns, of each message. The place of a message is its index here."""
 
-    channels: NDArray[np.int64]
+    channels: NDArray[np.integer[Any]]
     log_times: NDArray[np.int64]
 
     @classmethod
     def of(cls, channels: ArrayLike, log_times: ArrayLike) -> Timeline:
         """The timeline of two lists; a damaged log time becomes -1."""
-        times = np.asarray(log_times, np.uint64)
-        return cls(np.asarray(channels, np.int64), np.where(times > MAX_LOG_TIME, -1, times.astype(np.int64)))
+        times = np.array(log_times, np.uint64)
+        times[times > MAX_LOG_TIME] = (1 << 64) - 1
+        return cls(np.asarray(channels, np.int32), times.view(np.int64))
 
     def __len__(self) -> int:
         return len(self.log_times)
@@ -36,7 +38,8 @@ class Timeline:
     def by_channel(self) -> dict[int, Places]:
         """Channel -> the places of its messages with a valid log time."""
         order = np.argsort(self.channels, kind="stable")
-        order = order[self.log_times[order] >= 0]
+        if (self.log_times < 0).any():
+            order = order[self.log_times[order] >= 0]
         numbers, first = np.unique(self.channels[order], return_index=True)
         return dict(zip(numbers.tolist(), np.split(order, first[1:]), strict=True)) if len(order) else {}
 

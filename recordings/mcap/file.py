@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -28,21 +28,30 @@ from recordings.containers.unpacking import ZSTD_MAGIC
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import MAX_CHUNK_BYTES, chunk_heads, unpack_chunk
 from recordings.mcap.index import (
-    MAGIC,
     MESSAGE,
     PARSE_ERRORS,
     RECORD,
-    UnchunkedMessage,
     index_from_summary,
     iter_records,
     lost_chunk,
-    parse_message,
+    opened,
     read_at,
 )
+from recordings.mcap.message_order import ChunkMessages, Ordered, in_log_time_order
 from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for
 
 HEAD_BYTES = 64  # of a message; they contain the stamp of its header
+
+
+class _Queued(NamedTuple):
+    """What comes next of a chunk, of the messages outside chunks, or of the losses. following: what comes then."""
+
+    log_time: int
+    offset: int  # in the file; of messages outside chunks -1
+    place: int
+    item: RawMessage | LostMessage | ChunkIndex
+    following: Iterator[Ordered] = iter(())
 
 
 class McapFile:
@@ -85,7 +94,7 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        self._file = _opened(self.path)
+        self._file = opened(self.path)
         try:
             self.size = self.path.stat().st_size
             self.index = index_from_summary(self._file, self.size) or walk(self._file, self.size)
@@ -114,11 +123,11 @@ class McapFile:
         low, high = (0 if start is None else start), (1 << 64 if end is None else end)
         queue = self._queue(channels, places)
         found = dict.fromkeys(channels, 0)
-        while queue and queue[0][0] < high:
-            log_time, _, _, item = heappop(queue)
+        while queue and queue[0].log_time < high:
+            first = heappop(queue)
+            log_time, item, following = first.log_time, first.item, first.following
             if isinstance(item, ChunkIndex):
-                if item.message_end_time >= low:
-                    self._open_chunk(item, queue, places)
+                following = self._in_order(item, channels, places) if item.message_end_time >= low else following
             elif item.channel is None or item.channel in channels:
                 if item.channel is not None:
                     found[item.channel] += 1
@@ -126,7 +135,9 @@ class McapFile:
                     damage = f"the message is lost: its log time is damaged ({log_time} ns)"
                     yield LostMessage(item.channel, self.end, item.reason if isinstance(item, LostMessage) else damage)
                 elif log_time >= low:
-                    yield self._read_unchunked(item) if isinstance(item, UnchunkedMessage) else item
+                    yield item
+            if (after := next(following, None)) is not None:
+                heappush(queue, first._replace(log_time=after[0], place=after[1], item=after[2], following=following))
         if start is None and end is None and places is None:
             yield from self._unaccounted(found)
 
@@ -140,9 +151,7 @@ class McapFile:
                 yield from list(self._chunk_heads(chunk, channels))
             except PARSE_ERRORS:
                 yield from (item for item in self._chunk_or_lost(chunk) if item.channel in channels)
-        for item in self.index.unchunked:
-            if item.channel in channels:
-                yield self._read_unchunked(item._replace(size=min(item.size, HEAD_BYTES)))
+        yield from (item for _, _, item in self._unchunked(channels, None, HEAD_BYTES))
         yield from (message for _, message in self.index.rescued if message.channel in channels)
         yield from self.index.lost
 
@@ -217,38 +226,56 @@ class McapFile:
         described = MessageSchema(schema.name, schema.encoding, schema.data) if schema else None
         return Channel(number, channel.topic, channel.message_encoding, described)
 
-    def _queue(self, channels: set[int], places: range | None) -> list[tuple[int, int, int, Any]]:
-        """Chunks, messages and losses, as a heap of (log time, offset in the file, place in a chunk, item)."""
-        index, kept = self.index, range(len(self.timeline)) if places is None else places
-        queue: list[tuple[int, int, int, Any]] = []
-        if kept.stop >= len(self.timeline):
-            queue += [(lost.log_time, self.size, number, lost) for number, lost in enumerate(index.lost)]
-        queue += [(item.log_time, self.size, place - (1 << 62), item) for place, item in index.rescued if place in kept]
-        queue += [
-            (item.log_time, item.offset, -1, item)
-            for item in index.unchunked
-            if item.channel in channels and item.place in kept
+    def _queue(self, channels: set[int], places: range | None) -> list[_Queued]:
+        """Chunks, messages outside chunks and losses, as a heap."""
+        index, size = self.index, len(self.timeline)
+        kept = range(size) if places is None else places
+        queue = [
+            _Queued(item.log_time, self.size, place - size, item) for place, item in index.rescued if place in kept
         ]
-        for chunk in self._chunks(channels):
+        if kept.stop >= size:
+            queue += [_Queued(lost.log_time, self.size, number, lost) for number, lost in enumerate(index.lost)]
+        for number, chunk in enumerate(self._chunks(channels)):
             inside = index.places[chunk.chunk_start_offset]
             if places is None or (inside.start < places.stop and inside.stop > places.start):
-                queue.append((chunk.message_start_time, chunk.chunk_start_offset, -1, chunk))
+                queue.append(_Queued(chunk.message_start_time, chunk.chunk_start_offset, number - size, chunk))
+        following = self._unchunked(channels, places)
+        if (first := next(following, None)) is not None:
+            queue.append(_Queued(first[0], -1, first[1], first[2], following))
         heapify(queue)
         return queue
 
-    def _open_chunk(self, chunk: ChunkIndex, queue: list[tuple[int, int, int, Any]], places: range | None) -> None:
-        """Add the messages of a chunk to the queue."""
+    def _in_order(self, chunk: ChunkIndex, channels: set[int], places: range | None) -> Iterator[Ordered]:
+        """The messages of a chunk in log-time order, or those lost with it."""
+        inside = self._chunk_or_lost(chunk)
         first = self.index.places[chunk.chunk_start_offset].start
-        for number, item in enumerate(self._chunk_or_lost(chunk)):
-            if places is None or first + number in places:
-                heappush(queue, (item.log_time, chunk.chunk_start_offset, number, item))
+        own = range(len(inside)) if places is None else range(max(places.start - first, 0), max(places.stop - first, 0))
+        if isinstance(inside, ChunkMessages):
+            return inside.in_order(channels, own)
+        return iter(sorted((item.log_time, n, item) for n, item in enumerate(inside) if n in own))
+
+    def _unchunked(self, channels: set[int], places: range | None, max_bytes: int | None = None) -> Iterator[Ordered]:
+        """The messages outside chunks in log-time order. max_bytes: so many bytes of each; None: all."""
+        outside, offsets, sizes = self.index.unchunked
+        if not outside:
+            return
+        all_places = np.asarray(outside, np.int64)
+        own, times = self.timeline.channels[all_places], np.asarray(self.index.counted_times, np.uint64)[all_places]
+        kept = (
+            range(len(outside)) if places is None else range(*np.searchsorted(all_places, [places.start, places.stop]))
+        )
+        for number in in_log_time_order(own, times, channels, kept):
+            size = sizes[number] if max_bytes is None else min(sizes[number], max_bytes)
+            data = memoryview(read_at(self._file, offsets[number], size))
+            log_time = int(times[number])
+            yield log_time, number, RawMessage(int(own[number]), log_time, data)
 
     def _chunks(self, channels: set[int]) -> list[ChunkIndex]:
         """The chunks with messages of the channels (or of unknown channels), in file order."""
         chunks = sorted(self.index.chunks, key=lambda chunk: chunk.chunk_start_offset)
         return [c for c in chunks if not c.message_index_offsets or channels & c.message_index_offsets.keys()]
 
-    def _chunk_or_lost(self, chunk: ChunkIndex) -> Sequence[RawMessage | LostMessage]:
+    def _chunk_or_lost(self, chunk: ChunkIndex) -> ChunkMessages | list[LostMessage]:
         """The messages of a chunk, or a `LostMessage` for each entry of its message index."""
         try:
             return self._chunk_messages(chunk)
@@ -260,17 +287,13 @@ class McapFile:
         lost = [LostMessage(channel, log_time, reason) for channel, log_time in zip(*known, strict=True)]
         return lost or [LostMessage(None, chunk.message_start_time, reason)]
 
-    def _chunk_messages(self, chunk: ChunkIndex) -> list[RawMessage]:
+    def _chunk_messages(self, chunk: ChunkIndex) -> ChunkMessages:
         length = chunk.chunk_length - RECORD.size
         head = read_at(self._file, chunk.chunk_start_offset, RECORD.size)
         if len(head) < RECORD.size or RECORD.unpack(head) != (int(Opcode.CHUNK), length):
             raise ValueError("there is no chunk at the offset in the index")
         content = read_at(self._file, chunk.chunk_start_offset + RECORD.size, min(length, MAX_CHUNK_BYTES))
-        inside = iter_records(unpack_chunk(content))
-        return [parse_message(content) for opcode, content in inside if opcode == Opcode.MESSAGE]
-
-    def _read_unchunked(self, place: UnchunkedMessage) -> RawMessage:
-        return RawMessage(place.channel, place.log_time, memoryview(read_at(self._file, place.offset, place.size)))
+        return ChunkMessages(unpack_chunk(content))
 
     def _message_index(self, chunk: ChunkIndex) -> tuple[NDArray[np.uint16], NDArray[np.uint64], NDArray[np.uint64]]:
         """Channel, log time and offset of each message of a chunk, in file order; empty without a message index."""
@@ -363,22 +386,3 @@ def iter_decoded(
                 lose(f"{topic} at {item.log_time} ns cannot be decoded ({sentence_of(error)})")
                 continue
             yield topic, item.log_time, message
-
-
-def _opened(path: Path) -> BinaryIO:
-    """The open file, if it begins like an MCAP file."""
-    if path.is_dir():
-        raise LogError(f"{path} is a folder; give the .mcap file in it")
-    if path.exists() and not path.is_file():
-        raise LogError(f"{path} is a pipe or a device; give a .mcap file")
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
-    start = file.read(16)
-    if start.startswith(MAGIC):
-        return file
-    file.close()
-    if not start:
-        raise LogError(f"{path} is empty (0 bytes); record it again")
-    raise LogError(f"{path} is not an MCAP log (its first bytes differ); give a .mcap file")

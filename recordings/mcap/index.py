@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import Any, BinaryIO, NamedTuple
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import zstandard
 from isal.isal_zlib import crc32
@@ -24,7 +25,7 @@ from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.timeline import MAX_LOG_TIME
-from recordings.errors import sentence_of
+from recordings.errors import LogError, sentence_of
 
 MAGIC = b"\x89MCAP0\r\n"
 PARSE_ERRORS = (
@@ -38,22 +39,13 @@ _MAX_SUMMARY_BYTES = 1 << 30  # of a summary or header that is read
 _TAIL = RECORD.size + _FOOTER_LENGTH + len(MAGIC)
 
 
-class UnchunkedMessage(NamedTuple):
-    """A message outside any chunk. place: in the timeline; offset, size: of its data, bytes."""
-
-    place: int
-    channel: int
-    log_time: int
-    offset: int
-    size: int
-
-
 @dataclass
 class Index:
     """The index of a file.
 
-    chunks: each with its channels (none listed: unknown); rescued: messages of a cut chunk, each with its place; lost:
-    the damage found; stated_counts: messages by channel, stated_records: number of chunks, channels and schemas, both
+    chunks: each with its channels (none listed: unknown); unchunked: the place, the offset and the size of the data,
+    bytes, of the messages outside chunks; rescued: messages of a cut chunk, each with its place; lost: the damage
+    found; stated_counts: messages by channel, stated_records: number of chunks, channels and schemas, both
     from the file's statistics. Of the messages counted so far, all with `walked`: counted_channels and counted_times:
     in file order; places: chunk offset -> the places of its messages; latest: the last log time, ns.
     """
@@ -61,7 +53,9 @@ class Index:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
-    unchunked: list[UnchunkedMessage] = field(default_factory=list)
+    unchunked: tuple[array[int], array[int], array[int]] = field(
+        default_factory=lambda: (array("Q"), array("Q"), array("Q"))
+    )
     rescued: list[tuple[int, RawMessage]] = field(default_factory=list)
     lost: list[LostMessage] = field(default_factory=list)
     counted_channels: array[int] = field(default_factory=lambda: array("H"))
@@ -104,6 +98,25 @@ def _check_read(record: Schema | Channel, content: bytes | memoryview) -> None:
     written = builder.end()[RECORD.size :]
     if written != bytes(content[: len(written)]):  # padding may follow
         raise ValueError("a definition is cut short")
+
+
+def opened(path: Path) -> BinaryIO:
+    """The open file, if it begins like an MCAP file."""
+    if path.is_dir():
+        raise LogError(f"{path} is a folder; give the .mcap file in it")
+    if path.exists() and not path.is_file():
+        raise LogError(f"{path} is a pipe or a device; give a .mcap file")
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+    start = file.read(16)
+    if start.startswith(MAGIC):
+        return file
+    file.close()
+    if not start:
+        raise LogError(f"{path} is empty (0 bytes); record it again")
+    raise LogError(f"{path} is not an MCAP log (its first bytes differ); give a .mcap file")
 
 
 def index_from_summary(file: BinaryIO, size: int) -> Index | None:

@@ -32,7 +32,6 @@ from recordings.mcap.index import (
     PARSE_ERRORS,
     RECORD,
     Index,
-    UnchunkedMessage,
     iter_records,
     lost_chunk,
     parse_message,
@@ -57,6 +56,12 @@ def walk(file: BinaryIO, size: int) -> Index:
     while True:
         head = read_at(file, position, CHUNK_HEAD_BYTES)
         opcode, length = RECORD.unpack_from(head) if len(head) >= RECORD.size else (0, 0)
+        if opcode == Opcode.MESSAGE and length < _BLOCK_BYTES // 2:
+            block = read_at(file, position, _BLOCK_BYTES)
+            if taken := _note_messages(index, block, position):
+                checksum = None if checksum is None else crc32(block[:taken], checksum)
+                position, before = position + taken, opcode
+                continue
         is_record = opcode != Opcode.CHUNK or is_chunk(head)
         if opcode == 0 or length > size - position - RECORD.size or not is_record:
             found = find_chunk(file, position + 1, size)
@@ -96,9 +101,7 @@ def _note(index: Index, opcode: int, content: bytes, length: int, position: int,
     if opcode == Opcode.CHUNK:
         _note_chunk(index, content, position)
     elif opcode == Opcode.MESSAGE:
-        channel, _, log_time, _ = MESSAGE.unpack_from(content)
-        place, data_at = index.count_message(channel, log_time), position + RECORD.size + MESSAGE.size
-        index.unchunked.append(UnchunkedMessage(place, channel, log_time, data_at, length - MESSAGE.size))
+        _note_message(index, content, position, length)
     elif opcode == Opcode.HEADER and before == 0:
         index.profile = profile_of(content)
     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -109,6 +112,28 @@ def _note(index: Index, opcode: int, content: bytes, length: int, position: int,
             raise ValueError("a message index without its chunk")
     elif opcode not in (Opcode.ATTACHMENT, Opcode.METADATA) and opcode < _MIN_PRIVATE_OPCODE:
         raise ValueError(f"a record of opcode {opcode} is not allowed there")
+
+
+def _note_messages(index: Index, block: bytes, position: int) -> int:
+    """Note the messages at the start of a block; returns the length of their records."""
+    at, shortest = 0, RECORD.size + MESSAGE.size
+    while at + shortest <= len(block):
+        opcode, length = RECORD.unpack_from(block, at)
+        end = at + RECORD.size + length
+        if opcode != Opcode.MESSAGE or length < MESSAGE.size or end > len(block):
+            break
+        _note_message(index, block, position + at, length, at + RECORD.size)
+        at = end
+    return at
+
+
+def _note_message(index: Index, content: bytes, position: int, length: int, start: int = 0) -> None:
+    """Note a message outside chunks. position: of its record in the file; start: of the record's content."""
+    channel, _, log_time, _ = MESSAGE.unpack_from(content, start)
+    places, offsets, sizes = index.unchunked
+    places.append(index.count_message(channel, log_time))
+    offsets.append(position + RECORD.size + MESSAGE.size)
+    sizes.append(length - MESSAGE.size)
 
 
 def _note_chunk(index: Index, content: bytes, position: int) -> None:
