@@ -173,13 +173,13 @@ class UpEstimator:
         states, blocks = smoothed(self._steps), self._blocks[:count]
         self._steps, self._blocks = self._steps[count:], self._blocks[count:]
         ends = blocks.stamps[np.searchsorted(blocks.block, np.arange(count), side="right") - 1]
-        made = []
+        sigmas, made = [sigma_of(state) for state in states[1 : count + 1]], []
         for stamp, rotation, at in zip(blocks.stamps.tolist(), blocks.rotations, blocks.block.tolist(), strict=True):
             if stamp - self._last < MIN_TILT_INTERVAL_NS:
                 continue
             length = blocks.seconds[at] * 1e9
             share = 1 - (ends[at] - stamp) / length if length > 0 else 1.0
             up = rotation.T @ ((1 - share) * states[at].mean[:3] + share * states[at + 1].mean[:3])
-            made.append(Tilt(stamp, up / np.linalg.norm(up), self.frame_id, sigma_of(states[at + 1]), filtered=True))
+            made.append(Tilt(stamp, up / np.linalg.norm(up), self.frame_id, sigmas[at], filtered=True))
             self._last = stamp
         return made

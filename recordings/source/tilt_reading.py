@@ -156,13 +156,17 @@ def _answered(waiting: deque[Sampled], tilts: list[Tilt]) -> Iterator[tuple[int,
 def _by_stamp(samples: Iterable[Sampled]) -> Iterator[Sampled]:
     """The samples in the order of stamps; a LogError in place of one whose stamp does not follow the one before."""
     heap = list[tuple[int, int, int, InertialSample]]()
-    last, doubted = dict[bool, tuple[int, int]](), dict[bool, int]()  # of each of two topics: stamp and log time; stamp
+    last = dict[bool, tuple[int, int]]()  # stamp and log time, of each of two topics
+    doubted, newest = dict[bool, int](), dict[bool, InertialSample]()
     given = 0  # the stamp up to which samples were given
     for number, (log_time, sample) in enumerate(samples):
         if isinstance(sample, LogError):
             yield log_time, sample
             continue
         topic = sample.rate is None
+        if sample == newest.get(topic):  # recorded twice
+            continue
+        newest[topic] = sample
         stamp, logged = last.get(topic, (sample.stamp - 1, log_time))
         ahead = sample.stamp - stamp > log_time - logged + MAX_JUMP_NS
         believed = 0 < sample.stamp - doubted.get(topic, sample.stamp) <= MAX_JUMP_NS  # two in a row are

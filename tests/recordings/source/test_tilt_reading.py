@@ -18,6 +18,7 @@ from recordings.ros2.tilt_from_msg import AccelerationField
 from recordings.ros2.to_msg import camera_info, header, image, odometry, quaternion, raw_imu, transform_message
 from recordings.source.inventory import describe, format_description
 from stages.data import Pose, Tilt, Transform
+from tests.conftest import rewrite
 from tests.recordings.inertial.drive import Drive, drive
 from tests.recordings.sample_log import TRANSFORMS, model, picture
 
@@ -119,6 +120,15 @@ def test_a_broken_sample_is_lost_alone_and_so_is_a_wrong_stamp(tmp_path):
     assert ["'linear_acceleration' contains" in sentence for sentence in lost] == [False, False, True]
     assert all("does not follow" in sentence for sentence in lost[:2])
     assert driven.errors(tilts).max() < 0.6
+
+
+def test_samples_recorded_twice_are_no_loss(tmp_path):
+    driven = drive(seconds=6)
+    once = written(tmp_path / "once.mcap", driven)
+    repeated = rewrite(once, tmp_path / "log.mcap", order=lambda messages: [m for m in messages for _ in range(2)])
+    tilts, lost, _ = read(repeated)
+    assert lost == []
+    assert [tilt.stamp for tilt in tilts] == driven.stamps.tolist()
 
 
 def split(number, stamp, rate, force):
