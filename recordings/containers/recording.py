@@ -23,36 +23,48 @@ from recordings.containers.container import Channel, Container, LostMessage, Raw
 from recordings.containers.header import begins_with_header, peek_stamp
 from recordings.containers.timeline import Timeline
 
+_MAX_REMEMBERED = 32  # messages of a topic, to leave out those that were recorded twice
 
-def _merged_channels(files: Sequence[Container]) -> tuple[dict[int, Channel], list[dict[int, int]]]:
-    """The channels of all files, and for each file its channels -> theirs. Equal ones of several files are one."""
-    merged, numbers, known = dict[int, Channel](), list[dict[int, int]](), dict[Any, list[int]]()
+
+@dataclass(frozen=True)
+class _Numbers:
+    """The numbers of a file's channels. merged: number in the file -> number in the recording."""
+
+    merged: Mapping[int, int]
+
+    @cached_property
+    def _own(self) -> dict[int, int]:
+        return {number: own for own, number in self.merged.items()}
+
+    def of_file(self, channels: set[int]) -> set[int]:
+        """The file's numbers of some channels of the recording."""
+        return {self._own[channel] for channel in channels if channel in self._own}
+
+
+def _merged_channels(files: Sequence[Container]) -> tuple[dict[int, Channel], list[_Numbers]]:
+    """The channels of all files, and their numbers in each. Equal channels of several files are one."""
+    merged, numbers, known = dict[int, Channel](), list[_Numbers](), dict[Any, list[int]]()
     for file in files:
-        own = dict[int, int]()
+        own, taken = dict[int, int](), set[int]()
         for number, channel in file.channels.items():
             same = known.setdefault((channel.topic, channel.message_encoding, channel.schema), [])
-            free = next((other for other in same if other not in own.values()), None)
+            free = next((other for other in same if other not in taken), None)
             if free is None:
                 free = number if number not in merged else max(merged) + 1
                 merged[free] = replace(channel, number=free)
                 same.append(free)
             own[number] = free
-        numbers.append(own)
+            taken.add(free)
+        numbers.append(_Numbers(own))
     return merged, numbers
-
-
-_MAX_REMEMBERED = 32  # messages of a topic, to leave out those that were recorded twice
 
 
 @dataclass(frozen=True)
 class _Part:
-    """A stretch of a file between two steps of the recorder's clock.
-
-    numbers: channel of the file -> channel of the recording; places: in the file.
-    """
+    """A stretch of a file between two steps of the recorder's clock. places: in the file."""
 
     file: Container
-    numbers: Mapping[int, int]
+    numbers: _Numbers
     places: range
     step: ClockStep
 
@@ -71,10 +83,10 @@ class _Part:
     def times(self, channels: set[int], allow_repeats: bool) -> NDArray[np.int64]:
         """The log times of some channels of the recording, ns, in any order."""
         found = [np.zeros(0, np.int64)]
-        for channel, places in self.file.timeline.by_channel.items():
-            if self.numbers.get(channel) in channels:
-                inside = places[(places >= self.places.start) & (places < self.places.stop)]
-                found.append(self.file.timeline.log_times[inside])
+        for channel in self.numbers.of_file(channels) & self.file.timeline.by_channel.keys():
+            places = self.file.timeline.by_channel[channel]
+            inside = places[(places >= self.places.start) & (places < self.places.stop)]
+            found.append(self.file.timeline.log_times[inside])
         times = np.concatenate(found)
         return times[times >= (0 if allow_repeats else self.step.repeats_until)] + self.step.shift
 
@@ -82,10 +94,10 @@ class _Part:
         self, channels: set[int], start: int | None, end: int | None, allow_repeats: bool
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of some channels of the recording, in log-time order."""
-        own = {channel for channel, number in self.numbers.items() if number in channels}
+        own = self.numbers.of_file(channels)
         low, high = (None if time is None else max(time - self.step.shift, 0) for time in (start, end))
         for item in self.file.messages(own, low, high, None if self.whole else self.places):
-            channel = None if item.channel is None else self.numbers[item.channel]
+            channel = None if item.channel is None else self.numbers.merged[item.channel]
             log_time = item.log_time + self.step.shift
             if isinstance(item, LostMessage):
                 yield LostMessage(channel, log_time, item.reason)
@@ -165,8 +177,14 @@ class Recording:
 
     def channels_of(self, topics: Iterable[str]) -> set[int]:
         """The channels of some topics."""
-        wanted = set(topics)
-        return {number for number, channel in self.channels.items() if channel.topic in wanted}
+        return {number for topic in set(topics) for number in self._by_topic.get(topic, ())}
+
+    @cached_property
+    def _by_topic(self) -> dict[str, list[int]]:
+        found = defaultdict[str, list[int]](list)
+        for number, channel in self.channels.items():
+            found[channel.topic].append(number)
+        return found
 
     def messages(
         self, channels: set[int], start: int | None = None, end: int | None = None, allow_repeats: bool = False
@@ -217,9 +235,9 @@ class Recording:
             yield from self.messages(channels)
             return
         for file, numbers in zip(self.files, self._numbers, strict=True):
-            own = {number for number in numbers if numbers[number] in channels}
+            own = numbers.of_file(channels)
             for item in file.heads(own) if own else ():
-                yield item if item.channel is None else item._replace(channel=numbers[item.channel])
+                yield item if item.channel is None else item._replace(channel=numbers.merged[item.channel])
 
     def times(self, channels: set[int], allow_repeats: bool = False) -> NDArray[np.int64]:
         """The sorted log times of some channels, ns; by default without those that repeat."""
@@ -228,7 +246,7 @@ class Recording:
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
         found = zip(self.files, self._numbers, strict=True)
-        return sum(file.count({n for n, number in numbers.items() if number in channels}) for file, numbers in found)
+        return sum(file.count(numbers.of_file(channels)) for file, numbers in found)
 
     def close(self) -> None:
         """Close the files."""

@@ -39,7 +39,7 @@ def write_rosbag2(
         own = folder.parent / f"{folder.name}-{number}"
         _write(own, rows[low:high], plugin, mode)
         (file,) = (path for path in own.iterdir() if path.name != "metadata.yaml")
-        names.append(f"{folder.name}_{number}{''.join(file.suffixes)}")
+        names.append(f"{folder.name}_{number}{file.name.removeprefix(own.name)}")
         file.rename(folder / names[-1])
         information = yaml.safe_load((own / "metadata.yaml").read_text())
     information["rosbag2_bagfile_information"]["relative_file_paths"] = names
