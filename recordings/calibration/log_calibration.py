@@ -10,10 +10,10 @@ import numpy as np
 
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
-from recordings.ros2.image_from_msg import pixels_of
 from recordings.source.cameras import CAMERAS, CalibrationTopic
 from recordings.source.topics import DecodedTopics
 from recordings.source.transforms import TransformTree
+from recordings.video.decoder import reader_of
 from stages.data import Array, CameraModel, Transform
 
 INCLINOMETER = "inclinometer"  # the frame of a tilt whose messages name none
@@ -60,7 +60,8 @@ def _sized(model: CameraModel, messages: DecodedTopics, topic: str) -> CameraMod
     """The calibration, with the size of the images where its file has none."""
     if model.width and model.height:
         return model
-    first = messages.first(topic, lambda message: pixels_of(message).shape)
+    pixels_of = reader_of(messages.schemas[topic])
+    first = messages.first(topic, lambda message: pixels_of(message, None).shape)
     if isinstance(first, LogError):
         raise LogError(f"the calibration has no size of the images, and no image of {topic} can be read: {first}")
     return replace(model, width=int(first[1]), height=int(first[0]), k=np.array(model.k))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from recordings.errors import LogError
+from recordings.video.formats import VIDEO
 from stages.data import Array
 
 _DISTORTIONS = {"kannala_brandt": "equidistant", "rational_polynomial": "rational_polynomial"}
@@ -84,6 +85,10 @@ def _compressed_image(message: Any) -> Any:
     return SimpleNamespace(header=_header(message), format=str(message.format), data=_bytes(message.data))
 
 
+def _video(message: Any) -> Any:
+    return SimpleNamespace(header=_header(message), video_format=str(message.format), data=_bytes(message.data))
+
+
 def _calibration(message: Any) -> Any:
     model = str(message.distortion_model)
     rectified = _numbers(message, "R", 9)
@@ -121,6 +126,7 @@ def _plain_pose(pose: Any) -> Any:
 _ADAPTERS: dict[str, tuple[str, Adapter]] = {
     "RawImage": ("sensor_msgs/msg/Image", _image),
     "CompressedImage": ("sensor_msgs/msg/CompressedImage", _compressed_image),
+    "CompressedVideo": (VIDEO, _video),
     "CameraCalibration": ("sensor_msgs/msg/CameraInfo", _calibration),
     "FrameTransforms": ("tf2_msgs/msg/TFMessage", _transforms),
     "FrameTransform": (

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
+from recordings.video.formats import unread_video
 from stages.data import Array
 
 # Encoding -> (dtype, channels in the message, conversion to gray or RGB)
@@ -55,14 +56,17 @@ def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
 
 
 def unread_encoding(message: Any) -> str:
-    """A sentence about an unsupported image encoding; empty for other messages."""
+    """A sentence about an unsupported image or video encoding; empty for other messages."""
+    if hasattr(message, "video_format"):
+        return unread_video(message.video_format)
     encoding = getattr(message, "encoding", None)
     if encoding is None or encoding in _ALL_ENCODINGS:
         return ""
-    return f"the image encoding '{encoding}' is not supported, only {', '.join(_ALL_ENCODINGS)}"
+    return f"the image encoding '{encoding}' is not supported; record it in one of {', '.join(_ALL_ENCODINGS)}"
 
 
-def _check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
+def check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
+    """Raise LogError for an image that is empty, too large, or of another size than `size`."""
     if width == 0 or height == 0:
         raise LogError(f"the image is empty ({width}x{height})")
     if width * height > MAX_PIXELS:
@@ -79,7 +83,7 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     height, width, data = int(message.height), int(message.width), np.asarray(message.data, np.uint8)
     row = width * channels * int(kind[1])
     step = int(message.step) or row
-    _check_size(width, height, size)
+    check_size(width, height, size)
     if step < row:
         raise LogError(f"the image's step of {step} bytes is shorter than a row of {width} {message.encoding} pixels")
     needed = (height - 1) * step + row  # the last row may lack its padding
@@ -104,7 +108,7 @@ def _compressed_pixels(message: Any, size: tuple[int, int] | None) -> Array:
         raise LogError(f"the compressed image is cut after {data.size} bytes")
     stated = _stated_size(content)
     if stated is not None:
-        _check_size(*stated, size)
+        check_size(*stated, size)
     encoding = message.format.split(";")[0].strip()
     pixels = unpacked_pixels(data, _BAYER.get(encoding.rstrip("0123456789"))) if stated else None
     if pixels is None:

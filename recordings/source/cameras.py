@@ -11,9 +11,10 @@ import numpy as np
 
 from recordings.errors import LogError
 from recordings.ros2.from_msg import camera_model, frame_of, stamp_or
-from recordings.ros2.image_from_msg import pixels_of, unread_encoding
+from recordings.ros2.image_from_msg import unread_encoding
 from recordings.source.calibration import Camera
 from recordings.source.topics import DecodedTopics
+from recordings.video.decoder import PixelReader, VideoDecoder, reader_of
 from stages.data import Array, CameraImage, CameraModel
 
 CAMERAS = ("left", "right")
@@ -59,24 +60,26 @@ class CalibrationHistory:
         return f"{'' if place else 'at or before '}{self.stamps[place]} ns"
 
 
-def _equal(one: CameraModel, other: CameraModel) -> bool:
-    numbers = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("k", "d", "r", "p"))
-    return numbers and (one.width, one.height, one.model) == (other.width, other.height, other.model)
-
-
 @dataclass(frozen=True)
 class ImageReading:
-    """Reads the images of one camera, unless another calibration than the first was in force."""
+    """Decodes the images of one camera, unless another calibration than the first was in force."""
 
     camera: Camera
     calibrations: CalibrationHistory
+    pixels_of: PixelReader
 
     def __call__(self, message: Any, log_time: int) -> CameraImage:
+        """The image of a message."""
         model, stamp = self.camera.model, stamp_or(message.header, log_time)
         self.calibrations.check(stamp)
         camera = self.camera if self.camera.frame_id else replace(self.camera, frame_id=frame_of(message))
-        pixels = pixels_of(message, (model.width, model.height))
+        pixels = self.pixels_of(message, (model.width, model.height))
         return CameraImage(stamp, pixels, model, camera.image_frame, camera.rectified)
+
+
+def _equal(one: CameraModel, other: CameraModel) -> bool:
+    numbers = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("k", "d", "r", "p"))
+    return numbers and (one.width, one.height, one.model) == (other.width, other.height, other.model)
 
 
 def first_calibrations(
@@ -105,7 +108,7 @@ def unreadable_images(messages: DecodedTopics, topics: Mapping[str, str], sides:
     for side in sides:
         why = messages.first(topics[side], unread_encoding)
         if why and not isinstance(why, LogError):
-            unread[side] = f"{topics[side]}: {why}; record it in one of these"
+            unread[side] = f"{topics[side]}: {why}"
     return unread
 
 
@@ -125,7 +128,9 @@ def mismatched_images(
 
 def _pixels(messages: DecodedTopics, topic: str, last: bool = False) -> Array | LogError | None:
     """The first (or last) image that can be decoded, or the last error; None without messages."""
-    found = None
+    found, pixels_of = None, reader_of(messages.schemas[topic])
+    if isinstance(pixels_of, VideoDecoder):
+        return messages.first(topic, pixels_of)
     for found in (messages.last if last else messages.sample)(topic, pixels_of):
         if not isinstance(found, LogError):
             break

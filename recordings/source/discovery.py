@@ -15,8 +15,9 @@ from itertools import takewhile
 
 from recordings.inertial.imu_content import ImuContent
 from recordings.source.settings import LogSettings
+from recordings.video.formats import VIDEO
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", VIDEO)  # the best first
 INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 IMU = "sensor_msgs/msg/Imu"
@@ -167,10 +168,10 @@ def _best(pairs: Sequence[tuple[Topic, Topic]]) -> list[tuple[Topic, Topic]]:
     return [pair for pair in pairs if _rank(pair) == best]
 
 
-def _rank(pair: tuple[Topic, Topic]) -> tuple[bool, bool, bool]:
-    """Rectified before raw, uncompressed before compressed, colour before gray."""
+def _rank(pair: tuple[Topic, Topic]) -> tuple[bool, int, bool]:
+    """Rectified before raw, uncompressed before compressed before video, colour before gray."""
     name = pair[0].name
-    return looks_rectified(name), pair[0].schema == IMAGES[0], "color" in name or "rgb" in name
+    return looks_rectified(name), -IMAGES.index(pair[0].schema), "color" in name or "rgb" in name
 
 
 def looks_rectified(topic: str) -> bool:

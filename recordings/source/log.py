@@ -23,8 +23,7 @@ from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
 from recordings.containers.time_range import EDGE_NS, MAX_LATENESS_NS, FramesInRange, TimeRange
-from recordings.encodings.decoding import Decoder
-from recordings.errors import LogError, sentence_of
+from recordings.errors import LogError
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
 from recordings.ros2.from_msg import pose_of, stamp_of
 from recordings.source.cameras import CAMERAS, CalibrationHistory, ImageReading
@@ -35,33 +34,19 @@ from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_noise import TiltNoise
 from recordings.source.tilt_reading import Sampled, TiltReading, estimated_tilts
-from recordings.source.topics import attempt
+from recordings.source.topics import TopicReader, attempt
+from recordings.video.decoder import VideoDecoder, reader_of
+from recordings.video.formats import VIDEO, VIDEO_NOTE
 from stages.data import CameraImage, Mount, Pose, Tilt
 
 INTERPOLATION_LEAD_NS = 1_000_000_000  # tilt and pose are read this far beyond a range, for interpolation at its ends
 MAX_CALIBRATION_LAG_NS = 100_000_000  # a calibration may be logged this much later than its image
 MAX_TRANSFORM_LAG_NS = 500_000_000  # the transforms of a moving camera may be this much later
+_MAX_KEY_INTERVAL = 1000  # frames before a range in which the key frame of a video is searched
 EXCERPT_FRAMES = 4  # so that an excerpt survives a broken frame
 STAMPED_SCHEMAS = {*IMAGES, *TILTS, *POSES, BARE_TILT} - {"geometry_msgs/msg/Quaternion"}  # begin with a header
 UNSTAMPED = "the header stamps are 0, so log times are used"
 STREAMS = (*CAMERAS, "inclinometer", "mount", "odometry")
-
-
-@dataclass
-class TopicReader:
-    """Reads the messages of one topic. item: (message, log time) -> item of the stream, None for none."""
-
-    stream: str
-    topic: str
-    decoders: dict[int, Decoder]
-    item: Callable[[Any, int], Any]
-
-    def __call__(self, raw: RawMessage) -> Any:
-        """The item of a message, or a LogError."""
-        try:
-            return self.item(self.decoders[raw.channel](raw.data), raw.log_time)
-        except Exception as error:  # foreign bytes may fail a codec in any way; the message is lost, not the log
-            return LogError(f"{self.topic} at {raw.log_time} ns: {sentence_of(error)}")
 
 
 @dataclass
@@ -176,23 +161,33 @@ class McapLog:
         infos, items = self._by_channel(readers), self._by_channel(self._stream_readers(calibrations, streams))
         if moving is not None:
             infos |= self._by_channel(self._transform_readers(moving, items))
+        if wide.low is not None:
+            for reader in items.values():
+                self._begin_video(wide.low, reader)
         lag = MAX_CALIBRATION_LAG_NS if moving is None else MAX_TRANSFORM_LAG_NS
         raws = self.file.messages(infos.keys() | items.keys(), wide.low, wide.high)
         for raw, noted in _with_lookahead(raws, infos, lag):
-            if isinstance(raw, LostMessage) and not near.has(0, raw.log_time):
-                continue
+            if isinstance(raw, LostMessage):
+                for reader in items.values():
+                    reader.note_lost(raw.channel)
+                if not near.has(0, raw.log_time):
+                    continue
             if raw.channel is None:
                 yield raw.log_time, "log", LogError(f"{self.path.name}: {raw.reason}")
                 continue
             reader = (infos if raw.channel in infos else items)[raw.channel]
             if isinstance(raw, LostMessage):
                 yield raw.log_time, reader.stream, LogError(f"{reader.topic}: {raw.reason}")
-            elif not part.edges or (
+                continue
+            is_inside = not part.edges or (
                 frames.has(reader.stream, self.stamp_of(raw), raw.log_time)
                 if reader.stream in CAMERAS
                 else near.has(0, raw.log_time)
-            ):
+            )
+            if is_inside or (reader.video is not None and raw.channel in items):
                 item = noted if raw.channel in infos else reader(raw)
+                if not is_inside:
+                    continue
                 if moving is not None and reader.stream == "left" and isinstance(item, CameraImage):
                     mount = attempt(moving.at, item.stamp)
                     item = mount if isinstance(mount, LogError) else item
@@ -211,9 +206,26 @@ class McapLog:
             if any(raw.channel in channels and isinstance(raw, RawMessage) and infos(raw) is None for raw in raws):
                 return
 
+    def _begin_video(self, log_time: int, reader: TopicReader) -> None:
+        """Decode a video from the last key frame before `log_time`."""
+        channels, video = set(reader.decoders), reader.video
+        times = self.file.times(channels) if video is not None else np.zeros(0, np.int64)
+        for time in reversed(times[times < log_time][-_MAX_KEY_INTERVAL:].tolist()):
+            raws = self.file.messages(channels, time, time + 1)
+            if any(isinstance(raw, RawMessage) and reader.begins_video(raw) for raw in raws):
+                for raw in self.file.messages(channels, time, log_time):
+                    if isinstance(raw, RawMessage):
+                        reader(raw)
+                    else:
+                        reader.note_lost(raw.channel)
+                return
+
     def notes(self) -> dict[str, str]:
         """Stream -> note: missing stamps, the source of the baseline, an unknown base frame."""
         notes = {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
+        for side in CAMERAS:
+            if self._schema(side) == VIDEO:
+                notes[side] = "; ".join((*filter(None, [notes.get(side)]), VIDEO_NOTE))
         if "right" in self.topics and (note := self.resolution.baseline_note):
             notes["right"] = "; ".join((*filter(None, [notes.get("right")]), note))
         if self.resolution.tilt is not None and (note := self.resolution.tilt.note(self._estimator, self.source)):
@@ -308,7 +320,7 @@ class McapLog:
             "odometry": lambda message, log_time: self._rover_pose(pose_of(message, log_time, base_frame)),
         }
         for side, camera in zip(CAMERAS, self.resolution.cameras or (), strict=False):
-            made[side] = ImageReading(camera, calibrations[side])
+            made[side] = ImageReading(camera, calibrations[side], reader_of(self._schema(side)))
         chosen = [(stream, topic) for stream, topic in self.topics.items() if stream in made and stream in streams]
         readers = [self._reader(stream, topic, made[stream]) for stream, topic in chosen]
         return [*readers, *self._tilt_readers()] if "inclinometer" in streams else readers
@@ -354,7 +366,12 @@ class McapLog:
     def _reader(self, stream: str, topic: str, item: Callable[[Any, int], Any]) -> TopicReader:
         messages = self.resolution.messages
         decoders = {number: messages.decoders[number] for number in messages.channels_of(topic)}
-        return TopicReader(stream, topic, decoders, item)
+        pixels_of = item.pixels_of if isinstance(item, ImageReading) else None
+        return TopicReader(stream, topic, decoders, item, pixels_of if isinstance(pixels_of, VideoDecoder) else None)
+
+    def _schema(self, stream: str) -> str:
+        """The full name of the type of a stream's messages, or an empty string."""
+        return self.resolution.messages.schemas.get(self.topics.get(stream, ""), "")
 
     @staticmethod
     def _by_channel(readers: Iterable[TopicReader]) -> dict[int, TopicReader]:

@@ -7,20 +7,52 @@ reading continues.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, TypeVar
 
-from recordings.containers.container import LostMessage
+from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.recording import Recording
 from recordings.encodings.decoding import Decoder, decoder_of
 from recordings.errors import LogError, sentence_of
 from recordings.ros2.from_msg import frame_of
+from recordings.video.decoder import VideoDecoder, begins_video
 
 MAX_CHANNELS = 1000  # that are decoded; a rover has a tenth of it
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
 
 T = TypeVar("T")
+
+
+@dataclass
+class TopicReader:
+    """Reads the messages of one topic. item: (message, log time) -> item of the stream, None for none;
+    video: the decoder of a video, for which no message may be left out.
+    """
+
+    stream: str
+    topic: str
+    decoders: dict[int, Decoder]
+    item: Callable[[Any, int], Any]
+    video: VideoDecoder | None = None
+
+    def __call__(self, raw: RawMessage) -> Any:
+        """The item of a message, or a LogError."""
+        try:
+            return self.item(self.decoders[raw.channel](raw.data), raw.log_time)
+        except Exception as error:  # foreign bytes may fail a codec in any way; the message is lost, not the log
+            self.note_lost(raw.channel)
+            return LogError(f"{self.topic} at {raw.log_time} ns: {sentence_of(error)}")
+
+    def note_lost(self, channel: int | None) -> None:
+        """Note a lost message, which a video needs for those after it. channel: None if unknown."""
+        if self.video is not None and (channel is None or channel in self.decoders):
+            self.video.skip()
+
+    def begins_video(self, raw: RawMessage) -> bool:
+        """Whether a message is a key frame of a video."""
+        return attempt(lambda: begins_video(self.decoders[raw.channel](raw.data))) is True
 
 
 class _GoneError(LogError):

@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from recordings.mcap.file import iter_decoded
 
+Convert = Callable[[str, Any], Any]  # (topic, message) -> Foxglove's message
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
@@ -62,7 +63,7 @@ def ros1_bag(source: Path, out: Path) -> Path:
     return out
 
 
-def _foxglove(name: str, header: Any = None, **fields: Any) -> Any:
+def foxglove(name: str, header: Any = None, **fields: Any) -> Any:
     cls = getattr(import_module(f"{schemas.__name__}.{name}_pb2"), name)
     made = cls(**fields)
     if header is not None:
@@ -82,25 +83,29 @@ def as_foxglove(message: Any) -> Any:
     """The Foxglove message with the same content; an Imu becomes a PoseInFrame, because Foxglove has none."""
     kind, header = message.__msgtype__.rpartition("/")[2], getattr(message, "header", None)
     if kind == "Image":
-        return _foxglove("RawImage", header, width=message.width, height=message.height, encoding=message.encoding,
+        return foxglove("RawImage", header, width=message.width, height=message.height, encoding=message.encoding,
                          step=message.step, data=message.data.tobytes(), frame_id=header.frame_id)  # fmt: skip
     if kind == "CameraInfo":
         matrices = {name.upper(): getattr(message, name).tolist() for name in "dkrp"}
-        return _foxglove("CameraCalibration", header, width=message.width, height=message.height,
+        return foxglove("CameraCalibration", header, width=message.width, height=message.height,
                          distortion_model=message.distortion_model, frame_id=header.frame_id, **matrices)  # fmt: skip
     if kind == "TFMessage":
         each = [
-            _foxglove("FrameTransform", item.header, parent_frame_id=item.header.frame_id,
+            foxglove("FrameTransform", item.header, parent_frame_id=item.header.frame_id,
                       child_frame_id=item.child_frame_id, translation=_xyz(item.transform.translation),
                       rotation=_xyzw(item.transform.rotation))
             for item in message.transforms
         ]  # fmt: skip
-        return _foxglove("FrameTransforms", transforms=each)
+        return foxglove("FrameTransforms", transforms=each)
     if kind == "Odometry":
         pose = {"position": _xyz(message.pose.pose.position), "orientation": _xyzw(message.pose.pose.orientation)}
-        return _foxglove("Odometry", header, frame_id=header.frame_id, body_frame_id=message.child_frame_id, pose=pose,
+        return foxglove("Odometry", header, frame_id=header.frame_id, body_frame_id=message.child_frame_id, pose=pose,
                          pose_covariance=message.pose.covariance.tolist())  # fmt: skip
     raise KeyError(kind)
+
+
+def _converted(topic: str, message: Any) -> Any:
+    return as_foxglove(message)
 
 
 def ros_json(message: Any) -> Any:
@@ -133,7 +138,7 @@ def foxglove_json(message: Any) -> dict[str, Any]:
     return plain
 
 
-def protobuf_log(source: Path, out: Path) -> Path:
+def protobuf_log(source: Path, out: Path, convert: Convert = _converted) -> Path:
     """Foxglove's messages in protobuf; the Imu in JSON."""
     with out.open("wb") as file, ProtobufWriter(file) as writer:
         imu = writer._writer.register_schema("sensor_msgs/msg/Imu", "jsonschema", b"{}")
@@ -143,22 +148,23 @@ def protobuf_log(source: Path, out: Path) -> Path:
                 data = json.dumps(ros_json(message)).encode()
                 writer._writer.add_message(channel, log_time, data, log_time)
             else:
-                writer.write_message(_renamed(topic), as_foxglove(message), log_time, log_time)
+                writer.write_message(_renamed(topic), convert(topic, message), log_time, log_time)
     return out
 
 
-def json_log(source: Path, out: Path) -> Path:
+def json_log(source: Path, out: Path, convert: Convert = _converted) -> Path:
     """Foxglove's messages in JSON."""
     with out.open("wb") as file:
         writer, channels = McapWriter(file), dict[str, int]()
         writer.start(profile="", library="")
         for topic, log_time, message in iter_decoded(source):
             is_imu = message.__msgtype__.endswith("Imu")
-            name = message.__msgtype__ if is_imu else as_foxglove(message).DESCRIPTOR.full_name
+            made = message if is_imu else convert(topic, message)
+            name = message.__msgtype__ if is_imu else made.DESCRIPTOR.full_name
             if topic not in channels:
                 schema = writer.register_schema(name, "jsonschema", b"{}")
                 channels[topic] = writer.register_channel(_renamed(topic), "json", schema)
-            plain = ros_json(message) if is_imu else foxglove_json(as_foxglove(message))
+            plain = ros_json(message) if is_imu else foxglove_json(made)
             writer.add_message(channels[topic], log_time, json.dumps(plain).encode(), log_time)
         writer.finish()
     return out

@@ -190,7 +190,7 @@ def test_an_unsupported_encoding_is_reported_before_the_run(tmp_path):
     with McapSource().open(path) as log:
         assert list(log.missing) == ["right"]
         assert log.missing["right"].startswith(f"{RIGHT}: the image encoding 'packed10' is not supported")
-        assert "only mono8, 8UC1, " in log.missing["right"]
+        assert "record it in one of mono8, 8UC1, " in log.missing["right"]
     described = inventory_of(path)
     assert (described["frames"]["pairs"], described["missing"]) == (0, log.missing)
 
