@@ -30,7 +30,7 @@ class Encoder:
 
     def __call__(self, gray: np.ndarray) -> bytes:
         if self._codec is None:
-            codec = av.CodecContext.create({"h264": "libx264", "h265": "libx265"}[self.format], "w")
+            codec: Any = av.CodecContext.create({"h264": "libx264", "h265": "libx265"}[self.format], "w")
             codec.height, codec.width = gray.shape
             codec.pix_fmt, codec.time_base, codec.gop_size, codec.max_b_frames = "yuv420p", Fraction(1, 30), 3, 0
             x265 = f"bframes=0:repeat-headers=1:log-level=none:keyint={KEY_INTERVAL}:min-keyint={KEY_INTERVAL}:qp=2"
@@ -38,7 +38,7 @@ class Encoder:
             codec.options = {"tune": "zerolatency", "preset": "ultrafast", **own}
             self._codec = codec
         colours = np.full((gray.shape[0] // 2, gray.shape[1]), 128, np.uint8)
-        frame = av.VideoFrame.from_ndarray(np.concatenate([gray, colours]), format="yuv420p")
+        frame: Any = av.VideoFrame.from_ndarray(np.concatenate([gray, colours]), format="yuv420p")
         (packet,) = self._codec.encode(frame)
         return bytes(packet)
 
