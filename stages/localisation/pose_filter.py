@@ -96,7 +96,9 @@ class PoseFilter(Stage):
             estimate = self._corrected(_predicted(before, motion, motion.camera), tilt, mount)
         state.estimate = estimate
         state.poses += 1
-        return self._pose(motion.stamp, estimate, mount)
+        # The error of a filtered tilt is common to its neighbours.
+        bias = np.hypot(self.tilt_bias, tilt.sigma or 0.0) if tilt.filtered else self.tilt_bias
+        return self._pose(motion.stamp, estimate, mount, float(bias))
 
     def finding(self, state: PoseMemory) -> Finding | None:
         """The source of the poses if it is not the log; a warning if tracking was lost or the log's poses are wrong."""
@@ -137,30 +139,15 @@ class PoseFilter(Stage):
         corrected = Transform(world.parent, world.child, turn @ world.rotation, world.translation + change[:3])
         return replace(estimate, world=corrected, covariance=covariance - gain @ covariance[3:5])
 
-    def _pose(self, stamp: int, estimate: _Estimate, mount: Mount) -> Pose:
+    def _pose(self, stamp: int, estimate: _Estimate, mount: Mount, bias: float) -> Pose:
         base = mount.base_from_camera
         rover = estimate.world if base is None else estimate.world.after(base.inverse())
-        common = self._common_errors(rover.translation, estimate.distance)
+        common = _common_errors(rover.translation, estimate.distance, bias)
         covariance = translated_covariance(estimate.covariance, rover.translation - estimate.world.translation)
         covariance = covariance + common.T @ common
         np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # at the origin zero but for rounding
         quaternion = Rotation.from_matrix(rover.rotation).as_quat(canonical=True)
         return Pose(stamp, rover.translation, quaternion, _frame_of(estimate.segment), rover.child, covariance)
-
-    def _common_errors(self, position: Array, distance: float) -> Array:
-        """One standard deviation (5, 6) of position and rotation for each error common to all steps.
-
-        Length, direction and rotation of the steps (a rotation bends the track by half of it), and up about two axes.
-        """
-        x, y, z = position
-        turned, bias = TURN_ERROR * distance, self.tilt_bias
-        return np.array([
-            [SCALE_ERROR * x, SCALE_ERROR * y, SCALE_ERROR * z, 0, 0, 0],
-            [-SCALE_ERROR / 2 * y, SCALE_ERROR / 2 * x, 0, 0, 0, 0],
-            [-turned / 2 * y, turned / 2 * x, 0, 0, 0, turned],
-            [0, -bias * z, bias * y, bias, 0, 0],
-            [bias * z, 0, -bias * x, 0, bias, 0],
-        ])  # fmt: skip
 
 
 def _predicted(before: _Estimate, motion: CameraMotion, camera: Transform) -> _Estimate:
@@ -177,6 +164,23 @@ def _predicted(before: _Estimate, motion: CameraMotion, camera: Transform) -> _E
     covariance = translated_covariance(before.covariance, way) + turned @ added @ turned.T
     distance = before.distance + float(np.linalg.norm(way))
     return _Estimate(motion.segment, camera, motion.covariance, world, covariance, distance)
+
+
+def _common_errors(position: Array, distance: float, bias: float) -> Array:
+    """One standard deviation (5, 6) of position and rotation for each error common to all steps.
+
+    Length, direction and rotation of the steps (a rotation bends the track by half of it), and up about two axes, by
+    `bias`, rad.
+    """
+    x, y, z = position
+    turned = TURN_ERROR * distance
+    return np.array([
+        [SCALE_ERROR * x, SCALE_ERROR * y, SCALE_ERROR * z, 0, 0, 0],
+        [-SCALE_ERROR / 2 * y, SCALE_ERROR / 2 * x, 0, 0, 0, 0],
+        [-turned / 2 * y, turned / 2 * x, 0, 0, 0, turned],
+        [0, -bias * z, bias * y, bias, 0, 0],
+        [bias * z, 0, -bias * x, 0, bias, 0],
+    ])  # fmt: skip
 
 
 def _frame_of(segment: int) -> str:

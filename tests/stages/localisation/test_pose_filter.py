@@ -99,6 +99,18 @@ def test_a_rover_that_stands_does_not_move_with_the_noise_of_its_tilt():
     assert np.max(stated) < 5e-4
 
 
+def test_the_error_of_a_filtered_tilt_does_not_average_out():
+    spreads = []
+    for filtered in (False, True):
+        stage = Running(PoseFilter(tilt_bias=0.0))
+        for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), DRIVE.ups(), strict=True):
+            pose = stage(motion, Tilt(motion.stamp, up, sigma=0.005, filtered=filtered), mount_of(DRIVE))
+        spreads.append(np.sqrt(np.diag(pose.covariance)))
+    assert max(spreads[0][3:5]) < 0.004
+    assert min(spreads[1][3:5]) > 0.005
+    assert spreads[1][2] > spreads[0][2]
+
+
 def test_a_logged_pose_passes_through_unchanged():
     pose = Pose(7, [1, 2, 3], [0, 0, 0, 1], "odom", "base_link")
     motion = motions(DRIVE.cameras(1), DRIVE.stamps(1))[0]
