@@ -64,14 +64,15 @@ class UpEstimator:
 
     def push(self, sample: InertialSample) -> list[Tilt]:
         """Add a sample. Its stamp must be later than that of the last one."""
-        made = list[Tilt]()
-        if sample.rate is not None:
-            last = self._last_rated()
-            if last is not None and sample.stamp - last > MAX_GAP_NS:
-                made = self.finish()
-            if self._waiting and sample.stamp - self._waiting[0].stamp > BATCH_NS and self._has_rate():
+        made, last = list[Tilt](), self._last_rated()
+        if sample.rate is not None and last is not None and sample.stamp - last > MAX_GAP_NS:
+            made = self.finish()
+        if self._waiting and sample.stamp - self._waiting[0].stamp > BATCH_NS:
+            if self._has_rate():
                 self._integrate()
                 made += self._tilts(LAG_BLOCKS)
+            else:
+                self._waiting = []
         self._waiting.append(sample)
         return made
 

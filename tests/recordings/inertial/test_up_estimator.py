@@ -1,6 +1,7 @@
 """Up from accelerations and rates: as right as its sigma says, from the first sample on, on any planet."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,9 +76,13 @@ def test_a_new_estimate_after_a_gap_keeps_the_biases():
     assert rms(after) < 0.3
 
 
-def test_memory_does_not_grow_with_the_log():
+@pytest.mark.parametrize("rates_until", [200, 20])
+def test_memory_does_not_grow_with_the_log(rates_until):
+    """rates_until: s, after which the gyroscope is silent."""
     estimator, most = UpEstimator("imu", 0.03), 0
-    for sample in drive(seconds=200, rate=50, rest=0).samples():
+    for number, sample in enumerate(drive(seconds=200, rate=50, rest=0).samples()):
+        if number > 50 * rates_until:
+            sample = replace(sample, rate=None)
         estimator.push(sample)
         waiting = 0 if estimator._blocks is None else len(estimator._blocks.stamps)
         most = max(most, waiting + len(estimator._waiting))

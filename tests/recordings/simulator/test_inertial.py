@@ -64,5 +64,6 @@ def test_a_log_has_a_raw_imu_in_place_of_the_inclinometer(tmp_path):
 
 
 def test_up_is_estimated_to_0_3_degrees():
-    errors = [rms_of_estimate(replace(DRIVE, seed=seed, rest=rest)) for seed in range(1, 5) for rest in (0.0, 5.0)]
+    drives = [replace(DRIVE, seed=seed, rest=5.0 * (seed % 2)) for seed in range(1, 5)]
+    errors = [rms_of_estimate(drive) for drive in drives]
     assert np.sqrt(np.mean(np.square(errors))) < 0.3
