@@ -223,9 +223,8 @@ class McapLog:
     def notes(self) -> dict[str, str]:
         """Stream -> note: missing stamps, the source of the baseline, an unknown base frame."""
         notes = {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
-        for side in CAMERAS:
-            if self._schema(side) == VIDEO:
-                notes[side] = "; ".join((*filter(None, [notes.get(side)]), VIDEO_NOTE))
+        if any(self._schema(side) == VIDEO for side in CAMERAS):
+            notes["left"] = "; ".join((*filter(None, [notes.get("left")]), VIDEO_NOTE))
         if "right" in self.topics and (note := self.resolution.baseline_note):
             notes["right"] = "; ".join((*filter(None, [notes.get("right")]), note))
         if self.resolution.tilt is not None and (note := self.resolution.tilt.note(self._estimator, self.source)):

@@ -141,11 +141,11 @@ def foxglove_json(message: Any) -> dict[str, Any]:
 def protobuf_log(source: Path, out: Path, convert: Convert = _converted) -> Path:
     """Foxglove's messages in protobuf; the Imu in JSON."""
     with out.open("wb") as file, ProtobufWriter(file) as writer:
-        imu = writer._writer.register_schema("sensor_msgs/msg/Imu", "jsonschema", b"{}")
-        channel = writer._writer.register_channel("/imu/data", "json", imu)
+        imu, channel = writer._writer.register_schema("sensor_msgs/msg/Imu", "jsonschema", b"{}"), 0
         for topic, log_time, message in iter_decoded(source):
             if message.__msgtype__.endswith("Imu"):
                 data = json.dumps(ros_json(message)).encode()
+                channel = channel or writer._writer.register_channel(topic, "json", imu)
                 writer._writer.add_message(channel, log_time, data, log_time)
             else:
                 writer.write_message(_renamed(topic), convert(topic, message), log_time, log_time)
