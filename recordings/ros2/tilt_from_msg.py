@@ -75,7 +75,8 @@ def rate_of(message: Any) -> Vector | None:
 
 
 def _measured(message: Any, name: str) -> Vector | None:
-    if getattr(message, f"{name}_covariance")[0] == -1:
+    covariance = getattr(message, f"{name}_covariance", None)
+    if covariance is not None and len(covariance) and covariance[0] == -1:
         return None
     vector = getattr(message, name)
     return _finite_vector([vector.x, vector.y, vector.z], name)

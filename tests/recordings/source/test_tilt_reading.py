@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,12 @@ from flow.contracts import Severity
 from recordings import McapSource
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
-from recordings.ros2.tilt_from_msg import AccelerationField
+from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
 from recordings.ros2.to_msg import camera_info, header, image, odometry, quaternion, raw_imu, transform_message
 from recordings.source.inventory import describe, format_description
 from stages.data import Pose, Tilt, Transform
 from tests.conftest import rewrite
+from tests.recordings.encodings.rewritten import ros1_bag
 from tests.recordings.inertial.drive import Drive, drive
 from tests.recordings.sample_log import TRANSFORMS, model, picture
 
@@ -97,6 +99,13 @@ def test_up_is_estimated_where_an_imu_has_no_orientation(tmp_path, messages, why
         assert f"note: inclinometer: up is estimated from the accelerations and rates on {IMU}" in (
             format_description(describe(log, max_gap_of=lambda intervals: 10**8))
         )
+
+
+def test_a_ros_1_bag_has_the_same_estimates(tmp_path):
+    path = written(tmp_path / "log.mcap", drive(seconds=6))
+    tilts, lost, _ = read(ros1_bag(path, tmp_path / "log.bag"))
+    assert lost == []
+    np.testing.assert_array_equal([tilt.up for tilt in tilts], [tilt.up for tilt in read(path)[0]])
 
 
 def test_a_part_of_a_log_has_tilts_as_good_as_the_whole(tmp_path):
@@ -217,6 +226,13 @@ def test_a_gyroscope_needs_accelerations(tmp_path):
     path = written(tmp_path / "log.mcap", drive(seconds=2), beside)
     assert read(path)[2] == ""
     assert "/imu0 has no accelerations to go with the rates" in missing(path, McapSource(gyroscope=IMU))
+
+
+def test_accelerations_need_no_covariance():
+    vector = SimpleNamespace(x=0, y=1, z=9.8)
+    assert acceleration_of(SimpleNamespace(linear_acceleration=vector)) == (0, 1, 9.8)
+    marked = SimpleNamespace(linear_acceleration=vector, linear_acceleration_covariance=[-1] + 8 * [0])
+    assert acceleration_of(marked) is None
 
 
 @pytest.mark.parametrize(("field", "sign"), [("vector", -1), ("vector.x vector.y vector.z", -1)])
