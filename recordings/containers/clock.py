@@ -153,4 +153,4 @@ def split(steps: list[ClockStep], first: int, size: int) -> list[tuple[range, Cl
         if high > low:
             parts.append((range(low - first, high - first), begun))
         begun = step
-    return parts
+    return parts or [(range(size), ClockStep(0, 0, 0, 0))]

@@ -45,7 +45,7 @@ class Db3File:
                 raise LogError(f"{path} contains no messages{damage}")
             self.start, self.end = int(times.min()), int(times.max())
             self._note_unwritten()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:  # a column may have any type
             self.close()
             raise LogError(f"{path} is no rosbag2 recording or is damaged ({sentence_of(error)})") from error
         except BaseException:

@@ -16,10 +16,12 @@ from mcap.stream_reader import StreamReader
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 
+_UNREADABLE = (McapError, OSError, ValueError, struct.error, MemoryError, OverflowError)
+
 
 def about_run(result: Path) -> dict[str, str]:
     """The facts of the run that wrote a result log; empty for another log."""
-    with suppress(McapError, OSError, ValueError, struct.error), result.open("rb") as file:
+    with suppress(*_UNREADABLE), result.open("rb") as file:
         *_, record = islice(StreamReader(file, emit_chunks=True).records, 2)  # the header and the first metadata record
         if isinstance(record, Metadata) and record.name == "roverflow":
             return dict(record.metadata)
@@ -28,7 +30,7 @@ def about_run(result: Path) -> dict[str, str]:
 
 def pipeline_of(result: Path) -> str:
     """The name of the pipeline that wrote a complete result log."""
-    with suppress(McapError, OSError, ValueError, struct.error), result.open("rb") as file:
+    with suppress(*_UNREADABLE), result.open("rb") as file:
         for record in make_reader(file).iter_metadata():
             if record.name == "roverflow.run":
                 return record.metadata["pipeline"]

@@ -81,6 +81,14 @@ def test_messages_of_an_unknown_topic_and_in_a_journal_are_reported(database):
     ("statements", "sentence"),
     [
         (["DROP TABLE topics"], "is an SQLite file, but no rosbag2 recording: it has no table of messages"),
+        (
+            [
+                "CREATE TABLE other AS SELECT NULL AS id, name, type, serialization_format FROM topics",
+                "DROP TABLE topics",
+                "ALTER TABLE other RENAME TO topics",
+            ],
+            "is no rosbag2 recording or is damaged (int() argument must be",
+        ),
         (["DELETE FROM messages"], "contains no messages; record it again"),
         (["ALTER TABLE topics RENAME COLUMN type TO kind"], "is no rosbag2 recording or is damaged (no such column"),
     ],

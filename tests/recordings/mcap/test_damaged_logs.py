@@ -197,6 +197,19 @@ def test_a_chunk_beyond_the_size_limit_is_broken():
         unpack_chunk(content)
 
 
+def test_a_log_whose_only_chunk_and_its_index_are_gone_has_lost_messages(sample, tmp_path):
+    path = rewrite(sample, tmp_path / "log.mcap", compression=CompressionType.NONE)
+    with McapFile(path) as log:
+        (chunk,) = log.index.chunks
+    content = bytearray(path.read_bytes())
+    end = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+    content[chunk.chunk_start_offset : end] = bytes(end - chunk.chunk_start_offset)
+    path.write_bytes(content)
+    with McapSource().open(path) as log:
+        assert log.missing["left"].startswith("the calibration on /stereo/left/camera_info cannot be read: ")
+        assert any(isinstance(item, LostMessage) for item in log.file.messages(set(log.file.channels)))
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("layout", ["small chunks", "no message index", "no index", "no chunks"])
 def test_an_impossible_log_time_loses_its_message(sample, whole, tmp_path, layout):
