@@ -166,6 +166,14 @@ class Recording:
         return gone + [LostMessage(None, item.log_time, self._named(file, item.reason)) for file, item in found]
 
     @property
+    def notes(self) -> list[str]:
+        """Sentences: that the path is only a part, and that log times are corrected."""
+        shifts = {part.step.shift for part in self._parts} - {0}
+        remedy = "and its log times are corrected by header stamps"
+        corrected = [f"the recorder's clock was set back by {shift / 1e9:.3g} s, {remedy}" for shift in sorted(shifts)]
+        return [*filter(None, [self.part]), *corrected]
+
+    @property
     def profile(self) -> str:
         """The profile that the files state."""
         return self.files[0].profile

@@ -229,8 +229,8 @@ class McapLog:
             notes["right"] = "; ".join((*filter(None, [notes.get("right")]), note))
         if self.resolution.tilt is not None and (note := self.resolution.tilt.note(self._estimator, self.source)):
             notes["inclinometer"] = "; ".join((*filter(None, [notes.get("inclinometer")]), note))
-        if self.file.part and "left" in self.topics:
-            notes["left"] = "; ".join((*filter(None, [notes.get("left")]), self.file.part))
+        if self.file.notes and "left" in self.topics:
+            notes["left"] = "; ".join((*filter(None, [notes.get("left")]), *self.file.notes))
         if self.resolution.mount is not None and self.resolution.mount.base_from_camera is None:
             notes["mount"] = (
                 f"no static transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "

@@ -61,7 +61,10 @@ def test_a_recorder_whose_clock_alone_is_set_back_loses_nothing(sample, whole, t
 
     path = rewrite(sample, tmp_path / "log.mcap", time=time, **options)
     assert [(t, s, essence(i)) for t, s, i in items_of(path)] == [(t, s, essence(i)) for t, s, i in whole]
-    assert inventory_of(path)["frames"]["with_tilt"] == FRAMES
+    description = inventory_of(path)
+    assert description["frames"]["with_tilt"] == FRAMES
+    note = f"the recorder's clock was set back by {back / 1e9:.3g} s, and its log times are corrected by header stamps"
+    assert description["notes"]["left"] == note
 
 
 ORDERS = {
