@@ -13,7 +13,6 @@ from recordings.errors import LogError
 from recordings.source.cameras import CAMERAS, CalibrationTopic
 from recordings.source.topics import DecodedTopics
 from recordings.source.transforms import TransformTree
-from recordings.video.decoder import reader_of
 from stages.data import Array, CameraModel, Transform
 
 INCLINOMETER = "inclinometer"  # the frame of a tilt whose messages name none
@@ -60,7 +59,7 @@ def _sized(model: CameraModel, messages: DecodedTopics, topic: str) -> CameraMod
     """The calibration, with the size of the images where its file has none."""
     if model.width and model.height:
         return model
-    pixels_of = reader_of(messages.schemas[topic])
+    pixels_of = messages.pixel_reader(topic)
     first = messages.first(topic, lambda message: pixels_of(message, None).shape)
     if isinstance(first, LogError):
         raise LogError(f"the calibration has no size of the images, and no image of {topic} can be read: {first}")

@@ -17,8 +17,11 @@ from recordings.errors import LogError
 from recordings.ros1.codec import decoder_for as ros1_decoder
 from recordings.ros2.cdr import decoder_for as cdr_decoder
 from recordings.ros2.cdr import full_name
+from recordings.video.formats import VIDEO
 
 MAX_SCHEMA_BYTES = 2_000_000  # the largest definitions in use have a tenth of it
+MAX_MESSAGE_BYTES = 4_000_000  # of a message that is no image; none in use has a tenth of it
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", VIDEO)
 ENCODINGS = ("cdr", "ros1", "protobuf", "json")
 
 Decoder = Callable[[bytes | memoryview], Any]
@@ -35,12 +38,14 @@ def decoder_of(channel: Channel) -> tuple[str, Decoder]:
         raise LogError(f"its schema has {len(schema.text)} bytes, which is more than {MAX_SCHEMA_BYTES}")
     decode, name = _plain_decoder(encoding, schema), "" if schema is None else schema.name
     adapted = adapter_of(name)
-    if adapted is not None:
-        ros_name, adapt = adapted
-        return ros_name, lambda data: adapt(decode(data))
-    if encoding in ("protobuf", "json"):
-        return full_name(name), lambda data: with_header(decode(data))
-    return full_name(name), decode
+    ros_name, adapt = adapted or (full_name(name), with_header if encoding in ("protobuf", "json") else None)
+
+    def decoded(data: bytes | memoryview) -> Any:
+        if len(data) > MAX_MESSAGE_BYTES and ros_name not in _IMAGES:
+            raise LogError(f"it has {len(data)} bytes; the limit of messages other than images is {MAX_MESSAGE_BYTES}")
+        return decode(data) if adapt is None else adapt(decode(data))
+
+    return ros_name, decoded
 
 
 def _plain_decoder(encoding: str, schema: MessageSchema | None) -> Decoder:

@@ -8,11 +8,16 @@ from typing import Any
 
 from recordings.errors import LogError
 
+_MAX_VALUES, _MAX_OBJECTS = 4_000_000, 100_000  # of a message; they take far more memory than their text
+
 
 def json_decoder(data: bytes | memoryview) -> Any:
     """The message of a JSON object. Raises LogError for anything else."""
+    text = bytes(data)
+    if text.count(b"{") > _MAX_OBJECTS or sum(map(text.count, (b",", b"["))) > _MAX_VALUES:
+        raise LogError(f"it has more than {_MAX_VALUES} values or {_MAX_OBJECTS} objects")
     try:
-        message = json.loads(bytes(data), object_hook=_object)
+        message = json.loads(text, object_hook=_object)
     except (ValueError, RecursionError) as error:
         raise LogError(f"it is not JSON ({error})") from error
     if not isinstance(message, SimpleNamespace):

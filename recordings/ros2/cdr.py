@@ -43,6 +43,7 @@ LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are a si
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message begins so
 _MAX_REASON = 100  # characters of a parser's message, which may contain the whole schema
+_MAX_ELEMENTS = 1000  # of an array of a fixed size, unless they are numbers
 _registering = RLock()  # rosbags builds classes and codecs in module-wide state
 
 
@@ -137,7 +138,19 @@ def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
             store.register(get_types_from_msg(text, name))
         known = _typestore("ros1_noetic") if encoding == "ros1msg" else TYPES
         _complete(store, known, name, [], set())
+        _check_arrays(store)
     return store
+
+
+def _check_arrays(store: SharedTypestore) -> None:
+    """Refuse long arrays of texts or messages: the codec has a line of code for each element."""
+    part: Any
+    for name, (_, fields) in store.fielddefs.items():
+        for field, (kind, part) in fields:
+            if kind == Nodetype.ARRAY and part[1] > _MAX_ELEMENTS:
+                (element, detail), size = part
+                if element == Nodetype.NAME or detail[0] in ("string", "wstring"):
+                    raise ValueError(f"{name}.{field} has {size} elements")
 
 
 def _complete(store: SharedTypestore, known: SharedTypestore, name: str, above: list[str], done: set[str]) -> None:

@@ -35,7 +35,8 @@ _BAYER = {
     "bayer_grbg": cv2.COLOR_BayerGRBG2RGB,
 }
 _MAX_PADDING_BYTES = 1024  # after the end of a compressed image
-MAX_PIXELS = 64_000_000  # of an image; navigation cameras have a tenth of it
+MAX_PIXELS = 32_000_000  # of an image, by default; navigation cameras have at most 20 million
+_MAX_SCANS = 64  # of a progressive JPEG, each of which takes the time of a picture; encoders make at most 12
 # Of these only the brightness is read. Encoding -> (bytes of a pixel in a row, place of the first brightness)
 _LUMA = {
     "uyvy": (2, 1), "yuv422": (2, 1), "UYVY": (2, 1),
@@ -46,13 +47,15 @@ _ENCODINGS = _PLAIN | {f"{name}{bits}": (f"u{bits // 8}", 1, code) for name, cod
 _ALL_ENCODINGS = (*_ENCODINGS, *_LUMA)
 
 
-def pixels_of(message: Any, size: tuple[int, int] | None = None) -> Array:
+def pixels_of(message: Any, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> Array:
     """The pixels of a sensor_msgs Image or CompressedImage, gray (H, W) or RGB (H, W, 3), uint8 or uint16.
 
-    size: width and height of the calibration; an image of another size is refused before it is decoded. Raises LogError
+    size: width and height of the calibration; an image of another size is refused before it is decoded, as is one of
+    more than `max_pixels`. Raises LogError
     if the image is damaged, cut, or in an unsupported encoding.
     """
-    return _raw_pixels(message, size) if hasattr(message, "encoding") else _compressed_pixels(message, size)
+    read = _raw_pixels if hasattr(message, "encoding") else _compressed_pixels
+    return read(message, size, max_pixels)
 
 
 def unread_encoding(message: Any) -> str:
@@ -65,17 +68,17 @@ def unread_encoding(message: Any) -> str:
     return f"the image encoding '{encoding}' is not supported; record it in one of {', '.join(_ALL_ENCODINGS)}"
 
 
-def check_size(width: int, height: int, size: tuple[int, int] | None) -> None:
+def check_size(width: int, height: int, size: tuple[int, int] | None, max_pixels: int) -> None:
     """Raise LogError for an image that is empty, too large, or of another size than `size`."""
     if width == 0 or height == 0:
         raise LogError(f"the image is empty ({width}x{height})")
-    if width * height > MAX_PIXELS:
-        raise LogError(f"the image is {width}x{height}, which is more than {MAX_PIXELS / 1e6:.0f} million pixels")
+    if width * height > max_pixels:
+        raise LogError(f"the image is {width}x{height}, more than 'max_pixels' of the source ({max_pixels}) allows")
     if size is not None and size != (width, height):
         raise LogError(f"the image is {width}x{height}, but its calibration is for {size[0]}x{size[1]}")
 
 
-def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
+def _raw_pixels(message: Any, size: tuple[int, int] | None, max_pixels: int) -> Array:
     if unread := unread_encoding(message):
         raise LogError(unread)
     luma = _LUMA.get(message.encoding)
@@ -83,7 +86,7 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     height, width, data = int(message.height), int(message.width), np.asarray(message.data, np.uint8)
     row = width * channels * int(kind[1])
     step = int(message.step) or row
-    check_size(width, height, size)
+    check_size(width, height, size, max_pixels)
     if step < row:
         raise LogError(f"the image's step of {step} bytes is shorter than a row of {width} {message.encoding} pixels")
     needed = (height - 1) * step + row  # the last row may lack its padding
@@ -98,7 +101,7 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     return _converted(pixels, conversion)
 
 
-def _compressed_pixels(message: Any, size: tuple[int, int] | None) -> Array:
+def _compressed_pixels(message: Any, size: tuple[int, int] | None, max_pixels: int) -> Array:
     data = np.ascontiguousarray(message.data, np.uint8)
     content = data.tobytes()
     # OpenCV may silently make a wrong picture of a JPEG whose end is replaced by zeros, the rest of a camera's buffer.
@@ -106,9 +109,11 @@ def _compressed_pixels(message: Any, size: tuple[int, int] | None) -> Array:
     end = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(content[:2], b"")
     if end not in content.rstrip(b"\0")[-_MAX_PADDING_BYTES:]:
         raise LogError(f"the compressed image is cut after {data.size} bytes")
+    if content.startswith(b"\xff\xd8") and (scans := content.count(b"\xff\xda")) > _MAX_SCANS:
+        raise LogError(f"the compressed image has {scans} scans; the limit is {_MAX_SCANS}")
     stated = _stated_size(content)
     if stated is not None:
-        check_size(*stated, size)
+        check_size(*stated, size, max_pixels)
     encoding = message.format.split(";")[0].strip()
     pixels = unpacked_pixels(data, _BAYER.get(encoding.rstrip("0123456789"))) if stated else None
     if pixels is None:

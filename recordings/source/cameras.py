@@ -14,7 +14,7 @@ from recordings.ros2.from_msg import camera_model, frame_of, stamp_or
 from recordings.ros2.image_from_msg import unread_encoding
 from recordings.source.calibration import Camera
 from recordings.source.topics import DecodedTopics
-from recordings.video.decoder import PixelReader, VideoDecoder, reader_of
+from recordings.video.decoder import PixelReader, VideoDecoder
 from stages.data import Array, CameraImage, CameraModel
 
 CAMERAS = ("left", "right")
@@ -128,7 +128,7 @@ def mismatched_images(
 
 def _pixels(messages: DecodedTopics, topic: str, last: bool = False) -> Array | LogError | None:
     """The first (or last) image that can be decoded, or the last error; None without messages."""
-    found, pixels_of = None, reader_of(messages.schemas[topic])
+    found, pixels_of = None, messages.pixel_reader(topic)
     if isinstance(pixels_of, VideoDecoder):
         return messages.first(topic, pixels_of)
     for found in (messages.last if last else messages.sample)(topic, pixels_of):

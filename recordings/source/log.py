@@ -35,7 +35,7 @@ from recordings.source.settings import LogSettings
 from recordings.source.tilt_noise import TiltNoise
 from recordings.source.tilt_reading import Sampled, TiltReading, estimated_tilts
 from recordings.source.topics import TopicReader, attempt
-from recordings.video.decoder import VideoDecoder, reader_of
+from recordings.video.decoder import VideoDecoder
 from recordings.video.formats import VIDEO, VIDEO_NOTE
 from stages.data import CameraImage, Mount, Pose, Tilt
 
@@ -318,8 +318,10 @@ class McapLog:
         made: dict[str, Callable[[Any, int], Any]] = {
             "odometry": lambda message, log_time: self._rover_pose(pose_of(message, log_time, base_frame)),
         }
+        read = self.resolution.messages.pixel_reader
         for side, camera in zip(CAMERAS, self.resolution.cameras or (), strict=False):
-            made[side] = ImageReading(camera, calibrations[side], reader_of(self._schema(side)))
+            if side in self.topics:
+                made[side] = ImageReading(camera, calibrations[side], read(self.topics[side]))
         chosen = [(stream, topic) for stream, topic in self.topics.items() if stream in made and stream in streams]
         readers = [self._reader(stream, topic, made[stream]) for stream, topic in chosen]
         return [*readers, *self._tilt_readers()] if "inclinometer" in streams else readers

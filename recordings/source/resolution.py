@@ -41,7 +41,7 @@ class SourceResolution:
     """
 
     def __init__(self, file: Recording, source: LogSettings) -> None:
-        self.file, self.source, self.messages = file, source, DecodedTopics(file)
+        self.file, self.source, self.messages = file, source, DecodedTopics(file, source.max_pixels)
         self.undecodable = self._undecodable_topics()
         found = self._discovered()
         self._without_topic = frozenset(found.missing)  # streams without a topic

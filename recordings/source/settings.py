@@ -8,6 +8,7 @@ from typing import Any
 
 from flow.parameters import check_parameters, parameter
 from recordings.ros2.from_msg import frame_name
+from recordings.ros2.image_from_msg import MAX_PIXELS
 from recordings.ros2.tilt_from_msg import AccelerationField, AngleField, PlainAngles
 
 
@@ -69,6 +70,7 @@ class LogSettings:
     joints: str | None = parameter(
         None, "YAML file of the axes that move the camera on the rover, whose angles are in a JointState"
     )
+    max_pixels: int = parameter(MAX_PIXELS, "pixels of the largest image that is decoded", low=1)
     base_frame: str = parameter("base_link", "the rover's frame")
 
     def __post_init__(self) -> None:

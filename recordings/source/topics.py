@@ -16,7 +16,7 @@ from recordings.containers.recording import Recording
 from recordings.encodings.decoding import Decoder, decoder_of
 from recordings.errors import LogError, sentence_of
 from recordings.ros2.from_msg import frame_of
-from recordings.video.decoder import VideoDecoder, begins_video
+from recordings.video.decoder import PixelReader, VideoDecoder, begins_video, reader_of
 
 MAX_CHANNELS = 1000  # that are decoded; a rover has a tenth of it
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
@@ -65,8 +65,8 @@ class DecodedTopics:
     decoders: by channel; undecodable_channels: channel -> reason; schemas: decodable topic -> full ROS 2 type name.
     """
 
-    def __init__(self, file: Recording) -> None:
-        self.file = file
+    def __init__(self, file: Recording, max_pixels: int) -> None:
+        self.file, self._max_pixels = file, max_pixels
         self.decoders: dict[int, Decoder] = {}
         self.undecodable_channels: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
@@ -78,6 +78,10 @@ class DecodedTopics:
                 self.schemas[channel.topic], self.decoders[number] = decoder_of(channel)
             except LogError as error:
                 self.undecodable_channels[number] = str(error)
+
+    def pixel_reader(self, topic: str) -> PixelReader:
+        """A function to the pixels of a topic's messages, in their order."""
+        return reader_of(self.schemas[topic], self._max_pixels)
 
     def channels_of(self, topic: str) -> set[int]:
         """The channels of a topic that can be decoded."""

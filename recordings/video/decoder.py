@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 
 from recordings.errors import LogError, sentence_of
-from recordings.ros2.image_from_msg import MAX_PIXELS, check_size, pixels_of
+from recordings.ros2.image_from_msg import check_size, pixels_of
 from recordings.video.formats import CODECS, VIDEO, FrameNumbers, is_key_frame, unread_video
 from stages.data import Array
 
@@ -23,7 +24,8 @@ class PixelReader(Protocol):
 class VideoDecoder:
     """The brightness of the images of one video. Its messages are given in their order, also those not needed."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_pixels: int) -> None:
+        self._max_pixels = max_pixels
         self._codec: Any = None
         self._format = ""
         self._is_begun = False
@@ -52,7 +54,7 @@ class VideoDecoder:
         if video_format == "h264" and not self._numbers.follows(data):
             raise LogError(f"a message before it is missing, so there is {NO_KEY_FRAME}")
         frame = self._frame(data)
-        check_size(frame.width, frame.height, size)
+        check_size(frame.width, frame.height, size, self._max_pixels)
         return _brightness(frame)
 
     def _begin(self, video_format: str) -> None:
@@ -62,7 +64,7 @@ class VideoDecoder:
         self._codec = av.CodecContext.create(CODECS[video_format], "r")
         self._codec.thread_count = 1
         self._codec.flags |= av.codec.context.Flags.low_delay
-        self._codec.options = {"max_pixels": str(MAX_PIXELS), "err_detect": "explode"}
+        self._codec.options = {"max_pixels": str(self._max_pixels), "err_detect": "explode"}
         self._format, self._is_begun, self._numbers = video_format, True, FrameNumbers()
 
     def _frame(self, data: bytes) -> Any:
@@ -93,6 +95,6 @@ def begins_video(message: Any) -> bool:
     return is_key_frame(str(message.video_format), np.asarray(message.data, np.uint8).tobytes())
 
 
-def reader_of(schema: str) -> PixelReader:
+def reader_of(schema: str, max_pixels: int) -> PixelReader:
     """A function to the pixels of the messages of one topic, in their order. schema: their full name."""
-    return VideoDecoder() if schema == VIDEO else pixels_of
+    return VideoDecoder(max_pixels) if schema == VIDEO else partial(pixels_of, max_pixels=max_pixels)

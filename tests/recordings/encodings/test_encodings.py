@@ -5,13 +5,14 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from mcap.writer import Writer
 
 from recordings import McapSource
 from recordings.containers.container import Channel, MessageSchema
-from recordings.encodings.decoding import MAX_SCHEMA_BYTES, decoder_of
+from recordings.encodings.decoding import MAX_MESSAGE_BYTES, MAX_SCHEMA_BYTES, decoder_of
 from recordings.errors import LogError
 from recordings.ros2.cdr import make
 from recordings.ros2.image_from_msg import pixels_of
@@ -21,6 +22,9 @@ from recordings.source.topics import MAX_CHANNELS
 from stages.data import Tilt
 from tests.recordings.encodings.rewritten import WRITERS
 from tests.recordings.sample_log import essence, items_of
+
+
+NOTHING = f"c/E[{{}}] x\n{'=' * 80}\nMSG: c/E\n"
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -67,7 +71,9 @@ def test_plain_angles_in_json_are_a_tilt_at_their_own_time(tmp_path, schema):
     assert np.degrees(np.arcsin(tilt.up[0])) == pytest.approx(2.0)
 
 
-@pytest.mark.parametrize("data", [b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000])
+@pytest.mark.parametrize(
+    "data", [b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000, b'{"a": [' + b"[]," * 4_000_000]
+)
 def test_foreign_json_is_an_error_in_one_sentence(data):
     _, decode = decoder_of(Channel(1, "/image", "json", MessageSchema("foxglove.RawImage", "jsonschema", b"")))
     with pytest.raises((LogError, AttributeError)):
@@ -80,6 +86,13 @@ def test_foreign_json_is_an_error_in_one_sentence(data):
         ("protobuf", MessageSchema("a.B", "protobuf", b"\xff\xff"), "schema 'a.B' cannot be used"),
         ("protobuf", MessageSchema("a.B", "jsonschema", b"{}"), "is in 'jsonschema', not in 'protobuf'"),
         ("ros1", MessageSchema("a/B", "ros1msg", b"Nothing nothing"), "schema 'a/B' cannot be parsed"),
+        (
+            "ros1",
+            MessageSchema("a/B", "ros1msg", NOTHING.format("").encode()),
+            "a list of c/msg/E, which has no fields",
+        ),
+        ("ros1", MessageSchema("a/B", "ros1msg", NOTHING.format(2000).encode()), "a/msg/B.x has 2000 elements"),
+        ("cdr", MessageSchema("a/B", "ros2msg", b"string[2000] x"), "a/msg/B.x has 2000 elements"),
         ("ros1", None, "its messages have no schema"),
         ("cdr", MessageSchema("a/B", "ros2msg", b" " * (MAX_SCHEMA_BYTES + 1)), "which is more than 2000000"),
     ],
@@ -106,6 +119,26 @@ def test_the_brightness_of_nv12_images_is_read():
     np.testing.assert_array_equal(pixels_of(message), luma)
 
 
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_a_mosaic_gives_the_colours_that_it_was_made_of(pattern, bits):
+    kind, colour = np.dtype(f"u{bits // 8}"), {"r": 200, "g": 90, "b": 30}
+    mosaic = np.tile(np.array([colour[letter] for letter in pattern], kind).reshape(2, 2), (4, 5))
+    message = image(0, "camera", mosaic)
+    message.encoding = f"bayer_{pattern}{bits}"
+    pixels = pixels_of(message)
+    assert pixels.dtype == kind
+    assert (pixels == [200, 90, 30]).all()
+
+
+@pytest.mark.parametrize("order", ["rgba8", "bgra8"])
+def test_images_with_transparency_are_read_without_it(order):
+    given = np.random.default_rng(1).integers(0, 256, (4, 6, 4), np.uint8)
+    message = image(0, "camera", given[..., 0])
+    message.encoding, message.step, message.data = order, 24, given.ravel()
+    np.testing.assert_array_equal(pixels_of(message), given[..., :3] if order == "rgba8" else given[..., 2::-1])
+
+
 def png_head(width: int, height: int) -> bytes:
     """The beginning and the end of a PNG file, which is all that a check of its size may read."""
     return b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", width, height) + b"\0" * 64 + b"IEND\xaeB`\x82"
@@ -114,14 +147,34 @@ def png_head(width: int, height: int) -> bytes:
 def test_an_image_bomb_is_refused_before_it_is_decoded():
     message = image(0, "camera", np.zeros((4, 6), np.uint8))
     message.height, message.width = 30_000, 30_000
-    with pytest.raises(LogError, match="the image is 30000x30000, which is more than 64 million pixels"):
+    with pytest.raises(LogError, match="the image is 30000x30000, more than 'max_pixels' of the source"):
         pixels_of(message)
     compressed = make(
         "sensor_msgs/msg/CompressedImage", header=message.header, format="png",
         data=np.frombuffer(png_head(30_000, 30_000), np.uint8),
     )  # fmt: skip
-    with pytest.raises(LogError, match="the image is 30000x30000, which is more than 64 million pixels"):
+    with pytest.raises(LogError, match="the image is 30000x30000, more than 'max_pixels' of the source"):
         pixels_of(compressed)
+
+
+def test_a_picture_of_many_scans_is_refused_before_it_is_decoded():
+    content = bytes(cv2.imencode(".jpg", np.zeros((16, 16), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1])
+    scan = content[content.index(b"\xff\xda") : -2]
+    for times, is_refused in ((1, False), (100, True)):
+        data = np.frombuffer(content[:-2] + scan * times + content[-2:], np.uint8)
+        header = image(0, "camera", np.zeros((4, 6), np.uint8)).header
+        message = make("sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=data)
+        if is_refused:
+            with pytest.raises(LogError, match="the compressed image has [0-9]+ scans; the limit is 64"):
+                pixels_of(message)
+        else:
+            assert pixels_of(message).shape == (16, 16)
+
+
+def test_only_images_may_have_many_bytes():
+    decode = decoder_of(Channel(1, "/tf", "json", MessageSchema("foxglove.FrameTransforms", "jsonschema", b"")))[1]
+    with pytest.raises(LogError, match="it has 4000001 bytes; the limit of messages other than images is 4000000"):
+        decode(b" " * (MAX_MESSAGE_BYTES + 1))
 
 
 def test_a_log_of_thousands_of_topics_opens_quickly(tmp_path):
