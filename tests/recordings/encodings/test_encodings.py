@@ -23,7 +23,6 @@ from stages.data import Tilt
 from tests.recordings.encodings.rewritten import WRITERS
 from tests.recordings.sample_log import essence, items_of
 
-
 NOTHING = f"c/E[{{}}] x\n{'=' * 80}\nMSG: c/E\n"
 
 
@@ -165,7 +164,7 @@ def test_a_picture_of_many_scans_is_refused_before_it_is_decoded():
         header = image(0, "camera", np.zeros((4, 6), np.uint8)).header
         message = make("sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=data)
         if is_refused:
-            with pytest.raises(LogError, match="the compressed image has [0-9]+ scans; the limit is 64"):
+            with pytest.raises(LogError, match=r"the compressed image has [0-9]+ scans; the limit is 64"):
                 pixels_of(message)
         else:
             assert pixels_of(message).shape == (16, 16)
