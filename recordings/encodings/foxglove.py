@@ -5,7 +5,7 @@ The fields are those of foxglove-sdk's schemas. Bytes are base64 in JSON, and ti
 
 from __future__ import annotations
 
-from base64 import b64decode
+from binascii import a2b_base64
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -62,7 +62,7 @@ def _time(time: Any) -> Any:
 def _bytes(data: Any) -> Array:
     """The bytes of a field, (N,) uint8; base64 in JSON."""
     if isinstance(data, str):
-        data = b64decode(data, validate=True)
+        data = a2b_base64(data, strict_mode=True)
     return np.frombuffer(data, np.uint8) if isinstance(data, bytes) else np.asarray(data, np.uint8)
 
 

@@ -6,7 +6,6 @@ little ahead of the images, so that no image is delivered with a calibration tha
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,7 +33,7 @@ from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_noise import TiltNoise
 from recordings.source.tilt_reading import Sampled, TiltReading, estimated_tilts
-from recordings.source.topics import TopicReader, attempt
+from recordings.source.topics import TopicReader, attempt, with_lookahead
 from recordings.video.decoder import VideoDecoder
 from recordings.video.formats import VIDEO, VIDEO_NOTE
 from stages.data import CameraImage, Mount, Pose, Tilt
@@ -166,7 +165,7 @@ class McapLog:
                 self._begin_video(wide.low, reader)
         lag = MAX_CALIBRATION_LAG_NS if moving is None else MAX_TRANSFORM_LAG_NS
         raws = self.file.messages(infos.keys() | items.keys(), wide.low, wide.high)
-        for raw, noted in _with_lookahead(raws, infos, lag):
+        for raw, noted in with_lookahead(raws, infos, lag):
             if isinstance(raw, LostMessage):
                 for reader in items.values():
                     reader.note_lost(raw.channel)
@@ -377,18 +376,6 @@ class McapLog:
     @staticmethod
     def _by_channel(readers: Iterable[TopicReader]) -> dict[int, TopicReader]:
         return {channel: reader for reader in readers for channel in reader.decoders}
-
-
-def _with_lookahead(
-    raws: Iterable[RawMessage | LostMessage], early: dict[int, TopicReader], lag: int
-) -> Iterator[tuple[RawMessage | LostMessage, Any]]:
-    """Each message with the result of its reader in `early`, which reads `lag` ns ahead."""
-    waiting: deque[tuple[RawMessage | LostMessage, Any]] = deque()
-    for raw in raws:
-        waiting.append((raw, early[raw.channel](raw) if isinstance(raw, RawMessage) and raw.channel in early else None))
-        while waiting[0][0].log_time < raw.log_time - lag:
-            yield waiting.popleft()
-    yield from waiting
 
 
 def _both(first: Callable[[Any, int], Any], then: Callable[[Any, int], Any], message: Any, log_time: int) -> Any:

@@ -6,7 +6,8 @@ reading continues.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, TypeVar
@@ -136,3 +137,15 @@ def attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:
         return LogError(f"its content does not match the name of its type ({sentence_of(error)})")
     except Exception as error:
         return LogError(sentence_of(error))
+
+
+def with_lookahead(
+    raws: Iterable[RawMessage | LostMessage], early: dict[int, TopicReader], lag: int
+) -> Iterator[tuple[RawMessage | LostMessage, Any]]:
+    """Each message with the result of its reader in `early`, which reads `lag` ns ahead."""
+    waiting: deque[tuple[RawMessage | LostMessage, Any]] = deque()
+    for raw in raws:
+        waiting.append((raw, early[raw.channel](raw) if isinstance(raw, RawMessage) and raw.channel in early else None))
+        while waiting[0][0].log_time < raw.log_time - lag:
+            yield waiting.popleft()
+    yield from waiting
