@@ -6,6 +6,7 @@ another type keeps its own fields.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +20,7 @@ from recordings.ros2.cdr import decoder_for as cdr_decoder
 from recordings.ros2.cdr import full_name
 from recordings.video.formats import VIDEO
 
-MAX_SCHEMA_BYTES = 2_000_000  # the largest definitions in use have a tenth of it
+MAX_SCHEMA_BYTES = 1_000_000  # of all schemas of a log without comments; those in use have a fifth of it
 MAX_MESSAGE_BYTES = 4_000_000  # of a message that is no image; none in use has a tenth of it
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", VIDEO)
 ENCODINGS = ("cdr", "ros1", "protobuf", "json")
@@ -34,8 +35,6 @@ def decoder_of(channel: Channel) -> tuple[str, Decoder]:
         raise LogError(f"its messages are in '{encoding}', which cannot be read; {', '.join(ENCODINGS)} can")
     if schema is None and encoding != "json":
         raise LogError("its messages have no schema")
-    if schema is not None and len(schema.text) > MAX_SCHEMA_BYTES:
-        raise LogError(f"its schema has {len(schema.text)} bytes, which is more than {MAX_SCHEMA_BYTES}")
     decode, name = _plain_decoder(encoding, schema), "" if schema is None else schema.name
     adapted = adapter_of(name)
     ros_name, adapt = adapted or (full_name(name), with_header if encoding in ("protobuf", "json") else None)
@@ -46,6 +45,12 @@ def decoder_of(channel: Channel) -> tuple[str, Decoder]:
         return decode(data) if adapt is None else adapt(decode(data))
 
     return ros_name, decoded
+
+
+def weight_of(schema: MessageSchema) -> int:
+    """The number of bytes of a schema without comments, which determines the time to parse it."""
+    is_ros = schema.encoding.startswith("ros")
+    return len(re.sub(rb"#[^\n]*", b"", schema.text) if is_ros else schema.text)
 
 
 def _plain_decoder(encoding: str, schema: MessageSchema | None) -> Decoder:

@@ -43,6 +43,8 @@ LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are a si
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message begins so
 _MAX_REASON = 100  # characters of a parser's message, which may contain the whole schema
+_SEPARATOR = re.compile(r"^={20,}\s*$", re.MULTILINE)
+_MAX_LINES = 1000  # of a definition
 _MAX_ELEMENTS = 1000  # of an array of a fixed size, unless they are numbers
 _registering = RLock()  # rosbags builds classes and codecs in module-wide state
 
@@ -127,10 +129,14 @@ def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
     """A store of the types in the schema, completed by the standard types that it leaves out."""
     store = _typestore("empty")
     with _registering:
-        # Lines of '=' separate a schema's definitions; an IDL one begins with "IDL: package/msg/Name". Its includes are
-        # among the definitions, and the parser does not know #include.
+        # Lines of '=' separate a schema's definitions. The time to parse one grows with its square.
+        parts = _SEPARATOR.split(text)
+        if max(map(_lines_of, parts)) > _MAX_LINES:
+            raise ValueError(f"a definition has more than {_MAX_LINES} lines")
+        # One in IDL begins with "IDL: package/msg/Name". Its includes are among the definitions, and the parser does
+        # not know #include.
         if encoding == "ros2idl":
-            for part in re.split(r"^={20,}\s*$", text, flags=re.MULTILINE):
+            for part in parts:
                 body = re.sub(r"^\s*(IDL:|#).*$", "", part, flags=re.MULTILINE)
                 if body.strip():
                     store.register(get_types_from_idl(body))
@@ -140,6 +146,11 @@ def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
         _complete(store, known, name, [], set())
         _check_arrays(store)
     return store
+
+
+def _lines_of(part: str) -> int:
+    """The number of lines or statements of a definition, without comments."""
+    return sum(bool(line.strip()) for line in re.split(r"[\n;]", re.sub(r"#.*|//.*", "", part)))
 
 
 def _check_arrays(store: SharedTypestore) -> None:

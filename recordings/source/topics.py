@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any, TypeVar
 
-from recordings.containers.container import LostMessage, RawMessage
+from recordings.containers.container import LostMessage, MessageSchema, RawMessage
 from recordings.containers.recording import Recording
-from recordings.encodings.decoding import Decoder, decoder_of
+from recordings.encodings.decoding import MAX_SCHEMA_BYTES, Decoder, decoder_of, weight_of
 from recordings.errors import LogError, sentence_of
 from recordings.ros2.from_msg import frame_of
 from recordings.video.decoder import PixelReader, VideoDecoder, begins_video, reader_of
@@ -71,11 +71,16 @@ class DecodedTopics:
         self.decoders: dict[int, Decoder] = {}
         self.undecodable_channels: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
+        weights = dict[MessageSchema, int]()
         for place, (number, channel) in enumerate(file.channels.items()):
             if place >= MAX_CHANNELS:
                 self.undecodable_channels[number] = f"the log has more than {MAX_CHANNELS} channels"
                 continue
+            if channel.schema is not None and channel.schema not in weights:
+                weights[channel.schema] = weight_of(channel.schema)
             try:
+                if sum(weights.values()) > MAX_SCHEMA_BYTES:
+                    raise LogError(f"the schemas of the log have more than {MAX_SCHEMA_BYTES} bytes")
                 self.schemas[channel.topic], self.decoders[number] = decoder_of(channel)
             except LogError as error:
                 self.undecodable_channels[number] = str(error)

@@ -9,7 +9,7 @@ from typing import Any
 
 import foxglove_schemas_protobuf as schemas
 import numpy as np
-from google.protobuf.json_format import MessageToDict  # type: ignore[import-untyped]
+from google.protobuf.json_format import MessageToDict
 from mcap.writer import Writer as McapWriter
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from rosbags.rosbag1 import Writer as BagWriter

@@ -8,11 +8,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.writer import Writer
+from mcap_protobuf.writer import Writer as ProtobufWriter
 
 from recordings import McapSource
 from recordings.containers.container import Channel, MessageSchema
-from recordings.encodings.decoding import MAX_MESSAGE_BYTES, MAX_SCHEMA_BYTES, decoder_of
+from recordings.encodings.decoding import MAX_MESSAGE_BYTES, decoder_of
 from recordings.errors import LogError
 from recordings.ros2.cdr import make
 from recordings.ros2.image_from_msg import pixels_of
@@ -55,16 +60,47 @@ def json_angles(path: Path, angles: list[dict[str, Any]], schema: bool) -> Path:
     return path
 
 
-@pytest.mark.parametrize("schema", [True, False])
-def test_plain_angles_in_json_are_a_tilt_at_their_own_time(tmp_path, schema):
-    angles = [{"timestamp": {"sec": 5, "nsec": 7}, "body": {"pitch": 2.0, "roll": 0.0}}]
-    log = json_angles(tmp_path / "log.mcap", angles, schema)
+def protobuf_angles(path: Path, seconds: int, nanoseconds: int, pitch: float) -> Path:
+    """A log of one message of a type of one's own in protobuf."""
+    file = FileDescriptorProto(name="rover.proto", package="rover", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    tilt, body = file.message_type.add(name="Tilt"), file.message_type.add(name="Body")
+    number = {"label": 1, "type": FieldDescriptorProto.TYPE_DOUBLE}
+    body.field.add(name="pitch", number=1, **number)
+    body.field.add(name="roll", number=2, **number)
+    part = {"label": 1, "type": FieldDescriptorProto.TYPE_MESSAGE}
+    tilt.field.add(name="timestamp", number=1, type_name=".google.protobuf.Timestamp", **part)
+    tilt.field.add(name="body", number=2, type_name=".rover.Body", **part)
+    pool = DescriptorPool()
+    pool.AddSerializedFile(Timestamp.DESCRIPTOR.file.serialized_pb)
+    pool.Add(file)
+    made = GetMessageClass(pool.FindMessageTypeByName("rover.Tilt"))()
+    made.timestamp.seconds, made.timestamp.nanos, made.body.pitch = seconds, nanoseconds, pitch
+    with path.open("wb") as out, ProtobufWriter(out) as writer:
+        writer.write_message("/tilt", made, 10**9, 10**9)
+    return path
+
+
+def tilts_of(log: Path) -> list[Any]:
+    """The tilts of a log with the fields body.pitch and body.roll."""
     field = {"unit": "deg", "sign": 1}
     source = McapSource(
         inclinometer="/tilt", tilt_model="axis",
         pitch=AngleField(field="body.pitch", **field), roll=AngleField(field="body.roll", **field),
     )  # fmt: skip
-    (tilt,) = [item for _, _, item in items_of(log, source)]
+    return [item for _, _, item in items_of(log, source)]
+
+
+def test_plain_angles_in_a_protobuf_message_of_ones_own_are_a_tilt(tmp_path):
+    (tilt,) = tilts_of(protobuf_angles(tmp_path / "log.mcap", 5, 7, 2.0))
+    assert tilt.stamp == 5_000_000_007
+    assert np.degrees(np.arcsin(tilt.up[0])) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("schema", [True, False])
+def test_plain_angles_in_json_are_a_tilt_at_their_own_time(tmp_path, schema):
+    angles = [{"timestamp": {"sec": 5, "nsec": 7}, "body": {"pitch": 2.0, "roll": 0.0}}]
+    (tilt,) = tilts_of(json_angles(tmp_path / "log.mcap", angles, schema))
     assert isinstance(tilt, Tilt)
     assert tilt.stamp == 5_000_000_007
     assert np.degrees(np.arcsin(tilt.up[0])) == pytest.approx(2.0)
@@ -93,7 +129,7 @@ def test_foreign_json_is_an_error_in_one_sentence(data):
         ("ros1", MessageSchema("a/B", "ros1msg", NOTHING.format(2000).encode()), "a/msg/B.x has 2000 elements"),
         ("cdr", MessageSchema("a/B", "ros2msg", b"string[2000] x"), "a/msg/B.x has 2000 elements"),
         ("ros1", None, "its messages have no schema"),
-        ("cdr", MessageSchema("a/B", "ros2msg", b" " * (MAX_SCHEMA_BYTES + 1)), "which is more than 2000000"),
+        ("cdr", MessageSchema("a/B", "ros2msg", b"int32 x\n" * 2000), "a definition has more than 1000 lines"),
     ],
 )
 def test_a_schema_that_cannot_be_used_is_refused(encoding, schema, sentence):
@@ -188,3 +224,18 @@ def test_a_log_of_thousands_of_topics_opens_quickly(tmp_path):
     with McapSource().open(tmp_path / "log.mcap") as log:
         assert len(log.resolution.messages.decoders) == MAX_CHANNELS
         assert "the log has more than 1000 channels" in log.missing["left"]
+
+
+def test_schemas_are_parsed_up_to_a_limit_for_all(tmp_path, monkeypatch):
+    monkeypatch.setattr("recordings.source.topics.MAX_SCHEMA_BYTES", 30)
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="")
+        for number in range(3):
+            schema = writer.register_schema(f"a/B{number}", "ros2msg", b"int32 xxxxxx # " + b"comment" * 9)
+            channel = writer.register_channel(f"/t{number}", "cdr", schema)
+            writer.add_message(channel, 10**9, b"\0\1\0\0\0\0\0\0", 10**9)
+        writer.finish()
+    with McapSource().open(tmp_path / "log.mcap") as log:
+        assert list(log.resolution.messages.schemas) == ["/t0", "/t1"]
+        assert "the schemas of the log have more than 30 bytes" in log.missing["left"]
