@@ -57,7 +57,9 @@ READERS: list[tuple[str, str, int, Callable[[Path], list[Message]]]] = [
 ]
 
 
-@pytest.mark.parametrize(("folder", "pattern", "number", "expected"), READERS, ids=lambda value: str(value)[:30])
+@pytest.mark.parametrize(
+    ("folder", "pattern", "number", "expected"), READERS, ids=[f"{row[0]}-{row[1]}" for row in READERS]
+)
 def test_every_log_is_read_to_the_messages_that_another_reader_finds(folder, pattern, number, expected):
     paths = sorted(data_folder(f"logs/{folder}").glob(pattern))
     assert len(paths) == number
