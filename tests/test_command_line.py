@@ -357,7 +357,7 @@ def test_an_interrupted_demo_reports_its_files_and_stops(traverse, tmp_path, cap
             os.kill(os.getpid(), signal.SIGINT)
 
     folder = tmp_path / "demo"
-    monkeypatch.setattr("flow.cli.demo.simulate", lambda log, frames: log.write_bytes(traverse.read_bytes()))
+    monkeypatch.setattr("flow.cli.commands.demo.simulate", lambda log, frames: log.write_bytes(traverse.read_bytes()))
     monkeypatch.setattr(McapSink, "write", interrupted)
     assert roverflow("demo", "--out", folder) == 130
     assert f"{folder / 'result.mcap'} (" in capsys.readouterr().out.splitlines()[-2]
@@ -378,7 +378,7 @@ def test_an_interrupt_inside_compiled_code_is_an_interrupt(traverse, capsys, mon
     def compiled(*arguments, **more):
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
 
-    monkeypatch.setattr("flow.cli.run.replay", compiled)
+    monkeypatch.setattr("flow.cli.commands.run.replay", compiled)
     assert roverflow("run", traverse, "-o", traverse.with_name("interrupted.mcap")) == 130
     assert capsys.readouterr().err == "roverflow: interrupted\n"
 

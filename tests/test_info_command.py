@@ -2,10 +2,17 @@
 
 import json
 import re
+import shlex
+
+import numpy as np
+import pytest
+import yaml
 
 from flow.config.loader import SHIPPED
+from recordings.mcap.file import iter_decoded
+from recordings.ros2.from_msg import read_disparity
 from tests.conftest import FRAMES, roverflow
-from tests.recordings.sample_log import RIGHT, TILT, write_sample
+from tests.recordings.sample_log import LEFT, RIGHT, TILT, dropped, write_sample
 
 
 def test_info_describes_a_log(traverse, capsys):
@@ -13,15 +20,76 @@ def test_info_describes_a_log(traverse, capsys):
     output = capsys.readouterr().out
     assert "/stereo/left/image_rect_color" in output
     assert f"{FRAMES}" in output
-    assert output.splitlines()[-1] == "run -p rover: can run on this log"
+    verdict, command, costs = output.splitlines()[-3:]
+    assert verdict == "run -p rover: can run on this log"
+    assert command == f"  roverflow run {traverse}"
+    assert re.match(rf"  {FRAMES} frames: about \d+ s on .*; result log about \d+ MB, recording about \d+ MB; ", costs)
 
 
 def test_info_reports_why_a_run_would_refuse_the_log(traverse, capsys):
-    assert roverflow("info", traverse, "-p", "paper", "--set", "source.left=/nix") == 0
-    output = capsys.readouterr().out.splitlines()[-1]
-    assert output.startswith("run -p paper: would refuse this log: the source's 'left' is set to /nix")
+    assert roverflow("info", traverse, "-p", "paper", "--set", "source.left=/nix") == 2
+    output = capsys.readouterr().out
+    _, _, why = output.partition("run -p paper: would refuse this log: ")
+    why = why.splitlines()[0]
+    assert why.startswith("the source's 'left' is set to /nix")
+    assert output.count(why) == 1
     assert roverflow("run", traverse, "-p", "paper", "--set", "source.left=/nix") == 2
-    assert output.partition("refused: ")[2] in capsys.readouterr().err
+    assert why in capsys.readouterr().err
+
+
+REFUSED = {
+    "names": {"names": ("/a/picture", "/b/picture")},
+    "no calibration": {"edit": dropped("/stereo/left/camera_info", "/stereo/right/camera_info")},
+    "no tilt": {"edit": dropped(TILT)},
+    "no mount": {"edit": dropped("/tf_static")},
+}
+
+
+CAMERA = {
+    "camera_model": "pinhole", "intrinsics": [20, 20, 11.5, 7.5], "resolution": [24, 16],
+    "distortion_model": "radtan", "distortion_coeffs": [0, 0, 0, 0],
+}  # fmt: skip
+RIGHT_FROM_LEFT = [[1, 0, 0, -0.25], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+KALIBR = {"cam0": CAMERA, "cam1": {**CAMERA, "T_cn_cnm1": RIGHT_FROM_LEFT}}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_every_remedy_that_info_lists_leads_to_a_log_that_a_run_accepts(fault, tmp_path, capsys):
+    log, file = write_sample(tmp_path / "log.mcap", **REFUSED[fault]), tmp_path / "calibration.yaml"
+    file.write_text(json.dumps(KALIBR))  # JSON is YAML
+    assert roverflow("info", log) == 2
+    offered = capsys.readouterr().out.partition("what would supply it:\n")[2].splitlines()
+    commands = {line: shlex.split(line.partition("  (")[0].replace("=FILE", f"={file}")) for line in offered}
+    refused = [line for line, changes in commands.items() if roverflow("info", log, *changes) != 0]
+    right_as_left = [line for line in offered if "if /b/picture is the left camera" in line]
+    assert len(offered) > len(refused)
+    assert refused == right_as_left
+
+
+def test_a_pipeline_that_info_writes_names_the_topics_and_the_alternatives(tmp_path, capsys):
+    log, written = write_sample(tmp_path / "log.mcap"), tmp_path / "mine.yaml"
+    assert roverflow("info", log, "--write-pipeline", written) == 0
+    source = yaml.safe_load(written.read_text())["source"]
+    assert (source["left"], source["right"], source["inclinometer"]) == (LEFT, RIGHT, TILT)
+    assert roverflow("info", log, "-p", written) == 0
+    capsys.readouterr()
+    assert roverflow("info", log, "--write-pipeline", written) == 2
+    assert "exists; choose another name" in capsys.readouterr().err
+    named = write_sample(tmp_path / "named.mcap", names=("/a/picture", "/b/picture"))
+    assert roverflow("info", named, "--write-pipeline", tmp_path / "other.yaml") == 2
+    assert "  #   left: /a/picture\n  #   right: /b/picture\n" in (tmp_path / "other.yaml").read_text()
+
+
+def test_info_compares_the_search_range_with_the_ground_in_view(traverse, capsys):
+    assert roverflow("info", traverse, "--json") == 0
+    found = json.loads(capsys.readouterr().out)["search_range"]
+    disparities = [
+        read_disparity(message) for topic, _, message in iter_decoded(traverse) if topic == "/truth/disparity"
+    ]
+    truth = max(float(np.nanmax(disparity)) for disparity in disparities)
+    assert 0.9 * found["ground_px"] < truth < found["range_px"]
+    assert roverflow("info", traverse, "--set", "disparities=16") == 0
+    assert f"--set=disparities={found['range_px']:.0f} includes it" in capsys.readouterr().out
 
 
 def test_info_recognises_a_result_and_its_pipeline(result, capsys):
@@ -40,8 +108,8 @@ def test_info_of_a_cut_log_ends_incomplete(traverse, tmp_path, capsys):
 
 
 def test_info_uses_the_settings_of_the_pipeline(traverse, tmp_path, capsys):
-    def streams(*given):
-        assert roverflow("info", traverse, "--json", *given) == 0
+    def streams(*given, code=0):
+        assert roverflow("info", traverse, "--json", *given) == code
         return json.loads(capsys.readouterr().out)["streams"]
 
     pipeline = tmp_path / "tf.yaml"
@@ -49,7 +117,7 @@ def test_info_uses_the_settings_of_the_pipeline(traverse, tmp_path, capsys):
     pipeline.write_text(text.replace("{use: recordings.McapSource}", "{use: recordings.McapSource, odometry: /nix}"))
     assert streams()["odometry"] == "/odometry"
     assert streams("-p", pipeline, "--set", "source.odometry=/odometry") == streams()
-    assert "odometry" not in streams("-p", pipeline)
+    assert "odometry" not in streams("-p", pipeline, code=2)
 
 
 def test_info_counts_pairs_and_tilts_by_the_pipeline(tmp_path, capsys):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import rerun
 
-from flow.cli.demo import check_folder
+from flow.cli.commands.demo import check_folder
 from flow.errors import UsageError
 from recordings import McapSource, RerunSink
 from recordings.sinks.overwrite import is_ours

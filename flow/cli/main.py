@@ -1,7 +1,7 @@
 """The command line: `main` finds the command, runs it and turns errors into one sentence and an exit code.
 
-Each command is a module of this package with HELP, `add_arguments` and `run`. A command imports heavy modules inside
-`run`, so that `roverflow --help` answers at once.
+Each command is a module of `flow.cli.commands` with HELP, `add_arguments` and `run`. A command imports heavy modules
+inside `run`, so that `roverflow --help` answers at once.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
-from flow.cli import (
+from flow.cli.commands import (
     demo,
     export,
     graph,

@@ -20,13 +20,13 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from flow.parameters import check_parameters, is_required, parameter
+from recordings.discovery.images import SIDES
 from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.image_from_msg import unpacked_pixels
 from recordings.ros2.to_msg import camera_info, image, imu, transform_message
 from recordings.source.calibration import pinhole
-from recordings.source.discovery import SIDES
 from recordings.source.transforms import BODY_FROM_OPTICAL
 from stages.data import Array, StereoCamera, StereoFrame, Transform
 

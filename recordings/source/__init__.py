@@ -1,1 +1,1 @@
-"""From the topics of a log to a pipeline's streams: discovery, calibration, transforms, settings, inventory."""
+"""From the topics of a log to a pipeline's streams: discovery, calibration, transforms and settings."""

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recordings.discovery.images import looks_rectified
 from recordings.errors import LogError
-from recordings.source.discovery import looks_rectified
 from recordings.source.transforms import TRANSFORM_ATOL, TransformTree
 from stages.data import CameraModel, StereoCamera, Transform
 

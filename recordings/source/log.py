@@ -22,11 +22,11 @@ from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
 from recordings.containers.time_range import EDGE_NS, MAX_LATENESS_NS, FramesInRange, TimeRange
+from recordings.discovery.roles import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import LogError
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
 from recordings.ros2.from_msg import pose_of, stamp_of
 from recordings.source.cameras import CAMERAS, CalibrationHistory, ImageReading
-from recordings.source.discovery import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.source.mount import pose_of_base
 from recordings.source.moving_mount import MovingMount
 from recordings.source.resolution import SourceResolution

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recordings.discovery.roles import TRANSFORMS
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name, frame_of, stamp_or, transform_of
 from recordings.source.calibration import Camera
-from recordings.source.discovery import TRANSFORMS
 from recordings.source.joints import Joint
 from recordings.source.mount import mount_of
 from recordings.source.topics import DecodedTopics, attempt

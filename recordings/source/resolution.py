@@ -10,12 +10,13 @@ import numpy as np
 from flow.contracts import counted
 from recordings.calibration.log_calibration import INCLINOMETER, calibrations_of_files
 from recordings.containers.recording import Recording
+from recordings.discovery.discover import discover
+from recordings.discovery.roles import IMU, TRANSFORMS, DiscoveredTopics, Remedy, TiltKind, Topic
 from recordings.errors import LogError
 from recordings.inertial.imu_content import ImuContent, imu_content
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
 from recordings.source.calibration import Camera, baseline_note, calibrated_pair
 from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_images, unreadable_images
-from recordings.source.discovery import IMU, TRANSFORMS, DiscoveredTopics, TiltKind, Topic, discover
 from recordings.source.joints import read_joints
 from recordings.source.mount import mount_of, pose_of_base
 from recordings.source.moving_mount import MovingMount, moving_mount
@@ -33,17 +34,19 @@ _MAX_LISTED = 5  # topics in a sentence
 class SourceResolution:
     """What a log provides.
 
-    messages: decoded by topic; topics: stream -> topic; unavailable: stream -> reason and remedy; refused: setting
-    of the source that contradicts the log -> reason; undecodable: a sentence; static: the tf tree; infos: side -> its
-    first calibration; cameras: the calibrated pair, if complete; tilt: how it is read, if there is an inclinometer;
-    tilt_frame: of the first inclinometer message; mount: of the camera on the rover, the first one if it moves; moving:
-    its mount at any time, if it moves; problems: (stream, error) pairs for the ledger.
+    messages: decoded by topic; topics: stream -> topic; chosen: role -> topic; why: stream -> why its topic;
+    unavailable: stream -> reason and remedy; remedies: stream -> settings, any of which would supply it; refused:
+    setting of the source that contradicts the log -> reason; undecodable: a sentence; static: the tf tree; infos: side
+    -> its first calibration; cameras: the calibrated pair, if complete; tilt: how it is read, if there is an
+    inclinometer; tilt_frame: of the first inclinometer message; mount: of the camera on the rover, the first one if it
+    moves; moving: its mount at any time, if it moves; problems: (stream, error) pairs for the ledger.
     """
 
     def __init__(self, file: Recording, source: LogSettings) -> None:
         self.file, self.source, self.messages = file, source, DecodedTopics(file, source.max_pixels)
         self.undecodable = self._undecodable_topics()
         found = self._discovered()
+        self.chosen, self.why, self.remedies = found.chosen, found.why, found.remedies
         self._without_topic = frozenset(found.missing)  # streams without a topic
         self.static, files = TransformTree(), source.calibration
         of_files = calibrations_of_files(files, self.messages, found.chosen, self.static) if files else {}
@@ -168,6 +171,8 @@ class SourceResolution:
         else:
             mount = attempt(self.moving.first)
         if isinstance(mount, LogError):
+            quaternion = "with the rotation from inclinometer to left camera, x, y, z, w"
+            self.remedies["mount"] = [Remedy({"camera_from_inclinometer": [0, 0, 0, 1]}, quaternion)]
             return frame, None, {"mount": str(mount)}
         return frame, mount, {}
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from flow.contracts import Finding, Severity
+from recordings.discovery.roles import TiltKind
 from recordings.errors import LogError
 from recordings.inertial.blocks import InertialSample
 from recordings.inertial.up_estimator import UpEstimator
@@ -23,7 +24,6 @@ from recordings.ros2.tilt_from_msg import (
     tilt_of_acceleration,
     tilt_of_pose,
 )
-from recordings.source.discovery import TiltKind
 from recordings.source.settings import LogSettings
 from stages.data import Array, Tilt
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from zstandard import ZstdCompressor
 
 from recordings import McapSource
+from recordings.inventory.description import describe
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import camera_info, image, imu, odometry, transform_message
-from recordings.source.inventory import describe
 from stages.data import CameraImage, CameraModel, Pose, Tilt, Transform
 
 WIDTH, HEIGHT = 24, 16

@@ -1,11 +1,11 @@
 """One simulated traverse in every container and encoding gives the same maps."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from flow.cli.main import main
 from recordings.mcap.file import iter_decoded
@@ -33,15 +33,30 @@ def databases(source: Path, out: Path) -> Path:
     return write_rosbag2(rows_of(source), out, StoragePlugin.SQLITE3, parts=2)
 
 
+def compressed(source: Path, out: Path) -> Path:
+    """A rosbag2 folder whose two files are compressed."""
+    return write_rosbag2(rows_of(source), out, parts=2, mode=CompressionMode.FILE)
+
+
 FORMS: dict[str, Callable[[Path, Path], Path]] = {
-    **WRITERS, "split": folder, "stopped": folder_without_metadata, "db3": databases,
+    **WRITERS, "split": folder, "stopped": folder_without_metadata, "db3": databases, "compressed": compressed,
 }  # fmt: skip
 
 
-def results_of(log: Path, out: Path) -> dict[tuple[str, int], bytes]:
+def results_of(log: Path | Sequence[Path], out: Path) -> dict[tuple[str, int], bytes]:
     """The results of a run by topic and time."""
     out.parent.mkdir()
-    words = ["run", log, "-p", "fast", "-o", out, "--no-rrd", "--set", "disparities=64"]
+    words = [
+        "run",
+        *([log] if isinstance(log, Path) else log),
+        "-p",
+        "fast",
+        "-o",
+        out,
+        "--no-rrd",
+        "--set",
+        "disparities=64",
+    ]
     assert main([str(word) for word in words]) == 0
     return {(topic, time): data for topic, _, time, data in rows_of(out)}
 
@@ -74,6 +89,12 @@ def test_a_log_in_another_form_gives_the_same_maps(traverse, tmp_path, name):
     assert found.keys() == expected.keys()
     assert [key for key in found if found[key] != expected[key]] == []
     assert any(topic == "/nav/elevation_map" for topic, _ in found)
+
+
+def test_the_files_of_a_recording_may_be_named_one_by_one(traverse, tmp_path):
+    log, expected = traverse
+    files = sorted(folder(log, tmp_path / "bag").glob("*.mcap"))
+    assert results_of(files, tmp_path / "results" / "out.mcap") == expected
 
 
 def test_a_log_in_h264_gives_nearly_the_same_maps(traverse, tmp_path):

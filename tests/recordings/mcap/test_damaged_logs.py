@@ -22,10 +22,10 @@ from mcap.writer import CompressionType, IndexType, Writer
 from recordings import McapSource
 from recordings.containers.container import LostMessage
 from recordings.errors import LogError
+from recordings.inventory.text import format_description
 from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MAGIC, Index
-from recordings.source.inventory import format_description
 from tests.conftest import rewrite
 from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, inventory_of, items_of
 

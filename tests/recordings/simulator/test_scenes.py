@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from flow.cli.commands.simulate import OPTIONS
 from flow.cli.main import main
-from flow.cli.simulate import OPTIONS
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.image_from_msg import pixels_of
 from recordings.simulator import Simulation, camera, write_log

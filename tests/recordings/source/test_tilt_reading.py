@@ -13,11 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import Severity
 from recordings import McapSource
+from recordings.inventory.description import describe
+from recordings.inventory.text import format_description
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
 from recordings.ros2.to_msg import camera_info, header, image, odometry, quaternion, raw_imu, transform_message
-from recordings.source.inventory import describe, format_description
 from stages.data import Pose, Tilt, Transform
 from tests.conftest import rewrite
 from tests.recordings.encodings.rewritten import ros1_bag

@@ -10,10 +10,10 @@ import shutil
 from pathlib import Path
 
 from flow.cli.arguments import count
+from flow.cli.commands.simulate import simulate
 from flow.cli.outputs import check_outputs, write_text
 from flow.cli.replay import replay
 from flow.cli.report import exit_code, report, say
-from flow.cli.simulate import simulate
 from flow.errors import INTERRUPTED, UsageError
 from recordings.atomic_write import writing
 from recordings.sinks.overwrite import is_ours

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.contracts import counted
 from recordings.containers.container import LostMessage
+from recordings.inventory.search_range import search_range
 from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.source.cameras import CAMERAS
 from recordings.source.log import McapLog
@@ -31,7 +31,8 @@ def describe(
     """
     resolution, lost = log.resolution, log.file.lost
     damage = sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems})
-    stamps = {stream: _stamps(log, stream, damage) for stream in CAMERAS}
+    delays = list[int]()
+    stamps = {stream: _stamps(log, stream, damage, delays if stream == "left" else None) for stream in CAMERAS}
     stamps["inclinometer"] = (_tilts if _is_verified(log) else _tilt_stamps)(log, damage)
     left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
     max_gap = None if max_gap_of is None else max_gap_of(np.diff(tilts).tolist())
@@ -47,6 +48,7 @@ def describe(
         "topics": _topics(log),
         "notes": log.notes(),
         "streams": dict(log.topics),
+        "why": {stream: why for stream, why in resolution.why.items() if stream in log.topics},
         "calibration": _calibration(log),
         "frames": {
             "left": len(stamps["left"]),
@@ -55,44 +57,20 @@ def describe(
             "slop_s": slop / 1e9,
             "with_tilt": None if max_gap is None else _tilted(left, tilts, max_gap),
             "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
+            "delay_s": [float(np.quantile(delays, part)) / 1e9 for part in (0, 0.5, 1)] if delays else None,
         },
         "transforms": resolution.static.listed(),
         "mount": _mount(log),
+        "search_range": _search_range(log),
         "missing": dict(resolution.unavailable),
+        "remedies": {
+            stream: [asdict(remedy) for remedy in remedies]
+            for stream, remedies in resolution.remedies.items()
+            if stream in resolution.unavailable
+        },
         "undecodable": resolution.undecodable,
         "damage": list(dict.fromkeys(damage)),
     }
-
-
-def format_description(description: dict[str, Any]) -> str:
-    """Format the inventory for a terminal."""
-    d = description
-    how = "indexed (chunk CRCs not verified yet)" if d["indexed"] else "no valid index (read through)"
-    lines = [f"{d['path']}: {d['duration_s']:.3f} s, {d['size_bytes'] / 1e6:.1f} MB, {how}", ""]
-    lines += [f"This is a result of {d['result']}.", ""] if d["result"] else []
-    lines += [*_table(d["topics"], d["streams"]), ""]
-    if camera := d["calibration"]:
-        state = "rectified" if camera["rectified"] else "not rectified"
-        lines.append(
-            f"camera: {camera['width']}x{camera['height']} px, fx {camera['fx']:.3f} px, "
-            f"baseline {camera['baseline']:.4f} m, {state}, frame '{camera['frame_id']}'"
-        )
-        lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
-    if all(side in d["streams"] for side in CAMERAS):
-        lines.append(_frame_line(d["frames"]))
-    if d["mount"]:
-        base, position = d["mount"]["base"], d["mount"]["position"]
-        lines.append("mount: camera position unknown" if base is None else f"mount: camera at {position} m in '{base}'")
-    lines += [f"transform: {transform}" for transform in d["transforms"]]
-    reasons = dict.fromkeys(() if d["result"] else d["missing"].values())
-    for why in reasons:
-        streams = ", ".join(stream for stream in d["missing"] if d["missing"][stream] == why)
-        known = next((other for other in reasons if why.endswith(f": {other}")), "")  # it has a line of its own
-        lines.append(f"missing: {streams}: {why.removesuffix(f': {known}')}")
-    lines += [f"note: {stream}: {note}" for stream, note in d["notes"].items()]
-    lines += [d["undecodable"]] if d["undecodable"] else []
-    lines += [f"damaged: {damage}" for damage in _grouped(d["damage"])]
-    return "\n".join(lines)
 
 
 def _run(log: McapLog) -> str:
@@ -100,33 +78,6 @@ def _run(log: McapLog) -> str:
     about = about_run(log.path)
     pipeline = pipeline_of(log.path) if log.file.indexed else "unknown"
     return f"roverflow {about['roverflow']}: pipeline {pipeline}, run on {about['log']}" if about else ""
-
-
-def _table(topics: list[dict[str, Any]], streams: dict[str, str]) -> list[str]:
-    rows = [("topic", "schema", "messages", "Hz", "largest gap", "stream")]
-    roles = {topic: stream for stream, topic in streams.items()}
-    for topic in topics:
-        hz = "" if topic["hz"] is None else f"{topic['hz']:.2f}"
-        gap = "" if topic["largest_gap_s"] is None else f"{topic['largest_gap_s']:.3f} s"
-        name = topic["topic"]
-        rows.append((name, topic["schema"], str(topic["messages"]), hz, gap, roles.get(name, "")))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    aligned = [str.ljust, str.ljust, str.rjust, str.rjust, str.rjust, str.ljust]
-    return [
-        "  ".join(align(cell, width) for align, cell, width in zip(aligned, row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
-
-
-def _frame_line(frames: dict[str, Any]) -> str:
-    line = (
-        f"frames: {counted(frames['pairs'], 'stereo pair')} (stamps within {frames['slop_s'] * 1e3:g} ms) from "
-        f"{counted(frames['left'], 'left image')} and {counted(frames['right'], 'right image')}"
-    )
-    if frames["with_tilt"] is None:
-        return line
-    gap = f"{frames['tilt_gap_s'] * 1e3:g} ms"
-    return f"{line}; {counted(frames['with_tilt'], 'left image')} with a tilt (readings at most {gap} apart)"
 
 
 def _topics(log: McapLog) -> list[dict[str, Any]]:
@@ -148,23 +99,19 @@ def _topics(log: McapLog) -> list[dict[str, Any]]:
     return found
 
 
-def _grouped(damage: list[str]) -> list[str]:
-    """The sentences; those about single messages that differ only in numbers are counted."""
-    groups: dict[str, list[str]] = {}
-    for what in damage:
-        pattern = re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", what) if re.search(r" at \d+ ns\b", what) else what
-        groups.setdefault(pattern, []).append(what)
-    return [f"{len(same)} similar, first: {same[0]}" if len(same) > 1 else same[0] for same in groups.values()]
+def _stamps(log: McapLog, stream: str, damage: list[str], delays: list[int] | None = None) -> list[int]:
+    """The stamps of a camera's images, ns, without decoding them; losses are added to `damage`.
 
-
-def _stamps(log: McapLog, stream: str, damage: list[str]) -> list[int]:
-    """The stamps of a camera's images, ns, without decoding them; losses are added to `damage`."""
+    delays: receives the log times less the stamps, ns.
+    """
     if stream not in log.topics:
         return []
     topic, stamps = log.topics[stream], []
     for raw in (log.file.messages if _is_verified(log) else log.file.heads)(log.channels(stream)):
         if not isinstance(raw, LostMessage):
             stamps.append(log.stamp_of(raw) or raw.log_time)
+            if delays is not None:
+                delays.append(raw.log_time - stamps[-1])
         elif raw.channel is not None:
             damage.append(f"{topic} at {raw.log_time} ns: {raw.reason}")
     return stamps
@@ -231,6 +178,19 @@ def _calibration(log: McapLog) -> dict[str, Any] | None:
     names = ("width", "height", "fx", "fy", "cx", "cy", "cx_right", "baseline", "frame_id")
     values = {name: getattr(camera, name) for name in names}
     return values | {"rectified": left.rectified, "doubts": list(camera.doubts)}
+
+
+def _search_range(log: McapLog) -> dict[str, float] | None:
+    """The disparities that the camera's mount and the first tilt suggest; None if its height is unknown."""
+    cameras, mount = log.resolution.cameras, log.resolution.mount
+    if cameras is None or mount is None or mount.base_from_camera is None:
+        return None
+    tilt = next((item for _, _, item in log.events(("inclinometer",)) if isinstance(item, Tilt)), None)
+    if tilt is None:
+        return None
+    left, right = cameras
+    camera = StereoCamera.from_models(left.model, right.model, left.image_frame, left.rectified)
+    return search_range(camera, mount.camera_from_inclinometer @ tilt.up, float(mount.base_from_camera.translation[2]))
 
 
 def _mount(log: McapLog) -> dict[str, Any] | None:

@@ -1,6 +1,7 @@
 """The inventory of a log for `roverflow info`."""
 
 import json
+import re
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,9 @@ from mcap.writer import CompressionType
 from recordings import McapSource
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
+from recordings.inventory.text import format_description
 from recordings.mcap.file import HEAD_BYTES, McapFile
 from recordings.ros2.to_msg import transform_message
-from recordings.source.inventory import format_description
 from stages.data import Transform
 from tests.conftest import rewrite
 from tests.recordings.sample_log import (
@@ -62,7 +63,8 @@ def test_the_text_lists_topics_streams_and_missing_streams(tmp_path):
     path = write_sample(tmp_path / "log.mcap", dropped("/odom"))
     text = format_description(inventory_of(path))
     line = next(line for line in text.splitlines() if line.startswith(LEFT))
-    assert line.split() == [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100", "s", "left"]
+    columns = [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100 s", "left (the only stereo pair)"]
+    assert re.split(r"  +", line) == columns
     assert "missing: odometry: the log has no nav_msgs/Odometry" in text
     frames = "frames: 5 stereo pairs (stamps within 5 ms) from 5 left images and 5 right images"
     assert f"{frames}; 5 left images with a tilt (readings at most 200 ms apart)" in text
@@ -234,7 +236,7 @@ def test_without_a_tilt_no_frame_has_one(tmp_path):
 def test_a_large_log_is_described_by_the_starts_of_its_messages(sample, tmp_path, monkeypatch, layout):
     path = rewrite(sample, tmp_path / "log.mcap", **LAYOUTS[layout])
     whole = inventory_of(path)
-    monkeypatch.setattr("recordings.source.inventory.MAX_VERIFIED_BYTES", 0)
+    monkeypatch.setattr("recordings.inventory.description.MAX_VERIFIED_BYTES", 0)
     assert inventory_of(path) == whole
 
 

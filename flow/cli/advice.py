@@ -1,0 +1,144 @@
+"""What `roverflow info` recommends: the command to type, what it will cost, and the settings that a log needs."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from argparse import Namespace
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from flow.cli.outputs import default_result
+from flow.config.loader import pipeline_file
+from flow.contracts import counted
+from flow.errors import UsageError
+from flow.runtime.graph import Graph
+from flow.runtime.run import fitted
+
+if TYPE_CHECKING:
+    from recordings.source.log import McapLog
+    from recordings.source.settings import LogSettings
+
+# CPU seconds of a frame: at any size, and for each megapixel of the left image (`make bench`, docs/benchmarks.md)
+_SECONDS = {"fast": (0.14, 0.34), "rover": (0.15, 0.38), "accurate": (0.16, 0.75), "paper": (0.2, 13.0)}
+_STARTING_SECONDS = 2.0  # before the first frame
+# Megabytes of a frame: at any size, and for each megapixel of the left image
+_LOG_MB, _RECORDING_MB = (0.9, 2.0), (0.65, 0.35)
+_SOURCE = re.compile(r"^source:.*\n(?:[ \t]+.*\n)*", re.MULTILINE)
+
+
+def refusal_of(graph: Graph, log: McapLog) -> str:
+    """Why a run would refuse a log; empty if it would not."""
+    try:
+        fitted(graph, log)
+    except UsageError as error:
+        return str(error)
+    return ""
+
+
+def advice(options: Namespace, description: Mapping[str, Any], graph: Graph) -> list[str]:
+    """The command that runs the log, its time and the sizes of its outputs, and a search range if another is needed."""
+    pipeline = [] if options.pipeline == "rover" else ["-p", options.pipeline]
+    changes = [f"--set={change}" for change in options.set]
+    lines = [f"  {shlex.join(['roverflow', 'run', *map(str, options.log), *pipeline, *changes])}"]
+    if line := _costs(options.pipeline, description):
+        lines.append(f"  {line}; it writes {default_result(options.log).name} beside the log")
+    return lines + _range_advice(description["search_range"], graph)
+
+
+def remedies(description: Mapping[str, Any]) -> list[str]:
+    """Settings that supply what is missing: one line each; each is enough."""
+    known = description["remedies"]
+    given = [
+        remedy
+        for stream in known
+        if description["missing"][stream] in description["refused"]
+        for remedy in known[stream]
+    ]
+    lines = [
+        f"  {shlex.join(f'--set=source.{name}={_flow(value)}' for name, value in remedy['settings'].items())}"
+        f"{_note(remedy['condition'])}"
+        for remedy in given
+    ]
+    return ["what would supply it:", *dict.fromkeys(lines)] if lines else []
+
+
+def pipeline_for(pipeline: str, source: LogSettings, log: McapLog) -> str:
+    """The text of a pipeline file whose source names the topics of a log; what is missing is in its comments.
+
+    Raises
+    ------
+    UsageError
+        If the pipeline has no `source` at the beginning of a line.
+    """
+    resolution = log.resolution
+    own = {
+        item.name: getattr(source, item.name) for item in fields(source) if getattr(source, item.name) != item.default
+    }
+    given = {role: topic for role, topic in resolution.chosen.items() if role not in own}
+    lines = ["source:", "  use: recordings.McapSource"]
+    lines += [f"  {name}: {_flow(value)}" for name, value in {**given, **own}.items()]
+    for stream, why in log.missing.items():
+        lines.append(f"  # {stream}: {why}")
+        for remedy in resolution.remedies.get(stream, ()):
+            lines.append(f"  # either{_note(remedy.condition)}:")
+            lines += [f"  #   {name}: {_flow(value)}" for name, value in remedy.settings.items()]
+    file = pipeline_file(pipeline)
+    text, count = _SOURCE.subn(lambda _: "\n".join(lines) + "\n", file.read_text(encoding="utf-8"), count=1)
+    if not count:
+        raise UsageError(f"{file} has no 'source:' at the beginning of a line; write it so")
+    return text
+
+
+def _costs(pipeline: str, description: Mapping[str, Any]) -> str:
+    """The time and the sizes that a run will take; empty for a pipeline of the user's own."""
+    frames, camera, cores = description["frames"]["pairs"], description["calibration"], os.cpu_count() or 1
+    if pipeline not in _SECONDS or camera is None:
+        return ""
+    megapixels = camera["width"] * camera["height"] / 1e6
+    seconds, log, recording = (
+        frames * (fixed + each * megapixels) for fixed, each in (_SECONDS[pipeline], _LOG_MB, _RECORDING_MB)
+    )
+    time = _duration(_STARTING_SECONDS + seconds / cores)
+    return (
+        f"{counted(frames, 'frame')}: about {time} on {counted(cores, 'core')}; result log about {_size(log)}, "
+        f"recording about {_size(recording)}"
+    )
+
+
+def _range_advice(found: Mapping[str, float] | None, graph: Graph) -> list[str]:
+    """What to set if the ground has more disparities than the pipeline searches."""
+    searched = max((getattr(node.actor, "disparities", 0) for node in graph.nodes), default=0)
+    if found is None or not searched or found["ground_px"] < searched:
+        return []
+    enough = f"--set=disparities={found['range_px']:.0f}"
+    return [f"  the near ground has more disparities than the {searched} that are searched: {enough} includes it"]
+
+
+def _flow(value: Any) -> str:
+    """A value as YAML in one line."""
+    value = list(value) if isinstance(value, tuple) else value
+    value = dict(vars(value)) if hasattr(value, "__dataclass_fields__") else value
+    return yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False).removesuffix("...\n").strip()
+
+
+def _note(condition: str) -> str:
+    return f"  ({condition})" if condition else ""
+
+
+def _duration(seconds: float) -> str:
+    return (
+        f"{seconds:.0f} s"
+        if seconds < 120
+        else f"{seconds / 60:.0f} min"
+        if seconds < 7200
+        else f"{seconds / 3600:.1f} h"
+    )
+
+
+def _size(megabytes: float) -> str:
+    return f"{megabytes:.0f} MB" if megabytes < 1000 else f"{megabytes / 1000:.1f} GB"

@@ -1,0 +1,168 @@
+"""Finds the inclinometer, and the gyroscope of an estimate."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+
+from recordings.discovery.roles import (
+    BARE_TILT,
+    IMAGES,
+    IMU,
+    INFO,
+    POSES,
+    RESULTS,
+    TILTS,
+    TRANSFORMS,
+    DiscoveredTopics,
+    Remedy,
+    TiltKind,
+    Topic,
+    names_of,
+    not_there,
+)  # fmt: skip
+from recordings.inertial.imu_content import ImuContent
+from recordings.source.settings import LogSettings
+
+
+def find_tilt(
+    topics: Sequence[Topic], settings: LogSettings, content_of: Callable[[str], ImuContent], found: DiscoveredTopics
+) -> None:
+    """Find the inclinometer, and for an estimate the gyroscope."""
+    topics = [topic for topic in topics if topic.messages]
+    found.tilt = _kind_set(settings)
+    given = settings.inclinometer
+    if given is None:
+        _search_tilt(topics, settings, content_of, found)
+    else:
+        topic = next((topic for topic in topics if topic.name == given), None)
+        if topic is None or topic.schema not in _schemas_of(found.tilt, topic.schema):
+            candidates = [topic for topic in topics if topic.schema in (*TILTS, BARE_TILT)]
+            found.refuse("inclinometer", "inclinometer", not_there("inclinometer", given, "tilt", candidates))
+            found.offer("inclinometer", "inclinometer", [t.name for t in candidates if t.schema in TILTS])
+        elif found.tilt == TiltKind.ORIENTATION and topic.schema not in TILTS:
+            found.refuse("inclinometer", "inclinometer", _undefined(topic))
+            found.remedies["inclinometer"] = _meanings(topic.name)
+        else:
+            found.chosen["inclinometer"], found.why["inclinometer"] = given, "as set"
+            content = content_of(given) if topic.schema == IMU and found.tilt == TiltKind.ORIENTATION else None
+            if content is not None and content.no_orientation and content.accelerations:
+                found.tilt = TiltKind.ACCELERATIONS
+    if "inclinometer" in found.chosen and (settings.gyroscope or found.tilt == TiltKind.ACCELERATIONS):
+        _find_gyroscope(topics, settings, content_of, found)
+
+
+def _kind_set(settings: LogSettings) -> TiltKind:
+    """What the settings make a tilt of."""
+    if settings.angles() is not None:
+        return TiltKind.ANGLES
+    if settings.upright_frame is not None:
+        return TiltKind.POSE
+    return TiltKind.ORIENTATION if settings.accelerations is None else TiltKind.ACCELERATIONS
+
+
+def _schemas_of(kind: TiltKind, schema: str) -> tuple[str, ...]:
+    """The schemas that a tilt of this kind may have: `schema`, unless such messages never contain one."""
+    if kind == TiltKind.POSE:
+        return (*POSES, TRANSFORMS)
+    never = (*IMAGES, INFO, TRANSFORMS, *(POSES if kind == TiltKind.ORIENTATION else ()))
+    return () if schema in never else (schema,)
+
+
+def _search_tilt(
+    topics: Sequence[Topic], settings: LogSettings, content_of: Callable[[str], ImuContent], found: DiscoveredTopics
+) -> None:
+    """Find the inclinometer without a setting of its topic."""
+    bare = [topic for topic in topics if topic.schema == BARE_TILT]
+    candidates = {
+        TiltKind.POSE: [topic for topic in topics if topic.schema in POSES and not topic.name.startswith(RESULTS)],
+        TiltKind.ORIENTATION: [topic for topic in topics if topic.schema in TILTS],
+    }.get(found.tilt, bare)
+    choice, why = candidates, ""
+    if found.tilt == TiltKind.ORIENTATION:
+        contents = {topic.name: content_of(topic.name) for topic in candidates if topic.schema == IMU}
+        unoriented = {name: content.no_orientation for name, content in contents.items() if content.no_orientation}
+        choice = [topic for topic in candidates if topic.name not in unoriented]
+        why = next(iter(unoriented.values()), "")
+        if not choice and (forced := [topic for topic in candidates if contents[topic.name].accelerations]):
+            choice = [topic for topic in forced if contents[topic.name].rates] or forced
+            found.tilt = TiltKind.ACCELERATIONS
+    choice = [topic for topic in choice if re.search("inclin|tilt", topic.name, re.IGNORECASE)] or choice
+    if len(choice) == 1:
+        found.chosen["inclinometer"] = choice[0].name
+        found.why["inclinometer"] = "the only tilt" if len(candidates) == 1 else "by its name and content"
+    elif len(choice) > 1:
+        found.missing["inclinometer"] = (
+            f"several topics could be the inclinometer ({names_of(choice)}); set 'inclinometer' of the source"
+        )
+        found.offer("inclinometer", "inclinometer", [topic.name for topic in choice])
+    elif candidates:
+        found.missing["inclinometer"] = (
+            f"{names_of(candidates)} contains no orientation ({why}) and no accelerations; record one of them"
+        )
+    elif bare:
+        found.missing["inclinometer"] = _undefined(bare[0])
+        found.remedies["inclinometer"] = [remedy for topic in bare for remedy in _meanings(topic.name)]
+    else:
+        found.missing["inclinometer"] = (
+            "the log has no tilt (an Imu, or a QuaternionStamped); set 'inclinometer' of the source"
+        )
+
+
+def _find_gyroscope(
+    topics: Sequence[Topic], settings: LogSettings, content_of: Callable[[str], ImuContent], found: DiscoveredTopics
+) -> None:
+    """Find the rates that go with the accelerations; without any, up is that of each acceleration."""
+    imus, own = [topic for topic in topics if topic.schema == IMU], found.chosen["inclinometer"]
+    if settings.gyroscope is not None:
+        if settings.gyroscope not in {topic.name for topic in imus}:
+            found.refuse("inclinometer", "gyroscope", not_there("gyroscope", settings.gyroscope, "Imu", imus))
+            return
+        if settings.accelerations is None and not _accelerates(own, imus, content_of):
+            own = next((name for name in (settings.gyroscope,) if settings.inclinometer is None), own)
+            if not _accelerates(own, imus, content_of):
+                why = f"{own} has no accelerations to go with the rates; set 'inclinometer' to the Imu that has them"
+                found.refuse("inclinometer", "gyroscope", f"'gyroscope' of the source is set, but {why}")
+                del found.chosen["inclinometer"]
+                return
+            found.chosen["inclinometer"] = own
+        rated = [settings.gyroscope]
+    elif settings.accelerations is not None:
+        return
+    else:
+        rated = [topic.name for topic in imus if content_of(topic.name).rates]
+        rated = [name for name in rated if name in (own, own.replace("accel", "gyro"))] or rated
+        rated = [own] if own in rated else rated
+    if len(rated) > 1:
+        del found.chosen["inclinometer"]
+        found.missing["inclinometer"] = (
+            f"several topics have rates that may go with the accelerations of {own} ({', '.join(rated)}); "
+            "set 'gyroscope' of the source"
+        )
+        found.offer("inclinometer", "gyroscope", rated)
+    elif rated:
+        found.tilt, found.chosen["gyroscope"] = TiltKind.ESTIMATE, rated[0]
+
+
+def _accelerates(name: str, imus: Sequence[Topic], content_of: Callable[[str], ImuContent]) -> bool:
+    return name in {topic.name for topic in imus} and content_of(name).accelerations
+
+
+def _undefined(topic: Topic) -> str:
+    return (
+        f"{topic.name} is a {topic.schema}, whose numbers have no defined meaning; "
+        "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source, or 'accelerations'"
+    )
+
+
+def _meanings(topic: str) -> list[Remedy]:
+    """Settings that define bare numbers."""
+    angles = {
+        name: {"field": f"vector.{axis}", "unit": "deg", "sign": 1} for name, axis in (("pitch", "y"), ("roll", "x"))
+    }
+    return [
+        Remedy(
+            {"inclinometer": topic, **angles, "tilt_model": "axis"}, "with the sensor's own fields, units and signs"
+        ),
+        Remedy({"inclinometer": topic, "accelerations": {"field": "vector"}}, "if these are accelerations"),
+    ]

@@ -1,0 +1,1 @@
+"""What a log contains, and what a run needs beside it: for `roverflow info`."""

@@ -1,0 +1,61 @@
+"""The disparities that a camera's height and tilt suggest."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from stages.data import Array, StereoCamera
+
+ROCK = 0.3  # m; height above the ground of what should still be within the search range
+
+
+def ground_disparity(camera: StereoCamera, up: Array, height: float) -> float:
+    """The largest disparity, px, of level ground in view.
+
+    A ray r = (x, y, 1) meets the ground at the depth height / -(up . r). So the disparity is fx * baseline * -(up . r)
+    / height, which is largest in a corner of the image.
+
+    Parameters
+    ----------
+    camera : StereoCamera
+        Of the rectified images.
+    up : (3,) ndarray
+        Unit vector against gravity in the coordinates of the left image (x right, y down, z forward).
+    height : float
+        Of the camera above the ground, m.
+
+    Returns
+    -------
+    float
+        0 where no ground is in view.
+
+    Examples
+    --------
+    >>> camera = StereoCamera(640, 480, fx=500, fy=500, cx=320, cy=240, cx_right=320, baseline=0.2, frame_id="left")
+    >>> round(ground_disparity(camera, np.array([0.0, -1.0, 0.0]), height=1.0), 3)
+    47.8
+    """
+    corners = itertools.product((0, camera.width - 1), (0, camera.height - 1))
+    rays = [np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]) for u, v in corners]
+    inverse_depth = max(0.0, *(-float(up @ ray) for ray in rays)) / height
+    offset = camera.cx_right - camera.cx  # of disparities whose principal points differ
+    return max(0.0, camera.fx * camera.baseline * inverse_depth - offset) if inverse_depth else 0.0
+
+
+def search_range(camera: StereoCamera, up: Array, height: float) -> dict[str, float] | None:
+    """The disparities of level ground and of a rock on it, px, and a search range that holds both.
+
+    None if the camera is not above the rock, which means that its height is unknown.
+    """
+    if height <= ROCK or not math.isfinite(height):
+        return None
+    ground, rock = (ground_disparity(camera, up, height - above) for above in (0.0, ROCK))
+    return {
+        "height_m": height,
+        "ground_px": ground,
+        "rock_px": rock,
+        "range_px": 16.0 * max(1, math.ceil((rock + 1) / 16)),
+    }

@@ -1,0 +1,89 @@
+"""The inventory of a log as text for a terminal."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from flow.contracts import counted
+from recordings.inventory.search_range import ROCK
+from recordings.source.cameras import CAMERAS
+
+
+def format_description(description: dict[str, Any]) -> str:
+    """Format the inventory for a terminal."""
+    d = description
+    how = "indexed" if d["indexed"] else "no valid index (read through)"
+    lines = [f"{d['path']}: {d['duration_s']:.3f} s, {d['size_bytes'] / 1e6:.1f} MB, {how}", ""]
+    lines += [f"This is a result of {d['result']}.", ""] if d["result"] else []
+    lines += [
+        *_table(d["topics"], {topic: f"{stream} ({d['why'][stream]})" for stream, topic in d["streams"].items()}),
+        "",
+    ]
+    if camera := d["calibration"]:
+        state = "rectified" if camera["rectified"] else "not rectified"
+        lines.append(
+            f"camera: {camera['width']}x{camera['height']} px, fx {camera['fx']:.3f} px, "
+            f"baseline {camera['baseline']:.4f} m, {state}, frame '{camera['frame_id']}'"
+        )
+        lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
+    if all(side in d["streams"] for side in CAMERAS):
+        lines.append(_frame_line(d["frames"]))
+    if d["mount"]:
+        base, position = d["mount"]["base"], d["mount"]["position"]
+        lines.append("mount: camera position unknown" if base is None else f"mount: camera at {position} m in '{base}'")
+    lines += [f"transform: {transform}" for transform in d["transforms"]]
+    if found := d["search_range"]:
+        lines.append(
+            f"disparities: level ground has up to {found['ground_px']:.0f} px in this view, a rock {ROCK} m high up to "
+            f"{found['rock_px']:.0f} px (camera {found['height_m']:.2f} m above '{d['mount']['base']}')"
+        )
+    reasons = dict.fromkeys(() if d["result"] else d["missing"].values())
+    for why in reasons:
+        if why in d.get("refused", ""):
+            continue  # the verdict says it
+        streams = ", ".join(stream for stream in d["missing"] if d["missing"][stream] == why)
+        known = next((other for other in reasons if why.endswith(f": {other}")), "")  # it has a line of its own
+        lines.append(f"missing: {streams}: {why.removesuffix(f': {known}')}")
+    lines += [f"note: {stream}: {note}" for stream, note in d["notes"].items()]
+    lines += [d["undecodable"]] if d["undecodable"] and d["undecodable"] not in d.get("refused", "") else []
+    lines += [f"damaged: {damage}" for damage in _grouped(d["damage"])]
+    return "\n".join(lines)
+
+
+def _table(topics: list[dict[str, Any]], roles: dict[str, str]) -> list[str]:
+    rows = [("topic", "schema", "messages", "Hz", "largest gap", "stream")]
+    for topic in topics:
+        hz = "" if topic["hz"] is None else f"{topic['hz']:.2f}"
+        gap = "" if topic["largest_gap_s"] is None else f"{topic['largest_gap_s']:.3f} s"
+        name = topic["topic"]
+        rows.append((name, topic["schema"], str(topic["messages"]), hz, gap, roles.get(name, "")))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    aligned = [str.ljust, str.ljust, str.rjust, str.rjust, str.rjust, str.ljust]
+    return [
+        "  ".join(align(cell, width) for align, cell, width in zip(aligned, row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def _frame_line(frames: dict[str, Any]) -> str:
+    line = (
+        f"frames: {counted(frames['pairs'], 'stereo pair')} (stamps within {frames['slop_s'] * 1e3:g} ms) from "
+        f"{counted(frames['left'], 'left image')} and {counted(frames['right'], 'right image')}"
+    )
+    if frames["with_tilt"] is not None:
+        gap = f"{frames['tilt_gap_s'] * 1e3:g} ms"
+        line += f"; {counted(frames['with_tilt'], 'left image')} with a tilt (readings at most {gap} apart)"
+    if frames["delay_s"]:
+        least, median, most = (f"{1e3 * delay:.3g}" for delay in frames["delay_s"])
+        line += f"; left images were logged {median} ms after their stamps ({least} to {most} ms)"
+    return line
+
+
+def _grouped(damage: list[str]) -> list[str]:
+    """The sentences; those about single messages that differ only in numbers are counted."""
+    groups: dict[str, list[str]] = {}
+    for what in damage:
+        pattern = re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", what) if re.search(r" at \d+ ns\b", what) else what
+        groups.setdefault(pattern, []).append(what)
+    return [f"{len(same)} similar, first: {same[0]}" if len(same) > 1 else same[0] for same in groups.values()]
