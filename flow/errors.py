@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 COMPLETE, FAILED, UNUSABLE, INCOMPLETE, INTERRUPTED = 0, 1, 2, 3, 130  # exit codes
+DIFFERENT = 3  # of two results
 
 
 class RoverflowError(Exception):

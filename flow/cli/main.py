@@ -17,6 +17,7 @@ from typing import Any
 
 from flow.cli.commands import (
     demo,
+    diff,
     export,
     graph,
     info,
@@ -40,6 +41,7 @@ COMMANDS: dict[str, ModuleType] = {
     "pipeline": pipeline,
     "simulate": simulate,
     "score": score,
+    "diff": diff,
     "export": export,
 }
 IMPORTERS: dict[str, ModuleType] = {"images": images, "middlebury": middlebury}

@@ -191,12 +191,12 @@ def read_grid_map(message: Any) -> ElevationMap:
     """
     info, centre = message.info, message.info.pose.position
     return ElevationMap(
-        stamp_of(message.header), _layers(message), float(info.resolution),
+        stamp_of(message.header), read_layers(message), float(info.resolution),
         (centre.x - info.length_x / 2, centre.y - info.length_y / 2), message.header.frame_id,
     )  # fmt: skip
 
 
-def _layers(message: Any) -> dict[str, Array]:
+def read_layers(message: Any) -> dict[str, Array]:
     """The layers of a GridMap, (rows, cols) float32 each."""
     layers = {}
     for name, array in zip(message.layers, message.data, strict=True):
@@ -230,7 +230,7 @@ def read_occupancy_grid(message: Any, reasons: Any = None) -> NavigationMap:
     reason[cells == Cell.FREE] = CellReason.CLEAR
     reason[cells == Cell.UNKNOWN] = CellReason.UNOBSERVED
     if reasons is not None:
-        reason = _layers(reasons)["reason"].astype(np.uint8)
+        reason = read_layers(reasons)["reason"].astype(np.uint8)
     resolution = float(str(np.float32(info.resolution)))  # of float32, so 0.05 stays 0.05
     origin = (float(info.origin.position.x), float(info.origin.position.y))
     return NavigationMap(stamp_of(message.header), cells, reason, resolution, origin, message.header.frame_id)

@@ -9,6 +9,7 @@ from pathlib import Path
 _HEADER = b"\x89MCAP0\r\n" + struct.pack("<BQI4sI9s", 1, 21, 4, b"ros2", 9, b"roverflow")  # with profile and library
 _ABOUT = 12, struct.pack("<I9s", 9, b"roverflow")  # the metadata record that follows it in result logs, and its name
 _RECORDING = b"RRF", b"/summary", b"# RUNNING"  # its magic, and its first summary
+_DIFFERENCE = b"roverflow_diff"  # the application of recordings of differences
 _BEGINNING = 1 << 18  # bytes that contain these
 _KEYS = {
     "summary": {"frames_in", "verdict"},
@@ -19,7 +20,7 @@ _KEYS = {
 def is_ours(path: Path, kind: str) -> bool:
     """Whether the file `path` is an earlier output of roverflow of that kind, or empty, so that another may replace it.
 
-    kind: "input log", as simulator and imports make them, "result log", "recording", "summary" or "score".
+    kind: "input log", as simulator and imports make them, "result log", "recording", "difference", "summary", "score".
     """
     with path.open("rb") as file:
         start = file.read(_BEGINNING)
@@ -29,6 +30,8 @@ def is_ours(path: Path, kind: str) -> bool:
         return start.startswith(b"{") and _has_keys(path, _KEYS[kind])
     if kind == "recording":
         return start.startswith(_RECORDING[0]) and all(mark in start for mark in _RECORDING)
+    if kind == "difference":
+        return start.startswith(_RECORDING[0]) and _DIFFERENCE in start
     code, name = _ABOUT
     follows = start[len(_HEADER) :]
     result = follows[:1] == bytes([code]) and follows[9:].startswith(name)  # 8 bytes between them are its length

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.errors import LogError
-from recordings.export.png_pages import MARGIN_PX, disparity_page, draw, elevation_page, navigation_page
+from recordings.export.page_layout import MARGIN_PX
+from recordings.export.png_pages import disparity_page, draw, elevation_page, navigation_page
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
 from recordings.sinks import colormaps

@@ -1,0 +1,1 @@
+"""Two results side by side: what differs, from which frame on, by how much, in tables and pictures."""

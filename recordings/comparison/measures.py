@@ -1,0 +1,153 @@
+"""How much two messages of one topic differ, in the terms of their type."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recordings.ros2.from_msg import read_disparity, read_layers, read_occupancy_grid
+from recordings.scoring.metrics import angle_between
+from stages.data import Array, Cell, ElevationMap, NavigationMap
+
+Measures = dict[str, float]
+Layers = Mapping[str, Array]
+_CELLS = {Cell.UNKNOWN: "unknown", Cell.FREE: "free", Cell.HAZARD: "hazard"}
+
+
+class _Grid(NamedTuple):
+    """Where a grid lies: (x, y) of its lower-left corner and the size of its cells, m."""
+
+    origin: tuple[float, float]
+    resolution: float
+
+
+def measures(schema: str, one: Any, other: Any) -> Measures:
+    """What differs between two messages; empty where only bytes without a measure differ.
+
+    Parameters
+    ----------
+    schema : str
+        Full ROS 2 name of the type.
+    one, other : message
+        Two decoded messages of one topic and stamp.
+
+    Returns
+    -------
+    dict
+        Name with unit -> number, such as {"pixels": 120, "largest px": 0.5}. A larger number is a larger difference.
+    """
+    measure = _MEASURES.get(schema)
+    return {} if measure is None else {name: value for name, value in measure(one, other).items() if value}
+
+
+def side_by_side(one: Layers, other: Layers, grids: Sequence[Any]) -> dict[str, tuple[Array, Array]]:
+    """The layers that two grids of one resolution share, each on the smallest grid that contains both.
+
+    grids: the two grids (`origin`, `resolution`), whose layers `one` and `other` are. Cells outside are NaN.
+    """
+    first = [tuple(round(value / grid.resolution) for value in grid.origin[::-1]) for grid in grids]
+    shapes = [next(iter(layers.values())).shape for layers in (one, other)]
+    low = np.min(first, axis=0)
+    high = np.max([np.add(start, shape) for start, shape in zip(first, shapes, strict=True)], axis=0)
+
+    def placed(layer: Array, start: tuple[int, ...]) -> Array:
+        whole = np.full(high - low, np.nan, np.float32)
+        row, col = np.subtract(start, low)
+        whole[row : row + layer.shape[0], col : col + layer.shape[1]] = layer
+        return whole
+
+    names = [name for name in one if name in other]
+    return {name: (placed(one[name], first[0]), placed(other[name], first[1])) for name in names}
+
+
+def elevations(one: ElevationMap, other: ElevationMap) -> tuple[Array, Array]:
+    """The elevations of two maps on one grid, m."""
+    return side_by_side(one.layers, other.layers, (one, other))["elevation"]
+
+
+def cells(one: NavigationMap, other: NavigationMap) -> tuple[Array, Array]:
+    """The cells of two maps on one grid, codes of `Cell`."""
+    first, second = ({"cells": grid.cells.astype(np.float32)} for grid in (one, other))
+    found = side_by_side(first, second, (one, other))["cells"]
+    return tuple(np.where(np.isnan(part), Cell.UNKNOWN, part).astype(np.int8) for part in found)  # type: ignore[return-value]
+
+
+def _disparities(one: Any, other: Any) -> Measures:
+    return _changes(read_disparity(one), read_disparity(other), "pixels", "px", 1.0)
+
+
+def _maps(one: Any, other: Any) -> Measures:
+    grids = [_grid_of(message) for message in (one, other)]
+    if grids[0].resolution != grids[1].resolution:
+        return {"maps of other resolution": 1.0}
+    layers = side_by_side(read_layers(one), read_layers(other), grids)
+    heights = layers.pop("elevation", None)
+    found = {} if heights is None else _changes(*heights, "cells", "cm", 100.0)
+    return found | {f"cells of {name}": float(np.sum(_differ(*pair))) for name, pair in layers.items()}
+
+
+def _grid_of(message: Any) -> _Grid:
+    info, centre = message.info, message.info.pose.position
+    return _Grid((centre.x - info.length_x / 2, centre.y - info.length_y / 2), float(info.resolution))
+
+
+def _verdicts(one: Any, other: Any) -> Measures:
+    grids = read_occupancy_grid(one), read_occupancy_grid(other)
+    if grids[0].resolution != grids[1].resolution:
+        return {"maps of other resolution": 1.0}
+    first, second = cells(*grids)
+    return {
+        f"cells from {name} to {_CELLS[after]}": float(np.sum((first == before) & (second == after)))
+        for before, name in _CELLS.items()
+        for after in _CELLS
+        if before != after
+    }
+
+
+def _codes(one: Any, other: Any) -> Measures:
+    first, second = (np.frombuffer(bytes(message.data), np.uint8) for message in (one, other))
+    return {"pixels": float(np.sum(first != second)) if first.shape == second.shape else float(first.size)}
+
+
+def _poses(one: Any, other: Any) -> Measures:
+    first, second = one.pose.pose, other.pose.pose
+    places = [np.array([pose.position.x, pose.position.y, pose.position.z]) for pose in (first, second)]
+    turns = [np.array([q.x, q.y, q.z, q.w]) for q in (first.orientation, second.orientation)]
+    angle = 2.0 * angle_between(turns[0], turns[1] * np.sign(turns[0] @ turns[1] or 1.0))
+    return {"position mm": 1e3 * float(np.linalg.norm(places[1] - places[0])), "angle deg": float(np.degrees(angle))}
+
+
+def _points(one: Any, other: Any) -> Measures:
+    return {"points": float(abs(one.width * one.height - other.width * other.height))}
+
+
+def _differ(one: Array, other: Array) -> Array:
+    return np.asarray((one != other) & ~(np.isnan(one) & np.isnan(other)))
+
+
+def _changes(one: Array, other: Array, what: str, unit: str, scale: float) -> Measures:
+    """The differences of two arrays in which NaN is unknown."""
+    if one.shape != other.shape:
+        return {f"{what} of another size": float(one.size)}
+    both = np.isfinite(one) & np.isfinite(other)
+    change = scale * np.abs(one[both] - other[both])
+    moved = change[change > 0]
+    return {
+        what: float(moved.size),
+        f"{what} known only in A": float(np.sum(np.isfinite(one) & ~both)),
+        f"{what} known only in B": float(np.sum(np.isfinite(other) & ~both)),
+        f"median {unit}": float(np.median(moved)) if moved.size else 0.0,
+        f"largest {unit}": float(moved.max()) if moved.size else 0.0,
+    }
+
+
+_MEASURES: Mapping[str, Callable[[Any, Any], Measures]] = {
+    "stereo_msgs/msg/DisparityImage": _disparities,
+    "grid_map_msgs/msg/GridMap": _maps,
+    "nav_msgs/msg/OccupancyGrid": _verdicts,
+    "sensor_msgs/msg/Image": _codes,
+    "nav_msgs/msg/Odometry": _poses,
+    "sensor_msgs/msg/PointCloud2": _points,
+}

@@ -1,0 +1,82 @@
+"""A rerun recording of the differences of two results: A, B, and B less A beside each other on one timeline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from recordings.atomic_write import written
+from recordings.comparison.diff import Change
+from recordings.comparison.pages import pages
+from recordings.ros2.cdr import full_name
+
+MAX_FRAMES = 50  # stamps that are drawn
+_SIDES = {"a": "A", "b": "B", "difference": "B less A"}  # entity -> name of its view
+
+
+class DiffRecording:
+    """Collects the pages of differences and writes them as a recording.
+
+    Examples
+    --------
+    >>> recording = DiffRecording()
+    >>> diff(Path("a.mcap"), Path("b.mcap"), recording.add)  # doctest: +SKIP
+    >>> recording.write(Path("diff.rrd"), "a and b")  # doctest: +SKIP
+    """
+
+    def __init__(self) -> None:
+        self.pictures: list[tuple[str, int, tuple[bytes, ...]]] = []
+        self.stamps: list[int] = []
+        self.left_out = 0
+
+    def add(self, change: Change) -> None:
+        """Draw a change, unless enough stamps are drawn."""
+        if change.one is None or change.other is None:
+            return
+        if change.stamp not in self.stamps:
+            if len(self.stamps) == MAX_FRAMES:
+                self.left_out += 1
+                return
+            self.stamps.append(change.stamp)
+        found = pages(full_name(change.one.__msgtype__), change.one, change.other)
+        if found is not None:
+            self.pictures.append((change.topic, change.stamp, tuple(map(_png, found))))
+
+    def write(self, path: Path, name: str, tables: str = "") -> None:
+        """Write the recording. tables: Markdown that is shown beside the pictures. Raises UnwritableError."""
+        with written(path) as temporary:
+            stream = rr.RecordingStream("roverflow_diff")
+            stream.set_log_time_enabled(False)
+            stream.set_sinks(rr.FileSink(str(temporary)))
+            stream.send_recording_name(name)
+            stream.log("tables", rr.TextDocument(tables, media_type=rr.MediaType.MARKDOWN), static=True)
+            for topic, stamp, pictures in self.pictures:
+                stream.set_time("time", timestamp=np.datetime64(stamp, "ns"))
+                stream.set_time("frame", sequence=self.stamps.index(stamp))
+                for side, picture in zip(_SIDES, pictures, strict=True):
+                    stream.log(f"{topic}/{side}", rr.EncodedImage(contents=picture, media_type="image/png"))
+            stream.send_blueprint(self._blueprint())
+            stream.flush()
+            stream.disconnect()
+
+    def _blueprint(self) -> rrb.Blueprint:
+        topics = dict.fromkeys(topic for topic, _, _ in self.pictures)
+        tabs = [
+            rrb.Horizontal(
+                *(rrb.Spatial2DView(origin=f"{topic}/{side}", name=title) for side, title in _SIDES.items()), name=topic
+            )
+            for topic in topics
+        ]
+        table = rrb.TextDocumentView(origin="tables", name="what differs")
+        return rrb.Blueprint(
+            rrb.Vertical(rrb.Tabs(*tabs), table, row_shares=[3, 1]) if tabs else table, collapse_panels=True
+        )
+
+
+def _png(page: np.ndarray) -> bytes:
+    _, blob = cv2.imencode(".png", cv2.cvtColor(page, cv2.COLOR_RGB2BGR))
+    return blob.tobytes()

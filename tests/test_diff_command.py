@@ -1,0 +1,68 @@
+"""`roverflow diff`: two results side by side."""
+
+import json
+
+import pytest
+
+from recordings.mcap.file import iter_decoded
+from tests.conftest import SMALL, roverflow
+
+
+@pytest.fixture(scope="module")
+def variant_of(traverse, tmp_path_factory):
+    """Makes a result of the traverse with some settings."""
+
+    def make(*changes):
+        out = tmp_path_factory.mktemp("variant") / "out.mcap"
+        settings = [word for change in changes for word in ("--set", change)]
+        assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd", *settings) == 0
+        return out
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def plain(variant_of):
+    return variant_of()
+
+
+def test_a_run_and_the_same_run_are_equal(plain, variant_of, capsys):
+    assert roverflow("diff", plain, plain) == 0
+    assert roverflow("diff", plain, variant_of()) == 0
+    assert capsys.readouterr().out.splitlines()[-1].startswith("equal: all ")
+
+
+@pytest.mark.parametrize(
+    ("change", "topic", "measure"),
+    [
+        ("disparity/full.paths=8", "/nav/disparity", "largest px"),
+        ("cells.max_range=4 m", "/nav/elevation_map", "cells known only in A"),
+        ("navigation_map.rover.max_step=5 cm", "/nav/navigation_map", "cells from free to hazard"),
+    ],
+)
+def test_the_first_difference_is_in_the_stream_that_a_setting_touches(
+    plain, variant_of, capsys, tmp_path, change, topic, measure
+):
+    capsys.readouterr()
+    other = variant_of(change)
+    capsys.readouterr()
+    assert roverflow("diff", plain, other, "--json", "-o", tmp_path / "diff.rrd") == 3
+    found = json.loads(capsys.readouterr().out)
+    first = min(stamp for name, stamp, _ in iter_decoded(plain, [topic]))
+    assert found["first"] == [topic, first]
+    assert found["topics"][topic]["worst"][measure] > 0
+    assert found["facts"] == {"overrides": [SMALL[1], f"{SMALL[1]}\n{change}"]}
+    names = list(found["topics"])
+    assert all(found["topics"][name]["first"] is None for name in names[: names.index(topic)])
+    assert (tmp_path / "diff.rrd").stat().st_size > 10_000
+
+
+def test_a_difference_is_also_a_message_that_only_one_result_has(plain, variant_of, tmp_path, capsys):
+    other = variant_of("McapSink.results=[disparity]")
+    assert roverflow("diff", plain, other) == 3
+    assert "/nav/elevation_map: 0 of 0 messages differ, " in capsys.readouterr().out
+
+
+def test_a_log_without_results_is_refused(traverse, plain, capsys):
+    assert roverflow("diff", plain, traverse) == 2
+    assert "is not a result log; give two logs that roverflow run wrote" in capsys.readouterr().err
