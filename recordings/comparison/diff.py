@@ -21,7 +21,7 @@ from recordings.scoring.result_log import about_run
 _LATE = ("/tf", "/nav/diagnostics")  # they follow from the streams, so they are never the first to differ
 
 
-class Change(NamedTuple):
+class MessageDifference(NamedTuple):
     """One topic at one stamp. one, other: the messages, None where a result has none; values: how much they differ."""
 
     topic: str
@@ -56,7 +56,7 @@ class TopicDiff:
     first: int | None = None
     worst: Measures = field(default_factory=dict)
 
-    def add(self, change: Change) -> None:
+    def add(self, change: MessageDifference) -> None:
         """Count a difference."""
         self.only_one += change.other is None
         self.only_other += change.one is None
@@ -93,7 +93,7 @@ class Diff:
         return self.first is None
 
 
-def diff(one: Path, other: Path, on_change: Callable[[Change], None] = lambda change: None) -> Diff:
+def diff(one: Path, other: Path, on_change: Callable[[MessageDifference], None] = lambda change: None) -> Diff:
     """Compare two result logs.
 
     Parameters
@@ -101,7 +101,7 @@ def diff(one: Path, other: Path, on_change: Callable[[Change], None] = lambda ch
     one, other : Path
         Result logs of `roverflow run`.
     on_change : callable
-        Called with each `Change`, in the order of stamps.
+        Called with each `MessageDifference`, in the order of stamps.
 
     Returns
     -------
@@ -168,7 +168,7 @@ class _Reader:
         return self._decoders[number](data)
 
 
-def _changes(one: _Reader, other: _Reader, topics: Mapping[str, TopicDiff]) -> Iterator[Change]:
+def _changes(one: _Reader, other: _Reader, topics: Mapping[str, TopicDiff]) -> Iterator[MessageDifference]:
     """The messages that differ, by stamp and then in the order of `topics`; messages that both have are counted."""
     for stamp, first, second in _aligned(one.groups(), other.groups()):
         for topic in topics:
@@ -178,7 +178,7 @@ def _changes(one: _Reader, other: _Reader, topics: Mapping[str, TopicDiff]) -> I
                 continue
             decoded = [None if item is None else log.decoded(*item) for log, item in ((one, a), (other, b))]
             values = measures(one.schema(a[0]), *decoded) if a is not None and b is not None else {}
-            yield Change(topic, stamp, decoded[0], decoded[1], values)
+            yield MessageDifference(topic, stamp, decoded[0], decoded[1], values)
 
 
 def _aligned(

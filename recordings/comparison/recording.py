@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from recordings.atomic_write import written
-from recordings.comparison.diff import Change
+from recordings.comparison.diff import MessageDifference
 from recordings.comparison.pages import pages
 from recordings.ros2.cdr import full_name
 
@@ -33,7 +33,7 @@ class DiffRecording:
         self.stamps: list[int] = []
         self.left_out = 0
 
-    def add(self, change: Change) -> None:
+    def add(self, change: MessageDifference) -> None:
         """Draw a change, unless enough stamps are drawn."""
         if change.one is None or change.other is None:
             return
