@@ -22,13 +22,13 @@ from flow.contracts import counted
 from flow.parameters import check_parameters, is_required, parameter
 from recordings.discovery.images import SIDES
 from recordings.errors import LogError
+from recordings.importers.files import read_bytes, read_pixels
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import LAST_STAMP
-from recordings.ros2.image_from_msg import unpacked_pixels
 from recordings.ros2.to_msg import camera_info, image, imu, transform_message
 from recordings.source.calibration import pinhole
 from recordings.source.transforms import BODY_FROM_OPTICAL
-from stages.data import Array, StereoCamera, StereoFrame, Transform
+from stages.data import StereoCamera, StereoFrame, Transform
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
 FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
@@ -228,7 +228,7 @@ def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) ->
 
     values: fx, fy, cx, cy, cx_right (px), baseline (m), width and height; missing sizes are set. Raises LogError.
     """
-    images = [_pixels(path) for path in pair]
+    images = [read_pixels(path) for path in pair]
     height, width = images[0].shape[:2]
     if images[0].shape != images[1].shape or images[0].dtype != images[1].dtype:
         kinds = ("gray" if image.ndim == 2 else "colour" for image in images)
@@ -265,20 +265,3 @@ def _write_images(writer: Ros2Writer, frame: StereoFrame) -> None:
         info = camera_info(frame.stamp, CAMERA_FRAMES[side], pinhole(frame.camera, side))
         writer.write(f"/stereo/{side}/camera_info", info, frame.stamp)
         writer.write(f"/stereo/{side}/image_rect", image(frame.stamp, CAMERA_FRAMES[side], pixels), frame.stamp)
-
-
-def read_bytes(path: Path) -> bytes:
-    """The content of a file. Raises LogError."""
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
-
-
-def _pixels(path: Path) -> Array:
-    """Gray or RGB pixels of an image file."""
-    data = np.frombuffer(read_bytes(path), np.uint8)
-    pixels = unpacked_pixels(data)
-    if pixels is None:
-        raise LogError(f"{path} is not a readable image of 8 or 16 bit")
-    return pixels

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.importers.images import CAMERA_FRAMES, FIRST_STAMP, read_bytes, read_frame, write_frames
+from recordings.importers.files import read_bytes
+from recordings.importers.images import CAMERA_FRAMES, FIRST_STAMP, read_frame, write_frames
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, image
 from recordings.scoring.stereo_metrics import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns

@@ -111,7 +111,7 @@ def _compressed_pixels(message: Any, size: tuple[int, int] | None, max_pixels: i
         raise LogError(f"the compressed image is cut after {data.size} bytes")
     if content.startswith(b"\xff\xd8") and (scans := content.count(b"\xff\xda")) > _MAX_SCANS:
         raise LogError(f"the compressed image has {scans} scans; the limit is {_MAX_SCANS}")
-    stated = _stated_size(content)
+    stated = stated_size(content)
     if stated is not None:
         check_size(*stated, size, max_pixels)
     encoding = message.format.split(";")[0].strip()
@@ -134,7 +134,7 @@ def unpacked_pixels(data: Array, mosaic: int | None = None) -> Array | None:
     return _converted(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
 
 
-def _stated_size(content: bytes) -> tuple[int, int] | None:
+def stated_size(content: bytes) -> tuple[int, int] | None:
     """(width, height) in the head of a PNG or JPEG file, else None."""
     if content.startswith(b"\x89PNG") and len(content) >= 24:
         width, height = struct.unpack_from(">II", content, 16)

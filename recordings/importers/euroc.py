@@ -1,0 +1,117 @@
+"""Reads recordings in EuRoC's (ASL) layout, for `roverflow import euroc`: EuRoC, TUM-VI and all that is written so.
+
+A folder `mav0` contains cam0 and cam1 (data.csv, data/, sensor.yaml), imu0 (rates, then accelerations) and maybe the
+truth. T_BS is the pose of a sensor in the body, which is the Imu. Images are paired by stamp, as lists may name files
+that are missing. Up is not in the files; a run estimates it from the Imu.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from flow.contracts import counted
+from recordings.calibration.formats import StereoCalibration, read_calibration
+from recordings.calibration.yaml_files import numbers, read_yaml
+from recordings.errors import LogError
+from recordings.importers.files import nanoseconds, numbers_of, read_rows
+from recordings.importers.recording import IMU, LEFT, RIGHT, ImagePair, ImportedRecording, Logged, between, raw_models
+from recordings.importers.rig import Rig
+from recordings.importers.track import Track
+from recordings.ros2.to_msg import raw_imu
+
+# Relative to mav0. Position, then quaternion w, x, y, z, of the body in a world with z up.
+TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt")
+
+
+def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> ImportedRecording:
+    """The recording in a folder that contains mav0, or mav0 itself.
+
+    calibration: files instead of cam0/sensor.yaml and cam1/sensor.yaml; rig: where base_link is, if known. Raises
+    LogError.
+    """
+    folder = source / "mav0" if (source / "mav0").is_dir() else source
+    if not (folder / "cam0").is_dir():
+        raise LogError(f"{source} contains no mav0 with cam0, cam1 and imu0; give the folder of one sequence")
+    if not calibration:
+        calibration = [folder / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
+        if not calibration[0].exists():
+            raise LogError(f"there is no {calibration[0]}; give --calibration, such as Kalibr's camchain.yaml")
+    notes = [note for path in calibration if (note := _header_note(path))]
+    (left, right), calibrated = ordered(("cam0", "cam1"), read_calibration(calibration), notes)
+    if calibrated.camera_from_imu is None or calibrated.right_in_left is None:
+        raise LogError(f"{calibration[0]} lacks the transform between Imu and camera; give the file of imu and cameras")
+    camera_from_imu = calibrated.camera_from_imu @ _imu_in_body(folder / "imu0" / "sensor.yaml")
+    mounts = [between(LEFT, RIGHT, calibrated.right_in_left), between(LEFT, IMU, camera_from_imu)]
+    truth = next((path for name in TRUTHS if (path := folder / name / "data.csv").exists()), None)
+    return ImportedRecording(
+        raw_models(calibrated), False, _pairs(folder, left, right, notes),
+        [*filter(None, [rig.mount]), *mounts], [_imu(folder / "imu0" / "data.csv")],
+        None if truth is None else _track(truth), true_tilt=True, notes=notes,
+    )  # fmt: skip
+
+
+def _header_note(path: Path) -> str:
+    """A note about OpenCV's first line, which is not YAML."""
+    begins = path.is_file() and path.read_bytes().startswith(b"%YAML:")
+    return (
+        f"{path.name} of {path.parent.name} begins with %YAML:1.0, which is no YAML; the line is ignored"
+        if begins
+        else ""
+    )
+
+
+def ordered(
+    names: tuple[str, str], calibration: StereoCalibration, notes: list[str]
+) -> tuple[tuple[str, str], StereoCalibration]:
+    """The cameras with the left one first, by the calibration; a note if that exchanges them."""
+    moved = calibration.right_in_left
+    if moved is None or moved[0, 3] > 0:
+        return names, calibration
+    notes.append(f"{names[1]} is the left camera by the calibration, and {names[0]} the right one")
+    return (names[1], names[0]), calibration.exchanged()
+
+
+def _pairs(folder: Path, left: str, right: str, notes: list[str]) -> list[ImagePair]:
+    """The pairs of equal stamps of which both files exist; notes about the others."""
+    found: list[dict[int, Path]] = []
+    for camera in (left, right):
+        listed = {
+            nanoseconds(row[0], where): folder / camera / "data" / row[1]
+            for where, row in read_rows(folder / camera / "data.csv", 2, ",")
+        }
+        there = {stamp: path for stamp, path in listed.items() if path.exists()}
+        if missing := [path.name for stamp, path in listed.items() if stamp not in there]:
+            names = f"{missing[0]}{' and others' if len(missing) > 1 else ''}"
+            notes.append(f"{camera}/data.csv lists {counted(len(missing), 'image')} that {camera}/data lacks: {names}")
+        found.append(there)
+    lefts, rights = found
+    alone = len(lefts.keys() ^ rights.keys())
+    if alone:
+        notes.append(f"{counted(alone, 'image')} without a partner of the same stamp")
+    return [ImagePair(stamp, lefts[stamp], rights[stamp]) for stamp in sorted(lefts.keys() & rights.keys())]
+
+
+def _imu(path: Path) -> Iterator[Logged]:
+    """Rates, rad/s, and accelerations, m/s^2."""
+    samples = [(nanoseconds(row[0], where), where, row[1:7]) for where, row in read_rows(path, 7, ",")]
+    for stamp, where, row in sorted(samples, key=lambda sample: sample[0]):
+        values = numbers_of(row, where)
+        yield stamp, "/imu/data_raw", raw_imu(stamp, IMU, values[:3], values[3:])
+
+
+def _imu_in_body(path: Path) -> np.ndarray:
+    """The pose of the Imu in the body: 1, unless its own file has another."""
+    content = read_yaml(path) if path.exists() else {}
+    return numbers(content, "T_BS", (4, 4), str(path)) if "T_BS" in content else np.eye(4)
+
+
+def _track(path: Path) -> Track:
+    """The poses of the body."""
+    poses = []
+    for where, row in read_rows(path, 8, ","):
+        values = numbers_of(row[1:8], where)
+        poses.append((nanoseconds(row[0], where), values[:3], np.roll(values[3:], -1)))
+    return Track.of(IMU, poses, path)

@@ -1,0 +1,126 @@
+"""Reads the files of data sets: tables as text, stamps without rounding, and images as they are."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from recordings.errors import LogError
+from recordings.ros2.cdr import LAST_STAMP
+from recordings.ros2.image_from_msg import stated_size, unpacked_pixels
+from stages.data import Array
+
+ENCODED = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg"}  # first bytes of the files that a log contains unchanged
+_TIME = re.compile(r"(\d{4})[-_](\d\d)[-_](\d\d)[ T_](\d\d)[:_](\d\d)[:_](\d\d)(?:[._](\d{1,9}))?(Z|[-+]\d\d:?\d\d)?$")
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file. Raises LogError."""
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def read_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Each line with content of a text file, after its place in words; without comments (# and %). Raises LogError."""
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise LogError(f"{path} is not a text file; get it again") from error
+    for number, line in enumerate(text.splitlines(), 1):
+        if (content := line.strip()) and content[0] not in "#%":
+            yield f"{path}, line {number}", content
+
+
+def read_rows(path: Path, columns: int, separator: str | None = None) -> Iterator[tuple[str, list[str]]]:
+    """The columns of each line, after its place in words; separator: None is blanks. Raises LogError for too few."""
+    for where, line in read_lines(path):
+        row = [value.strip() for value in line.rstrip(f"{separator or ''} ").split(separator)]
+        if len(row) < columns:
+            raise LogError(f"{where} has {len(row)} columns, but at least {columns} are needed; get the file again")
+        yield where, row
+
+
+def numbers_of(values: list[str], where: str) -> Array:
+    """The values as float64. Raises LogError if one is not a finite number."""
+    try:
+        found = np.array([float(value) for value in values])
+    except ValueError as error:
+        raise LogError(f"{where} contains what is no number ({error}); get the file again") from error
+    if not np.isfinite(found).all():
+        raise LogError(f"{where} contains a number that is not finite; get the file again")
+    return found
+
+
+def nanoseconds(text: str, where: str) -> int:
+    """A stamp in whole nanoseconds. Raises LogError, also for one that a spreadsheet rounded (1.40363E+18)."""
+    if not text.isdecimal():
+        raise LogError(
+            f"{where} has the stamp '{text}', not whole nanoseconds; spreadsheets round stamps, so get the file again"
+        )
+    return _checked(int(text), text, where)
+
+
+def from_seconds(text: str, where: str, start: int = 0) -> int:
+    """A stamp in ns of decimal seconds after `start`, ns. Raises LogError."""
+    try:
+        stamp = start + int((Decimal(text) * 1_000_000_000).to_integral_value())
+    except (InvalidOperation, ValueError, OverflowError) as error:
+        raise LogError(f"{where} has the time '{text}', not seconds; get the file again") from error
+    return _checked(stamp, text, where)
+
+
+def from_date(text: str, where: str) -> int:
+    """A stamp in ns of a date with time, parted by `-`, `:`, `.`, `T`, blanks or `_`; UTC without a zone.
+
+    >>> from_date("1970-01-02 00:00:00.000000001", "")
+    86400000000001
+    """
+    found = _TIME.match(text)
+    try:
+        if found is None:
+            raise ValueError
+        *parts, fraction, zone = found.groups()
+        moment = datetime(*map(int, parts), tzinfo=UTC)  # type: ignore[arg-type, misc]
+    except ValueError as error:
+        raise LogError(f"{where} has the time '{text}', which is no date with time; get the file again") from error
+    seconds = int(moment.timestamp())
+    if zone and zone != "Z":
+        hours, minutes = int(zone[1:3]), int(zone[-2:])
+        seconds -= (1 if zone[0] == "+" else -1) * (3600 * hours + 60 * minutes)
+    return _checked(seconds * 1_000_000_000 + int((fraction or "0").ljust(9, "0")), text, where)
+
+
+def _checked(stamp: int, text: str, where: str) -> int:
+    if not 0 < stamp < LAST_STAMP:
+        raise LogError(f"{where} has the time '{text}', which is not between 1970 and 2038; correct it")
+    return stamp
+
+
+def encoding_of(content: bytes) -> str:
+    """ "png" or "jpeg" for the bytes of such an image file, else empty."""
+    return next((name for start, name in ENCODED.items() if content.startswith(start)), "")
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, px. Raises LogError."""
+    content = read_bytes(path)
+    size = stated_size(content)
+    if size is None:
+        height, width = read_pixels(path).shape[:2]
+        return width, height
+    return size
+
+
+def read_pixels(path: Path) -> Array:
+    """Gray or RGB pixels of an image file. Raises LogError."""
+    pixels = unpacked_pixels(np.frombuffer(read_bytes(path), np.uint8))
+    if pixels is None:
+        raise LogError(f"{path} is not a readable image of 8 or 16 bit")
+    return pixels

@@ -1,0 +1,182 @@
+"""Writes a recording from other people's files as a log: calibration, mounts, images, sensors and truth.
+
+Images of PNG and JPEG files are logged with their bytes unchanged. Messages keep the stamps of the files, and are in
+their order. The log gets its name when it is complete; an import that was interrupted leaves none, and starts again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from heapq import merge
+from itertools import chain
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flow.contracts import counted
+from recordings.calibration.formats import StereoCalibration
+from recordings.errors import LogError
+from recordings.importers.files import encoding_of, image_size, read_bytes, read_pixels
+from recordings.importers.track import WORLD, Track, upright
+from recordings.mcap.writer import Ros2Writer
+from recordings.ros2 import to_msg as ros2
+from recordings.ros2.cdr import make
+from recordings.source.calibration import Camera, calibrated_pair, pinhole
+from recordings.source.transforms import TransformTree
+from stages.data import CameraModel, Pose, StereoCamera, Transform
+
+BASE, LEFT, RIGHT, IMU = "base_link", "left_camera_optical", "right_camera_optical", "imu_link"
+SIDES = ("left", "right")
+
+Logged = tuple[int, str, Any]
+
+
+@dataclass(frozen=True)
+class ImagePair:
+    """The files of a stereo frame."""
+
+    stamp: int
+    left: Path
+    right: Path
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedRecording:
+    """What a data set contains.
+
+    cameras: left and right; rectified: whether the images are; pairs: in the order of stamps; mounts: static
+    transforms; sensors: streams of (stamp, topic, message), each in the order of stamps; truth: the exact poses, of
+    which those at the frames are written; true_tilt: whether they are better than the sensors' tilt; more: further
+    messages of a frame; notes: what a user should know.
+    """
+
+    cameras: tuple[CameraModel, CameraModel]
+    rectified: bool
+    pairs: Sequence[ImagePair]
+    mounts: Sequence[Transform]
+    sensors: Sequence[Iterable[Logged]] = ()
+    truth: Track | None = None
+    true_tilt: bool = False
+    more: Callable[[int], Iterable[Logged]] = lambda number: ()
+    notes: list[str] = field(default_factory=list)
+
+
+def write_recording(
+    recording: ImportedRecording, out: Path, progress: Callable[[int], None] = lambda done: None
+) -> tuple[int, list[str]]:
+    """Write the log; returns its number of frames and the notes. progress: called with the frames done so far.
+
+    A pair with a file that is no image is left out, with a note. Raises LogError if no log can be made.
+    """
+    tree = TransformTree()
+    for mount in recording.mounts:
+        tree.join(mount)
+    topics = [f"/stereo/{side}/{'image_rect' if recording.rectified else 'image_raw'}" for side in SIDES]
+    cameras = calibrated_pair(recording.cameras, (LEFT, RIGHT), (topics[0], topics[1]), tree)
+    if not recording.pairs:
+        raise LogError("no pair of images was found; check the folder")
+    first = recording.pairs[0]
+    for path, model in zip((first.left, first.right), recording.cameras, strict=True):
+        if image_size(path) != (model.width, model.height):
+            size = "{}x{}".format(*image_size(path))
+            raise LogError(f"{path} is {size}, but the calibration is for {model.width}x{model.height}")
+    unreadable: list[str] = []
+    frames = _frames(recording, cameras[0], tree, topics, unreadable, progress)
+    events = merge(*recording.sensors, frames, key=itemgetter(0))
+    start = next(events)
+    with Ros2Writer(out) as writer:
+        writer.write("/tf_static", ros2.transform_message((mount, start[0]) for mount in recording.mounts), start[0])
+        for stamp, topic, message in chain([start], events):
+            writer.write(topic, message, stamp)
+        if len(unreadable) == len(recording.pairs):
+            raise LogError(f"none of {counted(len(unreadable), 'pair')} can be read, first: {unreadable[0]}")
+    left_out = f"{counted(len(unreadable), 'pair')} left out, first: {unreadable[0]}" if unreadable else ""
+    return len(recording.pairs) - len(unreadable), [*recording.notes, *filter(None, [left_out])]
+
+
+def _frames(
+    recording: ImportedRecording,
+    camera: Camera,
+    tree: TransformTree,
+    topics: Sequence[str],
+    unreadable: list[str],
+    progress: Callable[[int], None],
+) -> Iterator[Logged]:
+    """The messages of each frame; the reasons why a pair is left out go into `unreadable`."""
+    for number, pair in enumerate(recording.pairs):
+        stamp = pair.stamp
+        try:
+            files = [_image(stamp, frame, path) for frame, path in ((LEFT, pair.left), (RIGHT, pair.right))]
+        except LogError as error:
+            unreadable.append(str(error))
+            continue
+        for side, frame, model in zip(SIDES, (LEFT, RIGHT), recording.cameras, strict=True):
+            yield stamp, f"/stereo/{side}/camera_info", ros2.camera_info(stamp, frame, model)
+        yield from ((stamp, topic + ending, message) for topic, (ending, message) in zip(topics, files, strict=True))
+        if recording.truth is not None:
+            yield from _true_pose(recording, stamp, camera, tree)
+        yield from recording.more(number)
+        progress(number + 1)
+
+
+def _image(stamp: int, frame: str, path: Path) -> tuple[str, Any]:
+    """The ending of the topic, and the message of an image file."""
+    content = read_bytes(path)
+    if encoding := encoding_of(content):
+        return "/compressed", ros2.compressed_image(stamp, frame, np.frombuffer(content, np.uint8), encoding)
+    return "", ros2.image(stamp, frame, read_pixels(path))
+
+
+def _true_pose(recording: ImportedRecording, stamp: int, camera: Camera, tree: TransformTree) -> Iterator[Logged]:
+    """The true pose of base_link, or of the left camera's rectified image without it, and the true tilt."""
+    track = recording.truth
+    placed = None if track is None else track.at(stamp)
+    to_camera = None if placed is None else tree.between(placed.child, LEFT)
+    if placed is None or to_camera is None:
+        return
+    base = tree.between(placed.child, BASE)
+    body = placed.after(to_camera.after(camera.image) if base is None else base)
+    turn = Rotation.from_matrix(body.rotation).as_quat(canonical=True)
+    yield stamp, "/truth/pose", ros2.odometry(Pose(stamp, body.translation, turn, WORLD, body.child))
+    if recording.true_tilt:
+        whole = Rotation.from_matrix(placed.after(to_camera).rotation).as_quat(canonical=True)
+        message = make(
+            "geometry_msgs/msg/QuaternionStamped", header=ros2.header(stamp, LEFT), quaternion=ros2.quaternion(whole)
+        )
+        yield stamp, "/truth/tilt", message
+
+
+def tilts_of(track: Track, stamps: Iterable[int]) -> Iterator[Logged]:
+    """The tilt of the track's body, without its heading, at each of the stamps that the track contains."""
+    for stamp in stamps:
+        if (placed := track.at(stamp)) is not None:
+            yield stamp, "/inclinometer", ros2.imu(stamp, track.body, upright(placed.rotation[2]))
+
+
+def rectified_models(camera: StereoCamera) -> tuple[CameraModel, CameraModel]:
+    """The calibration of a rectified pair."""
+    return pinhole(camera, "left"), pinhole(camera, "right")
+
+
+def raw_models(calibration: StereoCalibration) -> tuple[CameraModel, CameraModel]:
+    """The calibration of a pair before rectification, with K as the projection where the files have none."""
+    left, right = (
+        model if np.any(model.p) else replace(model, p=np.column_stack([model.k, np.zeros(3)]))
+        for model in calibration.models
+    )
+    return left, right
+
+
+def between(parent: str, child: str, matrix: Any) -> Transform:
+    """The transform of a (4, 4) matrix, its rotation made orthonormal."""
+    rotation = Rotation.from_matrix(np.asarray(matrix)[:3, :3]).as_matrix()
+    return Transform(parent, child, rotation, np.asarray(matrix)[:3, 3])
+
+
+def beside(camera: StereoCamera) -> Transform:
+    """left camera <- right camera of a rectified pair."""
+    return Transform(LEFT, RIGHT, np.eye(3), np.array([camera.baseline, 0.0, 0.0]))

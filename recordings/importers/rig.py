@@ -1,0 +1,106 @@
+"""The rig file: what a data set does not say about its rover, in YAML with units, as pipeline files have them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flow.parameters import check_parameters, coerced, parameter
+from recordings.calibration.yaml_files import read_yaml
+from recordings.errors import LogError
+from recordings.importers.recording import BASE, LEFT
+from recordings.source.transforms import BODY_FROM_OPTICAL
+from stages.data import StereoCamera, Transform
+
+_PLACE: dict[str, Any] = {"unit": "m", "low": -100.0, "high": 100.0}
+_LENS: dict[str, Any] = {"unit": "px", "low": 0.0, "high": 1e6}
+_TURN: dict[str, Any] = {"unit": "rad", "low": -np.pi, "high": np.pi}
+_COLUMN: dict[str, Any] = {"low": 2, "high": 1000}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rig:
+    """The entries of a rig file. A camera without turns looks straight ahead; base_link is on the ground below it."""
+
+    height: float | None = parameter(None, "height of the left camera above base_link", unit="m", low=0.0, high=100.0)
+    pitch_down: float | None = parameter(None, "angle of the camera below base_link's x axis", **_TURN)
+    roll: float = parameter(0.0, "rotation of the camera about its line of sight, right side down positive", **_TURN)
+    yaw: float = parameter(0.0, "heading of the camera to the left of base_link's x axis", **_TURN)
+    forward: float = parameter(0.0, "place of the left camera ahead of base_link", **_PLACE)
+    left: float = parameter(0.0, "place of the left camera to the left of base_link", **_PLACE)
+    fx: float | None = parameter(None, "focal length", **_LENS)
+    cx: float | None = parameter(None, "principal point", **_LENS)
+    cy: float | None = parameter(None, "principal point", **_LENS)
+    baseline: float | None = parameter(None, "distance of the cameras", unit="m", low=0.001, high=10.0)
+    body_axes: str | None = parameter(
+        None, "axes of the data set's body: x, y and z are each forward, back, left, right, up or down, such as flu"
+    )
+    world_up: str | None = parameter(
+        None, "axis of the data set's world that points up", choices=("z", "-z", "y", "-y")
+    )
+    pitch_column: int | None = parameter(None, "column of the inclinometer's pitch, the first is 1", **_COLUMN)
+    roll_column: int | None = parameter(None, "column of the inclinometer's roll", **_COLUMN)
+    angle_unit: str | None = parameter(None, "unit of the inclinometer", choices=("deg", "rad"))
+    pitch_sign: int | None = parameter(None, "1: positive is nose up", choices=(1, -1))
+    roll_sign: int | None = parameter(None, "1: positive is left side up", choices=(1, -1))
+    tilt_model: str | None = parameter(
+        None, "axis: the angles are those of the sensor's axes to the horizon; euler: Euler angles",
+        choices=("axis", "euler"),
+    )  # fmt: skip
+    where: str = field(default="", init=False)
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+    def need(self, kind: str, *names: str) -> None:
+        """Raise LogError if one of the entries is missing that the data set does not say."""
+        for known in fields(self):
+            if known.name in names and getattr(self, known.name) is None:
+                unit = {"rad": ", with deg", "m": ", with m"}.get(known.metadata.get("unit", ""), "")
+                choices = known.metadata.get("choices")
+                of = f": {' or '.join(map(str, choices))}" if choices else unit
+                where = self.where or "there is no rig file (--rig FILE), which"
+                raise LogError(
+                    f"{where} lacks '{known.name}' ({known.metadata['help']}{of}); {kind} does not contain it"
+                )
+
+    @property
+    def mount(self) -> Transform | None:
+        """base_link <- left camera; None without a height."""
+        if self.height is None:
+            return None
+        turn = Rotation.from_euler("ZYX", [self.yaw, self.pitch_down or 0.0, self.roll]).as_matrix()
+        return Transform(BASE, LEFT, turn @ BODY_FROM_OPTICAL, np.array([self.forward, self.left, self.height]))
+
+    def camera(self, usual: StereoCamera) -> StereoCamera:
+        """The rectified camera: the usual one of the data set with the entries of the file."""
+        given = {name: getattr(self, name) for name in ("fx", "cx", "cy", "baseline")}
+        values = {name: value for name, value in given.items() if value is not None}
+        return replace(usual, **values, **{to: values[of] for of, to in _SAME.items() if of in values})
+
+
+_SAME = {"fx": "fy", "cx": "cx_right"}
+
+
+def read_rig(path: Path | None) -> Rig:
+    """The rig of a file; an empty one without a file. Raises LogError for an unknown entry or a value that is none."""
+    if path is None:
+        return Rig()
+    content, hints = read_yaml(path), get_type_hints(Rig)
+    known = {entry.name: entry for entry in fields(Rig) if entry.init}
+    values: Mapping[str, Any] = {}
+    for name, value in content.items():
+        if name not in known:
+            raise LogError(f"{path} has the unknown entry '{name}'; it may have {', '.join(known)}")
+        try:
+            values = {**values, name: coerced(value, hints[name], known[name])}
+        except ValueError as error:
+            raise LogError(f"{path}: '{name}': {error}") from error
+    rig = Rig(**values)
+    object.__setattr__(rig, "where", str(path))
+    return rig

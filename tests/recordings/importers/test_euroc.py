@@ -1,0 +1,167 @@
+"""Recordings in EuRoC's layout become logs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recordings.mcap.file import iter_decoded
+from tests.conftest import roverflow
+from tests.recordings.importers.simulated import (
+    EXACT,
+    RIG,
+    assert_same,
+    assert_same_maps,
+    assert_same_truth,
+    gray,
+    own_log,
+    seen_in,
+    write_images,
+)
+from tests.recordings.sample_log import data_folder
+
+SIMULATION = replace(gray(EXACT), imu="raw", imu_rate=50.0, rest=2.0)
+SENSOR = """%YAML:1.0
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: {pose}
+rate_hz: 2
+resolution: [{width}, {height}]
+camera_model: pinhole
+intrinsics: [{fx!r}, {fy!r}, {cx!r}, {cy!r}] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [0.0, 0.0, 0.0, 0.0]
+"""
+
+
+def write_euroc(simulation, folder):
+    """The traverse as mav0, with a listed image that is missing, one without partner, and CRLF."""
+    mav0, camera, (*mounts, imu) = folder / "mav0", simulation.camera, simulation.mounts
+    stamps = [simulation.stamp(number) for number in range(simulation.frames)]
+    cams = {"left": "cam0", "right": "cam1"}
+    write_images(simulation, lambda number, side: mav0 / cams[side] / "data" / f"{stamps[number]}.png")
+    for cam, mount in zip(cams.values(), mounts, strict=True):
+        pose = np.eye(4)
+        pose[:3] = np.column_stack([(at := imu.inverse().after(mount)).rotation, at.translation])
+        words = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        (mav0 / cam / "sensor.yaml").write_text(SENSOR.format(pose=pose.ravel().tolist(), **words))
+        listed = [*stamps, stamps[-1] + 50_000_000]
+        text = "".join(f"{stamp},{stamp}.png\r\n" for stamp in listed)
+        (mav0 / cam / "data.csv").write_text("#timestamp [ns],filename\r\n" + text, newline="")
+    alone = mav0 / "cam1" / "data" / f"{stamps[-1] + 50_000_000}.png"
+    alone.write_bytes((mav0 / "cam1" / "data" / f"{stamps[-1]}.png").read_bytes())
+    measured = zip(simulation.sensor_stamps(simulation.imu_rate), simulation.inertial.rates,
+                   simulation.inertial.accelerations, strict=True)  # fmt: skip
+    rows = [",".join([str(stamp), *map(repr, map(float, (*rate, *force)))]) for stamp, rate, force in measured]
+    write_rows(mav0 / "imu0" / "data.csv", "#timestamp [ns],w_RS_S_x [rad s^-1]", rows)
+    rows = []
+    for stamp in sorted({*stamps, *simulation.sensor_stamps(10)}):
+        body = simulation.base_at(stamp).after(imu)
+        w_first = np.roll(Rotation.from_matrix(body.rotation).as_quat(), 1)
+        rows.append(",".join([str(stamp), *map(repr, map(float, (*body.translation, *w_first, *np.zeros(9))))]))
+    write_rows(mav0 / "state_groundtruth_estimate0" / "data.csv", "#timestamp, p_RS_R_x [m]", rows)
+    return folder
+
+
+def write_rows(path, header, rows):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join([header, *rows, ""]))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    home = tmp_path_factory.mktemp("euroc")
+    (home / "rig.yaml").write_text(RIG)
+    return write_euroc(SIMULATION, home / "room"), home / "rig.yaml", own_log(SIMULATION, home / "own.mcap")
+
+
+def test_a_recording_in_eurocs_layout_is_the_simulators_log(recording, tmp_path, capsys):
+    folder, rig, own = recording
+    log = tmp_path / "log.mcap"
+    assert roverflow("import", "euroc", folder, log, "--rig", rig) == 0
+    said = capsys.readouterr().out
+    assert "cam0/data.csv lists 1 image that cam0/data lacks" in said
+    assert "1 image without a partner of the same stamp" in said
+    assert "sensor.yaml of cam0 begins with %YAML:1.0" in said
+    assert said.splitlines()[-1].startswith(f"{log}: 3 stereo frames")
+    assert_same(log, own)
+    assert_same_truth(log, own)
+    files = {path.read_bytes() for path in folder.glob("mav0/cam?/data/*.png")}
+    topics = [f"/stereo/{side}/image_raw/compressed" for side in ("left", "right")]
+    assert all(item.data.tobytes() in files for _, _, item in iter_decoded(log, topics))  # nothing is encoded again
+
+
+def test_a_recording_in_eurocs_layout_gives_the_simulators_maps(recording, tmp_path):
+    folder, rig, own = recording
+    assert roverflow("import", "euroc", folder / "mav0", tmp_path / "log.mcap", "--rig", rig) == 0
+    assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
+    scored = tmp_path / "imported-out.mcap", "--truth", tmp_path / "log.mcap"
+    assert roverflow("score", *scored) == 0
+
+
+def test_cameras_in_the_wrong_order_are_exchanged(recording, tmp_path, capsys):
+    folder, rig, own = recording
+    turned = tmp_path / "mav0"
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            exchanged = {"cam0": "cam1", "cam1": "cam0"}
+            parts = [exchanged.get(part, part) for part in path.relative_to(folder / "mav0").parts]
+            (copy := turned.joinpath(*parts)).parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    assert roverflow("import", "euroc", turned, tmp_path / "log.mcap", "--rig", rig) == 0
+    assert "cam1 is the left camera by the calibration" in capsys.readouterr().out
+    assert_same(tmp_path / "log.mcap", own)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "words"),
+    [
+        ("imu0/data.csv", "1700086", "1.7E+18", "spreadsheets round stamps"),
+        ("cam0/data.csv", ",", ";", "has 1 columns"),
+        ("cam1/sensor.yaml", "pinhole", "omni", "the camera model 'omni'"),
+        ("imu0/data.csv", None, None, "cannot read"),
+        ("cam0/sensor.yaml", None, None, "give --calibration"),
+    ],
+)
+def test_a_spoilt_file_is_named_in_one_sentence(recording, tmp_path, capsys, name, old, new, words):
+    folder, _, _ = recording
+    path = folder / "mav0" / name
+    before = path.read_bytes()
+    try:
+        path.unlink() if old is None else path.write_bytes(before.replace(old.encode(), new.encode()))
+        assert roverflow("import", "euroc", folder, tmp_path / "log.mcap") == 2
+    finally:
+        path.write_bytes(before)
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_image_that_is_none_is_left_out_with_a_note(recording, tmp_path, capsys):
+    folder, _, _ = recording
+    path = sorted((folder / "mav0" / "cam1" / "data").iterdir())[1]
+    before = path.read_bytes()
+    try:
+        path.write_bytes(b"")
+        assert roverflow("import", "euroc", folder, tmp_path / "log.mcap") == 0
+    finally:
+        path.write_bytes(before)
+    said = capsys.readouterr().out
+    assert f"1 pair left out, first: {path} is not a readable image" in said
+    assert "2 stereo frames" in said
+
+
+def test_a_real_sequence_has_its_baseline_and_up(tmp_path, capsys):
+    folder = data_folder("euroc")
+    log = tmp_path / "log.mcap"
+    assert roverflow("import", "euroc", folder, log) == 0
+    assert "data.csv lists 75 images that cam0/data lacks" in capsys.readouterr().out
+    seen = seen_in(log)
+    assert len(seen) == 20
+    assert seen[0].camera.baseline == pytest.approx(0.110, abs=5e-4)
+    rectified = seen[0].camera.raw[0].r @ [0.036, -0.927, -0.372]
+    assert np.degrees(np.arccos(seen[0].up @ rectified / np.linalg.norm(rectified))) < 1
