@@ -27,7 +27,7 @@ from flow.cli.commands import (
     simulate,
     stages,
 )
-from flow.cli.importers import euroc, images, middlebury
+from flow.cli.importers import euroc, images, kitti, middlebury
 from flow.cli.replay import product_version
 from flow.errors import FAILED, INTERRUPTED, UNUSABLE, RoverflowError
 from recordings.errors import LogError, UnwritableError
@@ -44,7 +44,7 @@ COMMANDS: dict[str, ModuleType] = {
     "diff": diff,
     "export": export,
 }
-IMPORTERS: dict[str, ModuleType] = {"euroc": euroc, "images": images, "middlebury": middlebury}
+IMPORTERS: dict[str, ModuleType] = {"euroc": euroc, "images": images, "kitti": kitti, "middlebury": middlebury}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

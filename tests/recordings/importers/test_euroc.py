@@ -18,6 +18,7 @@ from tests.recordings.importers.simulated import (
     own_log,
     seen_in,
     write_images,
+    write_lines,
 )
 from tests.recordings.sample_log import data_folder
 
@@ -49,26 +50,21 @@ def write_euroc(simulation, folder):
         words = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         (mav0 / cam / "sensor.yaml").write_text(SENSOR.format(pose=pose.ravel().tolist(), **words))
         listed = [*stamps, stamps[-1] + 50_000_000]
-        text = "".join(f"{stamp},{stamp}.png\r\n" for stamp in listed)
-        (mav0 / cam / "data.csv").write_text("#timestamp [ns],filename\r\n" + text, newline="")
+        rows = [f"{stamp},{stamp}.png" for stamp in listed]
+        write_lines(mav0 / cam / "data.csv", ["#timestamp [ns],filename", *rows], "\r\n")
     alone = mav0 / "cam1" / "data" / f"{stamps[-1] + 50_000_000}.png"
     alone.write_bytes((mav0 / "cam1" / "data" / f"{stamps[-1]}.png").read_bytes())
     measured = zip(simulation.sensor_stamps(simulation.imu_rate), simulation.inertial.rates,
                    simulation.inertial.accelerations, strict=True)  # fmt: skip
     rows = [",".join([str(stamp), *map(repr, map(float, (*rate, *force)))]) for stamp, rate, force in measured]
-    write_rows(mav0 / "imu0" / "data.csv", "#timestamp [ns],w_RS_S_x [rad s^-1]", rows)
+    write_lines(mav0 / "imu0" / "data.csv", ["#timestamp [ns],w_RS_S_x [rad s^-1]", *rows])
     rows = []
     for stamp in sorted({*stamps, *simulation.sensor_stamps(10)}):
         body = simulation.base_at(stamp).after(imu)
         w_first = np.roll(Rotation.from_matrix(body.rotation).as_quat(), 1)
         rows.append(",".join([str(stamp), *map(repr, map(float, (*body.translation, *w_first, *np.zeros(9))))]))
-    write_rows(mav0 / "state_groundtruth_estimate0" / "data.csv", "#timestamp, p_RS_R_x [m]", rows)
+    write_lines(mav0 / "state_groundtruth_estimate0" / "data.csv", ["#timestamp, p_RS_R_x [m]", *rows])
     return folder
-
-
-def write_rows(path, header, rows):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join([header, *rows, ""]))
 
 
 @pytest.fixture(scope="module")

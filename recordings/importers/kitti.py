@@ -1,0 +1,152 @@
+"""Reads raw drives of KITTI, for `roverflow import kitti`: images, calibration, and the attitude and place of the INS.
+
+A drive is synchronised and rectified (`_sync`) or not (`_extract`), which the size of its images says. The INS (oxts)
+gives roll, pitch and yaw, Euler angles of x forward, y left, z up: its orientation is the tilt, its place the truth.
+Both images of a number get the left one's stamp, as they were exposed together. Times without a zone count as UTC.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flow.contracts import counted
+from recordings.errors import LogError
+from recordings.importers.files import from_date, image_size, numbers_of, read_lines
+from recordings.importers.kitti_odometry import read_odometry, stereo_camera
+from recordings.importers.recording import (
+    BASE,
+    IMU,
+    LEFT,
+    RIGHT,
+    ImagePair,
+    ImportedRecording,
+    Logged,
+    beside,
+    between,
+    rectified_models,
+)
+from recordings.importers.rig import Rig
+from recordings.importers.track import Track, mercator
+from recordings.ros2.to_msg import imu
+from stages.data import Array, CameraModel, Transform
+
+IMU_HEIGHT = 0.93  # m above the road, by KITTI's description of its car
+CALIBRATIONS = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
+
+
+def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording:
+    """The drive in a folder with image_00 and so on and oxts, or the odometry sequence in one with calib.txt.
+
+    rig: where base_link is, if not on the road below the Imu of KITTI's car; color: images of the colour cameras.
+    Raises LogError.
+    """
+    if (source / "calib.txt").exists():
+        return read_odometry(source, rig, color)
+    left, right = ("02", "03") if color else ("00", "01")
+    if not (source / f"image_{left}").is_dir():
+        raise LogError(
+            f"{source} has no folder image_{left}; give the folder of one drive, or of one odometry sequence"
+        )
+    home = source if (source / CALIBRATIONS[0]).exists() else source.resolve().parent
+    cameras, velo_to_cam, imu_to_velo = (_calibration(home / name) for name in CALIBRATIONS)
+    notes: list[str] = []
+    pairs = _pairs(source, left, right, notes)
+    camera_from_imu = _rigid(velo_to_cam, "R", "T") @ _rigid(imu_to_velo, "R", "T")
+    size = image_size(pairs[0].left) if pairs else (0, 0)
+    rectified = size == tuple(cameras[f"S_rect_{left}"].astype(int))
+    read = _rectified if rectified else _raw
+    models, right_in_left, left_from_first = read(cameras, left, right)
+    to_imu = between(LEFT, IMU, left_from_first @ camera_from_imu)
+    base = rig.mount
+    if base is None:
+        base = Transform(BASE, IMU, np.eye(3), np.array([0.0, 0.0, IMU_HEIGHT])).after(to_imu.inverse())
+        notes.append(f"base_link is {IMU_HEIGHT} m below the Imu, as on KITTI's car; the rig file can place it")
+    track = _track(source / "oxts")
+    return ImportedRecording(
+        models, rectified, pairs, [base, right_in_left, to_imu], [_tilts(track)], track, notes=notes
+    )
+
+
+def _pairs(source: Path, left: str, right: str, notes: list[str]) -> list[ImagePair]:
+    """The pairs of which both images exist; a note about the others."""
+    pairs = []
+    stamps = [from_date(line, where) for where, line in read_lines(source / f"image_{left}" / "timestamps.txt")]
+    for number, stamp in enumerate(stamps):
+        files = [source / f"image_{camera}" / "data" / f"{number:010d}.png" for camera in (left, right)]
+        if all(file.exists() for file in files):
+            pairs.append(ImagePair(stamp, *files))
+    if len(pairs) < len(stamps):
+        notes.append(f"timestamps.txt lists {counted(len(stamps) - len(pairs), 'pair')} without one of the images")
+    return sorted(pairs, key=lambda pair: pair.stamp)
+
+
+def _calibration(path: Path) -> dict[str, Array]:
+    """The numbers of each `key: numbers` in a file; other entries, such as a time, are left out."""
+    found = {}
+    for where, line in read_lines(path):
+        key, _, values = line.partition(":")
+        try:
+            found[key] = numbers_of(values.split(), where)
+        except LogError:
+            continue
+    return found
+
+
+def _entry(values: dict[str, Array], name: str, *shape: int) -> Array:
+    if name not in values or values[name].size != int(np.prod(shape)):
+        raise LogError(f"KITTI's calibration lacks '{name}' with {int(np.prod(shape))} numbers; get the files again")
+    return values[name].reshape(shape)
+
+
+def _rigid(values: dict[str, Array], rotation: str, translation: str) -> Array:
+    whole = np.eye(4)
+    whole[:3, :3], whole[:3, 3] = _entry(values, rotation, 3, 3), _entry(values, translation, 3)
+    return whole
+
+
+def _rectified(values: dict[str, Array], left: str, right: str) -> tuple[Any, Transform, Array]:
+    """Models, left <- right camera, and the (4, 4) transform from the unrectified first camera to the left one."""
+    projections = [_entry(values, f"P_rect_{number}", 3, 4) for number in (left, right)]
+    width, height = _entry(values, f"S_rect_{left}", 2)
+    camera, shift = stereo_camera(projections, (int(width), int(height)))
+    whole = np.eye(4)
+    whole[:3, :3], whole[:3, 3] = _entry(values, "R_rect_00", 3, 3), shift
+    return rectified_models(camera), beside(camera), whole
+
+
+def _raw(values: dict[str, Array], left: str, right: str) -> tuple[Any, Transform, Array]:
+    """The same for images that are not rectified."""
+    models = []
+    for number in (left, right):
+        k, (width, height) = _entry(values, f"K_{number}", 3, 3), _entry(values, f"S_{number}", 2)
+        p, d = np.column_stack([k, np.zeros(3)]), _entry(values, f"D_{number}", 5)
+        models.append(CameraModel(int(width), int(height), k=k, d=d, r=np.eye(3), p=p))
+    first, second = (_rigid(values, f"R_{number}", f"T_{number}") for number in (left, right))
+    return tuple(models), between(LEFT, RIGHT, first @ np.linalg.inv(second)), first
+
+
+def _track(oxts: Path) -> Track:
+    """The poses of the Imu: east, north and up of the first place."""
+    rows, stamps = [], []
+    for number, (where, line) in enumerate(read_lines(oxts / "timestamps.txt")):
+        if (path := oxts / "data" / f"{number:010d}.txt").exists():
+            stamps.append(from_date(line, where))
+            rows.append(next((numbers_of(text.split()[:6], place) for place, text in read_lines(path)), np.zeros(0)))
+            if rows[-1].size < 6:
+                raise LogError(f"{path} has fewer than 6 numbers; get it again")
+    if not rows:
+        raise LogError(f"{oxts} contains no readings of the Imu; get the drive's oxts folder")
+    table = np.array(rows)
+    places = np.column_stack([mercator(table[:, 0], table[:, 1]), table[:, 2]])
+    turns = Rotation.from_euler("ZYX", table[:, 5:2:-1]).as_quat()
+    return Track.of(IMU, list(zip(stamps, places, turns, strict=True)), oxts)
+
+
+def _tilts(track: Track) -> Iterator[Logged]:
+    for stamp, turn in zip(track.stamps.tolist(), track.rotations.as_quat(), strict=True):
+        yield stamp, "/imu/data", imu(stamp, IMU, turn)

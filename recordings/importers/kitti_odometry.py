@@ -1,0 +1,115 @@
+"""Reads sequences of KITTI's odometry benchmark: rectified images, times since the start, and maybe true poses.
+
+The files contain no tilt. The rig file gives the camera's attitude in the first frame. From there the true poses turn
+it; without poses the car is taken as level, with a note. The true poses are those of the first camera, y down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flow.contracts import counted
+from recordings.errors import LogError
+from recordings.importers.files import from_seconds, image_size, numbers_of, read_lines
+from recordings.importers.recording import (
+    BASE,
+    LEFT,
+    ImagePair,
+    ImportedRecording,
+    Logged,
+    beside,
+    rectified_models,
+    tilts_of,
+)
+from recordings.importers.rig import Rig
+from recordings.importers.track import Track
+from recordings.ros2.to_msg import imu
+from stages.data import Array, StereoCamera, Transform
+
+FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
+
+
+def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
+    """The sequence in a folder with image_0 and so on, calib.txt and times.txt; poses in ../../poses/NN.txt."""
+    rig.need("KITTI's odometry benchmark", "height", "pitch_down")
+    mount, cameras = rig.mount, (2, 3) if color else (0, 1)
+    assert mount is not None
+    stamps = [from_seconds(line, where, FIRST_STAMP) for where, line in read_lines(source / "times.txt")]
+    folders = [source / f"image_{camera}" for camera in cameras]
+    listed = [
+        ImagePair(stamp, folders[0] / f"{number:06d}.png", folders[1] / f"{number:06d}.png")
+        for number, stamp in enumerate(stamps)
+    ]
+    pairs = [pair for pair in listed if pair.left.exists() and pair.right.exists()]
+    notes: list[str] = []
+    tilts: Iterable[Logged]
+    if len(pairs) < len(stamps):
+        notes.append(f"times.txt lists {counted(len(stamps) - len(pairs), 'pair')} without one of the images")
+    if not pairs:
+        raise LogError(f"{source} contains no pair of images in image_{cameras[0]} and image_{cameras[1]}")
+    projections = [_projections(source / "calib.txt")[camera] for camera in cameras]
+    camera, shift = stereo_camera(projections, image_size(pairs[0].left))
+    poses = next(
+        (path for path in (source.resolve().parents[1] / "poses" / f"{source.resolve().name}.txt", source / "poses.txt")
+         if path.exists()), None,
+    )  # fmt: skip
+    if poses is None:
+        notes.append("there are no poses, and no tilt in the files: the car is taken as level in every frame")
+        track, tilts = None, map(level_tilt, stamps)
+    else:
+        notes.append(f"the tilt is that of the first frame by the rig file, turned by the true poses in {poses.name}")
+        track = _track(poses, stamps, mount, shift)
+        tilts = tilts_of(track, [pair.stamp for pair in pairs])
+    return ImportedRecording(
+        rectified_models(camera), True, pairs, [mount, beside(camera)], [tilts], track, notes=notes
+    )  # fmt: skip
+
+
+def level_tilt(stamp: int) -> Logged:
+    """The tilt of a rover that stands level."""
+    return stamp, "/inclinometer", imu(stamp, BASE, np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+def stereo_camera(projections: list[Array], size: tuple[int, int]) -> tuple[StereoCamera, Array]:
+    """The rectified camera of two projections (3, 4), and (3,) m from the first camera's place to the left one's."""
+    left, right = projections
+    shifts = [np.linalg.solve(projection[:, :3], projection[:, 3]) for projection in projections]
+    baseline = float(shifts[0][0] - shifts[1][0])
+    if not baseline > 0:
+        raise LogError(f"KITTI's calibration has a baseline of {baseline:g} m; get the files again")
+    camera = StereoCamera(
+        fx=float(left[0, 0]), fy=float(left[1, 1]), cx=float(left[0, 2]), cy=float(left[1, 2]), baseline=baseline,
+        width=size[0], height=size[1], cx_right=float(right[0, 2]), frame_id=LEFT,
+    )  # fmt: skip
+    return camera, shifts[0]
+
+
+def _projections(path: Path) -> list[Array]:
+    """P0 to P3; some copies of the file have them without their names."""
+    found = []
+    for where, line in read_lines(path):
+        key, colon, values = line.rpartition(":")
+        numbers = numbers_of(values.split(), where)
+        if (not colon or key.startswith("P")) and numbers.size == 12:
+            found.append(numbers.reshape(3, 4))
+    if len(found) < 4:
+        raise LogError(f"{path} has {len(found)} projections of 12 numbers, not P0 to P3; get it again")
+    return found
+
+
+def _track(path: Path, stamps: list[int], mount: Transform, shift: Array) -> Track:
+    """The poses of the left camera, in a world in which base_link is level in the first frame."""
+    poses = []
+    for (where, line), stamp in zip(read_lines(path), stamps, strict=False):
+        row = numbers_of(line.split(), where)
+        if row.size != 12:
+            raise LogError(f"{where} has {row.size} numbers, not 12; get the file again")
+        pose = row.reshape(3, 4)
+        place = mount.rotation @ (pose[:, 3] - pose[:, :3] @ shift)
+        turn = Rotation.from_matrix(mount.rotation @ Rotation.from_matrix(pose[:, :3]).as_matrix())
+        poses.append((stamp, place, turn.as_quat()))
+    return Track.of(LEFT, poses, path)

@@ -1,0 +1,168 @@
+"""Drives and odometry sequences in KITTI's layout become logs."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recordings.importers.kitti import CALIBRATIONS, read_kitti
+from recordings.importers.rig import Rig
+from tests.conftest import roverflow
+from tests.recordings.importers.simulated import (
+    EXACT,
+    RIG,
+    assert_same,
+    assert_same_maps,
+    assert_same_truth,
+    gray,
+    numbers,
+    own_log,
+    write_images,
+    write_lines,
+)
+from tests.recordings.sample_log import data_folder
+
+# Any rotations and places do, if the chain of transforms is right.
+TURNS = [Rotation.from_euler("xyz", angles, degrees=True).as_matrix() for angles in ([1, 2, -1], [88, -3, 91])]
+SHIFT = np.array([0.06, 0.0, 0.0])  # m, of the left colour camera
+EARTH_RADIUS = 6_378_137.0
+
+
+def date(stamp):
+    """As KITTI writes a time."""
+    return f"{datetime.fromtimestamp(stamp // 10**9, UTC):%Y-%m-%d %H:%M:%S}.{stamp % 10**9:09d}"
+
+
+def write_drive(simulation, home, cameras=("00", "01")):
+    """The traverse as a drive: rectified, the Imu 0.93 m above base_link, right images 2 ms later."""
+    folder, camera = home / "2011_09_26_drive_0001_sync", simulation.camera
+    shift = SHIFT if cameras[0] == "02" else np.zeros(3)
+    names = dict(zip(("left", "right"), cameras, strict=True))
+    write_images(simulation, lambda number, side: folder / f"image_{names[side]}" / "data" / f"{number:010d}.png")
+    stamps = [simulation.stamp(number) for number in range(simulation.frames)]
+    for name, delay in zip(cameras, (0, 2_000_000), strict=True):
+        lines = [date(stamp + delay) for stamp in [*stamps, stamps[-1] + 10**9]]  # the last image is missing
+        write_lines(folder / f"image_{name}" / "timestamps.txt", [*lines, ""])
+    write_oxts(simulation, folder / "oxts", stamps)
+    write_calibration(simulation, home, cameras, shift)
+    assert camera.fx == camera.fy
+    return folder
+
+
+def write_calibration(simulation, home, cameras, shift):
+    camera, (left, *_) = simulation.camera, simulation.mounts
+    k, entries = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]), []
+    for name, place in zip(cameras, (shift, shift - [camera.baseline, 0, 0]), strict=True):
+        size = f"S_rect_{name}: {camera.width:e} {camera.height:e}"
+        entries += [size, f"P_rect_{name}: {numbers(np.column_stack([k, k @ place]))}"]
+    head = "calib_time: 09-Jan-2012 13:57:47"
+    write_lines(home / CALIBRATIONS[0], [head, *entries, f"R_rect_00: {numbers(TURNS[0])}"])
+    whole, imu_to_velo, rectify = np.eye(4), np.eye(4), np.eye(4)
+    imu = replace(left, rotation=np.eye(3), translation=np.array([0, 0, 0.93]))
+    from_imu = left.inverse().after(imu)
+    whole[:3, :3], whole[:3, 3] = from_imu.rotation, from_imu.translation - shift
+    imu_to_velo[:3, :3], imu_to_velo[:3, 3] = TURNS[1], [-0.8, 0.3, -0.8]
+    rectify[:3, :3] = TURNS[0]
+    velo_to_cam = np.linalg.inv(rectify) @ whole @ np.linalg.inv(imu_to_velo)
+    for name, matrix in ((CALIBRATIONS[1], velo_to_cam), (CALIBRATIONS[2], imu_to_velo)):
+        write_lines(home / name, [head, f"R: {numbers(matrix[:3, :3])}", f"T: {numbers(matrix[:3, 3])}"])
+
+
+def write_oxts(simulation, oxts, stamps):
+    write_lines(oxts / "timestamps.txt", map(date, stamps))
+    first = simulation.base_at(stamps[0])(np.array([[0, 0, 0.93]]))[0, 1]
+    for number, stamp in enumerate(stamps):
+        base = simulation.base_at(stamp)
+        yaw, pitch, roll = Rotation.from_matrix(base.rotation).as_euler("ZYX")
+        east, north, up = base(np.array([[0, 0, 0.93]]))[0]
+        scale = EARTH_RADIUS * np.cos(np.radians(49))
+        latitude = 2 * np.arctan(np.exp((north - first) / scale) * np.tan(np.radians(139 / 2))) - np.pi / 2
+        place = np.degrees([latitude, east / scale])
+        write_lines(oxts / "data" / f"{number:010d}.txt", [numbers(place, [up, roll, pitch, yaw], np.zeros(24))])
+
+
+def write_sequence(simulation, home, keys=True):
+    """The traverse as sequence 05 of the odometry benchmark, with its poses; returns it and the rig file."""
+    folder, camera = home / "sequences" / "05", simulation.camera
+    names = {"left": "image_0", "right": "image_1"}
+    write_images(simulation, lambda number, side: folder / names[side] / f"{number:06d}.png")
+    write_lines(folder / "times.txt", [f"{number / simulation.rate:e}" for number in range(simulation.frames)])
+    k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    places = [[0, 0, 0], [-camera.baseline, 0, 0], [0, 0, 0], [-camera.baseline, 0, 0]]
+    lines = [numbers(np.column_stack([k, k @ place])) for place in places]
+    write_lines(folder / "calib.txt", [f"P{number}: {line}" for number, line in enumerate(lines)] if keys else lines)
+    cameras = [simulation.base_at(simulation.stamp(number)).after(simulation.mounts[0]) for number in range(3)]
+    poses = [cameras[0].inverse().after(pose) for pose in cameras]
+    rows = [numbers(np.column_stack([pose.rotation, pose.translation])) for pose in poses]
+    write_lines(home / "poses" / "05.txt", rows)
+    (home / "rig.yaml").write_text(RIG)
+    return folder, home / "rig.yaml"
+
+
+@pytest.mark.parametrize("cameras", [("00", "01"), ("02", "03")], ids=["gray", "colour"])
+def test_a_drive_is_the_simulators_log(tmp_path, capsys, cameras):
+    simulation = gray(EXACT) if cameras[0] == "00" else EXACT
+    folder, own = write_drive(simulation, tmp_path, cameras), own_log(simulation, tmp_path / "own.mcap")
+    log, option = tmp_path / "log.mcap", ["--color"] if cameras[0] == "02" else []
+    assert roverflow("import", "kitti", folder, log, *option) == 0
+    said = capsys.readouterr().out
+    assert "timestamps.txt lists 1 pair without one of the images" in said
+    assert "base_link is 0.93 m below the Imu" in said
+    assert_same(log, own)
+    assert_same_truth(log, own, 1e-6)
+    (folder / "oxts" / "data" / "0000000001.txt").write_text("49 8 \n")
+    assert roverflow("import", "kitti", folder, log, *option) == 2
+    assert "fewer than 6 numbers" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_drive_gives_the_simulators_maps(tmp_path):
+    folder, own = write_drive(EXACT, tmp_path, ("02", "03")), own_log(EXACT, tmp_path / "own.mcap")
+    assert roverflow("import", "kitti", folder, tmp_path / "log.mcap", "--color") == 0
+    assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
+
+
+def test_a_drive_before_rectification_has_its_lenses():
+    home = data_folder("kitti")
+    from recordings.importers.kitti import _calibration, _raw, _rectified
+
+    values = _calibration(home / CALIBRATIONS[0])
+    (left, _), moved, _ = _raw(values, "00", "01")
+    assert (left.width, left.height) == (1392, 512)
+    assert left.d[0] == -0.3728755
+    assert np.linalg.norm(moved.translation) == pytest.approx(0.5372, abs=1e-3)
+    for cameras in (("00", "01"), ("02", "03")):
+        models, beside, _ = _rectified(values, *cameras)
+        assert beside.translation[0] == pytest.approx(0.537 if cameras[0] == "00" else 0.5327, abs=2e-4)
+        assert models[0].width == 1242
+
+
+@pytest.mark.parametrize("keys", [True, False], ids=["with keys", "without keys"])
+def test_an_odometry_sequence_is_the_simulators_log(tmp_path, capsys, keys):
+    simulation = gray(replace(EXACT, slope=0.0))  # the rover stands level, as the rig file says
+    (folder, rig), own = write_sequence(simulation, tmp_path, keys), own_log(simulation, tmp_path / "own.mcap")
+    log = tmp_path / "log.mcap"
+    assert roverflow("import", "kitti", folder, log, "--rig", rig) == 0
+    assert "turned by the true poses in 05.txt" in capsys.readouterr().out
+    assert_same(log, own, stamps=False, tolerance=1e-7)
+    (tmp_path / "poses" / "05.txt").unlink()
+    assert roverflow("import", "kitti", folder, log, "--rig", rig) == 0
+    assert "the car is taken as level" in capsys.readouterr().out
+    assert_same(log, own, stamps=False, tolerance=1e-7)
+    assert roverflow("import", "kitti", folder, log) == 2
+    said = capsys.readouterr().err
+    assert "lacks 'height' (height of the left camera above base_link, with m); KITTI's odometry" in said
+
+
+def test_the_poses_of_a_sequence_tilt_its_frames(tmp_path):
+    folder, _ = write_sequence(EXACT, tmp_path)
+    first = EXACT.base_at(EXACT.stamp(0)).after(EXACT.mounts[0])
+    up = first.rotation[2]
+    recording = read_kitti(
+        folder, Rig(height=0.9, pitch_down=float(-np.arcsin(up[2])), roll=-np.arctan2(up[0], -up[1]))
+    )
+    for number, pair in enumerate(recording.pairs):
+        true = EXACT.base_at(EXACT.stamp(number)).after(EXACT.mounts[0]).rotation[2]
+        np.testing.assert_allclose(recording.truth.at(pair.stamp).rotation[2], true, atol=1e-9)
