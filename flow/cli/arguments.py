@@ -11,15 +11,20 @@ _MAX_WORKERS = 1024
 _MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
 
 
-def count(text: str) -> int:
+def count(text: str, low: int = 1) -> int:
     """A whole number of at least 1."""
     try:
         value = int(text)
     except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not '{text}'")
+        value = low - 1
+    if value < low:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least {low}, not '{text}'")
     return value
+
+
+def count_or_none(text: str) -> int:
+    """A whole number of at least 0."""
+    return count(text, low=0)
 
 
 def workers(text: str) -> int:

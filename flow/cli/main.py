@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from flow.cli.commands import (
+    attempt,
     demo,
     diff,
     export,
@@ -42,6 +43,7 @@ COMMANDS: dict[str, ModuleType] = {
     "simulate": simulate,
     "score": score,
     "diff": diff,
+    "try": attempt,
     "export": export,
 }
 IMPORTERS: dict[str, ModuleType] = {"euroc": euroc, "images": images, "kitti": kitti, "middlebury": middlebury}

@@ -37,7 +37,7 @@ def replay(
     graph = pipelines.load(pipeline, overrides)
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()
-    with loading_kernels(), graph.source.open(log, start=start, end=end) as opened, _one_thread_per_call():
+    with loading_kernels(), graph.source.open(log, start=start, end=end) as opened, one_thread_per_call():
         about = {
             "roverflow": product_version(),
             "pipeline": graph.text,
@@ -73,7 +73,7 @@ def _frames(of_log: int | None, every: Every | None) -> int | None:
 
 
 @contextmanager
-def _one_thread_per_call() -> Iterator[None]:
+def one_thread_per_call() -> Iterator[None]:
     """Let OpenCV, BLAS and OpenMP use one thread in each call: frames in flight fill the cores."""
     import cv2
     from threadpoolctl import threadpool_limits

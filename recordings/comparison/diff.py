@@ -125,6 +125,7 @@ def diff(one: Path, other: Path, on_change: Callable[[MessageDifference], None] 
             raise LogError(f"{path} is not a result log; give two logs that roverflow run wrote")
     found = Diff(facts=_facts(about[one], about[other]))
     with McapFile(one) as first, McapFile(other) as second:
+        found.begin = first.start
         rank = _rank_of(
             about[one]["pipeline"], {channel.topic for log in (first, second) for channel in log.channels.values()}
         )

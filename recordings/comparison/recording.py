@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -24,7 +26,7 @@ class DiffRecording:
     Examples
     --------
     >>> recording = DiffRecording()
-    >>> diff(Path("a.mcap"), Path("b.mcap"), recording.add)  # doctest: +SKIP
+    >>> diff(Path("a.mcap"), Path("b.mcap"), recording.of())  # doctest: +SKIP
     >>> recording.write(Path("diff.rrd"), "a and b")  # doctest: +SKIP
     """
 
@@ -33,8 +35,11 @@ class DiffRecording:
         self.stamps: list[int] = []
         self.left_out = 0
 
-    def add(self, change: MessageDifference) -> None:
-        """Draw a change, unless enough stamps are drawn."""
+    def of(self, variant: str = "") -> Callable[[MessageDifference], None]:
+        """A function that draws differences, unless enough stamps are drawn; variant: the name of B."""
+        return partial(self._add, f"/{variant}" if variant else "")
+
+    def _add(self, prefix: str, change: MessageDifference) -> None:
         if change.one is None or change.other is None:
             return
         if change.stamp not in self.stamps:
@@ -44,7 +49,7 @@ class DiffRecording:
             self.stamps.append(change.stamp)
         found = pages(full_name(change.one.__msgtype__), change.one, change.other)
         if found is not None:
-            self.pictures.append((change.topic, change.stamp, tuple(map(_png, found))))
+            self.pictures.append((prefix + change.topic, change.stamp, tuple(map(_png, found))))
 
     def write(self, path: Path, name: str, tables: str = "") -> None:
         """Write the recording. tables: Markdown that is shown beside the pictures. Raises UnwritableError."""

@@ -9,17 +9,18 @@ _MAX_MEASURES = 6  # of a topic, in a line
 
 
 def format_diff(found: Diff) -> str:
-    """The difference for a terminal."""
-    messages = sum(topic.messages for topic in found.topics.values())
-    lines = [f"{name}: {_shown(*values)}" for name, values in found.facts.items()]
+    """The difference for a terminal, with the facts of the runs that differ."""
+    return "\n".join([*(f"{name}: {_shown(*values)}" for name, values in found.facts.items()), comparison(found)])
+
+
+def comparison(found: Diff) -> str:
+    """The topics that differ, for a terminal."""
     if found.first is None:
-        return "\n".join(
-            [f"equal: all {counted(messages, 'message')} of {counted(len(found.topics), 'topic')}", *lines]
-        )
+        messages = sum(topic.messages for topic in found.topics.values())
+        return f"equal: all {counted(messages, 'message')} of {counted(len(found.topics), 'topic')}"
     topic, stamp = found.first
-    lines.append(
-        f"the results part at {topic}, {(stamp - found.begin) / 1e9:.3f} s after the first result ({stamp} ns)"
-    )
+    seconds = (stamp - found.begin) / 1e9
+    lines = [f"the results part at {topic}, {seconds:.3f} s after the first result ({stamp} ns)"]
     lines += [f"  {name}: {_line(item)}" for name, item in found.topics.items() if item.first is not None]
     same = [name for name, item in found.topics.items() if item.first is None]
     return "\n".join([*lines, *([f"equal: {', '.join(same)}"] if same else [])])
@@ -38,7 +39,7 @@ def markdown(found: Diff) -> str:
 
 
 def _line(item: TopicDiff) -> str:
-    parts = [f"{item.differing} of {counted(item.messages, 'message')} differ"]
+    parts = [f"{item.differing} of {item.messages} messages differ"]
     parts += [f"{number} only in {name}" for name, number in (("A", item.only_one), ("B", item.only_other)) if number]
     worst = list(item.worst.items())
     shown = [f"{value:.0f} {name}" if value >= 100 else f"{value:.3g} {name}" for name, value in worst[:_MAX_MEASURES]]

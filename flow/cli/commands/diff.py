@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> int:
     from recordings.comparison.text import format_diff, markdown
 
     recording = DiffRecording()
-    found = diff(options.one, options.other, recording.add if options.out else lambda change: None)
+    found = diff(options.one, options.other, recording.of() if options.out else lambda change: None)
     say(json.dumps(asdict(found) | {"equal": found.equal}, indent=2) if options.json else format_diff(found))
     if options.out:
         recording.write(options.out, f"{options.one.name} and {options.other.name}", markdown(found))

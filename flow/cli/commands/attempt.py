@@ -1,0 +1,88 @@
+"""`roverflow try`: an instant of a log with and without a change of the pipeline."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from flow.cli.arguments import count, count_or_none, seconds, workers
+from flow.cli.outputs import add_log, check_outputs
+from flow.cli.report import say
+from flow.errors import COMPLETE
+from recordings.containers.finding import find_files
+
+HELP = "run one instant of a log with and without a change of the pipeline, and compare"
+
+
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    add_log(sub)
+    sub.add_argument("--at", type=seconds, required=True, metavar="T", help="instant, seconds after the first message")
+    sub.add_argument("--frames", type=count, default=1, metavar="N", help="frames from that instant on (1)")
+    before = "frames before it, for the stages with memory: regional map, pose, tilt check (0)"
+    sub.add_argument("--before", type=count_or_none, default=0, metavar="N", help=before)
+    sub.add_argument("-p", "--pipeline", default="rover", help="rover, fast, accurate, paper, or a YAML file (rover)")
+    several = "the change; several values of one parameter are compared one by one"
+    sub.add_argument("--set", action="append", default=[], required=True, metavar="STREAM.PARAM=VALUE", help=several)
+    sub.add_argument("-o", "--out", type=Path, metavar="OUT.rrd", help="recording of the comparison (LOG-try.rrd)")
+    sub.add_argument("--workers", type=workers, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the variants, print how they differ, and write the recording."""
+    find_files(options.log)
+    out = options.out or options.log[0].with_name(f"{options.log[0].stem}-try.rrd")
+    check_outputs({"difference": out}, options.log)
+    from flow.cli.what_if import changes_of, part_of, run_variants, summary_lines
+    from flow.config.loader import load
+    from recordings.comparison.diff import diff
+    from recordings.comparison.recording import DiffRecording
+    from recordings.comparison.text import comparison, markdown
+
+    changes = changes_of(options.set)
+    with load(options.pipeline).source.open(options.log) as log:
+        part = part_of(log, options.at, options.frames, options.before)
+    with TemporaryDirectory(prefix="roverflow-try-") as folder:
+        paths, variants = run_variants(options.log, options.pipeline, changes, part, Path(folder), options.workers)
+        say("\n".join(summary_lines(variants, part, options.frames)))
+        recording, tables = DiffRecording(), list[str]()
+        for label, path in paths.items():
+            if label != "A":
+                found = diff(paths["A"], path, recording.of(label))
+                say(f"\n{label}: {', '.join(changes[label])}\n{comparison(found)}")
+                tables += [f"## {label}: {', '.join(changes[label])}", markdown(found)]
+        errors = _errors(paths, options.log[0])
+        if errors:
+            say("\n" + "\n".join("  ".join(f"{cell:>12}" for cell in row) for row in errors))
+            tables += ["## Errors", *_markdown_rows(errors)]
+        recording.write(out, f"{options.log[0].name} at {options.at:g} s", "\n\n".join(tables))
+    say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
+    return COMPLETE
+
+
+def _errors(paths: dict[str, Path], truth: Path) -> list[list[str]]:
+    """A table of the errors against the truth of the log: a row for each variant; empty without truth."""
+    from recordings.errors import LogError
+    from recordings.scoring.score import score
+
+    rows = [["", "known", "bad-0.5", "bad-1", "RMS px", "height cm", "missed", "false alarm"]]
+    for label, path in paths.items():
+        try:
+            found = score(path, truth)
+        except LogError:  # the log has no truth
+            return []
+        seen = {} if found.disparity is None else found.disparity["whole_image"]["nonocc"]
+        ground = {} if found.terrain is None else found.terrain
+        figures = [seen.get(name, math.nan) for name in ("density", "bad_0.5", "bad_1", "rmse")]
+        height = ground["heights"]["0-8 m"]["raw"]["rmse"] if ground else math.nan
+        hazards = [ground["hazards"][name] if ground else math.nan for name in ("false_safe", "false_alarm")]
+        shares = [f"{100 * value:.2f} %" for value in (*figures[:3], *hazards)]
+        rows.append([label, *shares[:3], f"{figures[3]:.3f}", f"{100 * height:.2f}", *shares[3:]])
+    return rows
+
+
+def _markdown_rows(rows: list[list[str]]) -> list[str]:
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return ["\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])]

@@ -1,0 +1,73 @@
+"""`roverflow try`: an instant of a log with and without a change."""
+
+import re
+from functools import wraps
+
+import pytest
+
+import stages
+from tests.conftest import FRAMES, SMALL, roverflow
+
+AT = ("--at", "0.5", "-p", "fast")
+
+
+def test_stages_before_the_change_run_once(traverse, tmp_path, capsys, monkeypatch):
+    runs = dict.fromkeys(("Match", "Voxelise", "Binarise"), 0)
+
+    def counting(name):
+        stage = getattr(stages, name)
+        call = stage.__call__
+
+        @wraps(call)
+        def counted(self, *arguments, **inputs):
+            runs[name] += 1
+            return call(self, *arguments, **inputs)
+
+        monkeypatch.setattr(stage, "__call__", counted)
+
+    for name in runs:
+        counting(name)
+    out = tmp_path / "try.rrd"
+    arguments = ("--set", "navigation_map.rover.max_step=5 cm", "-o", out)
+    assert roverflow("try", traverse, *AT, "--frames", 2, *arguments) == 0
+    output = capsys.readouterr().out
+    assert "the change touches navigation_map\n" in output
+    assert "the results part at /nav/navigation_map, 0.000 s after the first result" in output
+    assert re.search(r"/nav/navigation_map: 2 of 2 messages differ; at most .* cells from free to hazard", output)
+    assert "equal: /nav/disparity, " in output
+    # A frame has two matches, cells for its own and the regional map, and maps of its own, of the change, and regional.
+    assert runs == {"Match": 4, "Voxelise": 4, "Binarise": 6}
+    assert out.stat().st_size > 10_000
+
+
+def test_several_values_of_a_parameter_make_a_table_of_errors(traverse, tmp_path, capsys):
+    values = [word for number in (16, 64) for word in ("--set", f"disparities={number}")]
+    assert roverflow("try", traverse, *AT, *values, "-o", tmp_path / "try.rrd") == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if re.match(r" +[A-C] +\d", line)]
+    errors = {row[0]: float(row[row.index("%") + 3]) for row in rows}  # bad-1
+    assert errors.keys() == {"A", "B", "C"}
+    assert errors["B"] > 1.5 * errors["C"]
+
+
+def test_frames_before_the_instant_give_the_stages_with_memory_their_state(traverse, tmp_path, capsys):
+    change = ("-p", "fast", "--set", "regional_cells.max_range=4 m", "-o", tmp_path / "try.rrd")
+    assert roverflow("try", traverse, "--at", "1.05", "--before", FRAMES, *change) == 0
+    output = capsys.readouterr().out
+    assert "1 frame from 1.034 s on, after 1 frame before it" in output
+    assert "/nav/regional_map: 2 of 2 messages differ" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--at", "99", *SMALL), "--at 99 is outside the images of the log"),
+        (("--at", "0", *SMALL, "--set", "source.left=/nix"), "a change of the source needs a run of its own"),
+        (
+            ("--at", "0", *SMALL, *SMALL, *SMALL[:1], "a=1", *SMALL[:1], "a=2"),
+            "only one setting may have several values",
+        ),
+    ],
+)
+def test_what_cannot_be_tried_is_refused(traverse, tmp_path, capsys, arguments, sentence):
+    assert roverflow("try", traverse, *arguments, "-o", tmp_path / "try.rrd") == 2
+    assert sentence in capsys.readouterr().err
