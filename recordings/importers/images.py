@@ -1,41 +1,44 @@
 """Makes a log from stereo image files and a known camera attitude, for `roverflow import`.
 
 The log contains what a rover's own log would: calibration, the mount of the camera, and an inclinometer. The rover
-stands level and the camera is mounted on it pitched and rolled. So the attitude is in /tf_static, and the inclinometer,
-fixed to the rover, reads level.
+stands level and the camera is mounted on it pitched and rolled. So the attitude is in /tf_static, or on /tf if each
+pair has its own, and the inclinometer, fixed to the rover, reads level.
 """
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from flow.parameters import check_parameters, is_required, parameter
-from recordings.discovery.images import SIDES
 from recordings.errors import LogError
+from recordings.importers.attitudes import read_attitudes
 from recordings.importers.files import read_bytes, read_pixels
-from recordings.mcap.writer import Ros2Writer
+from recordings.importers.recording import (
+    BASE,
+    IMU,
+    LEFT,
+    ImagePair,
+    ImportedRecording,
+    Logged,
+    beside,
+    rectified_models,
+    write_recording,
+)
+from recordings.importers.rig import Rig
 from recordings.ros2.cdr import LAST_STAMP
-from recordings.ros2.to_msg import camera_info, image, imu, transform_message
-from recordings.source.calibration import pinhole
-from recordings.source.transforms import BODY_FROM_OPTICAL
+from recordings.ros2.to_msg import imu, transform_message
 from stages.data import StereoCamera, StereoFrame, Transform
 
-SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
 FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
-CAMERA_FRAMES = {"left": "left_camera_optical", "right": "right_camera_optical"}
-# Ground truth beside the images of data sets, such as Middlebury's mask0nocc.png.
-_NOT_CAMERAS = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
-_MAX_LISTED = 5  # files in a sentence
+TILT_OFFSET_NS = 10_000_000  # before and after each pair there is a tilt, so that one is on both sides of it
 _POSITIVE: dict[str, Any] = {"low": 1e-6, "high": 1e9}
 _ANY: dict[str, Any] = {"low": -1e9, "high": 1e9}
 
@@ -67,6 +70,8 @@ def import_images(
     roll: float = 0.0,
     height: float,
     rate: float = 1.0,
+    attitudes: Path | None = None,
+    progress: Callable[[int], None] = lambda done: None,
 ) -> int:
     """Write rectified image pairs as a log.
 
@@ -86,6 +91,11 @@ def import_images(
         Height of the left camera above the ground, m.
     rate : float
         Pairs per second in the log.
+    attitudes : Path, optional
+        CSV file with an attitude of the camera for each pair, in place of pitch_down and roll: columns name (of the
+        left image) or stamp (ns), pitch_down and maybe roll and yaw (to the left), deg.
+    progress : callable
+        Called with the pairs written so far.
 
     Returns
     -------
@@ -110,90 +120,32 @@ def import_images(
             f"a pitch of {pitch_down} and a roll of {roll} degrees are impossible; give at most 90 and 180 degrees"
         )
     period = round(1e9 / rate)
+    rig = Rig(height=height, pitch_down=math.radians(pitch_down), roll=math.radians(roll))
+    camera = [read_frame(0, pair, values).camera for pair in zip(left, right, strict=True)][-1]
     numbered = enumerate(zip(left, right, strict=True))
-    frames = (read_frame(FIRST_STAMP + number * period, pair, values) for number, pair in numbered)
-    tilt_offset = min(10_000_000, period // 4)
-    write_frames(frames, out, pitch_down=pitch_down, roll=roll, height=height, tilt_offset=tilt_offset)
+    paired = [ImagePair(FIRST_STAMP + number * period, *pair) for number, pair in numbered]
+    moving = None
+    if attitudes is not None:
+        paired, moving = read_attitudes(attitudes, paired, rig)
+    write_recording(standing(paired, camera, rig, moving), out, progress)
     return len(left)
 
 
-def write_frames(
-    frames: Iterable[StereoFrame],
-    out: Path,
-    *,
-    pitch_down: float,
-    roll: float = 0.0,
-    height: float,
-    tilt_offset: int = 10_000_000,
-    write_more: Callable[[Ros2Writer, StereoFrame], None] | None = None,
-) -> None:
-    """Write rectified frames of one camera as a log, with the attitude of `import_images`.
+def standing(
+    pairs: Sequence[ImagePair], camera: StereoCamera, rig: Rig, moving: Sequence[Transform] | None = None
+) -> ImportedRecording:
+    """The recording of a rectified camera on a rover that stands level.
 
-    tilt_offset: ns before and after each frame with a tilt, so that one is on both sides of it; write_more: writes
-    further messages of a frame.
+    moving: the mount of the camera at each pair, else it is that of the rig.
     """
-    with Ros2Writer(out) as writer:
-        for number, frame in enumerate(frames):
-            if number == 0:
-                mounts = _mounts(frame.camera.baseline, pitch_down, roll, height)
-                first = frame.stamp - tilt_offset
-                writer.write("/tf_static", transform_message([(mount, first) for mount in mounts]), first)
-            _write_tilt(writer, frame.stamp - tilt_offset)
-            _write_images(writer, frame)
-            if write_more is not None:
-                write_more(writer, frame)
-            _write_tilt(writer, frame.stamp)
-            _write_tilt(writer, frame.stamp + tilt_offset)
-
-
-def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The left and the right images of a folder, in order.
-
-    Names such as a-left.png and a-right.png, left/1.png and right/1.png, im0.png and im1.png are pairs. Raises LogError
-    if there are no pairs, or an image has no partner.
-    """
-    if not folder.is_dir():
-        raise LogError(f"{folder} is not a folder; give the folder with the left and right images")
-    candidates = (f for pattern in ("*", "[!.]*/*") for f in folder.glob(pattern))
-    files = sorted((f for f in candidates if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
-    named = {file.relative_to(folder).as_posix(): file for file in files}
-    names = {name: file for name, file in named.items() if not _NOT_CAMERAS.search(name)}
-    for word, other in SIDES:
-        partners = {name: word.sub(other, name) for name in names if word.search(name)}
-        pairs = [(one, two) for one, two in partners.items() if two in names and not _is_counter(one, word, names)]
-        if not pairs:
-            continue
-        paired = {name for pair in pairs for name in pair}
-        if alone := [name for name in names if name not in paired]:
-            more = f" and {len(alone) - _MAX_LISTED} more have" if len(alone) > _MAX_LISTED else " has"
-            listed = ", ".join(alone[:_MAX_LISTED])
-            raise LogError(f"{folder}: {listed}{more} no partner; add it, or remove the image")
-        folders = dict.fromkeys(parent for one, _ in pairs if word.search(parent := Path(one).parent.as_posix()))
-        if len(folders) > 1:
-            raise LogError(
-                f"{folder} contains pairs of several cameras ({', '.join(folders)}); give the folder of one camera"
-            )
-        return [names[one] for one, _ in pairs], [names[two] for _, two in pairs]
-    found = counted(len(files), "image")
-    raise LogError(
-        f"{folder} contains no image pairs, only {found}; the two names of a pair must differ in left/right, l/r or 0/1"
-    )
-
-
-def _is_counter(name: str, side: re.Pattern[str], names: Mapping[str, Path]) -> bool:
-    """Whether the digit of the side in `name` counts images, because other names have 2, 3, ... there."""
-    place = side.search(name)
-    if place is None or not place.group().isdecimal():
-        return False
-    pattern = re.compile(re.escape(name[: place.start()]) + r"(\d+)" + re.escape(name[place.end() :]))
-    counts = [int(found.group(1)) for found in map(pattern.fullmatch, names) if found is not None]
-    return max(counts) > int(place.group()) + 1
-
-
-def _natural(file: Path, folder: Path) -> list[tuple[int, int, str]]:
-    """A sort key with the numbers in a name by value."""
-    parts = re.split(r"(\d+)", file.relative_to(folder).as_posix())
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
+    stamps = [pair.stamp for pair in pairs]
+    offset = min([TILT_OFFSET_NS, *(np.diff(stamps) // 4).tolist()])
+    level, sensors = Transform(BASE, IMU, np.eye(3), np.zeros(3)), [_level_tilts(stamps, offset)]
+    if moving is None:
+        mounts = [*filter(None, [rig.mount]), beside(camera), level]
+        return ImportedRecording(rectified_models(camera), True, pairs, mounts, sensors)
+    turns = ((stamp, "/tf", transform_message([(mount, stamp)])) for stamp, mount in zip(stamps, moving, strict=True))
+    return ImportedRecording(rectified_models(camera), True, pairs, [beside(camera), level], [*sensors, turns])
 
 
 def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
@@ -242,26 +194,12 @@ def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) ->
     if (values.setdefault("width", width), values.setdefault("height", height)) != (width, height):
         expected = f"{values['width']:g}x{values['height']:g}"
         raise LogError(f"{pair[0]} is {width}x{height}, but the calibration or the first pair is {expected}")
-    camera = StereoCamera(**{**values, "width": width, "height": height}, frame_id=CAMERA_FRAMES["left"])
+    camera = StereoCamera(**{**values, "width": width, "height": height}, frame_id=LEFT)
     return StereoFrame(stamp, images[0], images[1], camera)
 
 
-def _mounts(baseline: float, pitch_down: float, roll: float, height: float) -> tuple[Transform, ...]:
-    """The left camera on the rover, the right one beside it, and the inclinometer."""
-    rotation = Rotation.from_euler("YX", [pitch_down, roll], degrees=True).as_matrix() @ BODY_FROM_OPTICAL
-    return (
-        Transform("base_link", CAMERA_FRAMES["left"], rotation, np.array([0.0, 0.0, height])),
-        Transform(CAMERA_FRAMES["left"], CAMERA_FRAMES["right"], np.eye(3), np.array([baseline, 0.0, 0.0])),
-        Transform("base_link", "imu_link", np.eye(3), np.zeros(3)),
-    )
-
-
-def _write_tilt(writer: Ros2Writer, stamp: int) -> None:
-    writer.write("/imu/data", imu(stamp, "imu_link", np.array([0.0, 0.0, 0.0, 1.0])), stamp)
-
-
-def _write_images(writer: Ros2Writer, frame: StereoFrame) -> None:
-    for side, pixels in (("left", frame.left), ("right", frame.right)):
-        info = camera_info(frame.stamp, CAMERA_FRAMES[side], pinhole(frame.camera, side))
-        writer.write(f"/stereo/{side}/camera_info", info, frame.stamp)
-        writer.write(f"/stereo/{side}/image_rect", image(frame.stamp, CAMERA_FRAMES[side], pixels), frame.stamp)
+def _level_tilts(stamps: Iterable[int], offset: int) -> Iterator[Logged]:
+    """The tilt of a rover that stands level at each stamp, and `offset` ns before and after it."""
+    for stamp in stamps:
+        for at in (stamp - offset, stamp, stamp + offset):
+            yield at, "/imu/data", imu(at, IMU, np.array([0.0, 0.0, 0.0, 1.0]))

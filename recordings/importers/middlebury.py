@@ -9,6 +9,7 @@ As in stereo_image_proc, doffs is added to the pixels of the disparity message, 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,8 +18,9 @@ import numpy as np
 
 from recordings.errors import LogError
 from recordings.importers.files import read_bytes
-from recordings.importers.images import CAMERA_FRAMES, FIRST_STAMP, read_frame, write_frames
-from recordings.mcap.writer import Ros2Writer
+from recordings.importers.images import FIRST_STAMP, read_frame, standing
+from recordings.importers.recording import LEFT, ImagePair, Logged, write_recording
+from recordings.importers.rig import Rig
 from recordings.ros2.to_msg import disparity_image, image
 from recordings.scoring.stereo_metrics import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns
 from stages.data import Array, Disparity, PixelOrigin, StereoFrame
@@ -60,9 +62,10 @@ def import_scene(folder: Path, out: Path) -> str:
     Assumes a level camera `HEIGHT` above the ground. Raises LogError if a file cannot be used.
     """
     scene = read_scene(folder)
-    write_frames(
-        [scene.frame], out, pitch_down=0.0, height=HEIGHT, write_more=lambda writer, _: _write_truth(writer, scene)
-    )
+    pair = ImagePair(scene.frame.stamp, folder / IMAGES[0], folder / IMAGES[1])
+    recording = standing([pair], scene.frame.camera, Rig(height=HEIGHT))
+    metadata = ("middlebury", {"scene": scene.name, **scene.calibration})
+    write_recording(replace(recording, more=lambda number: _truth(scene), metadata=metadata), out)
     if scene.truth is None:
         content = f"without truth (no {' or '.join(TRUTHS)})"
     elif scene.occlusion is None:
@@ -183,14 +186,13 @@ def _same_size(truth: Array, frame: StereoFrame, path: Path) -> Array:
     return truth
 
 
-def _write_truth(writer: Ros2Writer, scene: MiddleburyScene) -> None:
+def _truth(scene: MiddleburyScene) -> Iterator[Logged]:
     stamp, truth = scene.frame.stamp, scene.truth
-    writer.metadata("middlebury", {"scene": scene.name, **scene.calibration})
     if truth is not None:
         known = np.isfinite(truth)
         source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
         disparity = Disparity(stamp, truth, source, known.astype(np.float32), camera=scene.frame.camera)
         message = replace(disparity_image(disparity), min_disparity=0.0, max_disparity=float(scene.ndisp))
-        writer.write("/truth/disparity", message, stamp)
+        yield stamp, "/truth/disparity", message
     if scene.occlusion is not None:
-        writer.write("/truth/occlusion", image(stamp, CAMERA_FRAMES["left"], scene.occlusion), stamp)
+        yield stamp, "/truth/occlusion", image(stamp, LEFT, scene.occlusion)

@@ -6,7 +6,7 @@ their order. The log gets its name when it is complete; an import that was inter
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from heapq import merge
 from itertools import chain
@@ -51,7 +51,7 @@ class ImportedRecording:
     cameras: left and right; rectified: whether the images are; pairs: in the order of stamps; mounts: static
     transforms; sensors: streams of (stamp, topic, message), each in the order of stamps; truth: the exact poses, of
     which those at the frames are written; true_tilt: whether they are better than the sensors' tilt; more: further
-    messages of a frame; notes: what a user should know.
+    messages of a frame; metadata: name and content of a record; notes: what a user should know.
     """
 
     cameras: tuple[CameraModel, CameraModel]
@@ -62,6 +62,7 @@ class ImportedRecording:
     truth: Track | None = None
     true_tilt: bool = False
     more: Callable[[int], Iterable[Logged]] = lambda number: ()
+    metadata: tuple[str, Mapping[str, str]] | None = None
     notes: list[str] = field(default_factory=list)
 
 
@@ -92,6 +93,8 @@ def write_recording(
         writer.write("/tf_static", ros2.transform_message((mount, start[0]) for mount in recording.mounts), start[0])
         for stamp, topic, message in chain([start], events):
             writer.write(topic, message, stamp)
+        if recording.metadata is not None:
+            writer.metadata(*recording.metadata)
         if len(unreadable) == len(recording.pairs):
             raise LogError(f"none of {counted(len(unreadable), 'pair')} can be read, first: {unreadable[0]}")
     left_out = f"{counted(len(unreadable), 'pair')} left out, first: {unreadable[0]}" if unreadable else ""

@@ -27,7 +27,7 @@ _COLUMN: dict[str, Any] = {"low": 2, "high": 1000}
 class Rig:
     """The entries of a rig file. A camera without turns looks straight ahead; base_link is on the ground below it."""
 
-    height: float | None = parameter(None, "height of the left camera above base_link", unit="m", low=0.0, high=100.0)
+    height: float | None = parameter(None, "height of the left camera above base_link", unit="m", low=0.0, high=1e9)
     pitch_down: float | None = parameter(None, "angle of the camera below base_link's x axis", **_TURN)
     roll: float = parameter(0.0, "rotation of the camera about its line of sight, right side down positive", **_TURN)
     yaw: float = parameter(0.0, "heading of the camera to the left of base_link's x axis", **_TURN)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from flow.cli.outputs import check_outputs
@@ -19,7 +20,10 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     camera = "rectified pair: fx, cx, cy (px), baseline (m); optionally fy, cx_right, width, height"
     sub.add_argument("--calibration", type=Path, required=True, metavar="CAM.yaml", help=camera)
     pitch = "angle of the camera below the horizon"
-    sub.add_argument("--pitch-down", type=float, required=True, metavar="DEG", help=pitch)
+    attitude = sub.add_mutually_exclusive_group(required=True)
+    attitude.add_argument("--pitch-down", type=float, metavar="DEG", help=pitch)
+    each = "attitude of each pair: CSV file with columns name (of the left image) or stamp (ns), pitch_down, roll, yaw"
+    attitude.add_argument("--attitudes", type=Path, metavar="FILE", help=each)
     sub.add_argument("--roll", type=float, default=0.0, metavar="DEG", help="camera roll, right side down positive")
     sub.add_argument("--height", type=float, required=True, metavar="M", help="camera height above the ground")
     sub.add_argument("--rate", type=float, default=1.0, metavar="HZ", help="frames per second of the log (1)")
@@ -27,11 +31,21 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the log."""
-    from recordings.importers.images import import_images, pair_images
+    from tqdm import tqdm
+
+    from recordings.importers.images import import_images
+    from recordings.importers.pairing import pair_images
 
     left, right = pair_images(options.source)
-    check_outputs({"input log": options.out}, [options.calibration, *left, *right])
-    attitude = {name: getattr(options, name) for name in ("pitch_down", "roll", "height", "rate")}
-    frames = import_images(left, right, options.calibration, options.out, **attitude)
+    files = [options.calibration, *filter(None, [options.attitudes])]
+    check_outputs({"input log": options.out}, [*files, *left, *right])
+    given = {name: getattr(options, name) for name in ("roll", "height", "rate", "attitudes")}
+    given["pitch_down"] = options.pitch_down or 0.0
+    with tqdm(total=len(left), unit="pair", disable=not sys.stderr.isatty()) as bar:
+
+        def progress(done: int) -> None:
+            bar.update(done - bar.n)
+
+        frames = import_images(left, right, options.calibration, options.out, **given, progress=progress)
     say(f"{options.out}: {counted(frames, 'stereo frame')} ({options.out.stat().st_size / 1e6:.1f} MB)")
     return COMPLETE

@@ -65,7 +65,7 @@ def seen_in(log: Path) -> list[Seen]:
         after = min((tilt for tilt in tilts if tilt.stamp >= left.stamp), key=lambda tilt: tilt.stamp)
         tilt = before if before.stamp == left.stamp else before.interpolated(after, left.stamp)
         camera = left.pair_with(right).camera
-        mount = mounts[0]
+        mount = max((mount for mount in mounts if mount.stamp <= left.stamp), key=lambda mount: mount.stamp)
         up = mount.camera_from_inclinometer @ tilt.up
         found.append(Seen(left.stamp, left.pixels, right.pixels, camera, up, mount.base_from_camera))
     return found

@@ -6,10 +6,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.importers.images import import_images, pair_images
+from recordings.importers.images import import_images
+from recordings.importers.pairing import pair_images
+from recordings.source.transforms import BODY_FROM_OPTICAL
+from tests.conftest import roverflow
+from tests.recordings.importers.simulated import EXACT, assert_same, own_log, seen_in, write_images
 from tests.recordings.sample_log import data_folder, picture
 
 CALIBRATION = {"fx": 20.0, "cx": 11.5, "cy": 7.5, "baseline": 0.25}
@@ -80,6 +86,8 @@ def test_the_camera_has_the_given_attitude(tmp_path, pitch_down, roll):
         (["left/10.png", "left/9.png", "right/10.png", "right/9.png"], ["left/9.png", "left/10.png"]),
         (["im0.png", "im1.png", "mask0nocc.png"], ["im0.png"]),
         (["img_cam0_9m.png", "img_cam1_9m.png"], ["img_cam0_9m.png"]),
+        (["L_01.png", "L_02.png", "R_01.png", "R_02.png"], ["L_01.png", "L_02.png"]),
+        (["left/L_1.png", "right/R_1.png"], ["left/L_1.png"]),
     ],
 )
 def test_pairs_are_found_by_name_in_order(tmp_path, names, left):
@@ -180,3 +188,48 @@ def test_the_devon_pairs_become_a_log(tmp_path):
     assert [image.pixels.shape for image in images] == [(960, 1280, 3)] * 2
     expected = cv2.imread(str(left[0]))[:, :, ::-1]
     np.testing.assert_array_equal(images[0].pixels, expected)
+
+
+def test_each_pair_has_the_attitude_of_a_csv_file(tmp_path):
+    names = {"left": "L", "right": "R"}
+    write_images(EXACT, lambda number, side: tmp_path / "pairs" / f"{names[side]}_{number:02d}.png")
+    rows, bodies = ["name,stamp,yaw,pitch_down,roll"], []
+    for number in (2, 0, 1):  # in any order
+        stamp = EXACT.stamp(number)
+        camera = EXACT.base_at(stamp).after(EXACT.mounts[0])
+        turn = Rotation.from_matrix(camera.rotation @ BODY_FROM_OPTICAL.T)
+        bodies.append((stamp, turn.as_matrix()))
+        angles = [repr(float(angle)) for angle in turn.as_euler("ZYX", degrees=True)]
+        rows.append(",".join([f"L_{number:02d}", str(stamp), *angles]))
+    (tmp_path / "attitudes.csv").write_text("\r\n".join(rows))
+    camera = {name: getattr(EXACT.camera, name) for name in ("fx", "cx", "cy", "baseline")}
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
+    given = "--calibration", tmp_path / "camera.yaml", "--attitudes", tmp_path / "attitudes.csv", "--height", 0.9
+    log = tmp_path / "log.mcap"
+    assert roverflow("import", "images", tmp_path / "pairs", log, *given) == 0
+    assert_same(log, own_log(EXACT, tmp_path / "own.mcap"), mount=False)
+    for frame, (stamp, body) in zip(seen_in(log), sorted(bodies, key=lambda item: item[0]), strict=True):
+        assert frame.stamp == stamp
+        np.testing.assert_allclose(frame.mount.rotation, body @ BODY_FROM_OPTICAL, atol=1e-9)
+        np.testing.assert_allclose(frame.mount.translation, [0, 0, 0.9])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name,pitch\n0-left,3\n", "has the unknown column 'pitch'; its first line must name"),
+        ("name,roll\n0-left,3\n", "has the columns name, roll; its first line must name"),
+        ("name,pitch_down\n1-left,3\n", "has no row for 0-left.png"),
+        ("name,pitch_down,roll\n0-left,3\n", "line 2 has 2 columns, but the first line names 3"),
+        ("name,pitch_down\n0-left,down\n", "line 2 contains what is no number"),
+        ("name,pitch_down\n0-left,200\n", "line 2: pitch_down must be at most 180 deg"),
+    ],
+    ids=range(6),
+)
+def test_attitudes_that_are_none_are_refused(tmp_path, text, words):
+    left, right = make_pairs(tmp_path, 1)
+    (tmp_path / "attitudes.csv").write_text(text)
+    given = {"pitch_down": 0.0, "height": 1.0, "attitudes": tmp_path / "attitudes.csv"}
+    with pytest.raises(LogError, match=words):
+        import_images(left, right, CALIBRATION, tmp_path / "out.mcap", **given)
+    assert not list(tmp_path.glob("out*"))

@@ -1,0 +1,74 @@
+"""Finds the pairs among the image files of a folder, by the words and letters for left and right in their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from flow.contracts import counted
+from recordings.discovery import images
+from recordings.errors import LogError
+
+SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
+# Ground truth beside the images of data sets, such as Middlebury's mask0nocc.png.
+_NOT_CAMERAS = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
+_MAX_LISTED = 5  # files in a sentence
+_RIGHT = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
+# As in names of topics, but also single letters in capitals, and several words at once: left/L_01.png.
+SIDES: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ...] = (
+    *images.SIDES[:-1],
+    (re.compile(r"(?<![A-Za-z])L(?![A-Za-z])"), "R"),
+    (re.compile(r"left|Left|LEFT|(?<![A-Za-z])[lL](?![A-Za-z])"), lambda found: _RIGHT[found.group()]),
+    images.SIDES[-1],
+)
+
+
+def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The left and the right images of a folder, in order.
+
+    Names such as a-left.png and a-right.png, left/1.png and right/1.png, im0.png and im1.png are pairs. Raises LogError
+    if there are no pairs, or an image has no partner.
+    """
+    if not folder.is_dir():
+        raise LogError(f"{folder} is not a folder; give the folder with the left and right images")
+    candidates = (f for pattern in ("*", "[!.]*/*") for f in folder.glob(pattern))
+    files = sorted((f for f in candidates if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
+    named = {file.relative_to(folder).as_posix(): file for file in files}
+    names = {name: file for name, file in named.items() if not _NOT_CAMERAS.search(name)}
+    for word, other in SIDES:
+        partners = {name: word.sub(other, name) for name in names if word.search(name)}
+        pairs = [(one, two) for one, two in partners.items() if two in names and not _is_counter(one, word, names)]
+        if not pairs:
+            continue
+        paired = {name for pair in pairs for name in pair}
+        if alone := [name for name in names if name not in paired]:
+            more = f" and {len(alone) - _MAX_LISTED} more have" if len(alone) > _MAX_LISTED else " has"
+            listed = ", ".join(alone[:_MAX_LISTED])
+            raise LogError(f"{folder}: {listed}{more} no partner; add it, or remove the image")
+        folders = dict.fromkeys(parent for one, _ in pairs if word.search(parent := Path(one).parent.as_posix()))
+        if len(folders) > 1:
+            raise LogError(
+                f"{folder} contains pairs of several cameras ({', '.join(folders)}); give the folder of one camera"
+            )
+        return [names[one] for one, _ in pairs], [names[two] for _, two in pairs]
+    found = counted(len(files), "image")
+    raise LogError(
+        f"{folder} contains no image pairs, only {found}; the two names of a pair must differ in left/right, l/r or 0/1"
+    )
+
+
+def _is_counter(name: str, side: re.Pattern[str], names: Mapping[str, Path]) -> bool:
+    """Whether the digit of the side in `name` counts images, because other names have 2, 3, ... there."""
+    place = side.search(name)
+    if place is None or not place.group().isdecimal():
+        return False
+    pattern = re.compile(re.escape(name[: place.start()]) + r"(\d+)" + re.escape(name[place.end() :]))
+    counts = [int(found.group(1)) for found in map(pattern.fullmatch, names) if found is not None]
+    return max(counts) > int(place.group()) + 1
+
+
+def _natural(file: Path, folder: Path) -> list[tuple[int, int, str]]:
+    """A sort key with the numbers in a name by value."""
+    parts = re.split(r"(\d+)", file.relative_to(folder).as_posix())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
