@@ -65,6 +65,17 @@ def every(text: str) -> Every:
     return Every(frames=int(value))
 
 
+def pair(text: str) -> tuple[float, float]:
+    """Two numbers, such as 3.4,-0.6."""
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        first = second = math.nan
+    if not math.isfinite(first + second):
+        raise argparse.ArgumentTypeError(f"must be two numbers with a comma, such as 3.4,-0.6, not '{text}'")
+    return first, second
+
+
 def size(text: str) -> tuple[int, int]:
     """Width and height, px, such as 640x480."""
     width, _, height = text.partition("x")

@@ -27,6 +27,7 @@ from flow.cli.commands import (
     score,
     simulate,
     stages,
+    why,
 )
 from flow.cli.importers import euroc, images, kitti, middlebury
 from flow.cli.replay import product_version
@@ -44,6 +45,7 @@ COMMANDS: dict[str, ModuleType] = {
     "score": score,
     "diff": diff,
     "try": attempt,
+    "why": why,
     "export": export,
 }
 IMPORTERS: dict[str, ModuleType] = {"euroc": euroc, "images": images, "kitti": kitti, "middlebury": middlebury}

@@ -10,6 +10,7 @@ _HEADER = b"\x89MCAP0\r\n" + struct.pack("<BQI4sI9s", 1, 21, 4, b"ros2", 9, b"ro
 _ABOUT = 12, struct.pack("<I9s", 9, b"roverflow")  # the metadata record that follows it in result logs, and its name
 _RECORDING = b"RRF", b"/summary", b"# RUNNING"  # its magic, and its first summary
 _DIFFERENCE = b"roverflow_diff"  # the application of recordings of differences
+PICTURE = b"Software\x00roverflow"  # the text chunk of its PNG files
 _BEGINNING = 1 << 18  # bytes that contain these
 _KEYS = {
     "summary": {"frames_in", "verdict"},
@@ -20,7 +21,8 @@ _KEYS = {
 def is_ours(path: Path, kind: str) -> bool:
     """Whether the file `path` is an earlier output of roverflow of that kind, or empty, so that another may replace it.
 
-    kind: "input log", as simulator and imports make them, "result log", "recording", "difference", "summary", "score".
+    kind: "input log", as simulator and imports make them, "result log", "recording", "difference", "picture", "summary"
+    or "score".
     """
     with path.open("rb") as file:
         start = file.read(_BEGINNING)
@@ -30,6 +32,8 @@ def is_ours(path: Path, kind: str) -> bool:
         return start.startswith(b"{") and _has_keys(path, _KEYS[kind])
     if kind == "recording":
         return start.startswith(_RECORDING[0]) and all(mark in start for mark in _RECORDING)
+    if kind == "picture":
+        return start.startswith(b"\x89PNG") and PICTURE in start
     if kind == "difference":
         return start.startswith(_RECORDING[0]) and _DIFFERENCE in start
     code, name = _ABOUT

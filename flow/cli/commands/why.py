@@ -1,0 +1,107 @@
+"""`roverflow why`: what made a cell of a navigation map."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flow.cli.arguments import pair, seconds
+from flow.cli.outputs import check_outputs
+from flow.cli.report import say
+from flow.errors import COMPLETE
+
+if TYPE_CHECKING:
+    from flow.cli.explanation import Explanation
+
+HELP = "explain a cell of a navigation map: its pixels, its limits, and what would turn its verdict"
+MAX_TURNS = 5  # changes of parameters that are listed
+
+
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("result", type=Path, metavar="OUT.mcap", help="result log of a run")
+    sub.add_argument("--at", type=seconds, required=True, metavar="T", help="instant, seconds after the first message")
+    place = sub.add_mutually_exclusive_group(required=True)
+    place.add_argument("--cell", type=pair, metavar="X,Y", help="place in the map's frame, m")
+    place.add_argument("--pixel", type=pair, metavar="U,V", help="column and row in the left rectified image")
+    beside = "input of the run (the one that the result names, beside it)"
+    sub.add_argument("--log", type=Path, metavar="LOG", help=beside)
+    stream = "navigation map (navigation_map)"
+    sub.add_argument("--map", default="navigation_map", metavar="STREAM", help=stream)
+    sub.add_argument("-o", "--out", type=Path, metavar="OUT.png", help="picture with the cell's pixels (OUT-why.png)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the explanation and draw the pixels."""
+    out = options.out or options.result.with_name(f"{options.result.stem}-why.png")
+    check_outputs({"picture": out}, [options.result])
+    from flow.cli.explanation import why
+    from recordings.comparison.marked_pixels import write_marked
+
+    pixel = None if options.pixel is None else (round(options.pixel[0]), round(options.pixel[1]))
+    found = why(options.result, options.at, cell=options.cell, pixel=pixel, log=options.log, stream=options.map)
+    say("\n".join(lines_of(found)))
+    if found.image.size:
+        title = f"cell ({found.x:.3f}, {found.y:.3f}) m: {found.verdict.name.lower()}, {found.reason.name.lower()}"
+        write_marked(out, found.image, found.pixels, title)
+        say(f"wrote {out}")
+    return COMPLETE
+
+
+def lines_of(found: Explanation) -> list[str]:
+    """The explanation for a terminal."""
+    verdict, reason = found.verdict.name.lower(), found.reason.name.lower()
+    lines = [f"cell ({found.x:.3f}, {found.y:.3f}) m at {found.stamp} ns: {verdict}, reason {reason}"]
+    if found.recorded is not None and found.recorded != found.verdict:
+        lines.append(f"the result has {found.recorded.name.lower()} here: from earlier frames, or by another version")
+    layers = found.layers
+    if math.isfinite(layers.get("elevation", math.nan)):
+        sigma = f" +- {math.sqrt(layers['variance']):.3f} m" if layers.get("variance", -1.0) >= 0 else ""
+        points = f", {layers['count']:.0f} points" if "count" in layers else ""
+        lines.append(f"height: {layers['elevation']:.3f} m{sigma}{points}")
+    lines.append("limits:")
+    lines += [f"  {name:<24} {_against(*values)}" for name, values in found.limits.items()]
+    lines += [
+        f"{turn.verdict.name.lower()} with {turn.parameter} = {_shown(turn.needed, turn.unit)} "
+        f"instead of {_shown(turn.now, turn.unit)}"
+        for turn in found.turns[:MAX_TURNS]
+    ] or ["no single parameter of the hazard rule turns the verdict"]
+    return [*lines, *_pixel_lines(found), *_tilt_lines(found)]
+
+
+def _pixel_lines(found: Explanation) -> list[str]:
+    """The pixels and their disparities."""
+    if not found.pixels.size:
+        return ["pixels: none of this frame's points lies in the cell"]
+    width = found.image.shape[1] if found.image.size else 1
+    rows, cols = divmod(found.pixels, width)
+    sources = ", ".join(f"{number} {name.lower()}" for name, number in found.sources.items())
+    sigma = f", sigma {float(sorted(found.sigmas)[len(found.sigmas) // 2]):.2f} px" if found.sigmas.size else ""
+    extent = f"columns {cols.min()} to {cols.max()}, rows {rows.min()} to {rows.max()}"
+    low, high = found.disparities.min(), found.disparities.max()
+    return [
+        f"pixels: {found.pixels.size} in {extent}; {sources}",
+        f"disparity: {low:.2f} to {high:.2f} px{sigma}; {found.distance:.2f} m away",
+    ]
+
+
+def _tilt_lines(found: Explanation) -> list[str]:
+    if found.tilt is None:
+        return []
+    sigma = "" if found.tilt.sigma is None else f", sigma {math.degrees(found.tilt.sigma):.2f} deg"
+    lean = math.degrees(math.acos(min(1.0, max(-1.0, float(found.tilt.up[2])))))
+    return [f"tilt: up is {lean:.2f} deg off the z axis of '{found.tilt.frame_id}'{sigma}"]
+
+
+def _against(value: float, limit: float, unit: str) -> str:
+    if math.isnan(value):
+        return f"unknown (limit {_shown(limit, unit)})"
+    side = "exceeds" if value > limit else "within"
+    return f"{_shown(value, unit):>10} {side} {_shown(limit, unit)} by {_shown(abs(value - limit), unit)}"
+
+
+def _shown(value: float, unit: str) -> str:
+    if unit == "rad":
+        value, unit = math.degrees(value), "deg"
+    return f"{value:.3g} {unit}".strip()

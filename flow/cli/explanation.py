@@ -1,0 +1,290 @@
+"""Why a cell of a navigation map has its verdict: its pixels, layers, limits and the changes that would turn it.
+
+The frame is run again from the input log, so that every intermediate is there. The verdicts are compared with those of
+the result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from flow.cli.replay import one_thread_per_call
+from flow.cli.what_if import part_of
+from flow.config.loader import load
+from flow.contracts import FrameRecord
+from flow.errors import UsageError
+from flow.runtime.graph import Graph
+from flow.runtime.run import run
+from stages import Binarise
+from stages.data import (
+    Array,
+    Cell,
+    CellReason,
+    Disparity,
+    NavigationMap,
+    PixelOrigin,
+    PointCloud,
+    StereoFrame,
+    Tilt,
+)
+from stages.terrain.verdict_limits import Turn, limits_at, turns_at
+
+REACH_PX = 10.0  # from a pixel to the nearest one that has a point
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What made a cell.
+
+    Attributes
+    ----------
+    stamp : int
+        Of the frame, ns.
+    x, y : float
+        Centre of the cell, m, in the map's frame.
+    verdict : Cell
+        Free, hazard or unknown.
+    reason : CellReason
+        Why.
+    recorded : Cell or None
+        The verdict in the result; None where the result does not have the cell.
+    layers : dict
+        Layer of the elevation map -> its value in the cell; NaN is unknown.
+    limits : dict
+        Quantity -> (value, limit, unit): the rule compares value with limit.
+    turns : list of Turn
+        The smallest change of each parameter that would turn the verdict.
+    pixels : (N,) ndarray
+        The points' pixels, as indices into the flattened left image.
+    disparities, sigmas : (N,) ndarray
+        Of these pixels, px.
+    sources : dict
+        Origin of the disparity -> number of pixels.
+    distance : float
+        From the camera to the points, median, m.
+    tilt : Tilt or None
+        That levelled the frame.
+    image : (H, W) or (H, W, 3) ndarray
+        The left image.
+    """
+
+    stamp: int
+    x: float
+    y: float
+    verdict: Cell
+    reason: CellReason
+    recorded: Cell | None
+    layers: Mapping[str, float]
+    limits: Mapping[str, tuple[float, float, str]]
+    turns: list[Turn]
+    pixels: Array
+    disparities: Array
+    sigmas: Array
+    sources: Mapping[str, int]
+    distance: float
+    tilt: Tilt | None
+    image: Array
+
+
+def why(
+    result: Path,
+    at: float,
+    *,
+    cell: tuple[float, float] | None = None,
+    pixel: tuple[int, int] | None = None,
+    log: Path | None = None,
+    stream: str = "navigation_map",
+) -> Explanation:
+    """Explain a cell of one frame's navigation map.
+
+    Parameters
+    ----------
+    result : Path
+        The result log of a run.
+    at : float
+        Instant, seconds after the first message of the input log.
+    cell : (float, float), optional
+        x and y in the map's frame, m.
+    pixel : (int, int), optional
+        Column and row in the left rectified image, instead of the cell; its ground's cell is explained.
+    log : Path, optional
+        The input log; by default the one that the result names, beside it.
+    stream : str
+        The navigation map.
+
+    Returns
+    -------
+    Explanation
+        What made the cell.
+
+    Raises
+    ------
+    UsageError
+        If the input log is not there, the pipeline has no such map, or the cell or pixel is outside of it.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> why(Path("out.mcap"), 12.0, cell=(3.4, -0.6)).reason  # doctest: +SKIP
+    <CellReason.STEP: 3>
+    """
+    items, graph = instant(result, at, log)
+    node = next((node for node in graph.nodes if node.name == stream and isinstance(node.actor, Binarise)), None)
+    if node is None or not isinstance(items.get(stream), NavigationMap):
+        known = [node.name for node in graph.nodes if isinstance(node.actor, Binarise) and node.name in items]
+        raise UsageError(f"the frame has no navigation map '{stream}', only {', '.join(known) or 'none'}")
+    navigation, terrain = items[stream], items[node.inputs["elevation"]]
+    cloud = _last(items, PointCloud, navigation.frame_id)
+    if cloud is None:
+        raise UsageError(f"the frame has no points in frame '{navigation.frame_id}', so nothing leads to the pixels")
+    x, y = cell if cell is not None else _place(cloud, pixel)
+    place = _index(navigation, x, y)
+    if place is None:
+        raise UsageError(f"({x:g}, {y:g}) is outside the map, which has {_extent(navigation)}")
+    x, y = (navigation.origin[axis] + (place[1 - axis] + 0.5) * navigation.resolution for axis in (0, 1))
+    inside = _members(cloud, navigation, *place)
+    frame, origin = _last(items, StereoFrame), np.zeros(3) if cloud.sensor is None else cloud.sensor.translation
+    return Explanation(
+        stamp=navigation.stamp,
+        x=round(x, 6),
+        y=round(y, 6),
+        verdict=Cell(int(navigation.cells[place])),
+        reason=CellReason(int(navigation.reason[place])),
+        recorded=_recorded(result, stream, navigation.stamp, x, y),
+        layers={name: float(layer[place]) for name, layer in terrain.layers.items()},
+        limits=limits_at(node.actor, terrain, *place),
+        turns=turns_at(node.actor, terrain, *place),
+        distance=float(np.median(np.linalg.norm(cloud.points[inside] - origin, axis=1))) if inside.any() else math.nan,
+        tilt=_last(items, Tilt),
+        image=np.zeros((0, 0), np.uint8) if frame is None else frame.left,
+        **_pixels(_last(items, Disparity), cloud.pixel[inside]),
+    )
+
+
+def _pixels(disparity: Disparity | None, pixels: Array) -> dict[str, Any]:
+    """What the disparity image has at some pixels."""
+    nothing, counts = np.zeros(0, np.float32), Counter[int]()
+    found = {"pixels": pixels, "disparities": nothing, "sigmas": nothing}
+    if disparity is not None:
+        found["disparities"] = disparity.pixels.ravel()[pixels]
+        found["sigmas"] = nothing if disparity.sigma is None else disparity.sigma.ravel()[pixels]
+        counts = Counter(disparity.source.ravel()[pixels].tolist())
+    return found | {"sources": {PixelOrigin(code).name: number for code, number in counts.items()}}
+
+
+def instant(result: Path, at: float, log: Path | None = None) -> tuple[Mapping[str, Any], Graph]:
+    """Every stream of the frame of a result nearest to `at`, run again, and the graph.
+
+    Raises
+    ------
+    UsageError
+        If the input log is not there, or no frame goes through.
+    """
+    from recordings.scoring.result_log import about_run, pipeline_of
+    from stages.kernel_loading import loading_kernels
+
+    about = about_run(result)
+    if not about:
+        raise UsageError(f"{result} is not a result log; give the log that roverflow run wrote")
+    given = log or result.with_name(about["log"])
+    if not given.exists():
+        raise UsageError(f"the input of {result}, {about['log']}, is not beside it; give it with --log")
+    with TemporaryDirectory(prefix="roverflow-why-") as folder:
+        file = Path(folder) / f"{pipeline_of(result)}.yaml"
+        file.write_text(about["pipeline"], encoding="utf-8")
+        graph = load(str(file), about["overrides"].splitlines())
+    with graph.source.open(given) as opened:
+        part = part_of(opened, at, frames=1, before=0)
+    kept = _Keep()
+    with loading_kernels(), graph.source.open(given, start=part.start, end=part.end) as opened, one_thread_per_call():
+        run(replace(graph, sinks=(("keep", kept),)), opened, {"keep": Path("memory")})
+    if not kept.records:
+        raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.start:.3f} says why")
+    return kept.records[0].items, graph
+
+
+@dataclass
+class _Keep:
+    """A sink that keeps the frames in memory."""
+
+    records: list[FrameRecord] = field(default_factory=list)
+    suffix = ""
+
+    def wants(self, stream: str, kind: type) -> bool:
+        return True
+
+    def open(self, path: Any, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
+        """Nothing to begin."""
+
+    def write(self, record: FrameRecord) -> None:
+        self.records.append(record)
+
+    def close(self, summary: Mapping[str, Any]) -> None:
+        """Nothing to finish."""
+
+
+def _last(items: Mapping[str, Any], kind: Any, frame_id: str | None = None) -> Any:
+    """The last item of a type (in a frame); for images the last of the camera's full size."""
+    found = [item for item in items.values() if isinstance(item, kind)]
+    found = [item for item in found if frame_id is None or item.frame_id == frame_id]
+    if kind is StereoFrame:
+        width = max((item.camera.width for item in found), default=0)
+        found = [item for item in found if item.camera.width == width]
+    return found[-1] if found else None
+
+
+def _place(cloud: PointCloud, pixel: tuple[int, int] | None) -> tuple[float, float]:
+    """x and y of the point of a pixel, or of the nearest pixel that has one."""
+    if pixel is None or cloud.shape is None:
+        raise UsageError("give a cell or a pixel")
+    height, width = cloud.shape
+    if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
+        raise UsageError(f"the pixel {pixel[0]},{pixel[1]} is outside the image of {width}x{height}")
+    rows, cols = np.divmod(cloud.pixel, width)
+    nearest = int(np.argmin((rows - pixel[1]) ** 2 + (cols - pixel[0]) ** 2))
+    if math.hypot(rows[nearest] - pixel[1], cols[nearest] - pixel[0]) > 10:
+        raise UsageError(
+            f"no point of the map is within 10 px of the pixel {pixel[0]},{pixel[1]}: it is unknown or too far"
+        )
+    return float(cloud.points[nearest, 0]), float(cloud.points[nearest, 1])
+
+
+def _index(navigation: NavigationMap, x: float, y: float) -> tuple[int, int] | None:
+    """Row and column of the cell at (x, y); None outside the map."""
+    offsets = (y - navigation.origin[1], x - navigation.origin[0])
+    row, col = (math.floor(offset / navigation.resolution) for offset in offsets)
+    rows, cols = navigation.cells.shape
+    return (row, col) if 0 <= row < rows and 0 <= col < cols else None
+
+
+def _extent(navigation: NavigationMap) -> str:
+    rows, cols = navigation.cells.shape
+    (x, y), step = navigation.origin, navigation.resolution
+    return f"x {x:.2f} to {x + cols * step:.2f} m, y {y:.2f} to {y + rows * step:.2f} m in '{navigation.frame_id}'"
+
+
+def _members(cloud: PointCloud, navigation: NavigationMap, row: int, col: int) -> Array:
+    """Which points (N,) bool lie in a cell."""
+    cells = np.floor((cloud.points[:, :2] - np.array(navigation.origin)) / navigation.resolution)
+    return np.asarray((cells[:, 0] == col) & (cells[:, 1] == row))
+
+
+def _recorded(result: Path, stream: str, stamp: int, x: float, y: float) -> Cell | None:
+    """The verdict of the result at a place."""
+    from recordings.mcap.file import iter_decoded
+    from recordings.ros2.from_msg import read_occupancy_grid
+
+    for _, time, message in iter_decoded(result, [f"/nav/{stream}"]):
+        if time == stamp:
+            navigation = read_occupancy_grid(message)
+            place = _index(navigation, x, y)
+            return None if place is None else Cell(int(navigation.cells[place]))
+    return None

@@ -1,0 +1,117 @@
+"""The limits of the hazard rule at one cell, and the changes of its parameters that would turn the verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from stages.data import Cell, ElevationMap
+from stages.terrain.binarise import Binarise
+
+FACTORS = tuple(1.1**step for step in range(1, 25))  # by which a parameter is changed, up to ten times its value
+PRECISION = 0.01  # of a parameter that would turn the verdict
+NEIGHBOURHOOD = 2.0  # m around a cell that its verdict may depend on
+_LIMITS = ("max_step", "ground_clearance", "max_slope")  # of the rover
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A change of one parameter of the hazard rule that would turn a verdict. The values have the parameter's unit."""
+
+    parameter: str
+    now: float
+    needed: float
+    unit: str
+    verdict: Cell
+
+
+def limits_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> dict[str, tuple[float, float, str]]:
+    """What the rule compares in a cell: quantity -> (value, limit, unit); NaN is unknown."""
+    layers = {name: float(layer[row, col]) for name, layer in terrain.layers.items()}
+    if rule.method == "absolute" or "step" not in layers:
+        return {"elevation": (layers["elevation"], rule.rover.max_step, "m")}
+    found = {
+        "step": (layers["step"], rule.rover.max_step - rule.height_margin, "m"),
+        "height above the ground": (
+            layers["elevation"] - layers["ground"],
+            rule.rover.ground_clearance - rule.height_margin,
+            "m",
+        ),
+        "slope": (math.degrees(layers["slope"]), math.degrees(rule.rover.max_slope), "deg"),
+        "steepness": (math.degrees(layers["steepness"]), math.degrees(rule.rover.max_slope), "deg"),
+        "roughness": (layers["roughness"], rule.max_roughness, "m"),
+    }
+    if "variance" in layers:
+        found["sigma of the height"] = (math.sqrt(layers["variance"]), rule.max_sigma, "m")
+    if "drop" in layers:
+        found["drop"] = (layers["drop"], rule.min_drop, "m")
+    return found
+
+
+def turns_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> list[Turn]:
+    """The smallest change of each parameter of the rule that turns the verdict of a cell, the smallest first."""
+    part, row, col = _around(terrain, row, col)
+    verdict = int(rule(part).cells[row, col])
+    found = list[tuple[float, Turn]]()
+    for name, value, unit in _numbers(rule):
+        changes = [_turned(rule, name, value, (part, row, col), verdict, up) for up in (True, False)]
+        known = [change for change in changes if change is not None]
+        if known:
+            factor, turned = min(known, key=lambda change: abs(math.log(change[0])))
+            found.append((abs(math.log(factor)), Turn(name, value, value * factor, unit, turned)))
+    return [turn for _, turn in sorted(found, key=lambda item: item[0])]
+
+
+def _turned(
+    rule: Binarise, name: str, value: float, place: tuple[ElevationMap, int, int], verdict: int, up: bool
+) -> tuple[float, Cell] | None:
+    """The factor nearest to 1 by which a parameter turns a verdict, and the new verdict; None if none does."""
+    low = 1.0
+    for factor in FACTORS if up else (1 / factor for factor in FACTORS):
+        other = _verdict(rule, name, value * factor, *place)
+        if other is None:
+            return None
+        if other != verdict:
+            high, turned = factor, other
+            while abs(high / low - 1) > PRECISION:
+                middle = math.sqrt(low * high)
+                between = _verdict(rule, name, value * middle, *place)
+                if between is None or between == verdict:
+                    low = middle
+                else:
+                    high, turned = middle, between
+            return high, Cell(turned)
+        low = factor
+    return None
+
+
+def _around(terrain: ElevationMap, row: int, col: int) -> tuple[ElevationMap, int, int]:
+    """The part of a map that the verdict of a cell depends on, and the cell in it."""
+    reach = math.ceil(NEIGHBOURHOOD / terrain.resolution)
+    top, left = max(0, row - reach), max(0, col - reach)
+    part = {name: layer[top : row + reach + 1, left : col + reach + 1] for name, layer in terrain.layers.items()}
+    origin = (terrain.origin[0] + left * terrain.resolution, terrain.origin[1] + top * terrain.resolution)
+    return ElevationMap(terrain.stamp, part, terrain.resolution, origin, terrain.frame_id), row - top, col - left
+
+
+def _numbers(rule: Binarise) -> Iterator[tuple[str, float, str]]:
+    """(Name, value, unit) of the rule's limits."""
+    for known in fields(rule.rover):
+        if known.name in _LIMITS:
+            yield f"rover.{known.name}", getattr(rule.rover, known.name), known.metadata.get("unit", "")
+    for known in fields(rule):
+        value = getattr(rule, known.name)
+        if isinstance(value, int | float) and not isinstance(value, bool) and value > 0:
+            yield known.name, value, known.metadata.get("unit", "")
+
+
+def _verdict(rule: Binarise, name: str, value: float, part: ElevationMap, row: int, col: int) -> int | None:
+    """The verdict with another value of a parameter; None where the rule does not allow the value."""
+    change: dict[str, Any] = {name.removeprefix("rover."): round(value) if name == "min_points" else value}
+    try:
+        changed = replace(rule, **({"rover": replace(rule.rover, **change)} if name.startswith("rover.") else change))
+    except ValueError:
+        return None
+    return int(changed(part).cells[row, col])

@@ -1,0 +1,99 @@
+"""`roverflow why`: what made a cell of a navigation map."""
+
+import cv2
+import numpy as np
+import pytest
+
+from flow.cli.explanation import why
+from flow.cli.what_if import part_of
+from recordings import McapSource
+from recordings.mcap.file import iter_decoded
+from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
+from stages.data import Cell
+from tests.conftest import SMALL, roverflow
+
+AT = 1.0
+
+
+@pytest.fixture(scope="module")
+def fast_result(traverse, tmp_path_factory):
+    out = tmp_path_factory.mktemp("fast") / "out.mcap"
+    assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
+    return out
+
+
+def messages(result, topic):
+    return {stamp: message for _, stamp, message in iter_decoded(result, [topic])}
+
+
+@pytest.fixture(scope="module")
+def stamp(traverse):
+    with McapSource().open(traverse) as log:
+        part = part_of(log, AT, 1, 0)
+    with McapSource().open(traverse, start=part.start, end=part.end) as log:
+        return next(item.stamp for _, stream, item in log.events() if stream == "left")
+
+
+def verdict_at(result, stamp, x, y):
+    grid = read_occupancy_grid(messages(result, "/nav/navigation_map")[stamp])
+    row, col = int((y - grid.origin[1]) / grid.resolution), int((x - grid.origin[0]) / grid.resolution)
+    return grid.cells[row, col]
+
+
+def places(result, stamp, state, number):
+    """Centres of some cells of a state, the nearest to the rover first."""
+    grid = read_occupancy_grid(messages(result, "/nav/navigation_map")[stamp])
+    cells = np.argwhere(grid.cells == state)
+    centres = (cells[:, ::-1] + 0.5) * grid.resolution + grid.origin
+    order = np.argsort(np.hypot(*centres.T))
+    return centres[order[:: max(1, len(order) // number)]][:number]
+
+
+@pytest.mark.parametrize("state", [Cell.FREE, Cell.HAZARD])
+def test_the_change_that_would_turn_a_verdict_turns_it(traverse, fast_result, stamp, tmp_path, state):
+    (x, y), *_ = places(fast_result, stamp, state, 3)
+    found = why(fast_result, AT, cell=(x, y), log=traverse)
+    assert (found.stamp, found.verdict, found.recorded) == (stamp, state, state)
+    turn, out = found.turns[0], tmp_path / "turned.mcap"
+    unit = "rad" if turn.unit == "rad" else turn.unit
+    change = f"navigation_map.{turn.parameter}={turn.needed:.9f} {unit}"
+    assert roverflow("run", traverse, "-p", "fast", *SMALL, "--set", change, "-o", out, "--no-rrd") == 0
+    assert verdict_at(out, stamp, x, y) == turn.verdict != state
+
+
+def test_the_pixels_of_a_cell_have_the_disparities_of_the_result(traverse, fast_result, stamp):
+    (x, y), *_ = places(fast_result, stamp, Cell.FREE, 1)
+    found = why(fast_result, AT, cell=(x, y), log=traverse)
+    recorded = read_disparity(messages(fast_result, "/nav/disparity")[stamp]).ravel()[found.pixels]
+    assert found.pixels.size > 3
+    np.testing.assert_allclose(found.disparities, recorded, atol=1 / 64)
+    row, col = divmod(int(found.pixels[0]), found.image.shape[1])
+    again = why(fast_result, AT, pixel=(col, row), log=traverse)
+    assert (again.x, again.y, again.verdict) == (found.x, found.y, found.verdict)
+    assert sum(found.sources.values()) == found.pixels.size
+
+
+def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, stamp, tmp_path, capsys):
+    (x, y), *_ = places(fast_result, stamp, Cell.HAZARD, 1)
+    out, log = tmp_path / "why.png", ("--log", traverse)
+    capsys.readouterr()
+    for _ in range(2):  # the second picture replaces the first
+        assert roverflow("why", fast_result, "--at", AT, f"--cell={x},{y}", *log, "-o", out) == 0
+    output = capsys.readouterr().out
+    assert f"cell ({x:.3f}, {y:.3f}) m at {stamp} ns: hazard, reason " in output
+    assert "\n  step " in output
+    assert "\npixels: " in output
+    picture = cv2.imread(str(out)).astype(int)
+    assert ((picture[..., 2] > 200) & (picture[..., 1] < 80) & (picture[..., 0] > 150)).sum() > 20
+
+
+def test_what_cannot_be_explained_is_refused(traverse, fast_result, capsys):
+    def refusal(*arguments):
+        assert roverflow("why", fast_result, "--at", AT, *arguments) == 2
+        return capsys.readouterr().err
+
+    assert "traverse.mcap, is not beside it; give it with --log" in refusal("--cell", "1,1")
+    assert "is outside the map, which has x " in refusal("--cell", "99,1", "--log", traverse)
+    assert "is outside the image of 320x240" in refusal("--pixel", "999,1", "--log", traverse)
+    other = refusal("--cell", "1,1", "--log", traverse, "--map", "nix")
+    assert "no navigation map 'nix', only navigation_map, regional_navigation_map" in other
