@@ -23,6 +23,7 @@ from flow.cli.commands import (
     graph,
     info,
     pipeline,
+    report,
     run,
     score,
     simulate,
@@ -46,6 +47,7 @@ COMMANDS: dict[str, ModuleType] = {
     "diff": diff,
     "try": attempt,
     "why": why,
+    "report": report,
     "export": export,
 }
 IMPORTERS: dict[str, ModuleType] = {"euroc": euroc, "images": images, "kitti": kitti, "middlebury": middlebury}

@@ -11,6 +11,7 @@ _ABOUT = 12, struct.pack("<I9s", 9, b"roverflow")  # the metadata record that fo
 _RECORDING = b"RRF", b"/summary", b"# RUNNING"  # its magic, and its first summary
 _DIFFERENCE = b"roverflow_diff"  # the application of recordings of differences
 PICTURE = b"Software\x00roverflow"  # the text chunk of its PNG files
+REPORT = "<!-- roverflow report -->"  # the second line of its HTML files
 _BEGINNING = 1 << 18  # bytes that contain these
 _KEYS = {
     "summary": {"frames_in", "verdict"},
@@ -21,8 +22,8 @@ _KEYS = {
 def is_ours(path: Path, kind: str) -> bool:
     """Whether the file `path` is an earlier output of roverflow of that kind, or empty, so that another may replace it.
 
-    kind: "input log", as simulator and imports make them, "result log", "recording", "difference", "picture", "summary"
-    or "score".
+    kind: "input log", as simulator and imports make them, "result log", "recording", "difference", "picture", "report",
+    "summary" or "score".
     """
     with path.open("rb") as file:
         start = file.read(_BEGINNING)
@@ -32,6 +33,8 @@ def is_ours(path: Path, kind: str) -> bool:
         return start.startswith(b"{") and _has_keys(path, _KEYS[kind])
     if kind == "recording":
         return start.startswith(_RECORDING[0]) and all(mark in start for mark in _RECORDING)
+    if kind == "report":
+        return REPORT.encode() in start
     if kind == "picture":
         return start.startswith(b"\x89PNG") and PICTURE in start
     if kind == "difference":

@@ -1,0 +1,1 @@
+"""One HTML page about a run: map, frames, plots, losses, findings, parameters."""

@@ -1,0 +1,84 @@
+"""Figures of a report as SVG and embedded images."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from html import escape
+
+import cv2
+import numpy as np
+
+from stages.data import Array
+
+WIDTH, HEIGHT, MARGIN = 640, 180, 44
+MAX_WIDTH = 900  # px of a picture
+COLORS = ("#1f6fb2", "#c4502e")
+
+
+def line_plot(title: str, curves: Mapping[str, Sequence[tuple[float, float]]]) -> str:
+    """Curves over time as an SVG figure; curves: name -> (seconds, value) pairs."""
+    points = [point for curve in curves.values() for point in curve]
+    if not points:
+        return ""
+    times, values = (np.array(part) for part in zip(*points, strict=True))
+    low, high = float(values.min()), float(values.max())
+    margin = 0.05 * (high - low) or max(1.0, abs(high)) * 0.05
+    return _plot(title, curves, (float(times.min()), float(times.max())), (low - margin, high + margin), "s")
+
+
+def track_plot(title: str, tracks: Mapping[str, Sequence[tuple[float, float]]]) -> str:
+    """Ways driven, seen from above, with equal scales; tracks: name -> (x, y) pairs, m."""
+    points = np.array([point for track in tracks.values() for point in track])
+    if not len(points):
+        return ""
+    middle, room = (points.min(0) + points.max(0)) / 2, np.array([WIDTH - 2 * MARGIN, HEIGHT - 2 * MARGIN])
+    half = 0.55 * max(float((np.ptp(points, axis=0) / room).max()), 1e-3) * room
+    spans = [(float(m - h), float(m + h)) for m, h in zip(middle, half, strict=True)]
+    return _plot(title, tracks, spans[0], spans[1], "m")
+
+
+def picture(page: Array, alt: str) -> str:
+    """A page, RGB, as an embedded JPEG image."""
+    if page.shape[1] > MAX_WIDTH:
+        scale = MAX_WIDTH / page.shape[1]
+        page = cv2.resize(page, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, blob = cv2.imencode(".jpg", cv2.cvtColor(page, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    data = base64.b64encode(blob.tobytes()).decode()
+    return f'<img alt="{escape(alt)}" src="data:image/jpeg;base64,{data}">'
+
+
+def _plot(
+    title: str,
+    curves: Mapping[str, Sequence[tuple[float, float]]],
+    across: tuple[float, float],
+    along: tuple[float, float],
+    unit: str,
+) -> str:
+    """Axes, curves and their names."""
+    span = (across[1] - across[0]) or 1.0
+
+    def place(point: tuple[float, float]) -> str:
+        x = MARGIN + (point[0] - across[0]) / span * (WIDTH - 2 * MARGIN)
+        y = HEIGHT - MARGIN - (point[1] - along[0]) / (along[1] - along[0]) * (HEIGHT - 2 * MARGIN)
+        return f"{x:.1f},{y:.1f}"
+
+    parts = [f'<text x="{MARGIN}" y="18" class="title">{escape(title)}</text>']
+    for share in (0.0, 0.5, 1.0):
+        value, y = along[0] + share * (along[1] - along[0]), HEIGHT - MARGIN - share * (HEIGHT - 2 * MARGIN)
+        parts.append(f'<line x1="{MARGIN}" x2="{WIDTH - MARGIN}" y1="{y}" y2="{y}" class="grid"/>')
+        parts.append(f'<text x="{MARGIN - 6}" y="{y + 4}" class="left">{value:.4g}</text>')
+        x = MARGIN + share * (WIDTH - 2 * MARGIN)
+        label = f"{across[0] + share * span:.4g} {unit}"
+        parts.append(f'<text x="{x}" y="{HEIGHT - MARGIN + 18}" class="middle">{label}</text>')
+    for number, (name, curve) in enumerate(curves.items()):
+        color = COLORS[number % len(COLORS)]
+        drawn = " ".join(map(place, curve))
+        parts.append(f'<polyline points="{drawn}" fill="none" stroke="{color}" stroke-width="1.5"/>')
+        if len(curve) < 60:
+            places = (point.split(",") for point in drawn.split())
+            parts += [f'<circle cx="{x}" cy="{y}" r="2.2" fill="{color}"/>' for x, y in places]
+        if len(curves) > 1:
+            where = f'x="{WIDTH - MARGIN}" y="{18 + 15 * number}"'
+            parts.append(f'<text {where} class="left" fill="{color}">{escape(name)}</text>')
+    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(parts)}</svg>'

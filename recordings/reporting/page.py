@@ -1,0 +1,141 @@
+"""One self-contained HTML page about a result log, or about two beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from flow.contracts import counted
+from recordings.atomic_write import written
+from recordings.comparison.diff import diff
+from recordings.comparison.text import format_diff
+from recordings.export.png_pages import disparity_page, elevation_page, navigation_page
+from recordings.reporting.figures import line_plot, picture, track_plot
+from recordings.reporting.run_facts import REGIONAL, RunFacts, read_facts
+from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
+from recordings.sinks.overwrite import REPORT
+
+MAX_LOSSES = 100  # rows of the table
+_STYLE = Path(__file__).with_name("style.css")
+
+
+def write_report(path: Path, results: Sequence[Path]) -> None:
+    """Write the page of one result log, or of two beside each other.
+
+    Raises
+    ------
+    LogError
+        If a file is no result log, or cannot be read.
+    UnwritableError
+        If the page cannot be written.
+    """
+    facts = [read_facts(result) for result in results]
+    names = " and ".join(found.path.name for found in facts)
+    parts = [
+        f"<!doctype html>\n{REPORT}\n<html lang=en><head><meta charset=utf-8>",
+        '<meta name=viewport content="width=device-width, initial-scale=1">',
+        f"<title>{escape(names)}</title><style>{_STYLE.read_text()}</style></head><body><h1>{escape(names)}</h1>",
+        _beside([_verdict(found) for found in facts]),
+        _section("What differs", _differences(results)),
+        _section("Map", _beside([_regional(found) for found in facts])),
+        _section("Plots", _plots(facts)),
+        *(_section(name.capitalize(), _beside([_frame(found, name) for found in facts])) for name in facts[0].drawn),
+        _section("Losses", _beside([_losses(found) for found in facts])),
+        _section("Parameters", _beside([_parameters(found) for found in facts])),
+        "</body></html>",
+    ]
+    with written(path) as temporary:
+        temporary.write_text("\n".join(parts), encoding="utf-8")
+
+
+def _section(title: str, content: str) -> str:
+    return f"<h2>{escape(title)}</h2>{content}" if content else ""
+
+
+def _beside(parts: Sequence[str]) -> str:
+    return f"<div class=runs>{''.join(f'<div>{part}</div>' for part in parts)}</div>" if any(parts) else ""
+
+
+def _differences(results: Sequence[Path]) -> str:
+    return f"<pre>{escape(format_diff(diff(results[0], results[1])))}</pre>" if len(results) == 2 else ""
+
+
+def _table(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> str:
+    first = f"<tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr>" if head else ""
+    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+    return f"<table>{first}{body}</table>"
+
+
+def _verdict(facts: RunFacts) -> str:
+    """Verdict, counts and findings."""
+    verdict = facts.counts.get("verdict", "the log was cut before its verdict")
+    drops = {name.removeprefix("drops."): value for name, value in facts.counts.items() if name.startswith("drops.")}
+    findings = [(name.removeprefix("findings."), value) for name, value in facts.counts.items() if "findings." in name]
+    rows = [
+        ("log", facts.about.get("log", "")),
+        ("pipeline", facts.counts.get("pipeline", "")),
+        ("frames", f"{facts.counts.get('frames_out', '?')} of {facts.counts.get('frames_in', '?')} complete"),
+        ("losses", ", ".join(f"{number} {reason}" for reason, number in drops.items()) or "none"),
+        *findings,
+        ("version", facts.about.get("roverflow", "")),
+    ]
+    return f'<p class="verdict {escape(verdict)}">{escape(verdict)}</p>{_table(rows)}'
+
+
+def _regional(facts: RunFacts) -> str:
+    """The last regional maps, or those of the typical frame where there are none."""
+    terrain, navigation = (facts.regional.get(topic) for topic in REGIONAL)
+    pictures = []
+    if terrain is not None:
+        pictures.append(picture(elevation_page(read_grid_map(terrain)), "regional elevation map"))
+    if navigation is not None:
+        pictures.append(picture(navigation_page(read_occupancy_grid(navigation)), "regional navigation map"))
+    return f"<div class=pictures>{''.join(pictures)}</div>" if pictures else ""
+
+
+def _plots(facts: Sequence[RunFacts]) -> str:
+    """Shares of pixels and cells over time, and the way driven."""
+    begin = min((found.stamps[0] for found in facts if found.stamps), default=0)
+    labels = [found.path.name for found in facts]
+    plots = []
+    for name in dict.fromkeys(name for found in facts for name in found.series):
+        series = [found.series.get(name, {}) for found in facts]
+        curves = {
+            label: [((stamp - begin) / 1e9, value) for stamp, value in sorted(values.items())]
+            for label, values in zip(labels, series, strict=True)
+        }
+        plots.append(line_plot(name, curves))
+    tracks = {found.path.name: found.track for found in facts}
+    plots.append(track_plot("way driven, x to the right, y up, m", tracks))
+    return f"<div class=pictures>{''.join(plots)}</div>"
+
+
+def _frame(facts: RunFacts, name: str) -> str:
+    """The pages of one frame."""
+    if name not in facts.drawn:
+        return ""
+    stamp, messages = facts.drawn[name]
+    draw: dict[str, Any] = {
+        "/nav/disparity": lambda message: disparity_page(read_disparity(message)),
+        "/nav/elevation_map": lambda message: elevation_page(read_grid_map(message)),
+        "/nav/navigation_map": lambda message: navigation_page(read_occupancy_grid(message)),
+    }
+    pictures = [picture(draw[topic](message), f"{topic} of the {name}") for topic, message in messages.items()]
+    seconds = (stamp - facts.stamps[0]) / 1e9
+    return f"<p>{seconds:.3f} s after the first frame ({stamp} ns)</p><div class=pictures>{''.join(pictures)}</div>"
+
+
+def _losses(facts: RunFacts) -> str:
+    if not facts.losses:
+        return "<p>Nothing was lost.</p>"
+    left_out = len(facts.losses) - MAX_LOSSES
+    more = f"<p>{counted(left_out, 'more loss', 'more losses')} in /nav/diagnostics.</p>" if left_out > 0 else ""
+    return _table(facts.losses[:MAX_LOSSES], ("stream", "stamp, ns", "reason", "detail")) + more
+
+
+def _parameters(facts: RunFacts) -> str:
+    changes = facts.about.get("overrides", "")
+    shown = f"<p>Changes:</p><pre>{escape(changes)}</pre>" if changes else "<p>The pipeline as it is.</p>"
+    return f"{shown}<details><summary>Pipeline</summary><pre>{escape(facts.about.get('pipeline', ''))}</pre></details>"

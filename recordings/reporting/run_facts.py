@@ -1,0 +1,111 @@
+"""What a report says about a result log, read in one pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+
+from recordings.errors import LogError
+from recordings.mcap.file import iter_decoded
+from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
+from recordings.scoring.result_log import about_run
+from stages.data import Cell
+
+TOPICS = (
+    "/nav/disparity", "/nav/elevation_map", "/nav/navigation_map", "/nav/pose", "/nav/diagnostics", "/nav/regional_map",
+    "/nav/regional_navigation_map",
+)  # fmt: skip
+REGIONAL = ("/nav/regional_map", "/nav/regional_navigation_map")
+
+
+@dataclass
+class RunFacts:
+    """A result log in figures.
+
+    about, counts: facts of the run, and its verdict, counts and findings; stamps: of the frames, ns; series: name with
+    unit -> stamp -> value; track: (x, y) of the rover, m; losses: (stream, stamp, reason, detail); drawn: name -> stamp
+    and messages by topic, of the frames that are drawn; regional: topic -> last message.
+    """
+
+    path: Path
+    about: dict[str, str]
+    counts: dict[str, str]
+    stamps: list[int] = field(default_factory=list)
+    series: dict[str, dict[int, float]] = field(default_factory=dict)
+    track: list[tuple[float, float]] = field(default_factory=list)
+    losses: list[tuple[str, str, str, str]] = field(default_factory=list)
+    drawn: dict[str, tuple[int, dict[str, Any]]] = field(default_factory=dict)
+    regional: dict[str, Any] = field(default_factory=dict)
+
+
+def read_facts(path: Path) -> RunFacts:
+    """Read a result log twice: once for its figures, and once for the frames that are drawn.
+
+    Raises
+    ------
+    LogError
+        If the file is no result log, or cannot be read.
+    """
+    about = about_run(path)
+    if not about:
+        raise LogError(f"{path} is not a result log; give a log that roverflow run wrote")
+    facts = RunFacts(path, about, _counts(path))
+    for topic, stamp, message in iter_decoded(path, TOPICS):
+        _add(facts, topic, stamp, message)
+    facts.stamps = sorted({stamp for values in facts.series.values() for stamp in values})
+    chosen = _chosen(facts)
+    frames = {stamp: dict[str, Any]() for stamp in chosen.values()}
+    if frames:
+        for topic, stamp, message in iter_decoded(path, TOPICS[:3]):
+            if stamp in frames:
+                frames[stamp][topic] = message
+    facts.drawn = {name: (stamp, frames[stamp]) for name, stamp in chosen.items()}
+    return facts
+
+
+def _add(facts: RunFacts, topic: str, stamp: int, message: Any) -> None:
+    """Add one message."""
+    values = dict[str, float]()
+    if topic == "/nav/disparity":
+        values["known pixels, %"] = 100 * float(np.isfinite(read_disparity(message)).mean())
+    elif topic == "/nav/navigation_map":
+        cells = read_occupancy_grid(message).cells
+        values["free cells"] = float(np.sum(cells == Cell.FREE))
+        values["hazard cells"] = float(np.sum(cells == Cell.HAZARD))
+    elif topic == "/nav/pose":
+        place = message.pose.pose.position
+        facts.track.append((place.x, place.y))
+    elif topic == "/nav/diagnostics":
+        for status in message.status:
+            found = {pair.key: pair.value for pair in status.values}
+            if "reason" in found:
+                facts.losses.append((found["stream"], found["stamp"], found["reason"], status.message))
+    elif topic in REGIONAL:
+        facts.regional[topic] = message
+    for name, value in values.items():
+        facts.series.setdefault(name, {})[stamp] = value
+
+
+def _chosen(facts: RunFacts) -> dict[str, int]:
+    """Name -> stamp of the frames that are drawn: the worst and a typical one, by the share of known pixels."""
+    shares = facts.series.get("known pixels, %") or facts.series.get("free cells") or {}
+    ordered = sorted(shares, key=lambda stamp: (shares[stamp], stamp))
+    if not ordered:
+        return {}
+    return {"typical frame": ordered[len(ordered) // 2]} | ({"worst frame": ordered[0]} if len(ordered) > 1 else {})
+
+
+def _counts(path: Path) -> dict[str, str]:
+    """The verdict, counts and findings of the run; empty if its end is missing."""
+    try:
+        with path.open("rb") as file:
+            for record in make_reader(file).iter_metadata():
+                if record.name == "roverflow.run":
+                    return dict(record.metadata)
+    except Exception:  # of a cut log, by mcap's reader
+        return {}
+    return {}

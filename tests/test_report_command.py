@@ -1,0 +1,82 @@
+"""`roverflow report`: one HTML page about a run."""
+
+import base64
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+
+from tests.conftest import SMALL, rewrite, roverflow
+
+VOID = {"meta", "img", "link", "line", "circle", "polyline"}
+
+
+class Page(HTMLParser):
+    """The images, texts and outside references of a page, whose tags must be balanced."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.images, self.words, self.outside = [], [], [], []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.outside += [url for url in (values.get("src"), values.get("href")) if url and not url.startswith("data:")]
+        if tag == "img":
+            self.images.append((values["alt"], values["src"].partition(",")[2]))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+def test_a_report_stands_alone_and_shows_maps_frames_and_losses(result, tmp_path, capsys):
+    out = tmp_path / "out.html"
+    assert roverflow("report", result, "-o", out) == 0
+    assert f"wrote {out} (" in capsys.readouterr().out
+    page = Page(out.read_text())
+    assert page.outside == []
+    assert out.stat().st_size < 5_000_000
+    names = [name for name, _ in page.images]
+    assert names[:2] == ["regional elevation map", "regional navigation map"]
+    assert [name for name in names if "/nav/disparity" in name] == [
+        "/nav/disparity of the typical frame", "/nav/disparity of the worst frame"
+    ]  # fmt: skip
+    for _, data in page.images:
+        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        assert pixels.std() > 10
+    text = " ".join(page.words)
+    assert "COMPLETE" in text
+    assert "Nothing was lost." in text
+    assert re.search(r"disparities=64", text)
+
+
+def test_two_results_stand_beside_each_other(traverse, result, tmp_path):
+    other = tmp_path / "other.mcap"
+    assert (
+        roverflow("run", traverse, *SMALL, "-o", other, "--no-rrd", "--set", "navigation_map.rover.max_step=9 cm") == 0
+    )
+    assert roverflow("report", result, other) == 0
+    page = Page(result.with_suffix(".html").read_text())
+    assert "the results part at /nav/navigation_map" in " ".join(page.words)
+    assert len([name for name, _ in page.images if name == "/nav/navigation_map of the worst frame"]) == 2
+
+
+def test_losses_are_listed_and_a_foreign_file_is_kept(traverse, tmp_path, capsys):
+    right, out = "/stereo/right/image_rect_color", tmp_path / "out.mcap"
+    cut = rewrite(traverse, tmp_path / "cut.mcap", lambda topic, at, data: None if (topic, at) == (right, 1) else data)
+    assert roverflow("run", cut, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 3
+    assert roverflow("report", out) == 0
+    assert "<td>left</td><td>1700086400513000000</td><td>unmatched</td>" in out.with_suffix(".html").read_text()
+    out.with_suffix(".html").write_text("my own page")
+    assert roverflow("report", out) == 2
+    assert "exists and is no report of roverflow" in capsys.readouterr().err
+    assert roverflow("report", traverse) == 2
+    assert "is not a result log" in capsys.readouterr().err
