@@ -30,7 +30,7 @@ from flow.cli.commands import (
     stages,
     why,
 )
-from flow.cli.importers import euroc, images, kitti, middlebury
+from flow.cli.importers import euroc, images, kitti, lusnar, middlebury, tartanair
 from flow.cli.replay import product_version
 from flow.errors import FAILED, INTERRUPTED, UNUSABLE, RoverflowError
 from recordings.errors import LogError, UnwritableError
@@ -50,7 +50,14 @@ COMMANDS: dict[str, ModuleType] = {
     "report": report,
     "export": export,
 }
-IMPORTERS: dict[str, ModuleType] = {"euroc": euroc, "images": images, "kitti": kitti, "middlebury": middlebury}
+IMPORTERS: dict[str, ModuleType] = {
+    "euroc": euroc,
+    "images": images,
+    "kitti": kitti,
+    "lusnar": lusnar,
+    "middlebury": middlebury,
+    "tartanair": tartanair,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -23,6 +23,7 @@ from recordings.importers.attitudes import read_attitudes
 from recordings.importers.files import read_bytes, read_pixels
 from recordings.importers.recording import (
     BASE,
+    FIRST_STAMP,
     IMU,
     LEFT,
     ImagePair,
@@ -37,7 +38,6 @@ from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.to_msg import imu, transform_message
 from stages.data import StereoCamera, StereoFrame, Transform
 
-FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
 TILT_OFFSET_NS = 10_000_000  # before and after each pair there is a tilt, so that one is on both sides of it
 _POSITIVE: dict[str, Any] = {"low": 1e-6, "high": 1e9}
 _ANY: dict[str, Any] = {"low": -1e9, "high": 1e9}

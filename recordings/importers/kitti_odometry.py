@@ -17,6 +17,7 @@ from recordings.errors import LogError
 from recordings.importers.files import from_seconds, image_size, numbers_of, read_lines
 from recordings.importers.recording import (
     BASE,
+    FIRST_STAMP,
     LEFT,
     ImagePair,
     ImportedRecording,
@@ -29,8 +30,6 @@ from recordings.importers.rig import Rig
 from recordings.importers.track import Track
 from recordings.ros2.to_msg import imu
 from stages.data import Array, StereoCamera, Transform
-
-FIRST_STAMP = 1_000_000_000  # ns; a stamp of zero means "not stamped" in ROS
 
 
 def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:

@@ -18,8 +18,8 @@ import numpy as np
 
 from recordings.errors import LogError
 from recordings.importers.files import read_bytes
-from recordings.importers.images import FIRST_STAMP, read_frame, standing
-from recordings.importers.recording import LEFT, ImagePair, Logged, write_recording
+from recordings.importers.images import read_frame, standing
+from recordings.importers.recording import FIRST_STAMP, LEFT, ImagePair, Logged, write_recording
 from recordings.importers.rig import Rig
 from recordings.ros2.to_msg import disparity_image, image
 from recordings.scoring.stereo_metrics import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns

@@ -31,6 +31,7 @@ from stages.data import CameraModel, Pose, StereoCamera, Transform
 
 BASE, LEFT, RIGHT, IMU = "base_link", "left_camera_optical", "right_camera_optical", "imu_link"
 SIDES = ("left", "right")
+FIRST_STAMP = 1_000_000_000  # ns, where the files have no time; a stamp of zero means "not stamped" in ROS
 
 Logged = tuple[int, str, Any]
 
@@ -158,6 +159,16 @@ def tilts_of(track: Track, stamps: Iterable[int]) -> Iterator[Logged]:
     for stamp in stamps:
         if (placed := track.at(stamp)) is not None:
             yield stamp, "/inclinometer", ros2.imu(stamp, track.body, upright(placed.rotation[2]))
+
+
+def fix(stamp: int, latitude: float, longitude: float, altitude: float) -> Logged:
+    """A place by GPS, deg and m, of unknown accuracy."""
+    status = make("sensor_msgs/msg/NavSatStatus", status=0, service=1)
+    message = make(
+        "sensor_msgs/msg/NavSatFix", header=ros2.header(stamp, BASE), status=status, latitude=latitude,
+        longitude=longitude, altitude=altitude, position_covariance=np.zeros(9), position_covariance_type=0,
+    )  # fmt: skip
+    return stamp, "/gps/fix", message
 
 
 def rectified_models(camera: StereoCamera) -> tuple[CameraModel, CameraModel]:

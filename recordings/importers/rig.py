@@ -15,7 +15,7 @@ from recordings.calibration.yaml_files import read_yaml
 from recordings.errors import LogError
 from recordings.importers.recording import BASE, LEFT
 from recordings.source.transforms import BODY_FROM_OPTICAL
-from stages.data import StereoCamera, Transform
+from stages.data import Array, StereoCamera, Transform
 
 _PLACE: dict[str, Any] = {"unit": "m", "low": -100.0, "high": 100.0}
 _LENS: dict[str, Any] = {"unit": "px", "low": 0.0, "high": 1e6}
@@ -38,7 +38,7 @@ class Rig:
     cy: float | None = parameter(None, "principal point", **_LENS)
     baseline: float | None = parameter(None, "distance of the cameras", unit="m", low=0.001, high=10.0)
     body_axes: str | None = parameter(
-        None, "axes of the data set's body: x, y and z are each forward, back, left, right, up or down, such as flu"
+        None, "axes of the data set's body, each f, b, l, r, u or d, such as flu for x forward, y left, z up"
     )
     world_up: str | None = parameter(
         None, "axis of the data set's world that points up", choices=("z", "-z", "y", "-y")
@@ -77,6 +77,18 @@ class Rig:
         turn = Rotation.from_euler("ZYX", [self.yaw, self.pitch_down or 0.0, self.roll]).as_matrix()
         return Transform(BASE, LEFT, turn @ BODY_FROM_OPTICAL, np.array([self.forward, self.left, self.height]))
 
+    @property
+    def poses(self) -> tuple[Array, Array]:
+        """The rotations (3, 3) from the data set's world to one with z up, and from x forward, y left, z up to the axes
+        of its body. Raises LogError if the axes are none."""
+        axes = [_AXES.get(letter) for letter in self.body_axes or ""]
+        turn = np.array([axis for axis in axes if axis is not None], np.float64)
+        if len(axes) != 3 or turn.shape != (3, 3) or not np.isclose(np.linalg.det(turn), 1):
+            raise LogError(
+                f"{self.where}: the body_axes '{self.body_axes}' are not three right-handed axes, such as flu"
+            )
+        return np.array(_UPRIGHT[self.world_up or "z"], np.float64), turn
+
     def camera(self, usual: StereoCamera) -> StereoCamera:
         """The rectified camera: the usual one of the data set with the entries of the file."""
         given = {name: getattr(self, name) for name in ("fx", "cx", "cy", "baseline")}
@@ -84,6 +96,11 @@ class Rig:
         return replace(usual, **values, **{to: values[of] for of, to in _SAME.items() if of in values})
 
 
+_AXES = {"f": (1, 0, 0), "b": (-1, 0, 0), "l": (0, 1, 0), "r": (0, -1, 0), "u": (0, 0, 1), "d": (0, 0, -1)}
+_UPRIGHT = {
+    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)), "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+}  # fmt: skip
 _SAME = {"fx": "fy", "cx": "cx_right"}
 
 
@@ -103,4 +120,6 @@ def read_rig(path: Path | None) -> Rig:
             raise LogError(f"{path}: '{name}': {error}") from error
     rig = Rig(**values)
     object.__setattr__(rig, "where", str(path))
+    if rig.height is not None:
+        rig.need("the data set", "pitch_down")
     return rig

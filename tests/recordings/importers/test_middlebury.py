@@ -12,8 +12,8 @@ from mcap.reader import make_reader
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.importers.images import FIRST_STAMP
 from recordings.importers.middlebury import import_scene, logs_of, read_pfm, read_scene
+from recordings.importers.recording import FIRST_STAMP
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import from_msg as ros2

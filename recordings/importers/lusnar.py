@@ -1,0 +1,74 @@
+"""Reads scenes of LuSNAR, for `roverflow import lusnar`: rectified images and the poses of the rover.
+
+Images have their stamps as names. The axes of the rover's body and of the world are not in the files, and neither is
+the mount of the camera: the rig file says them. base_link is the body of the poses, which give the tilt.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flow.contracts import counted
+from recordings.errors import LogError
+from recordings.importers.files import image_size, nanoseconds, numbers_of, read_lines
+from recordings.importers.recording import (
+    BASE,
+    LEFT,
+    ImagePair,
+    ImportedRecording,
+    beside,
+    rectified_models,
+    tilts_of,
+)
+from recordings.importers.rig import Rig
+from recordings.importers.track import Track
+from stages.data import StereoCamera
+
+WIDTH, FOCAL, BASELINE = 1024, 610.17784, 0.310  # px, px, m
+POSES = "Rover_pose.txt"
+
+
+def read_lusnar(source: Path, rig: Rig) -> ImportedRecording:
+    """The scene in a folder with image1, image2 and Rover_pose.txt. Raises LogError."""
+    folders = [source / name / "RGB" for name in ("image1", "image2")]
+    if not folders[0].is_dir():
+        raise LogError(f"{source} has no folder image1/RGB; give the folder of one scene")
+    rig.need("LuSNAR", "height", "pitch_down", "body_axes", "world_up")
+    files = [{file.name: file for file in folder.glob("*.png")} for folder in folders]
+    notes = ["the tilt is that of the poses, as no sensor of the data set measures it"]
+    if alone := len(files[0].keys() ^ files[1].keys()):
+        notes.append(f"{counted(alone, 'image')} without a partner of the same stamp")
+    pairs = [
+        ImagePair(nanoseconds(file.stem, str(file)), file, files[1][name])
+        for name, file in files[0].items() if name in files[1]
+    ]  # fmt: skip
+    if not pairs:
+        raise LogError(f"{source} contains no pair of images in image1/RGB and image2/RGB")
+    pairs.sort(key=lambda pair: pair.stamp)
+    width, height = image_size(pairs[0].left)
+    focal = FOCAL * width / WIDTH
+    usual = StereoCamera(
+        fx=focal, fy=focal, cx=width / 2, cy=height / 2, baseline=BASELINE, width=width, height=height, frame_id=LEFT
+    )
+    camera, track = rig.camera(usual), _track(source / POSES, rig)
+    return ImportedRecording(
+        rectified_models(camera), True, pairs, [*filter(None, [rig.mount]), beside(camera)],
+        [tilts_of(track, track.stamps.tolist())], track, notes=notes,
+    )  # fmt: skip
+
+
+def _track(path: Path, rig: Rig) -> Track:
+    """The poses of the body: stamp, position, quaternion w, x, y, z, and more."""
+    upright, axes = rig.poses
+    poses = []
+    for where, line in read_lines(path):
+        row = line.replace(",", " ").split()
+        if len(row) < 8:
+            raise LogError(f"{where} has {len(row)} columns, but at least 8 are needed; get the file again")
+        values = numbers_of(row[1:8], where)
+        turn = upright @ Rotation.from_quat(np.roll(values[3:], -1)).as_matrix() @ axes
+        poses.append((nanoseconds(row[0], where), upright @ values[:3], Rotation.from_matrix(turn).as_quat()))
+    return Track.of(BASE, poses, path)

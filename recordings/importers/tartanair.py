@@ -1,0 +1,112 @@
+"""Reads trajectories of TartanAir and TartanGround, for `roverflow import tartanair`.
+
+The images are rectified, of cameras with a field of view of 90 degrees, 0.25 m apart, 10 a second. Poses have x north,
+y east, z down, of a body x forward, y right, z down. They give the tilt, as the sign of the simulated accelerations
+differs between the sets. A depth image has one little-endian float32 in the four bytes of each pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flow.contracts import counted
+from recordings.errors import LogError
+from recordings.importers.files import image_size, numbers_of, read_bytes, read_rows
+from recordings.importers.recording import (
+    FIRST_STAMP,
+    LEFT,
+    ImagePair,
+    ImportedRecording,
+    Logged,
+    beside,
+    rectified_models,
+    tilts_of,
+)
+from recordings.importers.rig import Rig
+from recordings.importers.track import Track
+from recordings.ros2.to_msg import disparity_image
+from recordings.source.transforms import BODY_FROM_OPTICAL
+from stages.data import Array, Disparity, PixelOrigin, StereoCamera
+
+# Names of the left and right camera, the second of TartanAir's first version.
+CAMERAS = (("lcam_front", "rcam_front"), ("left", "right"))
+PERIOD_NS, BASELINE = 100_000_000, 0.25
+MAX_DEPTH = 10_000.0  # m; the sky is farther
+_DOWN = np.diag([1.0, -1.0, -1.0])  # from x, y and z down to x, y and z up, and back
+
+
+def read_tartanair(source: Path, rig: Rig) -> ImportedRecording:
+    """The trajectory in a folder such as P000. rig: where base_link is, if known. Raises LogError."""
+    named = next((names for names in CAMERAS if (source / f"image_{names[0]}").is_dir()), None)
+    if named is None:
+        raise LogError(f"{source} has no folder image_{CAMERAS[0][0]}; give the folder of one trajectory, such as P000")
+    left, right = named
+    notes = ["the tilt is that of the poses, as no sensor of the data set measures it"]
+    found: dict[int, ImagePair] = {}
+    alone = 0
+    for file in sorted((source / f"image_{left}").glob(f"*_{left}.png")):
+        number, partner = file.name.partition("_")[0], source / f"image_{right}" / file.name.replace(left, right)
+        if number.isdecimal() and partner.exists():
+            found[int(number)] = ImagePair(FIRST_STAMP + int(number) * PERIOD_NS, file, partner)
+        else:
+            alone += 1
+    if alone:
+        notes.append(f"{counted(alone, 'image')} of image_{left} without a partner in image_{right}")
+    if not found:
+        raise LogError(f"{source} contains no pair of images in image_{left} and image_{right}")
+    width, height = image_size(next(iter(found.values())).left)
+    usual = StereoCamera(
+        fx=width / 2, fy=width / 2, cx=width / 2, cy=height / 2, baseline=BASELINE, width=width, height=height,
+        frame_id=LEFT,
+    )  # fmt: skip
+    camera, track, pairs = rig.camera(usual), _track(source / f"pose_{left}.txt"), list(found.values())
+    depths = [next(iter(source.glob(f"depth_{left}/{pair.left.stem}_depth.*")), None) for pair in pairs]
+    return ImportedRecording(
+        rectified_models(camera), True, pairs, [*filter(None, [rig.mount]), beside(camera)],
+        [tilts_of(track, [pair.stamp for pair in pairs])], track, notes=notes,
+        more=lambda number: _truth(pairs[number].stamp, camera, depths[number]),
+    )  # fmt: skip
+
+
+def _track(path: Path) -> Track:
+    """The poses of the left camera, one a line."""
+    poses = []
+    for number, (where, row) in enumerate(read_rows(path, 7)):
+        values = numbers_of(row[:7], where)
+        body = Rotation.from_quat(values[3:]).as_matrix() if values[3:].any() else np.eye(3)
+        turn = Rotation.from_matrix(_DOWN @ body @ _DOWN @ BODY_FROM_OPTICAL).as_quat()
+        poses.append((FIRST_STAMP + number * PERIOD_NS, _DOWN @ values[:3], turn))
+    return Track.of(LEFT, poses, path)
+
+
+def _truth(stamp: int, camera: StereoCamera, path: Path | None) -> Iterator[Logged]:
+    """The true disparity by a depth image."""
+    if path is None:
+        return
+    depth = _depth(path)
+    if depth.shape != (camera.height, camera.width):
+        raise LogError(
+            f"{path} is {depth.shape[1]}x{depth.shape[0]}, but the images are {camera.width}x{camera.height}"
+        )
+    known = np.isfinite(depth) & (depth > 0) & (depth < MAX_DEPTH)
+    pixels = np.full(depth.shape, np.nan, np.float32)
+    pixels[known] = camera.fx * camera.baseline / depth[known].astype(np.float64)
+    source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
+    disparity = Disparity(stamp, pixels, source, known.astype(np.float32), camera=camera)
+    yield stamp, "/truth/disparity", disparity_image(disparity)
+
+
+def _depth(path: Path) -> Array:
+    """(H, W) float32, m, of a depth image or, in TartanAir's first version, of a numpy file."""
+    try:
+        if path.suffix == ".npy":
+            return np.asarray(np.load(path, allow_pickle=False), np.float32)
+        content = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
+        return np.ascontiguousarray(content).view("<f4")[:, :, 0]
+    except (ValueError, IndexError, TypeError, cv2.error) as error:
+        raise LogError(f"{path} is not a depth image of four bytes a pixel; get it again") from error
