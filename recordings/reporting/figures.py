@@ -11,7 +11,7 @@ import numpy as np
 
 from stages.data import Array
 
-WIDTH, HEIGHT, MARGIN = 640, 180, 44
+WIDTH, HEIGHT, MARGIN = 480, 180, 52
 MAX_WIDTH = 900  # px of a picture
 COLORS = ("#1f6fb2", "#c4502e")
 
@@ -67,9 +67,9 @@ def _plot(
     for share in (0.0, 0.5, 1.0):
         value, y = along[0] + share * (along[1] - along[0]), HEIGHT - MARGIN - share * (HEIGHT - 2 * MARGIN)
         parts.append(f'<line x1="{MARGIN}" x2="{WIDTH - MARGIN}" y1="{y}" y2="{y}" class="grid"/>')
-        parts.append(f'<text x="{MARGIN - 6}" y="{y + 4}" class="left">{value:.4g}</text>')
+        parts.append(f'<text x="{MARGIN - 6}" y="{y + 4}" class="left">{_number(value)}</text>')
         x = MARGIN + share * (WIDTH - 2 * MARGIN)
-        label = f"{across[0] + share * span:.4g} {unit}"
+        label = f"{_number(across[0] + share * span)} {unit}"
         parts.append(f'<text x="{x}" y="{HEIGHT - MARGIN + 18}" class="middle">{label}</text>')
     for number, (name, curve) in enumerate(curves.items()):
         color = COLORS[number % len(COLORS)]
@@ -82,3 +82,7 @@ def _plot(
             where = f'x="{WIDTH - MARGIN}" y="{18 + 15 * number}"'
             parts.append(f'<text {where} class="left" fill="{color}">{escape(name)}</text>')
     return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(parts)}</svg>'
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
