@@ -30,7 +30,7 @@ from flow.cli.commands import (
     stages,
     why,
 )
-from flow.cli.importers import euroc, images, kitti, lusnar, middlebury, tartanair
+from flow.cli.importers import devon, euroc, images, katwijk, kitti, lusnar, middlebury, tartanair
 from flow.cli.replay import product_version
 from flow.errors import FAILED, INTERRUPTED, UNUSABLE, RoverflowError
 from recordings.errors import LogError, UnwritableError
@@ -51,8 +51,10 @@ COMMANDS: dict[str, ModuleType] = {
     "export": export,
 }
 IMPORTERS: dict[str, ModuleType] = {
+    "devon": devon,
     "euroc": euroc,
     "images": images,
+    "katwijk": katwijk,
     "kitti": kitti,
     "lusnar": lusnar,
     "middlebury": middlebury,

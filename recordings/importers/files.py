@@ -58,6 +58,13 @@ def numbers_of(values: list[str], where: str) -> Array:
     return found
 
 
+def whole_number(text: str, where: str) -> int:
+    """A number of an image. Raises LogError."""
+    if not text.isdecimal():
+        raise LogError(f"{where} begins with '{text}', not with the number of an image; get the file again")
+    return int(text)
+
+
 def nanoseconds(text: str, where: str) -> int:
     """A stamp in whole nanoseconds. Raises LogError, also for one that a spreadsheet rounded (1.40363E+18)."""
     if not text.isdecimal():

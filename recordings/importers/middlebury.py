@@ -63,7 +63,7 @@ def import_scene(folder: Path, out: Path) -> str:
     """
     scene = read_scene(folder)
     pair = ImagePair(scene.frame.stamp, folder / IMAGES[0], folder / IMAGES[1])
-    recording = standing([pair], scene.frame.camera, Rig(height=HEIGHT))
+    recording = standing([pair], scene.frame.camera, Rig(height=HEIGHT, pitch_down=0.0))
     metadata = ("middlebury", {"scene": scene.name, **scene.calibration})
     write_recording(replace(recording, more=lambda number: _truth(scene), metadata=metadata), out)
     if scene.truth is None:

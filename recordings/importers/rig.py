@@ -71,10 +71,11 @@ class Rig:
 
     @property
     def mount(self) -> Transform | None:
-        """base_link <- left camera; None without a height."""
+        """base_link <- left camera; None without a height. Raises LogError without an angle."""
         if self.height is None:
             return None
-        turn = Rotation.from_euler("ZYX", [self.yaw, self.pitch_down or 0.0, self.roll]).as_matrix()
+        self.need("the data set", "pitch_down")
+        turn = Rotation.from_euler("ZYX", [self.yaw, self.pitch_down, self.roll]).as_matrix()
         return Transform(BASE, LEFT, turn @ BODY_FROM_OPTICAL, np.array([self.forward, self.left, self.height]))
 
     @property
@@ -120,6 +121,4 @@ def read_rig(path: Path | None) -> Rig:
             raise LogError(f"{path}: '{name}': {error}") from error
     rig = Rig(**values)
     object.__setattr__(rig, "where", str(path))
-    if rig.height is not None:
-        rig.need("the data set", "pitch_down")
     return rig
