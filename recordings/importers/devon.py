@@ -14,7 +14,7 @@ import numpy as np
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import from_date, image_size, numbers_of, read_rows, whole_number
+from recordings.importers.files import from_date, numbers_of, read_rows, whole_number
 from recordings.importers.pairing import pair_images
 from recordings.importers.recording import (
     BASE,
@@ -24,6 +24,7 @@ from recordings.importers.recording import (
     ImportedRecording,
     Logged,
     beside,
+    common_size,
     rectified_models,
 )
 from recordings.importers.rig import Rig
@@ -58,7 +59,7 @@ def read_devon(source: Path, rig: Rig, logs: Path | None = None) -> ImportedReco
         int(row[0]): from_date(row[1], where) for where, row in read_rows(folder / TIMES, 2) if row[0].isdecimal()
     }
     pairs = _pairs(source, stamps, notes)
-    width, height = image_size(pairs[0].left)
+    width, height = common_size(pairs)
     if width not in LENSES:
         rig.need(f"a set with images of {width}x{height}", "fx", "cx", "cy", "baseline")
     focal, cx, cy = LENSES.get(width, (1.0, 0.0, 0.0))

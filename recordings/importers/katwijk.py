@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
-from recordings.importers.files import from_date, image_size, numbers_of, read_rows
+from recordings.importers.files import from_date, numbers_of, read_rows
 from recordings.importers.recording import (
     BASE,
     IMU,
@@ -28,6 +29,7 @@ from recordings.importers.recording import (
     ImportedRecording,
     Logged,
     between,
+    common_size,
     fix,
     raw_models,
 )
@@ -51,7 +53,7 @@ def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> Impor
     notes: list[str] = []
     pairs = _pairs(source / "LocCam", notes)
     read = calibration[0].suffix == ".mat"
-    size = image_size(pairs[0].left)
+    size = common_size(pairs)
     calibrated = _structs(calibration[0], size) if read else read_calibration(calibration)
     if calibrated.right_in_left is None:
         raise LogError(f"{calibration[0]} lacks the transform between the cameras; give the stereo calibration")
@@ -92,7 +94,7 @@ def _structs(path: Path, size: tuple[int, int]) -> StereoCalibration:
         models = [_model(found[f"CameraParameters{number}"], size) for number in (1, 2)]
         rotation = np.asarray(found["RotationOfCamera2"], np.float64).reshape(3, 3)
         shift = np.asarray(found["TranslationOfCamera2"], np.float64).reshape(3) / 1000
-    except (OSError, ValueError, KeyError, TypeError, IndexError, NotImplementedError) as error:
+    except (OSError, ValueError, KeyError, TypeError, IndexError, NotImplementedError, MatReadError) as error:
         raise LogError(
             f"{path} has no struct 'stereoParams' of numbers ({error}); save toStruct(stereoParams) with MATLAB, or "
             "give a calibration of OpenCV, Kalibr or ROS"

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import from_date, image_size, numbers_of, read_lines
+from recordings.importers.files import from_date, numbers_of, read_lines
 from recordings.importers.kitti_odometry import read_odometry, stereo_camera
 from recordings.importers.recording import (
     BASE,
@@ -28,6 +28,7 @@ from recordings.importers.recording import (
     Logged,
     beside,
     between,
+    common_size,
     rectified_models,
 )
 from recordings.importers.rig import Rig
@@ -57,8 +58,8 @@ def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording
     notes: list[str] = []
     pairs = _pairs(source, left, right, notes)
     camera_from_imu = _rigid(velo_to_cam, "R", "T") @ _rigid(imu_to_velo, "R", "T")
-    size = image_size(pairs[0].left) if pairs else (0, 0)
-    rectified = size == tuple(cameras[f"S_rect_{left}"].astype(int))
+    size = common_size(pairs)
+    rectified = size == tuple(_entry(cameras, f"S_rect_{left}", 2).astype(int))
     read = _rectified if rectified else _raw
     models, right_in_left, left_from_first = read(cameras, left, right)
     to_imu = between(LEFT, IMU, left_from_first @ camera_from_imu)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import from_seconds, image_size, numbers_of, read_lines
+from recordings.importers.files import from_seconds, numbers_of, read_lines
 from recordings.importers.recording import (
     BASE,
     FIRST_STAMP,
@@ -23,6 +23,7 @@ from recordings.importers.recording import (
     ImportedRecording,
     Logged,
     beside,
+    common_size,
     rectified_models,
     tilts_of,
 )
@@ -51,7 +52,7 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
     if not pairs:
         raise LogError(f"{source} contains no pair of images in image_{cameras[0]} and image_{cameras[1]}")
     projections = [_projections(source / "calib.txt")[camera] for camera in cameras]
-    camera, shift = stereo_camera(projections, image_size(pairs[0].left))
+    camera, shift = stereo_camera(projections, common_size(pairs))
     poses = next(
         (path for path in (source.resolve().parents[1] / "poses" / f"{source.resolve().name}.txt", source / "poses.txt")
          if path.exists()), None,
@@ -76,6 +77,8 @@ def level_tilt(stamp: int) -> Logged:
 def stereo_camera(projections: list[Array], size: tuple[int, int]) -> tuple[StereoCamera, Array]:
     """The rectified camera of two projections (3, 4), and (3,) m from the first camera's place to the left one's."""
     left, right = projections
+    if not all(projection[0, 0] > 0 and projection[1, 1] > 0 and projection[2, 2] > 0 for projection in projections):
+        raise LogError("KITTI's calibration has a projection without a focal length; get the files again")
     shifts = [np.linalg.solve(projection[:, :3], projection[:, 3]) for projection in projections]
     baseline = float(shifts[0][0] - shifts[1][0])
     if not baseline > 0:

@@ -13,13 +13,14 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import image_size, nanoseconds, numbers_of, read_lines
+from recordings.importers.files import nanoseconds, numbers_of, read_lines
 from recordings.importers.recording import (
     BASE,
     LEFT,
     ImagePair,
     ImportedRecording,
     beside,
+    common_size,
     rectified_models,
     tilts_of,
 )
@@ -48,7 +49,7 @@ def read_lusnar(source: Path, rig: Rig) -> ImportedRecording:
     if not pairs:
         raise LogError(f"{source} contains no pair of images in image1/RGB and image2/RGB")
     pairs.sort(key=lambda pair: pair.stamp)
-    width, height = image_size(pairs[0].left)
+    width, height = common_size(pairs)
     focal = FOCAL * width / WIDTH
     usual = StereoCamera(
         fx=focal, fy=focal, cx=width / 2, cy=height / 2, baseline=BASELINE, width=width, height=height, frame_id=LEFT

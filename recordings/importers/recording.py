@@ -72,7 +72,8 @@ def write_recording(
 ) -> tuple[int, list[str]]:
     """Write the log; returns its number of frames and the notes. progress: called with the frames done so far.
 
-    A pair with a file that is no image is left out, with a note. Raises LogError if no log can be made.
+    A pair with a file that is no image of the calibration's size is left out, with a note. Raises LogError if no log
+    can be made.
     """
     tree = TransformTree()
     for mount in recording.mounts:
@@ -81,11 +82,6 @@ def write_recording(
     cameras = calibrated_pair(recording.cameras, (LEFT, RIGHT), (topics[0], topics[1]), tree)
     if not recording.pairs:
         raise LogError("no pair of images was found; check the folder")
-    first = recording.pairs[0]
-    for path, model in zip((first.left, first.right), recording.cameras, strict=True):
-        if image_size(path) != (model.width, model.height):
-            size = "{}x{}".format(*image_size(path))
-            raise LogError(f"{path} is {size}, but the calibration is for {model.width}x{model.height}")
     unreadable: list[str] = []
     frames = _frames(recording, cameras[0], tree, topics, unreadable, progress)
     events = merge(*recording.sensors, frames, key=itemgetter(0))
@@ -97,7 +93,7 @@ def write_recording(
         if recording.metadata is not None:
             writer.metadata(*recording.metadata)
         if len(unreadable) == len(recording.pairs):
-            raise LogError(f"none of {counted(len(unreadable), 'pair')} can be read, first: {unreadable[0]}")
+            raise LogError(f"none of {counted(len(unreadable), 'pair')} can be used, first: {unreadable[0]}")
     left_out = f"{counted(len(unreadable), 'pair')} left out, first: {unreadable[0]}" if unreadable else ""
     return len(recording.pairs) - len(unreadable), [*recording.notes, *filter(None, [left_out])]
 
@@ -114,7 +110,8 @@ def _frames(
     for number, pair in enumerate(recording.pairs):
         stamp = pair.stamp
         try:
-            files = [_image(stamp, frame, path) for frame, path in ((LEFT, pair.left), (RIGHT, pair.right))]
+            sides = zip((LEFT, RIGHT), (pair.left, pair.right), recording.cameras, strict=True)
+            files = [_image(stamp, frame, path, model) for frame, path, model in sides]
         except LogError as error:
             unreadable.append(str(error))
             continue
@@ -127,8 +124,10 @@ def _frames(
         progress(number + 1)
 
 
-def _image(stamp: int, frame: str, path: Path) -> tuple[str, Any]:
-    """The ending of the topic, and the message of an image file."""
+def _image(stamp: int, frame: str, path: Path, model: CameraModel) -> tuple[str, Any]:
+    """The ending of the topic, and the message of an image file. Raises LogError if it does not fit the calibration."""
+    if (size := image_size(path)) != (model.width, model.height):
+        raise LogError(f"{path} is {size[0]}x{size[1]}, but the calibration is for {model.width}x{model.height}")
     content = read_bytes(path)
     if encoding := encoding_of(content):
         return "/compressed", ros2.compressed_image(stamp, frame, np.frombuffer(content, np.uint8), encoding)
@@ -152,6 +151,17 @@ def _true_pose(recording: ImportedRecording, stamp: int, camera: Camera, tree: T
             "geometry_msgs/msg/QuaternionStamped", header=ros2.header(stamp, LEFT), quaternion=ros2.quaternion(whole)
         )
         yield stamp, "/truth/tilt", message
+
+
+def common_size(pairs: Sequence[ImagePair]) -> tuple[int, int]:
+    """Width and height of the first left image that can be read, px. Raises LogError if none can."""
+    why = "there is none"
+    for pair in pairs:
+        try:
+            return image_size(pair.left)
+        except LogError as error:
+            why = str(error)
+    raise LogError(f"no left image can be read: {why}")
 
 
 def tilts_of(track: Track, stamps: Iterable[int]) -> Iterator[Logged]:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import image_size, numbers_of, read_bytes, read_rows
+from recordings.importers.files import numbers_of, read_bytes, read_rows
 from recordings.importers.recording import (
     FIRST_STAMP,
     LEFT,
@@ -24,6 +24,7 @@ from recordings.importers.recording import (
     ImportedRecording,
     Logged,
     beside,
+    common_size,
     rectified_models,
     tilts_of,
 )
@@ -59,7 +60,7 @@ def read_tartanair(source: Path, rig: Rig) -> ImportedRecording:
         notes.append(f"{counted(alone, 'image')} of image_{left} without a partner in image_{right}")
     if not found:
         raise LogError(f"{source} contains no pair of images in image_{left} and image_{right}")
-    width, height = image_size(next(iter(found.values())).left)
+    width, height = common_size(list(found.values()))
     usual = StereoCamera(
         fx=width / 2, fy=width / 2, cx=width / 2, cy=height / 2, baseline=BASELINE, width=width, height=height,
         frame_id=LEFT,

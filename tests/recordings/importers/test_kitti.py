@@ -115,6 +115,9 @@ def test_a_drive_is_the_simulators_log(tmp_path, capsys, cameras):
     (folder / "oxts" / "data" / "0000000001.txt").write_text("49 8 \n")
     assert roverflow("import", "kitti", folder, log, *option) == 2
     assert "fewer than 6 numbers" in capsys.readouterr().err
+    (tmp_path / CALIBRATIONS[0]).write_text("")
+    assert roverflow("import", "kitti", folder, log, *option) == 2
+    assert f"lacks 'S_rect_{cameras[0]}' with 2 numbers" in capsys.readouterr().err
 
 
 @pytest.mark.slow
