@@ -6,7 +6,7 @@ below. Its one trick: the layout is made from the entities that were really logg
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -18,7 +18,7 @@ from stages.data import LEVEL_FRAME
 CLOCK = "log clock"  # the timeline of the frames' stamps
 FRAME = "frame"  # the timeline that counts frames
 
-LEDGER, SUMMARY, SECONDS, QUEUES = "ledger", "summary", "seconds", "queues"
+LEDGER, FRAMES, SUMMARY, SECONDS, QUEUES = "ledger", "frames", "summary", "seconds", "queues"
 MAX_LEGEND_LINES = 4  # the legend of more lines would hide the plot
 
 Specs = tuple["ViewSpec", ...]
@@ -28,8 +28,8 @@ _Part = rrb.View | rrb.Container
 # The places of the layout. Derived images have another size than the camera's; OWN_... are of the user's own types.
 Panel = Enum(
     "Panel",
-    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE CLOUD VOXELS TERRAIN CAMERA TRAJECTORY RELIEF "
-    "LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE OWN_IMAGE OWN_NUMBER OWN_TEXT OWN_BARS OWN_TENSOR",
+    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE SIGMA CLOUD VOXELS TERRAIN CAMERA TRAJECTORY "
+    "RELIEF LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE OWN_IMAGE OWN_NUMBER OWN_TEXT OWN_BARS OWN_TENSOR",
 )
 
 
@@ -52,14 +52,17 @@ class ViewSpec:
         return f"{self.stream}/{self.part}" if self.part else self.stream
 
 
-def blueprint(views: Iterable[ViewSpec]) -> rrb.Blueprint:
-    """The layout of the entities logged so far, in the order in which each was first logged."""
+def blueprint(views: Iterable[ViewSpec], slowest: Sequence[str] = ()) -> rrb.Blueprint:
+    """The layout of the entities logged so far, in the order in which each was first logged.
+
+    slowest: the stages whose times are plotted with their names.
+    """
     drawn = tuple(views)
     columns: list[tuple[_Part, float]] = []
     for part, share in ((_images(drawn), 6.4), (_space(drawn), 5.6), (_maps(drawn), 4.0)):
         if part is not None:
             columns.append((part, share))
-    below = _below(drawn)
+    below = _below(drawn, slowest)
     if not columns:
         body: _Part = below
     else:
@@ -114,7 +117,7 @@ def _images(drawn: Specs) -> _Part | None:
         _tabs(disparities[-2::-1]),
         _tabs(disparities[-1:]),
         _tabs(reversed(_superpixels(drawn))),
-        _tabs(reversed(_flat_views(drawn, Panel.SOURCE))),
+        _tabs([*reversed(_flat_views(drawn, Panel.SOURCE)), *_flat_views(drawn, Panel.SIGMA)]),
         _tabs(_flat_views(drawn, Panel.OWN_IMAGE)),
     ]
     present = [part for part in parts if part is not None]
@@ -177,16 +180,19 @@ def _plot(specs: Iterable[ViewSpec], title: str) -> rrb.View | None:
     return rrb.TimeSeriesView(origin="/", contents=contents, name=title, plot_legend=legend) if contents else None
 
 
-def _below(drawn: Specs) -> _Part:
+def _below(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """Plots of stage times, queues, angles and own numbers; the ledger with the run's summary behind it."""
     plots: list[_Part] = []
     shares: list[float] = []
+    named = [spec for spec in _at(drawn, Panel.STAGE) if spec.stream == SECONDS and spec.title in slowest]
     for root, title in ((SECONDS, "stage time (s)"), (QUEUES, "queue depth (frames)")):
         lines = sum(spec.stream == root for spec in _at(drawn, Panel.STAGE))
         few = lines <= MAX_LEGEND_LINES
         if lines:
             name = title if few else f"{title}: hover for names"
-            plots.append(rrb.TimeSeriesView(origin=root, name=name, plot_legend=rrb.PlotLegend("LeftTop", visible=few)))
+            every = rrb.TimeSeriesView(origin=root, name=name, plot_legend=rrb.PlotLegend("LeftTop", visible=few))
+            first = _plot(named, "slowest stages (s)") if root == SECONDS and not few else None
+            plots.append(_tabs([first, every]) or every)
             shares.append(1.4)
     panels = (
         (Panel.ANGLE, "tilt (degrees)"),
@@ -202,7 +208,7 @@ def _below(drawn: Specs) -> _Part:
         timeline_columns=[TimelineColumn(CLOCK, visible=False), TimelineColumn(FRAME)],
         text_log_columns=[TextLogColumnKind.LogLevel, TextLogColumnKind.Body],
     )
-    texts = [(LEDGER, LEDGER), *((spec.path, spec.title) for spec in _at(drawn, Panel.OWN_TEXT))]
+    texts = [(LEDGER, LEDGER), (FRAMES, FRAMES), *((spec.path, spec.title) for spec in _at(drawn, Panel.OWN_TEXT))]
     logs = [rrb.TextLogView(origin=path, name=title, columns=shown) for path, title in texts]
     text = rrb.Tabs(logs[0], rrb.TextDocumentView(origin=SUMMARY, name="run"), *logs[1:], active_tab=0)
     return rrb.Horizontal(*plots, text, column_shares=[*shares, 2.0])

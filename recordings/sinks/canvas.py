@@ -49,6 +49,8 @@ class Canvas:
     _curves: dict[Panel, list[str]] = field(default_factory=dict)
     _texts: dict[str, str] = field(default_factory=dict)
     _legends: dict[str, Legend] = field(default_factory=dict)
+    _present: dict[str, set[int]] = field(default_factory=dict)
+    _limits: dict[str, float] = field(default_factory=dict)
     _kept: dict[str, Hashable] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
@@ -118,8 +120,12 @@ class Canvas:
             self._legends[path] = legend
             names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
             self.recording.log(path, rr.AnnotationContext(names), static=True)
-        self.log(f"{path}/labels", rr.SegmentationImage(codes.astype(np.uint8)), view)
-        self.log_legend(f"{path}/legend", codes.shape, legend.values(), beside)
+        labels = codes.astype(np.uint8)
+        self.log(f"{path}/labels", rr.SegmentationImage(labels), view)
+        counts = cv2.calcHist([labels], [0], None, [256], [0, 256]).ravel()
+        present = self._present.setdefault(path, set())  # codes of any frame so far, so that the legend stays
+        present.update(code for code in legend if counts[code & 0xFF])
+        self.log_legend(f"{path}/legend", codes.shape, [legend[code] for code in legend if code in present], beside)
 
     def log_scale(self, path: str, shape: tuple[int, ...], low: float, high: float, unit: str, palette: int) -> None:
         """The legend of a colour map: three of its values above the picture."""
@@ -146,6 +152,11 @@ class Canvas:
         # A label takes the colour of its dot, which may be as dark as the background, so labels have dots of their own.
         texts: dict[str, Any] = {"labels": names, "show_labels": True, "radii": pin, "draw_order": 31.0}
         self.keep(f"{path}/text", content, lambda: rr.Points2D(pins, colors=[TEXT_RGB], **texts))
+
+    def limit(self, path: str, value: float) -> float:
+        """The largest value given for `path` so far, so that a scale stays."""
+        self._limits[path] = max(value, self._limits.get(path, value))
+        return self._limits[path]
 
     def clear_missing(self) -> None:
         """Clear the entities of the last frame that this frame lacks."""

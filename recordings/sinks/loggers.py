@@ -39,7 +39,11 @@ from stages.data import (
 
 DISPARITY_STEPS = 4  # disparities are drawn to 1/4 px; the result log has them as they are
 ALL_CODES = np.arange(256, dtype=np.uint8)
+# Layer -> the upper end of its scale, twice the rover's usual limit, and its unit
+LAYER_SCALES = {"step": (0.4, "m"), "slope": (0.7, "rad"), "steepness": (0.7, "rad"), "roughness": (0.12, "m")}
+MAX_SIGMA = 0.5  # px, the upper end of the scale of the disparities' standard deviation
 MAX_CELLS = 4000  # known ones, of a surface and of the layers of a map; a relief has all
+MIN_DEPTH = 0.2  # m in front of the camera, of what is drawn over its image
 HAZARD_LIFT = 0.03  # m above the ground at which hazards are drawn, so that the surface does not hide them
 LINE_SPACING = 2  # m, between the lines across a map
 CAMERA_RGB: Rgb = (255, 210, 60)
@@ -99,6 +103,12 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     if not {*np.flatnonzero(counts).tolist()} <= {PixelOrigin.UNKNOWN, PixelOrigin.MEASURED}:
         view = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
         canvas.log_labels(view, colormaps.every_nth(disparity.source, width), colormaps.SOURCE_LEGEND, beside=True)
+    if disparity.sigma is not None and stream in canvas.full_size:
+        view = ViewSpec(Panel.SIGMA, stream, "sigma", f"{stream}: sigma")
+        sigma = np.where(np.isfinite(disparity.pixels), disparity.sigma, np.nan)
+        thinned = colormaps.every_nth(sigma, canvas.max_width * 3 // 8)
+        canvas.log_values(thinned.astype(np.float16), (0.0, MAX_SIGMA), view)
+        canvas.log_scale(f"{view.path}/scale", thinned.shape, 0.0, MAX_SIGMA, "px", cv2.COLORMAP_TURBO)
     if disparity.segments is not None:
         # They lie over the left image. Edges of fewer pixels are denser, so they are fainter.
         segments, step = disparity.segments, colormaps.stride(disparity.segments.shape[1], canvas.max_width)
@@ -116,7 +126,7 @@ def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int) -> N
     # Rounded; NaN and negative values become 0.
     thinned = np.ascontiguousarray(colormaps.every_nth(pixels, max_width))
     steps: Array = cv2.multiply(thinned, DISPARITY_STEPS, dtype=cv2.CV_16U)  # type: ignore[call-overload]
-    limit = colormaps.disparity_limit(pixels)
+    limit = canvas.limit(stream, colormaps.disparity_limit(pixels))
     image = rr.EncodedDepthImage(
         png16(steps), media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
         depth_range=(0.0, limit * DISPARITY_STEPS),
@@ -218,7 +228,11 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     coarse = colormaps.every_nth_cell(terrain, MAX_CELLS)
     for name, layer in coarse.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
         view = ViewSpec(Panel.LAYER, stream, f"layers/{rr.escape_entity_path_part(name)}", f"{name}{suffix}")
-        canvas.log_values(colormaps.birds_eye(layer.astype(np.float16)), colormaps.value_limits(layer), view)
+        end, unit = LAYER_SCALES.get(name, (0.0, ""))
+        limits = (0.0, end) if unit else colormaps.value_limits(layer)
+        canvas.log_values(colormaps.birds_eye(layer.astype(np.float16)), limits, view)
+        if unit:
+            canvas.log_scale(f"{view.path}/scale", coarse.shape[::-1], *limits, unit, cv2.COLORMAP_TURBO)
     vertices, triangles = colormaps.surface(coarse)
     if len(triangles):
         colors = colormaps.elevation_colors(coarse, (low, high))[np.isfinite(coarse.layers["elevation"])]
@@ -279,6 +293,29 @@ def log_hazards(canvas: Canvas, stream: str, navigation: NavigationMap, terrain:
             centres, colors=[colormaps.CELL_LEGEND[Cell.HAZARD][1]], radii=0.4 * terrain.resolution
         )  # fmt: skip
         canvas.log(f"{stream}/hazards", hazards, ViewSpec(Panel.TERRAIN, stream, "hazards", stream, terrain.frame_id))
+
+
+@logger_for(StereoFrame, PointCloud, ElevationMap, NavigationMap)
+def log_hazards_in_view(
+    canvas: Canvas, stream: str, frame: StereoFrame, cloud: PointCloud, terrain: ElevationMap, navigation: NavigationMap
+) -> None:
+    """The hazard cells of the frame's own map over the left image; hidden ones too."""
+    camera, sensor = frame.camera, cloud.sensor
+    same = (navigation.cells.shape, navigation.frame_id) == (terrain.shape, terrain.frame_id)
+    if sensor is None or not same or terrain.frame_id != LEVEL_FRAME or not canvas.pictures:
+        return
+    elevation = terrain.layers["elevation"]
+    row, col = np.nonzero((navigation.cells == Cell.HAZARD) & np.isfinite(elevation))
+    x, y = cell_centres(terrain)
+    seen = (np.column_stack([x[col], y[row], elevation[row, col]]) - sensor.translation) @ sensor.rotation
+    seen = seen[seen[:, 2] > MIN_DEPTH]
+    scale = min(1.0, canvas.width(stream) / camera.width)
+    focal = np.array([camera.fx, camera.fy])
+    pixels = (seen[:, :2] / seen[:, 2:] * focal + (camera.cx, camera.cy) + 0.5) * scale
+    inside = np.all((pixels >= 0) & (pixels < (scale * camera.width, scale * camera.height)), axis=1)
+    radii = np.maximum(1.0, 0.4 * terrain.resolution * camera.fx * scale / seen[inside, 2])
+    colors = [(*colormaps.CELL_LEGEND[Cell.HAZARD][1], 150)]
+    canvas.log(f"{stream}/left/hazards", rr.Points2D(pixels[inside], colors=colors, radii=radii, draw_order=20.0))
 
 
 def _plot_angle(canvas: Canvas, stream: str, name: str, sine: float) -> None:

@@ -7,6 +7,7 @@ errors by default; here they are raised.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from fnmatch import fnmatchcase
@@ -24,7 +25,19 @@ from flow.contracts import FrameRecord, Loss, counted
 from flow.parameters import check_parameters, parameter
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
 from recordings.errors import LogError
-from recordings.sinks.blueprint import CLOCK, FRAME, LEDGER, QUEUES, SECONDS, SUMMARY, Panel, ViewSpec, blueprint
+from recordings.sinks.blueprint import (
+    CLOCK,
+    FRAME,
+    FRAMES,
+    LEDGER,
+    MAX_LEGEND_LINES,
+    QUEUES,
+    SECONDS,
+    SUMMARY,
+    Panel,
+    ViewSpec,
+    blueprint,
+)  # fmt: skip
 from recordings.sinks.canvas import Canvas
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
@@ -92,6 +105,7 @@ class RerunSink:
         self._stamp = 0  # the latest, ns
         self._frames, self._views = 0, -1
         self._plots: list[tuple[int, int, dict[str, float]]] = []  # per frame: stamp, number, path -> value
+        self._work = Counter[str]()  # stage -> seconds of all frames
         with writing(self._path):
             self._partial.open("wb").close()
         try:
@@ -141,7 +155,7 @@ class RerunSink:
             self._plot(record)
             self._canvas.clear_missing()
             text = "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions])
-            self._recording.log(LEDGER, rr.TextLog(text, level=rr.TextLogLevel.INFO))
+            self._recording.log(FRAMES, rr.TextLog(text, level=rr.TextLogLevel.INFO))
             self._log_losses(record.entries, self._frames)
             self._send_blueprint()
         self._frames += 1
@@ -191,6 +205,7 @@ class RerunSink:
         if self.without:
             pictures["not drawn"] = ", ".join(self.without)
         self._recording.log(SUMMARY, _document(verdict, self._about, facts, pictures), static=True)
+        self._views = -1  # the slowest stages are known now
         self._send_blueprint()
 
     def _publish(self) -> None:
@@ -240,6 +255,7 @@ class RerunSink:
     def _plot(self, record: FrameRecord) -> None:
         """Keep stage times and queues, to send many frames at once: sent one by one they would be half of all calls."""
         values = {}
+        self._work.update(record.seconds)
         for root, numbers in ((SECONDS, record.seconds), (QUEUES, record.queues)):
             for stage, number in numbers.items():
                 view = ViewSpec(Panel.STAGE, root, rr.escape_entity_path_part(stage), stage)
@@ -276,7 +292,8 @@ class RerunSink:
         """Send the blueprint again if the frame added a view."""
         if len(self._canvas.views) != self._views:
             self._views = len(self._canvas.views)
-            self._recording.send_blueprint(blueprint(self._canvas.views.values()))
+            slowest = [stage for stage, _ in self._work.most_common(MAX_LEGEND_LINES)]
+            self._recording.send_blueprint(blueprint(self._canvas.views.values(), slowest))
 
 
 def _is(kind: Any, wanted: type) -> bool:
@@ -336,13 +353,14 @@ def _same(one: Array, other: Array) -> bool:
 
 def _document(verdict: str, *tables: Mapping[str, Any]) -> rr.TextDocument:
     """The verdict and the facts of the run, as markdown."""
+    values = [(key, value) for table in tables for key, value in table.items() if value not in ({}, "")]
     rows = [
         f"| {key} | {', '.join(f'{k} {v}' for k, v in value.items()) if isinstance(value, Mapping) else value} |"
-        for table in tables
-        for key, value in table.items()
-        if value not in ({}, "")
+        for key, value in values
+        if "\n" not in str(value)
     ]
-    text = "\n".join([f"# {verdict}", "", "| | |", "|---|---|", *rows])
+    texts = [f"## {key}\n```\n{value}\n```" for key, value in values if "\n" in str(value)]
+    text = "\n".join([f"# {verdict}", "", "| | |", "|---|---|", *rows, "", *texts])
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 
 

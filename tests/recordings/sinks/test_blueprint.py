@@ -16,7 +16,7 @@ def test_the_blueprint_has_a_view_for_each_entity_and_no_empty_one():
         ViewSpec(Panel.DISPARITY, "matched", "pixels", "matched"),
     ]
     names = [view.name for view in views(blueprint(specs).root_container)]
-    assert sorted(names) == ["ledger", "left", "matched", "run"]
+    assert sorted(names) == ["frames", "ledger", "left", "matched", "run"]
 
 
 def test_two_streams_of_one_type_have_tabs_of_two_names():
@@ -24,7 +24,7 @@ def test_two_streams_of_one_type_have_tabs_of_two_names():
         panels = ((Panel.RELIEF, "relief"), (Panel.LAYER, "elevation"), (Panel.LAYER, "slope"))
         specs = [ViewSpec(panel, stream, title, title) for stream in streams for panel, title in panels]
         specs.append(ViewSpec(Panel.RELIEF, "regional", "relief", "relief (odom)"))
-        return [view.name for view in views(blueprint(specs).root_container)][:-2]
+        return [view.name for view in views(blueprint(specs).root_container)][:-3]
 
     assert names("sparse") == ["relief", "relief (odom)", "elevation", "slope"]
     assert names("maps/sparse", "dense") == [

@@ -88,6 +88,17 @@ def test_hazards_are_drawn_on_the_ground_at_their_cells(rrd):
     np.testing.assert_allclose(position, [[0.35, -1.25, ground + 0.03]], atol=1e-6)
 
 
+def test_hazards_in_view_are_drawn_over_the_left_image(tmp_path):
+    items = scene()
+    cells = items["navigation_map"].cells.copy()
+    cells[16, 30] = Cell.HAZARD  # 3.05 m ahead and 0.15 m to the left; the other one is out of view
+    items["navigation_map"] = replace(items["navigation_map"], cells=cells)
+    path = record_of(tmp_path / "run.rrd", [Record(START, items)])
+    ((_, _, found),) = rows(path, "/rectified/left/hazards", "Points2D:positions")
+    down = 0.9 - items["elevation_map"].layers["elevation"][16, 30]
+    np.testing.assert_allclose(found, [[32.0 - 80 * 0.15 / 3.05, 24.0 + 80 * down / 3.05]], rtol=1e-5)
+
+
 def test_a_regional_map_is_drawn_in_its_own_frame_of_reference(tmp_path):
     items = scene()
     near, cells = items["elevation_map"], items["navigation_map"]

@@ -41,7 +41,7 @@ def test_every_map_left_out_is_within_a_step_of_the_maps_on_either_side(ways, st
         between = places[before : after + 1]
         assert after == before + 1 or np.abs(np.diff(between)).sum() <= step + ROOM
     for start, end in zip(found, found[2:], strict=False):
-        assert np.abs(np.diff(places[start : end + 1])).sum() > step, "and none of them is in vain"
+        assert np.abs(np.diff(places[start : end + 1])).sum() > step - ROOM, "and none of them is in vain"
 
 
 @pytest.mark.parametrize(("step", "stamps"), [(0.0, [0, 1, 2, 3, 4]), (0.5, [0, 2, 4]), (1.5, [0, 4])])
