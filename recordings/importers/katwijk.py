@@ -38,10 +38,12 @@ from recordings.importers.track import upright
 from recordings.ros2.to_msg import imu, raw_imu
 from stages.data import Array, CameraModel, Transform
 
+GPS = "gps_link"
 # The LocCam's left camera on the Imu, whose x axis points back.
 CAMERA_ON_IMU = Transform(
     IMU, LEFT, Rotation.from_quat([0.572, 0.572, -0.416, -0.416]).as_matrix(), np.array([-0.382, -0.078, 0.557])
 )
+GPS_ON_IMU = Transform(IMU, GPS, np.diag([-1.0, -1.0, 1.0]), np.array([0.2209, -0.0515, 1.5785]))
 PREFIX = "LocCam_"
 
 
@@ -61,7 +63,7 @@ def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> Impor
     place = np.array([*base.translation[:2], rig.height])
     mounts = [
         Transform(BASE, LEFT, base.rotation, place) if rig.pitch_down is None else rig.mount,
-        between(LEFT, RIGHT, calibrated.right_in_left), CAMERA_ON_IMU.inverse(),
+        between(LEFT, RIGHT, calibrated.right_in_left), CAMERA_ON_IMU.inverse(), GPS_ON_IMU,
     ]  # fmt: skip
     return ImportedRecording(
         raw_models(calibrated), False, pairs, [mount for mount in mounts if mount is not None],
@@ -130,7 +132,7 @@ def _places(path: Path, notes: list[str]) -> list[Logged]:
     if any(not (abs(values[0]) <= 90 and abs(values[1]) <= 180) for _, values in table):
         notes.append(f"{path.name} does not contain degrees; its places are left out")
         return []
-    return [fix(stamp, *values[:3].tolist()) for stamp, values in table]
+    return [fix(stamp, GPS, *values[:3].tolist()) for stamp, values in table]
 
 
 def _table(path: Path, columns: int) -> Iterator[tuple[int, Array]]:

@@ -29,6 +29,7 @@ from recordings.importers.recording import (
     beside,
     between,
     common_size,
+    fix,
     rectified_models,
 )
 from recordings.importers.rig import Rig
@@ -67,10 +68,10 @@ def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording
     if base is None:
         base = Transform(BASE, IMU, np.eye(3), np.array([0.0, 0.0, IMU_HEIGHT])).after(to_imu.inverse())
         notes.append(f"base_link is {IMU_HEIGHT} m below the Imu, as on KITTI's car; the rig file can place it")
-    track = _track(source / "oxts")
-    return ImportedRecording(
-        models, rectified, pairs, [base, right_in_left, to_imu], [_tilts(track)], track, notes=notes
-    )
+    stamps, table = _readings(source / "oxts")
+    track = _track(stamps, table, source / "oxts")
+    mounts, sensors = [base, right_in_left, to_imu], [_tilts(track), _fixes(stamps, table)]
+    return ImportedRecording(models, rectified, pairs, mounts, sensors, track, notes=notes)
 
 
 def _pairs(source: Path, left: str, right: str, notes: list[str]) -> list[ImagePair]:
@@ -131,8 +132,8 @@ def _raw(values: dict[str, Array], left: str, right: str) -> tuple[Any, Transfor
     return tuple(models), between(LEFT, RIGHT, first @ np.linalg.inv(second)), first
 
 
-def _track(oxts: Path) -> Track:
-    """The poses of the Imu: east, north and up of the first place."""
+def _readings(oxts: Path) -> tuple[list[int], Array]:
+    """Stamps, and (n, 6) latitude and longitude, deg, altitude, m, roll, pitch and yaw, rad, of the INS."""
     rows, stamps = [], []
     for number, (where, line) in enumerate(read_lines(oxts / "timestamps.txt")):
         if (path := oxts / "data" / f"{number:010d}.txt").exists():
@@ -142,12 +143,21 @@ def _track(oxts: Path) -> Track:
                 raise LogError(f"{path} has fewer than 6 numbers; get it again")
     if not rows:
         raise LogError(f"{oxts} contains no readings of the Imu; get the drive's oxts folder")
-    table = np.array(rows)
+    return stamps, np.array(rows)
+
+
+def _track(stamps: list[int], table: Array, where: Path) -> Track:
+    """The poses of the Imu: east, north and up of the first place."""
     places = np.column_stack([mercator(table[:, 0], table[:, 1]), table[:, 2]])
     turns = Rotation.from_euler("ZYX", table[:, 5:2:-1]).as_quat()
-    return Track.of(IMU, list(zip(stamps, places, turns, strict=True)), oxts)
+    return Track.of(IMU, list(zip(stamps, places, turns, strict=True)), where)
 
 
 def _tilts(track: Track) -> Iterator[Logged]:
     for stamp, turn in zip(track.stamps.tolist(), track.rotations.as_quat(), strict=True):
         yield stamp, "/imu/data", imu(stamp, IMU, turn)
+
+
+def _fixes(stamps: list[int], table: Array) -> Iterator[Logged]:
+    for stamp, row in sorted(zip(stamps, table.tolist(), strict=True)):
+        yield fix(stamp, IMU, *row[:3])

@@ -72,8 +72,8 @@ def write_recording(
 ) -> tuple[int, list[str]]:
     """Write the log; returns its number of frames and the notes. progress: called with the frames done so far.
 
-    A pair with a file that is no image of the calibration's size is left out, with a note. Raises LogError if no log
-    can be made.
+    A pair with a file that is no image of the calibration's size, or with the time of the pair before it, is left out
+    with a note. Raises LogError if no log can be made.
     """
     tree = TransformTree()
     for mount in recording.mounts:
@@ -107,14 +107,18 @@ def _frames(
     progress: Callable[[int], None],
 ) -> Iterator[Logged]:
     """The messages of each frame; the reasons why a pair is left out go into `unreadable`."""
+    before = -1
     for number, pair in enumerate(recording.pairs):
         stamp = pair.stamp
         try:
+            if stamp == before:
+                raise LogError(f"{pair.left} has the same time as the image before it, {stamp} ns")
             sides = zip((LEFT, RIGHT), (pair.left, pair.right), recording.cameras, strict=True)
             files = [_image(stamp, frame, path, model) for frame, path, model in sides]
         except LogError as error:
             unreadable.append(str(error))
             continue
+        before = stamp
         for side, frame, model in zip(SIDES, (LEFT, RIGHT), recording.cameras, strict=True):
             yield stamp, f"/stereo/{side}/camera_info", ros2.camera_info(stamp, frame, model)
         yield from ((stamp, topic + ending, message) for topic, (ending, message) in zip(topics, files, strict=True))
@@ -171,11 +175,11 @@ def tilts_of(track: Track, stamps: Iterable[int]) -> Iterator[Logged]:
             yield stamp, "/inclinometer", ros2.imu(stamp, track.body, upright(placed.rotation[2]))
 
 
-def fix(stamp: int, latitude: float, longitude: float, altitude: float) -> Logged:
-    """A place by GPS, deg and m, of unknown accuracy."""
+def fix(stamp: int, frame: str, latitude: float, longitude: float, altitude: float) -> Logged:
+    """The place of a frame by GPS, deg and m, of unknown accuracy."""
     status = make("sensor_msgs/msg/NavSatStatus", status=0, service=1)
     message = make(
-        "sensor_msgs/msg/NavSatFix", header=ros2.header(stamp, BASE), status=status, latitude=latitude,
+        "sensor_msgs/msg/NavSatFix", header=ros2.header(stamp, frame), status=status, latitude=latitude,
         longitude=longitude, altitude=altitude, position_covariance=np.zeros(9), position_covariance_type=0,
     )  # fmt: skip
     return stamp, "/gps/fix", message

@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -13,13 +15,14 @@ from recordings import McapSource
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_grid_map
 from recordings.simulator import Simulation, write_log
+from recordings.simulator.simulation import FrameTruth
 from stages.data import Mount, StereoCamera, Transform
 from tests.conftest import roverflow
 
 # Frames at the time of a tilt sample, and sensors without errors: what a layout does not round is equal bit by bit.
 EXACT = Simulation(
     scene="gravel", frames=3, width=160, height=120, relief_cells=512, slope=0.12, frame_offset=0.0, tilt_noise=0.0,
-    odometry_scale=0.0, odometry_turn=0.0,
+    odometry_scale=0.0, odometry_turn=0.0, map_resolution=0.2,
 )  # fmt: skip
 # Own tilts come more often than those of frames, so they must not be smoothed.
 EXACT_TILT = ("--set", "disparities=64", "--set", "tilt.smooth=0 s")
@@ -41,8 +44,21 @@ class Seen:
 
 def own_log(simulation: Simulation, out: Path) -> Path:
     """The simulator's own log."""
-    write_log(simulation, out)
+    out.write_bytes(_content(simulation))
     return out
+
+
+@lru_cache(maxsize=16)
+def _content(simulation: Simulation) -> bytes:
+    with TemporaryDirectory() as folder:
+        write_log(simulation, Path(folder) / "own.mcap")
+        return (Path(folder) / "own.mcap").read_bytes()
+
+
+@lru_cache(maxsize=16)
+def frames_of(simulation: Simulation) -> list[FrameTruth]:
+    """The frames of a traverse."""
+    return [simulation.frame(number) for number in range(simulation.frames)]
 
 
 def seen_in(log: Path) -> list[Seen]:
@@ -126,8 +142,8 @@ def assert_same_truth(log: Path, own: Path, tolerance: float = 1e-9) -> None:
 
 def write_images(simulation: Simulation, name: Callable[[int, str], Path]) -> None:
     """Write the images of all frames; name: (frame, "left" or "right") -> the file."""
-    for number in range(simulation.frames):
-        for side, pixels in zip(("left", "right"), simulation.frame(number).images, strict=True):
+    for number, frame in enumerate(frames_of(simulation)):
+        for side, pixels in zip(("left", "right"), frame.images, strict=True):
             path = name(number, side)
             path.parent.mkdir(parents=True, exist_ok=True)
             assert cv2.imwrite(str(path), pixels[:, :, ::-1] if pixels.ndim == 3 else pixels)

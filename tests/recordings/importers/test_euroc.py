@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings.mcap.file import iter_decoded
 from tests.conftest import roverflow
+from tests.recordings.calibration.euroc_bag import kalibr_camchain
 from tests.recordings.importers.simulated import (
     EXACT,
     RIG,
@@ -96,6 +98,24 @@ def test_a_recording_in_eurocs_layout_gives_the_simulators_maps(recording, tmp_p
     assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
     scored = tmp_path / "imported-out.mcap", "--truth", tmp_path / "log.mcap"
     assert roverflow("score", *scored) == 0
+
+
+def test_a_recording_in_tum_vis_layout_has_16_bits_and_kalibrs_calibration(tmp_path):
+    mav0 = write_euroc(SIMULATION, tmp_path / "room") / "mav0"
+    calibration, log = kalibr_camchain(mav0, tmp_path / "camchain.yaml"), tmp_path / "log.mcap"
+    for cam in ("cam0", "cam1"):
+        (mav0 / cam / "sensor.yaml").unlink()
+        for path in (mav0 / cam / "data").iterdir():
+            assert cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.uint16) * 257)
+    (mav0 / "state_groundtruth_estimate0").rename(mav0 / "mocap0")
+    assert roverflow("import", "euroc", mav0.parent, log, "--calibration", calibration) == 0
+    seen = seen_in(log)
+    assert [frame.left.dtype for frame in seen] == [np.uint16] * 3
+    np.testing.assert_array_equal(seen[0].left // 257, SIMULATION.frame(0).images[0])
+    assert seen[0].camera.baseline == pytest.approx(SIMULATION.baseline)
+    assert seen[0].mount is None
+    bodies = [item.child_frame_id for _, _, item in iter_decoded(log, ["/truth/pose"])]
+    assert bodies == ["left_camera_optical"] * 3  # as base_link is unknown
 
 
 def test_cameras_in_the_wrong_order_are_exchanged(recording, tmp_path, capsys):

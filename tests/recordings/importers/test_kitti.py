@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.importers.kitti import CALIBRATIONS, read_kitti
 from recordings.importers.rig import Rig
+from recordings.mcap.file import iter_decoded
 from tests.conftest import roverflow
 from tests.recordings.importers.simulated import (
     EXACT,
@@ -112,6 +113,9 @@ def test_a_drive_is_the_simulators_log(tmp_path, capsys, cameras):
     assert "base_link is 0.93 m below the Imu" in said
     assert_same(log, own)
     assert_same_truth(log, own, 1e-6)
+    _, _, place = next(iter_decoded(log, ["/gps/fix"]))
+    assert place.latitude == pytest.approx(49, abs=1e-9)
+    assert place.header.frame_id == "imu_link"
     (folder / "oxts" / "data" / "0000000001.txt").write_text("49 8 \n")
     assert roverflow("import", "kitti", folder, log, *option) == 2
     assert "fewer than 6 numbers" in capsys.readouterr().err
@@ -157,6 +161,16 @@ def test_an_odometry_sequence_is_the_simulators_log(tmp_path, capsys, keys):
     assert roverflow("import", "kitti", folder, log) == 2
     said = capsys.readouterr().err
     assert "lacks 'height' (height of the left camera above base_link, with m); KITTI's odometry" in said
+
+
+def test_a_pair_with_the_time_of_another_is_left_out_with_a_note(tmp_path, capsys):
+    folder, rig = write_sequence(gray(EXACT), tmp_path)
+    (folder / "times.txt").write_text("0.0\n0.1\n0.1\n")
+    assert roverflow("import", "kitti", folder, tmp_path / "log.mcap", "--rig", rig) == 0
+    said = capsys.readouterr().out
+    assert "1 pair left out, first:" in said
+    assert "000002.png has the same time as the image before it, 1100000000 ns" in said
+    assert "2 stereo frames" in said
 
 
 def test_the_poses_of_a_sequence_tilt_its_frames(tmp_path):

@@ -17,6 +17,7 @@ from tests.recordings.importers.simulated import (
     assert_same,
     assert_same_maps,
     assert_same_truth,
+    frames_of,
     numbers,
     own_log,
     true_poses,
@@ -38,7 +39,7 @@ def write_tartanair(simulation, folder, cameras=("lcam_front", "rcam_front")):
         pose = simulation.base_at(simulation.stamp(number)).after(simulation.mounts[0])
         turn = Rotation.from_matrix(DOWN @ pose.rotation @ BODY_FROM_OPTICAL.T @ DOWN).as_quat()
         rows.append(numbers(DOWN @ pose.translation, turn))
-        depth = np.where(np.isfinite(truth := simulation.frame(number).depth), truth, 1e10).astype("<f4")
+        depth = np.where(np.isfinite(truth := frames_of(simulation)[number].depth), truth, 1e10).astype("<f4")
         path = folder / f"depth_{cameras[0]}" / f"{number:06d}_{cameras[0]}_depth"
         if cameras[0] == "left":
             np.save(f"{path}.npy", depth)
