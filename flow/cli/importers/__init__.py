@@ -1,1 +1,1 @@
-"""`roverflow import KIND`: one module a kind of recording."""
+"""`roverflow import KIND`: one module a kind of recording, and what they share."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recordings.importers.kitti import CALIBRATIONS, read_kitti
+from recordings.importers.kitti import CALIBRATIONS, IMU_HEIGHT, _calibration, _raw, _rectified, _rigid, read_kitti
 from recordings.importers.rig import Rig
 from recordings.mcap.file import iter_decoded
 from tests.conftest import roverflow
@@ -36,8 +36,8 @@ def date(stamp):
     return f"{datetime.fromtimestamp(stamp // 10**9, UTC):%Y-%m-%d %H:%M:%S}.{stamp % 10**9:09d}"
 
 
-def write_drive(simulation, home, cameras=("00", "01")):
-    """The traverse as a drive: rectified, the Imu 0.93 m above base_link, right images 2 ms later."""
+def write_drive(simulation, home, cameras=("00", "01"), rectified=True):
+    """The traverse as a drive: the Imu is 0.93 m above base_link, and right images come 2 ms later."""
     folder, camera = home / "2011_09_26_drive_0001_sync", simulation.camera
     shift = SHIFT if cameras[0] == "02" else np.zeros(3)
     names = dict(zip(("left", "right"), cameras, strict=True))
@@ -47,17 +47,19 @@ def write_drive(simulation, home, cameras=("00", "01")):
         lines = [date(stamp + delay) for stamp in [*stamps, stamps[-1] + 10**9]]  # the last image is missing
         write_lines(folder / f"image_{name}" / "timestamps.txt", [*lines, ""])
     write_oxts(simulation, folder / "oxts", stamps)
-    write_calibration(simulation, home, cameras, shift)
+    write_calibration(simulation, home, cameras, shift, rectified)
     assert camera.fx == camera.fy
     return folder
 
 
-def write_calibration(simulation, home, cameras, shift):
+def write_calibration(simulation, home, cameras, shift, rectified):
     camera, (left, *_) = simulation.camera, simulation.mounts
     k, entries = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]), []
     for name, place in zip(cameras, (shift, shift - [camera.baseline, 0, 0]), strict=True):
-        size = f"S_rect_{name}: {camera.width:e} {camera.height:e}"
-        entries += [size, f"P_rect_{name}: {numbers(np.column_stack([k, k @ place]))}"]
+        size, other = f"{camera.width:e} {camera.height:e}", "1.392000e+03 5.120000e+02"
+        entries += [f"S_{name}: {other if rectified else size}", f"S_rect_{name}: {size if rectified else other}"]
+        entries += [f"P_rect_{name}: {numbers(np.column_stack([k, k @ place]))}", f"R_{name}: {numbers(np.eye(3))}"]
+        entries += [f"K_{name}: {numbers(k)}", f"D_{name}: {numbers(np.zeros(5))}", f"T_{name}: {numbers(place)}"]
     head = "calib_time: 09-Jan-2012 13:57:47"
     write_lines(home / CALIBRATIONS[0], [head, *entries, f"R_rect_00: {numbers(TURNS[0])}"])
     whole, imu_to_velo, rectify = np.eye(4), np.eye(4), np.eye(4)
@@ -65,7 +67,7 @@ def write_calibration(simulation, home, cameras, shift):
     from_imu = left.inverse().after(imu)
     whole[:3, :3], whole[:3, 3] = from_imu.rotation, from_imu.translation - shift
     imu_to_velo[:3, :3], imu_to_velo[:3, 3] = TURNS[1], [-0.8, 0.3, -0.8]
-    rectify[:3, :3] = TURNS[0]
+    rectify[:3, :3] = TURNS[0] if rectified else np.eye(3)
     velo_to_cam = np.linalg.inv(rectify) @ whole @ np.linalg.inv(imu_to_velo)
     for name, matrix in ((CALIBRATIONS[1], velo_to_cam), (CALIBRATIONS[2], imu_to_velo)):
         write_lines(home / name, [head, f"R: {numbers(matrix[:3, :3])}", f"T: {numbers(matrix[:3, 3])}"])
@@ -124,6 +126,14 @@ def test_a_drive_is_the_simulators_log(tmp_path, capsys, cameras):
     assert f"lacks 'S_rect_{cameras[0]}' with 2 numbers" in capsys.readouterr().err
 
 
+def test_a_drive_before_rectification_is_the_simulators_log(tmp_path):
+    folder, own = write_drive(gray(EXACT), tmp_path, rectified=False), own_log(gray(EXACT), tmp_path / "own.mcap")
+    assert roverflow("import", "kitti", folder, tmp_path / "log.mcap") == 0
+    topics = {topic for topic, _, _ in iter_decoded(tmp_path / "log.mcap")}
+    assert "/stereo/left/image_raw/compressed" in topics
+    assert_same(tmp_path / "log.mcap", own)
+
+
 @pytest.mark.slow
 def test_a_drive_gives_the_simulators_maps(tmp_path):
     folder, own = write_drive(EXACT, tmp_path, ("02", "03")), own_log(EXACT, tmp_path / "own.mcap")
@@ -131,17 +141,18 @@ def test_a_drive_gives_the_simulators_maps(tmp_path):
     assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
 
 
-def test_a_drive_before_rectification_has_its_lenses():
+def test_kittis_own_calibration_has_its_baselines_and_the_cameras_height():
     home = data_folder("kitti")
-    from recordings.importers.kitti import _calibration, _raw, _rectified
-
-    values = _calibration(home / CALIBRATIONS[0])
+    values, *others = (_calibration(home / name) for name in CALIBRATIONS)
+    velo_to_cam, imu_to_velo = (_rigid(other, "R", "T") for other in others)
     (left, _), moved, _ = _raw(values, "00", "01")
     assert (left.width, left.height) == (1392, 512)
     assert left.d[0] == -0.3728755
     assert np.linalg.norm(moved.translation) == pytest.approx(0.5372, abs=1e-3)
     for cameras in (("00", "01"), ("02", "03")):
-        models, beside, _ = _rectified(values, *cameras)
+        models, beside, turned = _rectified(values, *cameras)
+        imu_from_left = np.linalg.inv(turned @ velo_to_cam @ imu_to_velo)
+        assert imu_from_left[2, 3] + IMU_HEIGHT == pytest.approx(1.65, abs=0.02)  # as KITTI describes its car
         assert beside.translation[0] == pytest.approx(0.537 if cameras[0] == "00" else 0.5327, abs=2e-4)
         assert models[0].width == 1242
 
