@@ -27,7 +27,7 @@ from recordings.importers.recording import (
     common_size,
     rectified_models,
 )
-from recordings.importers.rig import Rig
+from recordings.importers.rig import INCLINOMETER, LENS, Rig
 from recordings.importers.track import upright
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import up_of
@@ -50,10 +50,7 @@ def read_devon(source: Path, rig: Rig, logs: Path | None = None) -> ImportedReco
     folder = next((place for place in places if (place / TIMES).exists()), None)
     if folder is None:
         raise LogError(f"there is no {places[0] / TIMES}; give --logs, or use import images for pairs without times")
-    rig.need(
-        "the Devon Island data set", "height", "pitch_down", "pitch_column", "roll_column", "angle_unit", "pitch_sign",
-        "roll_sign", "tilt_model",
-    )  # fmt: skip
+    rig.need("the Devon Island data set", "height", "pitch_down", *INCLINOMETER)
     notes: list[str] = []
     stamps = {
         int(row[0]): from_date(row[1], where) for where, row in read_rows(folder / TIMES, 2) if row[0].isdecimal()
@@ -61,7 +58,7 @@ def read_devon(source: Path, rig: Rig, logs: Path | None = None) -> ImportedReco
     pairs = _pairs(source, stamps, notes)
     width, height = common_size(pairs)
     if width not in LENSES:
-        rig.need(f"a set with images of {width}x{height}", "fx", "cx", "cy", "baseline")
+        rig.need(f"a set with images of {width}x{height}", *LENS)
     focal, cx, cy = LENSES.get(width, (1.0, 0.0, 0.0))
     camera = rig.camera(
         StereoCamera(fx=focal, fy=focal, cx=cx, cy=cy, baseline=BASELINE, width=width, height=height, frame_id=LEFT)

@@ -33,7 +33,7 @@ from recordings.importers.recording import (
     fix,
     raw_models,
 )
-from recordings.importers.rig import Rig
+from recordings.importers.rig import MOUNT, Rig
 from recordings.importers.track import upright
 from recordings.ros2.to_msg import imu, raw_imu
 from stages.data import Array, CameraModel, Transform
@@ -60,9 +60,10 @@ def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> Impor
     if calibrated.right_in_left is None:
         raise LogError(f"{calibration[0]} lacks the transform between the cameras; give the stereo calibration")
     base = Transform(BASE, IMU, np.diag([-1.0, -1.0, 1.0]), np.zeros(3)).after(CAMERA_ON_IMU)
+    usual = all(getattr(rig, name) in (None, 0.0) for name in MOUNT if name != "height")
     place = np.array([*base.translation[:2], rig.height])
     mounts = [
-        Transform(BASE, LEFT, base.rotation, place) if rig.pitch_down is None else rig.mount,
+        Transform(BASE, LEFT, base.rotation, place) if usual else rig.mount,
         between(LEFT, RIGHT, calibrated.right_in_left), CAMERA_ON_IMU.inverse(), GPS_ON_IMU,
     ]  # fmt: skip
     return ImportedRecording(

@@ -24,7 +24,7 @@ from recordings.importers.recording import (
     rectified_models,
     tilts_of,
 )
-from recordings.importers.rig import Rig
+from recordings.importers.rig import AXES, Rig
 from recordings.importers.track import Track
 from stages.data import StereoCamera
 
@@ -37,7 +37,7 @@ def read_lusnar(source: Path, rig: Rig) -> ImportedRecording:
     folders = [source / name / "RGB" for name in ("image1", "image2")]
     if not folders[0].is_dir():
         raise LogError(f"{source} has no folder image1/RGB; give the folder of one scene")
-    rig.need("LuSNAR", "height", "pitch_down", "body_axes", "world_up")
+    rig.need("LuSNAR", "height", "pitch_down", *AXES)
     files = [{file.name: file for file in folder.glob("*.png")} for folder in folders]
     notes = ["the tilt is that of the poses, as no sensor of the data set measures it"]
     if alone := len(files[0].keys() ^ files[1].keys()):

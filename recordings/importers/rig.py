@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -17,6 +17,11 @@ from recordings.importers.recording import BASE, LEFT
 from recordings.source.transforms import BODY_FROM_OPTICAL
 from stages.data import Array, StereoCamera, Transform
 
+# Entries that kinds of data sets share.
+MOUNT = ("height", "pitch_down", "roll", "yaw", "forward", "left")
+LENS = ("fx", "cx", "cy", "baseline")
+AXES = ("body_axes", "world_up")
+INCLINOMETER = ("pitch_column", "roll_column", "angle_unit", "pitch_sign", "roll_sign", "tilt_model")
 _PLACE: dict[str, Any] = {"unit": "m", "low": -100.0, "high": 100.0}
 _LENS: dict[str, Any] = {"unit": "px", "low": 0.0, "high": 1e6}
 _TURN: dict[str, Any] = {"unit": "rad", "low": -np.pi, "high": np.pi}
@@ -71,10 +76,10 @@ class Rig:
 
     @property
     def mount(self) -> Transform | None:
-        """base_link <- left camera; None without a height. Raises LogError without an angle."""
-        if self.height is None:
+        """base_link <- left camera; None if nothing is known. Raises LogError without a height or an angle."""
+        if all(getattr(self, name) in (None, 0.0) for name in MOUNT):
             return None
-        self.need("the data set", "pitch_down")
+        self.need("the data set", "height", "pitch_down")
         turn = Rotation.from_euler("ZYX", [self.yaw, self.pitch_down, self.roll]).as_matrix()
         return Transform(BASE, LEFT, turn @ BODY_FROM_OPTICAL, np.array([self.forward, self.left, self.height]))
 
@@ -92,7 +97,7 @@ class Rig:
 
     def camera(self, usual: StereoCamera) -> StereoCamera:
         """The rectified camera: the usual one of the data set with the entries of the file."""
-        given = {name: getattr(self, name) for name in ("fx", "cx", "cy", "baseline")}
+        given = {name: getattr(self, name) for name in LENS}
         values = {name: value for name, value in given.items() if value is not None}
         return replace(usual, **values, **{to: values[of] for of, to in _SAME.items() if of in values})
 
@@ -105,16 +110,19 @@ _UPRIGHT = {
 _SAME = {"fx": "fy", "cx": "cx_right"}
 
 
-def read_rig(path: Path | None) -> Rig:
-    """The rig of a file; an empty one without a file. Raises LogError for an unknown entry or a value that is none."""
+def read_rig(path: Path | None, entries: Collection[str]) -> Rig:
+    """The rig of a file with some of these entries; an empty one without a file.
+
+    Raises LogError for another entry or a value that is none.
+    """
     if path is None:
         return Rig()
     content, hints = read_yaml(path), get_type_hints(Rig)
-    known = {entry.name: entry for entry in fields(Rig) if entry.init}
+    known = {entry.name: entry for entry in fields(Rig) if entry.name in entries}
     values: Mapping[str, Any] = {}
     for name, value in content.items():
         if name not in known:
-            raise LogError(f"{path} has the unknown entry '{name}'; it may have {', '.join(known)}")
+            raise LogError(f"{path} has the entry '{name}', which is not used; it may have {', '.join(known)}")
         try:
             values = {**values, name: coerced(value, hints[name], known[name])}
         except ValueError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,15 +25,17 @@ def add_recording_arguments(sub: argparse.ArgumentParser, source: str, rig: str)
     sub.add_argument("--rig", type=Path, metavar="RIG.yaml", help=f"what the files do not say: {rig}")
 
 
-def import_recording(options: argparse.Namespace, read: Callable[[Rig], ImportedRecording]) -> int:
-    """Read and write a recording, and print notes, frames and size."""
+def import_recording(
+    options: argparse.Namespace, entries: Collection[str], read: Callable[[Rig], ImportedRecording]
+) -> int:
+    """Read and write a recording, and print notes, frames and size. entries: that the rig file may have."""
     from tqdm import tqdm
 
     from recordings.importers.recording import write_recording
     from recordings.importers.rig import read_rig
 
     check_outputs({"input log": options.out}, [path for path in [options.rig] if path is not None])
-    recording = read(read_rig(options.rig))
+    recording = read(read_rig(options.rig, entries))
     with tqdm(total=len(recording.pairs), unit="frame", disable=not sys.stderr.isatty()) as bar:
 
         def progress(done: int) -> None:

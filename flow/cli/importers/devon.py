@@ -20,5 +20,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the log."""
     from recordings.importers.devon import read_devon
+    from recordings.importers.rig import INCLINOMETER, LENS, MOUNT
 
-    return import_recording(options, lambda rig: read_devon(options.source, rig, options.logs))
+    return import_recording(
+        options, MOUNT + LENS + INCLINOMETER, lambda rig: read_devon(options.source, rig, options.logs)
+    )

@@ -21,5 +21,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the log."""
     from recordings.importers.euroc import read_euroc
+    from recordings.importers.rig import MOUNT
 
-    return import_recording(options, lambda rig: read_euroc(options.source, rig, options.calibration))
+    return import_recording(options, MOUNT, lambda rig: read_euroc(options.source, rig, options.calibration))

@@ -20,5 +20,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the log."""
     from recordings.importers.katwijk import read_katwijk
+    from recordings.importers.rig import MOUNT
 
-    return import_recording(options, lambda rig: read_katwijk(options.source, rig, tuple(options.calibration)))
+    return import_recording(options, MOUNT, lambda rig: read_katwijk(options.source, rig, tuple(options.calibration)))

@@ -18,5 +18,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the log."""
     from recordings.importers.kitti import read_kitti
+    from recordings.importers.rig import MOUNT
 
-    return import_recording(options, lambda rig: read_kitti(options.source, rig, options.color))
+    return import_recording(options, MOUNT, lambda rig: read_kitti(options.source, rig, options.color))

@@ -17,5 +17,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the log."""
     from recordings.importers.lusnar import read_lusnar
+    from recordings.importers.rig import AXES, LENS, MOUNT
 
-    return import_recording(options, lambda rig: read_lusnar(options.source, rig))
+    return import_recording(options, MOUNT + LENS + AXES, lambda rig: read_lusnar(options.source, rig))

@@ -17,6 +17,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the log."""
+    from recordings.importers.rig import LENS, MOUNT
     from recordings.importers.tartanair import read_tartanair
 
-    return import_recording(options, lambda rig: read_tartanair(options.source, rig))
+    return import_recording(options, MOUNT + LENS, lambda rig: read_tartanair(options.source, rig))
