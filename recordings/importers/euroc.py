@@ -17,7 +17,17 @@ from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.calibration.yaml_files import numbers, read_yaml
 from recordings.errors import LogError
 from recordings.importers.files import nanoseconds, numbers_of, read_rows
-from recordings.importers.recording import IMU, LEFT, RIGHT, ImagePair, ImportedRecording, Logged, between, raw_models
+from recordings.importers.recording import (
+    IMU,
+    LEFT,
+    RIGHT,
+    ImagePair,
+    ImportedRecording,
+    Logged,
+    between,
+    common_size,
+    raw_models,
+)
 from recordings.importers.rig import Rig
 from recordings.importers.track import Track
 from recordings.ros2.to_msg import raw_imu
@@ -45,9 +55,10 @@ def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> Impo
         raise LogError(f"{calibration[0]} lacks the transform between Imu and camera; give the file of imu and cameras")
     camera_from_imu = calibrated.camera_from_imu @ _imu_in_body(folder / "imu0" / "sensor.yaml")
     mounts = [between(LEFT, RIGHT, calibrated.right_in_left), between(LEFT, IMU, camera_from_imu)]
+    pairs = _pairs(folder, left, right, notes)
     truth = next((path for name in TRUTHS if (path := folder / name / "data.csv").exists()), None)
     return ImportedRecording(
-        raw_models(calibrated), False, _pairs(folder, left, right, notes),
+        raw_models(calibrated, common_size(pairs)), False, pairs,
         [*filter(None, [rig.mount]), *mounts], [_imu(folder / "imu0" / "data.csv")],
         None if truth is None else _track(truth), true_tilt=True, notes=notes,
     )  # fmt: skip

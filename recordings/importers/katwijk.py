@@ -57,17 +57,17 @@ def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> Impor
     read = calibration[0].suffix == ".mat"
     size = common_size(pairs)
     calibrated = _structs(calibration[0], size) if read else read_calibration(calibration)
-    if calibrated.right_in_left is None:
-        raise LogError(f"{calibration[0]} lacks the transform between the cameras; give the stereo calibration")
     base = Transform(BASE, IMU, np.diag([-1.0, -1.0, 1.0]), np.zeros(3)).after(CAMERA_ON_IMU)
     usual = all(getattr(rig, name) in (None, 0.0) for name in MOUNT if name != "height")
     place = np.array([*base.translation[:2], rig.height])
     mounts = [
         Transform(BASE, LEFT, base.rotation, place) if usual else rig.mount,
-        between(LEFT, RIGHT, calibrated.right_in_left), CAMERA_ON_IMU.inverse(), GPS_ON_IMU,
+        CAMERA_ON_IMU.inverse(), GPS_ON_IMU,
     ]  # fmt: skip
+    if calibrated.right_in_left is not None:  # else the projections contain the baseline
+        mounts.append(between(LEFT, RIGHT, calibrated.right_in_left))
     return ImportedRecording(
-        raw_models(calibrated), False, pairs, [mount for mount in mounts if mount is not None],
+        raw_models(calibrated, size), False, pairs, [mount for mount in mounts if mount is not None],
         [_sensors(source / "imu.txt"), _places(source / "gps-utm31.txt", notes)], notes=notes,
     )  # fmt: skip
 

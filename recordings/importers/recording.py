@@ -190,13 +190,16 @@ def rectified_models(camera: StereoCamera) -> tuple[CameraModel, CameraModel]:
     return pinhole(camera, "left"), pinhole(camera, "right")
 
 
-def raw_models(calibration: StereoCalibration) -> tuple[CameraModel, CameraModel]:
-    """The calibration of a pair before rectification, with K as the projection where the files have none."""
-    left, right = (
-        model if np.any(model.p) else replace(model, p=np.column_stack([model.k, np.zeros(3)]))
-        for model in calibration.models
-    )
-    return left, right
+def raw_models(calibration: StereoCalibration, size: tuple[int, int]) -> tuple[CameraModel, CameraModel]:
+    """The calibration of a pair before rectification, with K as the projection and `size`, px, where it has none."""
+    left, right = calibration.models
+    return _completed(left, size), _completed(right, size)
+
+
+def _completed(model: CameraModel, size: tuple[int, int]) -> CameraModel:
+    p = model.p if np.any(model.p) else np.column_stack([model.k, np.zeros(3)])
+    width, height = (model.width, model.height) if model.width and model.height else size
+    return replace(model, p=p, width=width, height=height)
 
 
 def between(parent: str, child: str, matrix: Any) -> Transform:

@@ -77,7 +77,7 @@ class Rig:
     @property
     def mount(self) -> Transform | None:
         """base_link <- left camera; None if nothing is known. Raises LogError without a height or an angle."""
-        if all(getattr(self, name) in (None, 0.0) for name in MOUNT):
+        if self.height is None and self.pitch_down is None and not any((self.roll, self.yaw, self.forward, self.left)):
             return None
         self.need("the data set", "height", "pitch_down")
         turn = Rotation.from_euler("ZYX", [self.yaw, self.pitch_down, self.roll]).as_matrix()

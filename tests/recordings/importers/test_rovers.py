@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+import yaml
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
@@ -113,6 +114,18 @@ def test_a_part_of_katwijk_is_the_simulators_log(tmp_path, capsys, outward):
     assert roverflow("import", "katwijk", folder, log, *given[:2]) == 2
     assert "lacks 'height'" in capsys.readouterr().err
     assert roverflow("import", "katwijk", folder, log, "--calibration", folder / "rig.yaml", *given[2:]) == 2
+
+
+def test_a_part_of_katwijk_takes_a_calibration_of_opencv(tmp_path):
+    folder, own = write_katwijk(BEACH, tmp_path / "Part1"), own_log(BEACH, tmp_path / "own.mcap")
+    camera = BEACH.camera
+    k = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    lenses = {"M1": k, "M2": k, "D1": [0.0] * 5, "D2": [0.0] * 5}  # without a size of the images
+    stereo = {**lenses, "R": np.eye(3).tolist(), "T": [-camera.baseline, 0, 0]}
+    (tmp_path / "stereo.yaml").write_text(yaml.safe_dump(stereo))
+    given = "--calibration", tmp_path / "stereo.yaml", "--rig", folder / "rig.yaml"
+    assert roverflow("import", "katwijk", folder, tmp_path / "log.mcap", *given) == 0
+    assert_same(tmp_path / "log.mcap", own, mount=False)
 
 
 @pytest.mark.slow
