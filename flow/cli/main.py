@@ -20,8 +20,10 @@ from flow.cli.commands import (
     demo,
     diff,
     export,
+    fleet,
     graph,
     info,
+    listing,
     pipeline,
     report,
     run,
@@ -49,6 +51,8 @@ COMMANDS: dict[str, ModuleType] = {
     "why": why,
     "report": report,
     "export": export,
+    "fleet": fleet,
+    "list": listing,
 }
 IMPORTERS: dict[str, ModuleType] = {
     "devon": devon,

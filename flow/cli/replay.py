@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -25,8 +25,12 @@ def replay(
     start: float | None = None,
     end: float | None = None,
     every: Every | None = None,
+    on_frame: Callable[[bool], None] | None = None,
 ) -> dict[str, Any]:
-    """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary."""
+    """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary.
+
+    on_frame: called after each frame, with whether it is complete, in place of a progress bar.
+    """
     from tqdm import tqdm
 
     from flow.config import loader as pipelines
@@ -50,10 +54,11 @@ def replay(
         }
         # A file name may hold bytes that are not UTF-8.
         about = {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}
-        with tqdm(total=_frames(opened.frames, every), unit="frame", disable=not sys.stderr.isatty()) as bar:
+        hidden = on_frame is not None or not sys.stderr.isatty()
+        with tqdm(total=_frames(opened.frames, every), unit="frame", disable=hidden) as bar:
             drops = 0
 
-            def on_frame(complete: bool) -> None:
+            def advance(complete: bool) -> None:
                 nonlocal drops
                 drops += not complete
                 bar.set_postfix(dropped=drops, refresh=False)
@@ -61,7 +66,7 @@ def replay(
 
             with interrupts(stop, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)):
                 settings: dict[str, Any] = {"workers": workers, "every": every}
-                summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame)
+                summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame or advance)
     return as_json(summary | {"overrides": list(overrides)})
 
 

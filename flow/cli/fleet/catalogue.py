@@ -1,0 +1,104 @@
+"""The catalogue of a fleet: one row for each log in an SQLite file, written by the client alone."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from flow.errors import UsageError
+
+NAME = "catalogue.sqlite"
+# state: waiting, running, done, unusable (a run refuses the log), failed, killed (it ends its workers), hung
+COLUMNS = {
+    "name": "TEXT PRIMARY KEY", "log": "TEXT", "bytes": "INTEGER", "log_digest": "TEXT", "pipeline": "TEXT",
+    "pipeline_digest": "TEXT", "version": "TEXT", "state": "TEXT", "verdict": "TEXT", "frames": "INTEGER",
+    "complete": "INTEGER", "losses": "TEXT", "findings": "TEXT", "seconds": "REAL", "cpu_seconds": "REAL",
+    "stage_seconds": "REAL", "node": "TEXT", "result": "TEXT", "why": "TEXT", "ended": "TEXT",
+}  # fmt: skip
+ENDED = ("done", "unusable", "killed", "hung")  # states that a second call leaves, unless log or pipeline change
+
+
+class Catalogue:
+    """The rows of a folder's catalogue.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of a fleet.
+    create : bool
+        Whether to make a catalogue that is not there.
+
+    Raises
+    ------
+    UsageError
+        If there is no catalogue, or the file is none.
+    """
+
+    def __init__(self, folder: Path, create: bool = False) -> None:
+        self.path = folder / NAME
+        if not create and not self.path.is_file():
+            raise UsageError(f"{folder} has no {NAME}; give the folder of roverflow fleet")
+        with self._opened(write=create) as database:
+            if create:
+                columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
+                database.execute(f"CREATE TABLE IF NOT EXISTS logs ({columns})")
+
+    def rows(self, where: str = "", sort: str = "name") -> list[dict[str, Any]]:
+        """The rows that fulfil an SQL condition, sorted by SQL columns. Raises UsageError for wrong SQL."""
+        query = f"SELECT * FROM logs{f' WHERE {where}' if where else ''} ORDER BY {sort}"
+        try:
+            with self._opened() as database:
+                return [dict(row) for row in database.execute(query)]
+        except sqlite3.Error as error:
+            columns = ", ".join(COLUMNS)
+            raise UsageError(
+                f"the catalogue cannot answer '{where or sort}': {error}; its columns are {columns}"
+            ) from error
+
+    def put(self, name: str, values: Mapping[str, Any]) -> None:
+        """Change columns of a row, or add it."""
+        known = {"name": name, **values}
+        names, marks = ", ".join(known), ", ".join("?" * len(known))
+        updates = ", ".join(f"{column} = excluded.{column}" for column in values)
+        query = f"INSERT INTO logs ({names}) VALUES ({marks}) ON CONFLICT (name) DO UPDATE SET {updates}"
+        with self._opened(write=True) as database:
+            database.execute(query, [_plain(value) for value in known.values()])
+
+    @contextmanager
+    def _opened(self, write: bool = False) -> Iterator[sqlite3.Connection]:
+        mode = "rwc" if write else "ro"
+        database = sqlite3.connect(f"file:{self.path.resolve()}?mode={mode}", uri=True, timeout=30)
+        database.row_factory = sqlite3.Row
+        try:
+            with database:
+                yield database
+        except sqlite3.DatabaseError as error:
+            if "not a database" in str(error):
+                raise UsageError(f"{self.path} is no catalogue; remove it or choose another folder") from error
+            raise
+        finally:
+            database.close()
+
+
+def as_table(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
+    """Rows as an aligned text table."""
+    names = list(columns)
+    cells = [names, *([_shown(row[name]) for name in names] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells
+    )
+
+
+def _plain(value: Any) -> Any:
+    return json.dumps(value) if isinstance(value, dict | list) else value
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.1f}" if isinstance(value, float) else str(value)

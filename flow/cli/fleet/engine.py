@@ -1,0 +1,192 @@
+"""Runs the tasks of a fleet on a Dask cluster and keeps the catalogue. The engine's traps are in docs/fleet.md."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from flow.cli.fleet.catalogue import Catalogue
+from flow.cli.fleet.jobs import Job
+from flow.cli.fleet.task import Task, about_worker, run_task
+from flow.errors import RoverflowError, UsageError
+
+POLL_SECONDS = 1.0
+WORKER_DEATHS = 1  # of a log that is tried once more; the next death sets it aside
+
+
+class ClusterLostError(RoverflowError):
+    """The scheduler is gone; what has ended is in the catalogue."""
+
+
+@dataclass
+class Fleet:
+    """What a fleet runs. stall_seconds: without a new frame, after which a log counts as hung."""
+
+    folder: Path
+    catalogue: Catalogue
+    tasks: dict[str, tuple[Job, Task]]
+    say: Callable[[str], None]
+    stall_seconds: float = 600.0
+    left: set[str] = field(default_factory=set)
+    _seen: dict[str, tuple[str, float]] = field(default_factory=dict)  # name -> progress and when it was new
+
+    def run(self, client: Any) -> None:
+        """Run all tasks, the largest first; raises ClusterLostError where the scheduler is gone."""
+        from distributed import as_completed
+
+        self._check(client)
+        futures = {}
+        for place, (name, (job, task)) in enumerate(self.tasks.items()):
+            self.catalogue.put(name, task.identity() | _row_of(job, task) | {"state": "waiting", "why": None})
+            key = f"roverflow-{task.log_digest}-{task.pipeline.digest}-{time.time_ns()}"
+            futures[client.submit(run_task, task, key=key, priority=-place, pure=False)] = name
+        self.left = set(self.tasks)
+        ended = as_completed(futures)
+        while self.left:
+            try:
+                for future in ended.next_batch(block=False):
+                    self._end(futures[future], future)
+                self._watch(client, futures)
+            except (OSError, TimeoutError, RuntimeError) as error:
+                raise ClusterLostError(f"the cluster does not answer: {error}; the same command continues") from error
+            if client.status not in ("running", "connecting"):
+                raise ClusterLostError("the scheduler is gone; the same command continues where this one ended")
+            if self.left:
+                time.sleep(POLL_SECONDS / 5)
+
+    def _check(self, client: Any) -> None:
+        """Refuse workers of another version, pipeline or machine, and logs that a worker does not see."""
+        _, task = next(iter(self.tasks.values()))
+        found = client.run(about_worker, task)
+        if not found:
+            raise UsageError("the cluster has no workers; start some")
+        expected = about_worker(task)
+        for worker, about in found.items():
+            for name in ("version", "pipeline", "machine"):
+                if about[name] != expected[name]:
+                    here, there = expected[name], about[name]
+                    raise UsageError(f"the worker {worker} has another {name} ({there}) than this machine ({here})")
+            if not about["log"]:
+                raise UsageError(f"the worker {worker} has no {task.log}; paths must mean the same on all machines")
+
+    def _end(self, name: str, future: Any) -> None:
+        """Write the row of a task that has ended, and say so."""
+        if name not in self.left:
+            return
+        job, _ = self.tasks[name]
+        if future.status == "finished":
+            row = dict(future.result())
+        else:
+            error = future.exception()
+            dead = type(error).__name__ == "KilledWorker"
+            why = (
+                "its workers died, by memory or a fault of the machine" if dead else f"{type(error).__name__}: {error}"
+            )
+            row = {"state": "killed" if dead else "failed", "why": why}
+        if row.get("result"):
+            row["result"] = job.result(self.folder).relative_to(self.folder).as_posix()
+        self._note(name, row)
+
+    def _note(self, name: str, row: dict[str, Any]) -> None:
+        """Write a row for good, and say what is left."""
+        self.left.discard(name)
+        self.catalogue.put(name, row | {"ended": datetime.now(UTC).isoformat(timespec="seconds")})
+        size = sum(self.tasks[other][0].size for other in self.left) / 1e9
+        done = f"{len(self.tasks) - len(self.left)} of {len(self.tasks)}"
+        self.say(f"{done}: {line_of(name, row)}" + (f"; {size:.1f} GB left" if self.left else ""))
+
+    def _watch(self, client: Any, futures: dict[Any, str]) -> None:
+        """Note which tasks run, and set aside those without progress."""
+        now = time.monotonic()
+        for future, name in futures.items():
+            if name not in self.left:
+                continue
+            try:
+                progress = self.tasks[name][1].progress.read_text()
+            except OSError:
+                continue  # it has not begun, or it ends just now
+            if name not in self._seen:
+                self.catalogue.put(name, {"state": "running"})
+            if self._seen.get(name, ("", 0.0))[0] != progress:
+                self._seen[name] = (progress, now)
+            elif now - self._seen[name][1] > self.stall_seconds:
+                holders = [worker for worker, keys in client.processing().items() if future.key in map(str, keys)]
+                future.cancel(force=True)
+                if holders:
+                    with suppress(Exception):  # the worker may die on its own
+                        client.restart_workers(holders, timeout=30, raise_for_error=False)
+                with suppress(OSError):
+                    self.tasks[name][1].progress.unlink()
+                why = f"no frame in {self.stall_seconds:g} s, after frame {int(progress) - 1}"
+                self._note(name, {"state": "hung", "why": why})
+
+
+def line_of(name: str, row: dict[str, Any]) -> str:
+    """One line about a log that has ended."""
+    if row["state"] != "done":
+        return f"{name}: {row['state']}: {row['why']}"
+    why = f", {row['why']}" if row.get("why") else ""
+    frames = f"{row['complete']} of {row['frames']} frames{why}"
+    return f"{name}: {row['verdict']}, {frames}; {row['seconds']:.0f} s on {row['node']}"
+
+
+def _row_of(job: Job, task: Task) -> dict[str, Any]:
+    return {"log": str(job.log), "bytes": job.size, "pipeline": task.pipeline.name}
+
+
+@contextmanager
+def cluster(address: str | None, processes: int, memory: str, dashboard: bool) -> Iterator[Any]:
+    """A client of the Dask cluster at `address`, or of worker processes of this machine that end with it.
+
+    Raises
+    ------
+    UsageError
+        If the extra `fleet` is missing, or nothing answers at the address.
+    """
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise UsageError("a fleet needs dask.distributed; install roverflow[fleet]") from error
+    for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
+        logging.getLogger(name).setLevel(logging.ERROR)  # each has a level of its own
+    dask.config.set(
+        {
+            "distributed.scheduler.allowed-failures": WORKER_DEATHS,
+            "distributed.scheduler.default-task-durations": {"roverflow": "30m"},
+            "distributed.worker.memory.target": False, "distributed.worker.memory.spill": False,
+            "distributed.worker.memory.pause": False,
+        }
+    )  # fmt: skip
+    if address is not None:
+        try:
+            client = Client(address, timeout=20)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise UsageError(f"no Dask scheduler answers at {address}: {error}") from error
+        with client:
+            yield client
+        return
+    settings = {"n_workers": processes, "threads_per_worker": 1, "processes": True, "memory_limit": memory}
+    shown = {"dashboard_address": f"127.0.0.1:{8787 if dashboard else 0}", "scheduler_kwargs": {"dashboard": dashboard}}
+    try:
+        local = LocalCluster(**settings, **shown, host="127.0.0.1", silence_logs=logging.ERROR)
+    except ValueError as error:
+        raise UsageError(f"the worker processes cannot start: {error}") from error
+    with local, Client(local) as client:
+        yield client
+
+
+def tasks_of(
+    jobs: Sequence[Job], folder: Path, pipeline: Any, recording: bool, workers: int
+) -> dict[str, tuple[Job, Task]]:
+    """Name -> job and task."""
+    return {
+        job.name: (job, Task(job.name, job.log, job.digest, job.result(folder), pipeline, recording, workers))
+        for job in jobs
+    }

@@ -1,0 +1,124 @@
+"""The jobs of a fleet: which logs there are, where their results go, and which of them still have to run."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+from flow.cli.fleet.catalogue import ENDED
+from flow.errors import UsageError
+from recordings.containers.finding import RESULT_ENDING, SUFFIXES, find_files
+from recordings.errors import LogError
+
+SAMPLE_BYTES = 1 << 20  # at the beginning and at the end of a file, for its digest
+
+
+@dataclass(frozen=True)
+class Job:
+    """One log. name: unique in the fleet; log: file or folder; size: bytes; digest: of its content."""
+
+    name: str
+    log: Path
+    size: int
+    digest: str
+
+    def result(self, folder: Path) -> Path:
+        """The result log."""
+        return folder / f"{self.name}{RESULT_ENDING}.mcap"
+
+
+def jobs_of(given: Sequence[str], folder: Path) -> list[Job]:
+    """The jobs of logs, folders of logs, patterns, and text files that list these; the largest first.
+
+    A folder that is one recording is one job. Raises UsageError if there is no log.
+    """
+    logs = list(dict.fromkeys(path.absolute() for word in given for path in _logs(word, folder)))
+    if not logs:
+        raise UsageError(f"there is no log in {', '.join(given)}; give files, folders, patterns or a text file of them")
+    root = Path(os.path.commonpath([log.parent for log in logs]))
+    jobs = [_job(log, root) for log in logs]
+    names = [job.name for job in jobs]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise UsageError(f"two logs have the name {twice[0]}; give them in different folders, or rename one")
+    return sorted(jobs, key=lambda job: (-job.size, job.name))
+
+
+def reason_to_run(job: Job, row: Mapping[str, Any] | None, pipeline_digest: str, version: str, folder: Path) -> str:
+    """Why a job has to run; empty if its row has the result of the same log, pipeline and version."""
+    if row is None or not row["state"]:
+        return "new"
+    if row["log_digest"] != job.digest:
+        return "the log changed"
+    if row["pipeline_digest"] != pipeline_digest:
+        return "the pipeline changed"
+    if row["version"] != version:
+        return "another version of roverflow"
+    if row["state"] not in ENDED:
+        return "it failed" if row["state"] == "failed" else "it was not finished"
+    if row["state"] == "done" and row["result"] and not (folder / row["result"]).is_file():
+        return "its result is missing"
+    return ""
+
+
+def _logs(word: str, folder: Path) -> Iterable[Path]:
+    """The logs that a word of the command line names."""
+    path = Path(word)
+    if path.is_dir():
+        yield from _in_folder(path, folder)
+    elif path.is_file() and path.suffix not in SUFFIXES:
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"{path} is neither a log nor a text file of logs") from error
+        for line in filter(None, (line.partition("#")[0].strip() for line in lines)):
+            yield from _logs(str(path.parent / line), folder)
+    elif path.is_file():
+        yield path
+    else:
+        found = sorted(glob(word, recursive=True))  # noqa: PTH207  # a pattern may be absolute
+        if not found:
+            raise UsageError(f"no file, folder or pattern {word}")
+        for item in found:
+            yield from _logs(item, folder)
+
+
+def _in_folder(path: Path, folder: Path) -> Iterable[Path]:
+    """A folder that is one recording, or the logs in it and in its folders, without results and the fleet's own."""
+    try:
+        files = find_files(path).files
+    except LogError:
+        files = ()
+    if len(files) > 1 or (path / "metadata.yaml").is_file():
+        yield path
+        return
+    for item in sorted(path.iterdir()):
+        if item.resolve() == folder.resolve() or item.name.startswith("."):
+            continue
+        if item.is_dir():
+            yield from _in_folder(item, folder)
+        elif item.suffix in SUFFIXES and not item.stem.endswith(RESULT_ENDING):
+            yield item
+
+
+def _job(log: Path, root: Path) -> Job:
+    files = find_files(log).files
+    name = log.relative_to(root)
+    digest = hashlib.blake2b(digest_size=16)
+    for file in files:
+        try:
+            size = file.stat().st_size
+            with file.open("rb") as stream:
+                digest.update(f"{file.name} {size} ".encode("utf-8", "surrogateescape"))
+                digest.update(stream.read(SAMPLE_BYTES))
+                stream.seek(max(0, size - SAMPLE_BYTES))
+                digest.update(stream.read(SAMPLE_BYTES))
+        except OSError as error:
+            raise UsageError(f"cannot read {file}: {error.strerror or error}") from error
+    size = sum(file.stat().st_size for file in files)
+    return Job((name if log.is_dir() else name.with_suffix("")).as_posix(), log, size, digest.hexdigest())

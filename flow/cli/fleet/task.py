@@ -1,0 +1,172 @@
+"""What a worker does: one log through the pipeline, as `roverflow run` does it. Only paths and summaries travel."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flow.cli.replay import product_version, replay
+from flow.config.loader import SHIPPED, load, shipped
+from flow.contracts import Verdict
+from flow.errors import RoverflowError, UsageError
+from recordings.errors import LogError, UnwritableError
+
+MAX_FILE_BYTES = 4 << 20  # of a file beside a pipeline that travels with it
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A pipeline that travels. name: of a shipped one, or of its file; files: name -> content, of its folder."""
+
+    name: str
+    files: Mapping[str, bytes]
+    changes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, name: str, changes: tuple[str, ...]) -> Pipeline:
+        """The pipeline `name`, as `load` takes it; a file takes the .py and .yaml files beside it along."""
+        if name in shipped():
+            return cls(name, {}, changes)
+        path = Path(name)
+        load(name, changes)  # refuses a wrong one at once
+        beside = [path, *(file for pattern in ("*.py", "*.yaml") for file in sorted(path.parent.glob(pattern)))]
+        small = {file.name: file.read_bytes() for file in beside if file.stat().st_size <= MAX_FILE_BYTES}
+        return cls(path.name, small, changes)
+
+    @property
+    def digest(self) -> str:
+        """Of everything that decides what the pipeline does, besides the version."""
+        text = b"".join(f"{name} {len(data)} ".encode() + data for name, data in sorted(self.files.items()))
+        if not self.files:
+            parts = sorted((SHIPPED / "parts").glob("*.yaml"))
+            text = b"".join(file.read_bytes() for file in (SHIPPED / f"{self.name}.yaml", *parts))
+        return hashlib.sha256(text + "\n".join(self.changes).encode()).hexdigest()[:16]
+
+    def local(self) -> str:
+        """Its name or file on this machine."""
+        if not self.files:
+            return self.name
+        folder = Path(tempfile.gettempdir()) / f"roverflow-{os.getuid()}-{self.digest}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        for name, data in self.files.items():
+            file = folder / name
+            if not file.exists() or file.read_bytes() != data:
+                partial = file.with_name(f".{name}.{os.getpid()}")
+                partial.write_bytes(data)
+                partial.replace(file)
+        return str(folder / self.name)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One log to run. result: the result log; recording: also write a rerun recording; workers: threads."""
+
+    name: str
+    log: Path
+    log_digest: str
+    result: Path
+    pipeline: Pipeline
+    recording: bool
+    workers: int
+
+    @property
+    def note(self) -> Path:
+        """The summary beside the result, by which a finished log is recognised."""
+        return self.result.with_suffix(".json")
+
+    @property
+    def progress(self) -> Path:
+        """A file that contains the number of frames so far, while the log runs."""
+        return self.result.with_suffix(".progress")
+
+    def identity(self) -> dict[str, str]:
+        """What the result depends on."""
+        return {"log_digest": self.log_digest, "pipeline_digest": self.pipeline.digest, "version": product_version()}
+
+
+def run_task(task: Task) -> dict[str, Any]:
+    """Run a log; returns the columns of its row in the catalogue. A log that cannot be used is a result.
+
+    A result of the same log, pipeline and version that is there already is taken as it is.
+    """
+    if (found := _finished(task)) is not None:
+        return found
+    task.result.parent.mkdir(parents=True, exist_ok=True)
+    for stale in task.result.parent.glob(f"{task.result.name}.*.partial"):  # of a worker that died
+        with suppress(OSError):
+            stale.unlink()
+    node = {"node": f"{platform.node()}:{os.getpid()}"}
+    try:
+        summary = _run(task)
+    except Exception as error:  # the log, a stage of the user's own, or the disk
+        usable = isinstance(error, UnwritableError) or not isinstance(error, UsageError | LogError)
+        known = isinstance(error, RoverflowError | LogError)
+        why = str(error) if known else f"{type(error).__name__}: {error}"
+        return task.identity() | node | {"state": "failed" if usable else "unusable", "why": why}
+    finally:
+        with suppress(OSError):
+            task.progress.unlink()
+    row = task.identity() | node | _columns(summary)
+    partial = task.note.with_suffix(f".{os.getpid()}.partial")
+    partial.write_text(json.dumps({"row": row, "summary": summary}, indent=2))
+    partial.replace(task.note)
+    return row
+
+
+def _run(task: Task) -> dict[str, Any]:
+    """The summary of the run."""
+    done = 0
+
+    def count(complete: bool) -> None:
+        nonlocal done
+        done += 1
+        with suppress(OSError):
+            task.progress.write_text(str(done))
+
+    count(True)
+    recording = task.result.with_suffix(".rrd") if task.recording else None
+    changes = task.pipeline.changes
+    return replay(
+        task.log, task.pipeline.local(), task.result, recording, overrides=changes, workers=task.workers, on_frame=count
+    )
+
+
+def _columns(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of a summary."""
+    drops = ", ".join(f"{number} {reason}" for reason, number in summary["drops"].items())
+    faults = {name: f"{item['severity']}: {item['sentence']}" for name, item in summary["findings"].items()}
+    interrupted = summary["interrupted"]
+    return {
+        "state": "failed" if interrupted else "done", "verdict": summary["verdict"], "frames": summary["frames_in"],
+        "complete": summary["frames_out"], "losses": summary["drops"], "findings": faults,
+        "seconds": summary["wall_seconds"], "cpu_seconds": summary["cpu_seconds"],
+        "stage_seconds": sum(summary.get("cpu_seconds_of", {}).values()),
+        "why": "" if summary["verdict"] == Verdict.COMPLETE else drops,
+        "result": Path(summary["outputs"][0]).name if summary["outputs"] else None,
+    }  # fmt: skip
+
+
+def _finished(task: Task) -> dict[str, Any] | None:
+    """The row of an earlier run of the same, if its files are there."""
+    try:
+        row: dict[str, Any] = json.loads(task.note.read_text())["row"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    same = all(row.get(name) == value for name, value in task.identity().items())
+    return row if same and row["state"] == "done" and (row["result"] is None or task.result.is_file()) else None
+
+
+def about_worker(task: Task) -> dict[str, Any]:
+    """What must be the same on all workers, and whether the log is there."""
+    return {
+        "version": product_version(), "pipeline": task.pipeline.digest, "machine": platform.machine(),
+        "python": platform.python_version(), "log": task.log.exists(),
+    }  # fmt: skip

@@ -1,0 +1,170 @@
+"""`roverflow fleet` and `roverflow list`: many logs, each once, with the bits of `roverflow run`."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from flow.cli.fleet.catalogue import Catalogue
+from flow.cli.fleet.jobs import jobs_of
+from flow.errors import UsageError
+from recordings.simulator import Simulation, write_log
+from tests.conftest import roverflow
+
+PIPELINE = ("-p", "fast", "--set", "disparities=48")
+TRAP = """
+import os, time
+from dataclasses import dataclass
+from stages import StereoFrame
+
+@dataclass(frozen=True)
+class Trap:
+    def __call__(self, frame: StereoFrame) -> StereoFrame:
+        width = frame.left.shape[1]
+        if width == 160:
+            os.kill(os.getpid(), 9)
+        while width == 176:
+            time.sleep(1)
+        if width == 192:
+            held = bytearray(8_000_000_000)
+            held[::4096] = b"x" * len(held[::4096])
+            time.sleep(60)
+        return frame
+"""
+TRAPPED = """
+source: {use: recordings.McapSource}
+streams:
+  stereo:    {use: flow.align.pair, left: left, right: right}
+  passed:    {use: trap.Trap, frame: stereo}
+  disparity: {use: stages.Match, frame: passed, disparities: 16}
+sinks: [{use: recordings.McapSink, results: [disparity]}]
+"""
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Three logs of different length, one of them in a folder, and a file that is none."""
+    folder = tmp_path_factory.mktemp("campaign")
+    (folder / "site").mkdir()
+    for name, frames in (("a", 1), ("b", 2), ("site/c", 1)):
+        write_log(Simulation(frames=frames, width=160, height=120, seed=frames), folder / f"{name}.mcap")
+    (folder / "junk.mcap").write_text("this is no log")
+    return folder
+
+
+def rows_of(folder: Path) -> dict[str, dict]:
+    return {row["name"]: row for row in Catalogue(folder).rows()}
+
+
+def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, capsys):
+    out, plain = tmp_path / "out", tmp_path / "plain.mcap"
+    words = ("fleet", logs, "--out", out, *PIPELINE, "--processes", 1)
+    assert roverflow(*words) == 3
+    printed = capsys.readouterr().out
+    assert "4 logs: 0 done before, 4 to run (4 new)" in printed
+    assert "junk: unusable: " in printed
+    for name in ("a", "b", "site/c"):
+        assert roverflow("run", logs / f"{name}.mcap", *PIPELINE, "--no-rrd", "-o", plain) == 0
+        assert (out / f"{name}-nav.mcap").read_bytes() == plain.read_bytes()
+    assert {name: row["state"] for name, row in rows_of(out).items()} == {
+        "a": "done", "b": "done", "site/c": "done", "junk": "unusable"
+    }  # fmt: skip
+    (out / "a-nav.mcap").unlink()
+    capsys.readouterr()
+    assert roverflow(*words) == 3
+    assert "4 logs: 3 done before, 1 to run (1 its result is missing)" in capsys.readouterr().out
+    assert (out / "a-nav.mcap").is_file()
+    assert roverflow("list", out, "--where", "verdict = 'COMPLETE'", "--sort", "frames DESC", "--json") == 0
+    assert next(row["name"] for row in json.loads(capsys.readouterr().out)) == "b"
+    assert roverflow("list", out, "--where", "nonsense") == 2
+    assert "its columns are name, log, bytes" in capsys.readouterr().err
+
+
+def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):
+    (logs / "which.txt").write_text("a.mcap  # the first\n\nsite\n")
+    names = {
+        given: [job.name for job in jobs_of([str(logs / given)], tmp_path)]
+        for given in ("b.mcap", "site", "*.mcap", "which.txt", ".")
+    }
+    assert names == {
+        "b.mcap": ["b"], "site": ["c"], "*.mcap": ["b", "a", "junk"], "which.txt": ["a", "site/c"],
+        ".": ["b", "a", "site/c", "junk"],
+    }  # fmt: skip
+    with pytest.raises(UsageError, match=r"no file, folder or pattern .*nix"):
+        jobs_of([str(logs / "nix")], tmp_path)
+
+
+@pytest.mark.slow
+def test_logs_that_end_or_stop_their_workers_leave_the_others_alone(logs, tmp_path, capsys):
+    home, out = tmp_path / "home", tmp_path / "out"
+    home.mkdir()
+    for name, width in (("dies", 160), ("hangs", 176), ("grows", 192), ("sound", 208), ("sound2", 208)):
+        write_log(Simulation(frames=1, width=width, height=120), home / f"{name}.mcap")
+    (home / "trap.py").write_text(TRAP)
+    (home / "own.yaml").write_text(TRAPPED)
+    words = ("fleet", home, "--out", out, "-p", home / "own.yaml", "--processes", 2, "--stall", 15, "--memory", "2GB")
+    assert roverflow(*words) == 3
+    states = {name: row["state"] for name, row in rows_of(out).items()}
+    assert states == {"dies": "killed", "hangs": "hung", "grows": "killed", "sound": "done", "sound2": "done"}
+    capsys.readouterr()
+    assert roverflow(*words) == 3
+    assert "5 logs: 5 done before, 0 to run" in capsys.readouterr().out
+
+
+@contextmanager
+def started(*words: object):
+    process = subprocess.Popen(
+        [sys.executable, "-m", *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.slow
+def test_a_cluster_of_other_processes_and_a_scheduler_that_dies(logs, tmp_path, capsys):
+    address, out = "tcp://127.0.0.1:18786", tmp_path / "out"
+    scheduler = ("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 18786, "--no-dashboard")
+    worker = ("distributed.cli.dask_worker", address, "--nworkers", 2, "--nthreads", 1, "--host", "127.0.0.1")
+    words = ("fleet", logs / "a.mcap", logs / "b.mcap", "--out", out, *PIPELINE, "--cluster", address)
+    with started(*scheduler), started(*worker):
+        time.sleep(8)
+        assert roverflow(*words) == 0
+    assert set(rows_of(out)) == {"a", "b"}
+    capsys.readouterr()
+    assert roverflow(*words[:-2], "--cluster", "tcp://127.0.0.1:1") == 0  # nothing is left to run
+    assert roverflow("fleet", logs / "site/c.mcap", "--out", out, *PIPELINE, "--cluster", "tcp://127.0.0.1:1") == 2
+    assert "no Dask scheduler answers at tcp://127.0.0.1:1" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_client_that_is_killed_is_continued_by_the_same_command(tmp_path):
+    home, out = tmp_path / "home", tmp_path / "out"
+    home.mkdir()
+    for number in range(6):
+        write_log(Simulation(frames=4, width=160, height=120, seed=number), home / f"log{number}.mcap")
+    words = [sys.executable, "-m", "flow", "fleet", str(home), "--out", str(out), *PIPELINE, "--processes", "2"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    first = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True)
+    assert first.stdout is not None
+    for line in first.stdout:
+        if line.startswith("2 of 6"):
+            break
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    done = [name for name, row in rows_of(out).items() if row["state"] == "done"]
+    assert len(done) >= 2
+    times = {name: (out / f"{name}-nav.mcap").stat().st_mtime_ns for name in done}
+    second = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert second.returncode == 0, second.stderr
+    assert {row["state"] for row in rows_of(out).values()} == {"done"}
+    assert {name: (out / f"{name}-nav.mcap").stat().st_mtime_ns for name in done} == times
+    assert not list(out.glob("*.partial"))
