@@ -76,6 +76,10 @@ class Canvas:
             self._kept[path] = content
             self.log(path, draw())
 
+    def keep_all(self, stream: str) -> None:
+        """Leave the entities of a stream as they were in the last frame."""
+        self._now |= {path: kind for path, kind in self._before.items() if path.startswith(f"{stream}/")}
+
     def plot(self, path: str, value: float, view: ViewSpec) -> None:
         """A value over time; the first five curves of a panel differ in colour."""
         drawn = self._curves.setdefault(view.panel, [])

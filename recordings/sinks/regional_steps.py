@@ -44,7 +44,7 @@ class RegionalSteps:
         """What is to be written now that a frame's maps are there, in the order of stamps."""
         held, last, self._held, self._last = self._held, self._last, None, new
         before = [] if held is None else [held]
-        way = _way(last, new) if last and self.step else math.inf
+        way = way_between(last, new) if last and self.step else math.inf
         if not math.isfinite(way):
             self._moved = 0.0
             return [*before, new]
@@ -72,7 +72,7 @@ def regional_maps(stamp: int, items: Mapping[str, Any], names: Iterable[str]) ->
     return RegionalMaps(stamp, maps, next(known, None))
 
 
-def _way(one: RegionalMaps, other: RegionalMaps) -> float:
+def way_between(one: RegionalMaps, other: RegionalMaps) -> float:
     """How far the rover has moved, m, or the place 4 m ahead of it, if that is more; inf if it is not known."""
     if one.level is None or other.level is None or one.origins != other.origins:
         return math.inf
