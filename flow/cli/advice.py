@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from recordings.source.settings import LogSettings
 
 # CPU seconds of a frame: at any size, and for each megapixel of the left image (`make bench`, docs/benchmarks.md)
-_SECONDS = {"fast": (0.14, 0.34), "rover": (0.15, 0.38), "accurate": (0.16, 0.75), "paper": (0.2, 13.0)}
+_SECONDS = {"fast": (0.15, 0.26), "rover": (0.15, 0.33), "accurate": (0.15, 0.55), "paper": (0.2, 3.8)}
 _STARTING_SECONDS = 2.0  # before the first frame
 # Megabytes of a frame: at any size, and for each megapixel of the left image
 _LOG_MB, _RECORDING_MB = (0.9, 2.0), (0.65, 0.35)
