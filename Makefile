@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test check-all bench study pictures docs lint clean
+.PHONY: demo test check-all bench fuzz study pictures docs lint clean
 
 demo: $(READY)
 	$(BIN)/roverflow demo --out demo
@@ -17,6 +17,10 @@ check-all: $(READY) lint
 
 bench: $(READY)
 	$(BIN)/python -m tests.bench
+
+FUZZ_SECONDS ?= 60
+fuzz: $(READY)
+	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS)
 
 study: $(READY)
 	$(BIN)/python -m tests.study demo/study

@@ -26,27 +26,41 @@ def _matrix(loader: _Loader, node: Any) -> Any:
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file. Raises LogError if there is none."""
+def read_yaml(path: Path, kind: str = "calibration") -> dict[str, Any]:
+    """The mapping in a YAML file. kind: of the file, for the sentence. Raises LogError if there is none."""
     try:
-        size = path.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise LogError(f"{path} has {size} bytes, too many for a calibration; give the calibration's file")
-        text = path.read_bytes().decode("utf-8-sig")
-        lines = text.splitlines()
+        with path.open("rb") as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise LogError(f"cannot read the {kind} {path}: {getattr(error, 'strerror', None) or error}") from error
+    if len(data) > MAX_FILE_BYTES:
+        raise LogError(f"the {kind} {path} has more than {MAX_FILE_BYTES} bytes; give a smaller file")
+    try:
+        lines = data.decode("utf-8-sig").splitlines()
         # OpenCV begins its files with %YAML:1.0, which is no YAML directive.
         content = yaml.load("\n".join(line for line in lines if not line.startswith("%")), _Loader)
-    except OSError as error:
-        raise LogError(f"cannot read the calibration {path}: {error.strerror or error}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        values = _count(content, {})
+    except Exception as error:  # foreign text may fail the parser in any way
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
         raise LogError(
-            f"the calibration {path}{where} is not YAML; write it again with the tool it comes from"
+            f"the {kind} {path}{where} cannot be read as YAML; correct it, or write it again with its tool"
         ) from error
+    if values > MAX_FILE_BYTES:
+        raise LogError(f"the {kind} {path} has more than {MAX_FILE_BYTES} values by its aliases; write it without them")
     if not isinstance(content, dict):
-        raise LogError(f"the calibration {path} contains no names with values; give the calibration's file")
+        raise LogError(f"the {kind} {path} contains no names with values; write lines of NAME: VALUE")
     return content
+
+
+def _count(value: Any, counts: dict[int, int]) -> int:
+    """The number of values in a value, an alias counted wherever it is used; counts: of the values so far."""
+    if not isinstance(value, dict | list):
+        return 1
+    if id(value) not in counts:
+        parts = value.values() if isinstance(value, dict) else value
+        counts[id(value)] = 1 + sum(_count(part, counts) for part in parts)
+    return counts[id(value)]
 
 
 def numbers(content: Mapping[str, Any], name: str, shape: tuple[int, ...], where: str) -> Array:
@@ -64,7 +78,7 @@ def numbers(content: Mapping[str, Any], name: str, shape: tuple[int, ...], where
         if -1 not in shape and found.size != int(np.prod(shape)):
             raise ValueError
         found = found.reshape(shape)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         count = "x".join("n" if size < 0 else str(size) for size in shape)
         raise LogError(f"'{name}' of {where} is not {count} numbers") from error
     if not np.isfinite(found).all():

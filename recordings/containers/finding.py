@@ -88,7 +88,7 @@ def _listed(metadata: Path) -> list[str]:
             content = yaml.load(file.read(_MAX_METADATA_BYTES), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         names = content["rosbag2_bagfile_information"]["relative_file_paths"]
         return [Path(str(name)).name for name in names]  # old versions put the folder's name before it
-    except (OSError, KeyError, TypeError, ValueError, RecursionError, yaml.YAMLError):
+    except Exception:  # foreign text may fail the parser in any way
         return []
 
 

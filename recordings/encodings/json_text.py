@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from types import SimpleNamespace
 from typing import Any
 
 from recordings.errors import LogError
 
 _MAX_VALUES, _MAX_OBJECTS = 4_000_000, 100_000  # of a message; they take far more memory than their text
+_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
 
 def json_decoder(data: bytes | memoryview) -> Any:
@@ -18,6 +20,8 @@ def json_decoder(data: bytes | memoryview) -> Any:
         raise LogError(f"it has more than {_MAX_VALUES} values or {_MAX_OBJECTS} objects")
     try:
         message = json.loads(text, object_hook=_object)
+        if _SURROGATE.search(text):  # a half of one is no character, and no output could contain it
+            json.dumps(json.loads(text), ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise LogError(f"it is not JSON ({error})") from error
     if not isinstance(message, SimpleNamespace):

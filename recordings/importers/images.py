@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from flow.contracts import counted
 from flow.parameters import check_parameters, is_required, parameter
+from recordings.calibration.yaml_files import read_yaml
 from recordings.errors import LogError
 from recordings.importers.attitudes import read_attitudes
-from recordings.importers.files import read_bytes, read_pixels
+from recordings.importers.files import read_pixels
 from recordings.importers.recording import (
     BASE,
     FIRST_STAMP,
@@ -152,13 +152,7 @@ def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
     """All values of the calibration. Raises LogError."""
     where, loaded = "the calibration", given
     if not isinstance(given, Mapping):
-        where = str(given)
-        try:
-            loaded = yaml.safe_load(read_bytes(given))
-        except yaml.YAMLError as error:
-            raise LogError(
-                f"the calibration {given} is not plain YAML; write fx, cx, cy and baseline into a file of their own"
-            ) from error
+        where, loaded = str(given), read_yaml(Path(given))
     required = [known.name for known in fields(ImageCalibration) if is_required(known)]
     optional = [known.name for known in fields(ImageCalibration) if not is_required(known)]
     if not isinstance(loaded, Mapping):

@@ -117,7 +117,7 @@ def read_rig(path: Path | None, entries: Collection[str]) -> Rig:
     """
     if path is None:
         return Rig()
-    content, hints = read_yaml(path), get_type_hints(Rig)
+    content, hints = read_yaml(path, "rig file"), get_type_hints(Rig)
     known = {entry.name: entry for entry in fields(Rig) if entry.name in entries}
     values: Mapping[str, Any] = {}
     for name, value in content.items():

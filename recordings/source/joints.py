@@ -6,20 +6,22 @@ frame, where the axis is (xyz, m), how it is turned (rpy, rad), and its directio
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
 
-from recordings.errors import LogError, sentence_of
+from recordings.calibration.yaml_files import read_yaml
+from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name
 from stages.data import Array, Transform
 
 _VECTORS = {"xyz": (0.0, 0.0, 0.0), "rpy": (0.0, 0.0, 0.0), "axis": (1.0, 0.0, 0.0)}  # as URDF has them by default
+_MAX_NUMBER = 1e6  # m or rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +46,8 @@ class Joint:
 
 def read_joints(path: str | Path) -> dict[str, Joint]:
     """The axes in a YAML file, by the names of their joints. Raises LogError."""
-    try:
-        content = yaml.safe_load(Path(path).read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise LogError(f"{path} cannot be read as YAML: {sentence_of(error)}") from error
-    if not isinstance(content, dict) or not content:
+    content = read_yaml(Path(path), "file of joints")
+    if not content:
         raise LogError(f"{path} has no joints; write one entry each, NAME: {{parent, child, xyz, rpy, axis}}")
     return {str(name): _joint(f"{path}: joint '{name}'", entry) for name, entry in content.items()}
 
@@ -73,8 +72,8 @@ def _joint(where: str, entry: Any) -> Joint:
 def _vector(where: str, name: str, entry: Mapping[str, Any]) -> Array:
     given = entry.get(name, _VECTORS[name])
     numbers = isinstance(given, list | tuple) and all(
-        isinstance(value, int | float) and not isinstance(value, bool) for value in given
+        isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MAX_NUMBER for value in given
     )
-    if not numbers or len(given) != 3 or not np.isfinite(given).all():
-        raise LogError(f"{where} has {name}: {given!r}, which are not three numbers")
+    if not numbers or len(given) != 3:
+        raise LogError(f"{where} has {name}: {reprlib.repr(given)}, which are not three numbers")
     return np.array(given, np.float64)

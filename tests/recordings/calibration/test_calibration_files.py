@@ -170,7 +170,14 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(tmp_path, change, sent
         read_calibration([path])
 
 
-@pytest.mark.parametrize("content", ["[1, 2", "- a", "", "!!python/object:os.system {}", "\x00"])
+ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{n + 1}: &a{n + 1} [*a{n}, *a{n}]\n" for n in range(40))
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["[1, 2", "- a", "", "!!python/object:os.system {}", "\x00", "!!timestamp x: 1", "a: &a [*a]", ALIASES],
+    ids=["cut", "list", "empty", "object", "zero", "no time", "contains itself", "aliases"],
+)
 def test_a_file_that_is_no_mapping_is_refused(tmp_path, content):
     (tmp_path / "file.yaml").write_text(content)
     with pytest.raises(LogError, match=r"the calibration .*file\.yaml"):

@@ -33,6 +33,8 @@ def essences(events):
 def test_a_split_recording_is_the_same_log_as_one_file(sample, whole, tmp_path, plugin, mode):
     folder = write_rosbag2(rows_of(sample), tmp_path / "bag", plugin, 11, mode)
     assert items_of(folder) == essences(whole)
+    (folder / "metadata.yaml").write_text("!!timestamp x: 1")  # which the parser fails on
+    assert items_of(folder) == essences(whole)
     (folder / "metadata.yaml").unlink()  # as a recorder leaves it that was stopped
     assert items_of(folder) == essences(whole)
     if mode != CompressionMode.FILE:

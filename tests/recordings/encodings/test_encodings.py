@@ -107,7 +107,9 @@ def test_plain_angles_in_json_are_a_tilt_at_their_own_time(tmp_path, schema):
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000, b'{"a": [' + b"[]," * 4_000_000]
+    "data",
+    [b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000, b'{"a": [' + b"[]," * 4_000_000, b'{"a": "\\ud800"}'],
+    ids=["empty", "list", "cut", "other type", "deep", "large", "half a character"],
 )
 def test_foreign_json_is_an_error_in_one_sentence(data):
     _, decode = decoder_of(Channel(1, "/image", "json", MessageSchema("foxglove.RawImage", "jsonschema", b"")))

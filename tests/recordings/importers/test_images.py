@@ -166,7 +166,7 @@ def test_the_calibration_may_be_a_file(tmp_path):
     camera = images["left"].pair_with(images["right"]).camera
     assert (camera.fy, camera.cx, camera.cx_right) == (21.5, 11.0, 13.0)
     file.write_text("fx: [")
-    with pytest.raises(LogError, match="is not plain YAML"):
+    with pytest.raises(LogError, match="cannot be read as YAML"):
         import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
 
 

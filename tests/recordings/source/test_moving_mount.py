@@ -184,7 +184,12 @@ def test_the_angles_of_joints_move_the_camera(tmp_path):
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("", "has no joints; write one entry each"),
+        ("", "contains no names with values"),
+        ("{}", "has no joints; write one entry each"),
+        ("pan: !!timestamp x", "cannot be read as YAML"),
+        ("pan: " + "[" * 2000, "cannot be read as YAML"),
+        ("pan: " + "9" * 5000, "cannot be read as YAML"),
+        (f"pan: {{parent: a, child: b, xyz: [1, 2, {'9' * 400}]}}", "which are not three numbers"),
         ("pan: [1, 2]", "joint 'pan' is no mapping"),
         ("pan: {parent: a, child: b, angle: 3}", "joint 'pan' has the unknown key 'angle'"),
         ("pan: {parent: a}", "joint 'pan' needs the name of its frame 'child'"),
@@ -199,4 +204,4 @@ def test_a_wrong_file_of_joints_is_refused(tmp_path, content, sentence):
     with McapSource(joints=str(file)).open(written(tmp_path / "log.mcap", angles)) as log:
         assert sentence in log.refused["joints"]
     with McapSource(joints=str(tmp_path / "none.yaml")).open(tmp_path / "log.mcap") as log:
-        assert "none.yaml cannot be read as YAML" in log.refused["joints"]
+        assert "cannot read the file of joints" in log.refused["joints"]
