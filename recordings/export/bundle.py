@@ -24,6 +24,7 @@ from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM_WIDTH, STRIP_ROWS, Mosaic
 from recordings.export.point_files import CELL_COLOR, add_colors, write_cells, write_points
+from recordings.export.tum import write_tum
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.scoring.result_log import without_results
@@ -88,9 +89,10 @@ def export(
     else:
         topics = _topics_of(result, maps)
         frames = frames or _is_in_level(result, topics, lost)
+    poses = [] if maps else write_tum(result, out / "poses.tum", lost)
     if frames:
-        return _export_frames(result, out, lost, topics, points=not maps)
-    return _export_region(result, out, lost, topics)
+        return _export_frames(result, out, lost, topics, points=not maps) + poses
+    return _export_region(result, out, lost, topics) + poses
 
 
 def _topics_of(result: Path, maps: Collection[str]) -> MapTopics:

@@ -23,6 +23,21 @@ MIN_OWN_CHUNK_BYTES = 64 * 1024  # of a message that gets a chunk of its own
 COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
 
 
+# Late subscribers also get maps and static transforms. The form is that of ROS 2 Jazzy and later.
+_FOREVER = "{sec: 9223372036, nsec: 854775807}"
+_LATCHED = f"""- history: keep_last
+  depth: 1
+  reliability: reliable
+  durability: transient_local
+  deadline: {_FOREVER}
+  lifespan: {_FOREVER}
+  liveliness: automatic
+  liveliness_lease_duration: {_FOREVER}
+  avoid_ros_namespace_conventions: false
+"""
+_LATCHED_TYPES = ("grid_map_msgs/msg/GridMap", "nav_msgs/msg/OccupancyGrid")
+
+
 class Ros2Writer:
     """Writes messages as `ros2msg` / CDR, with log time = publish time = stamp. Same calls, same bytes.
 
@@ -101,7 +116,9 @@ class Ros2Writer:
             if kind not in self._schemas:
                 text, _ = TYPES.generate_msgdef(kind, ros_version=2)
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind]), kind
+            latched = kind in _LATCHED_TYPES or topic == "/tf_static"
+            offered = {"offered_qos_profiles": _LATCHED} if latched else {}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], offered), kind
         channel, have = self._channels[topic]
         if have != kind:
             raise ValueError(f"topic {topic} has the type {have}, so {kind} cannot be written to it")

@@ -33,7 +33,17 @@ from recordings.sinks.map_cropping import cropped
 from recordings.sinks.own_types import leaves, plain_type, refusal
 from recordings.sinks.regional_steps import RegionalSteps, regional_maps
 from recordings.sinks.thinning import thinned
-from stages.data import Disparity, ElevationMap, NavigationMap, PointCloud, Pose, TiltHealth, Transform
+from recordings.sinks.viewer_topics import viewer_messages
+from stages.data import (
+    Disparity,
+    ElevationMap,
+    NavigationMap,
+    PointCloud,
+    Pose,
+    StereoFrame,
+    TiltHealth,
+    Transform,
+)  # fmt: skip
 
 _KNOWN = (Disparity, PointCloud, ElevationMap, NavigationMap, Pose, Transform)
 _OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/DiagnosticStatus
@@ -80,6 +90,9 @@ class McapSink:
         1.0, "path of the rover, or of the place 4 m ahead of it, between the regional maps that are written; 0: one a "
         "frame", unit="m", low=0, high=1.5,
     )  # fmt: skip
+    viewers: bool = parameter(
+        False, "also write depth, left image, coloured terrain and codes as colours, which viewers draw without plugins"
+    )
     compression: str = parameter(
         "lz4", "of the log; zstd takes a fifth less room than lz4 and twice the time", choices=tuple(COMPRESSIONS)
     )
@@ -99,7 +112,8 @@ class McapSink:
     def wants(self, stream: str, kind: Any) -> bool:
         """Whether the sink writes a stream of this name and type."""
         plain = plain_type(kind)
-        return stream in self._written or (isinstance(plain, type) and issubclass(plain, TiltHealth))
+        drawn = (TiltHealth, StereoFrame) if self.viewers else TiltHealth
+        return stream in self._written or (isinstance(plain, type) and issubclass(plain, drawn))
 
     def unwritable(self, stream: str, kind: Any) -> str:
         """Why the sink cannot write a stream that it is to write, in a sentence; empty where it can."""
@@ -130,6 +144,9 @@ class McapSink:
             self._write_items(due.maps, due.stamp)
         kept = {name: record.items[name] for name in self._written if name in record.items.keys() - regional.maps}
         self._write_items(kept, stamp)
+        if self.viewers:
+            for topic, message in viewer_messages(record.items, kept):
+                writer.write(topic, message, stamp)
         transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)

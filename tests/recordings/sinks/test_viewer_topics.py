@@ -1,0 +1,57 @@
+"""What viewers draw without plugins, read back with another decoder."""
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import Reader
+
+from recordings.mcap.file import iter_decoded
+from recordings.ros2.from_msg import read_disparity, read_point_cloud
+from tests.conftest import SMALL, roverflow
+
+
+@pytest.fixture(scope="module")
+def messages(traverse, tmp_path_factory):
+    """Topic -> its first message, by mcap-ros2-support."""
+    out = tmp_path_factory.mktemp("viewers") / "out.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--set", "McapSink.viewers=true") == 0
+    found = {}
+    with out.open("rb") as file:
+        for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            found.setdefault(channel.topic, message)
+    found["own"] = {topic: message for topic, _, message in reversed(list(iter_decoded(out)))}
+    return found
+
+
+def test_depth_is_that_of_the_disparities_with_the_calibration_of_its_pixels(messages):
+    depth, info = messages["/nav/disparity/depth/image_rect"], messages["/nav/disparity/depth/camera_info"]
+    disparity = read_disparity(messages["own"]["/nav/disparity"])
+    metres = np.frombuffer(depth.data, np.float32).reshape(depth.height, depth.width)
+    assert (depth.encoding, info.width, info.height) == ("32FC1", depth.width, depth.height)
+    known = np.isfinite(disparity) & (disparity > 1)
+    scale = messages["/nav/disparity"].f * messages["/nav/disparity"].t
+    np.testing.assert_allclose(metres[known] * disparity[known], scale, rtol=0.02)  # disparities are rounded to 1/32
+    assert np.isnan(metres[np.isnan(disparity)]).all()
+    assert info.k[0] == pytest.approx(messages["/nav/disparity"].f)
+
+
+def test_terrain_and_images_have_colours(messages):
+    points = read_point_cloud(messages["own"]["/nav/elevation_map/points"])
+    assert len(points["x"]) > 1000
+    assert points["colors"].std() > 10
+    for topic in ("rectified/left/image_rect", "disparity/source/color", "navigation_map/reason/color"):
+        picture = cv2.imdecode(np.frombuffer(messages[f"/nav/{topic}/compressed"].data, np.uint8), cv2.IMREAD_COLOR)
+        assert picture.std() > 5, topic
+
+
+def test_maps_are_offered_to_late_subscribers(result):
+    with Reader(result) as reader:
+        durability = {
+            connection.topic: [offered.durability for offered in connection.ext.offered_qos_profiles]
+            for connection in reader.connections
+        }
+    maps = {topic for topic, offered in durability.items() if offered == [QosDurability.TRANSIENT_LOCAL]}
+    assert maps == {topic for topic in durability if "map" in topic}
