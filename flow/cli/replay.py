@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,12 @@ def replay(
     end: float | None = None,
     every: Every | None = None,
     on_frame: Callable[[bool], None] | None = None,
+    live_port: int = 0,
 ) -> dict[str, Any]:
     """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary.
 
-    on_frame: called after each frame, with whether it is complete, in place of a progress bar.
+    on_frame: called after each frame, with whether it is complete, in place of a progress bar; live_port: of loopback,
+    where a viewer can watch the run; 0: none.
     """
     from tqdm import tqdm
 
@@ -39,6 +42,9 @@ def replay(
     from stages.kernel_loading import loading_kernels
 
     graph = pipelines.load(pipeline, overrides)
+    if live_port:
+        live = ((use, replace(s, live_port=live_port) if hasattr(s, "live_port") else s) for use, s in graph.sinks)
+        graph = replace(graph, sinks=tuple(live))
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()
     with loading_kernels(), graph.source.open(log, start=start, end=end) as opened, one_thread_per_call():

@@ -47,6 +47,7 @@ from stages.data import Array, Disparity, ElevationMap, Mount, Pose, StereoFrame
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
+LIVE_MEMORY = "512MB"  # of what a viewer that comes later still gets
 BATCH_BYTES = 4 << 20  # of some frames; each stored chunk takes 3 kB besides its content
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
@@ -82,6 +83,7 @@ class RerunSink:
         0.5, "path of the rover, or of the place 4 m ahead of it, between the regional maps that are drawn; 0: one a "
         "frame", unit="m", low=0,
     )  # fmt: skip
+    live_port: int = parameter(0, "port of loopback where a viewer can watch the run; 0: none", low=0, high=65535)
     without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
 
     suffix = ".rrd"
@@ -145,7 +147,10 @@ class RerunSink:
         batches = rr.ChunkBatcherConfig(flush_tick=BATCH_SECONDS, flush_num_bytes=BATCH_BYTES)
         self._recording = rr.RecordingStream(self.application_id, batcher_config=batches)
         self._recording.set_log_time_enabled(False)
-        self._recording.set_sinks(rr.FileSink(str(self._partial)))
+        sinks: list[Any] = [rr.FileSink(str(self._partial))]
+        if self.live_port:
+            sinks.append(rr.GrpcServerSink("127.0.0.1", self.live_port, server_memory_limit=LIVE_MEMORY))
+        self._recording.set_sinks(*sinks)
         self._recording.send_recording_name(self._about.get("log", self._path.stem))
         self._recording.log(SUMMARY, _document("RUNNING", self._about), static=True)
         self._recording.flush()  # the file begins with it
@@ -165,6 +170,8 @@ class RerunSink:
             self._recording.log(FRAMES, rr.TextLog(text, level=rr.TextLogLevel.INFO))
             self._log_losses(record.entries, self._frames)
             self._send_blueprint()
+            if self.live_port:
+                self._recording.flush()  # a viewer shows each frame at once
         self._frames += 1
 
     def close(self, summary: Mapping[str, Any]) -> None:

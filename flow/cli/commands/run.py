@@ -7,12 +7,14 @@ import json
 import os
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from flow.cli.arguments import every, seconds, workers
 from flow.cli.outputs import add_log, add_pipeline_options, check_outputs, default_result, write_text
 from flow.cli.replay import as_json, replay
 from flow.cli.report import exit_code, headline, report, say
-from flow.errors import SinkError
+from flow.cli.watching import watched
+from flow.errors import SinkError, UsageError
 from recordings.containers.finding import find_files
 from recordings.errors import UnwritableError
 
@@ -26,6 +28,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     recording = sub.add_mutually_exclusive_group()
     recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
     recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
+    watching = sub.add_mutually_exclusive_group()
+    watching.add_argument("--view", action="store_true", help="open the viewer and watch the run")
+    watching.add_argument(
+        "--serve", action="store_true", help="serve the run to a browser of this machine while it lasts"
+    )
     sub.add_argument("--start", type=seconds, metavar="T", help="begin T seconds after the log's first message")
     sub.add_argument("--end", type=seconds, metavar="T", help="stop T seconds after the log's first message")
     sub.add_argument(
@@ -45,9 +52,12 @@ def run(options: argparse.Namespace) -> int:
     rrd = None if options.no_rrd else options.rrd or out.parent / f"{out.stem}.rrd"
     outputs = {"result log": out, "recording": rrd, "summary": options.summary}
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
-    settings = {name: getattr(options, name) for name in ("workers", "start", "end", "every")}
+    if rrd is None and (options.view or options.serve):
+        raise UsageError("watching needs the recording; leave out --no-rrd")
+    settings: dict[str, Any] = {name: getattr(options, name) for name in ("workers", "start", "end", "every")}
     try:
-        summary = replay(options.log, options.pipeline, out, rrd, overrides=options.set, **settings)
+        with watched(options.view, options.serve) as port:
+            summary = replay(options.log, options.pipeline, out, rrd, overrides=options.set, live_port=port, **settings)
     except SinkError as error:
         say(headline(error.summary))
         with suppress(UnwritableError):  # the failed sink is the error to report

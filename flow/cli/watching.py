@@ -1,0 +1,59 @@
+"""Watching a run: a viewer of this machine, or a browser, which a server in the sink feeds.
+
+The server holds what came before a viewer and drops the oldest beyond MEMORY. It waits for nobody, so a viewer that is
+slow, suspended or closed costs only its own picture.
+"""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from flow.cli.report import say
+from flow.errors import UsageError
+
+PORT, WEB_PORT = 9876, 9090  # the first ones tried, on loopback
+
+
+@contextmanager
+def watched(view: bool, serve: bool) -> Iterator[int]:
+    """Start what watches a run; yields the port of loopback for the sink, 0 for none.
+
+    view: open the viewer, which stays open after the run; serve: serve a page to browsers, which ends with the run.
+    """
+    if not (view or serve):
+        yield 0
+        return
+    port = _free(PORT)
+    address, web = f"rerun+http://127.0.0.1:{port}/proxy", _free(WEB_PORT)
+    words = ["--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(web)] if serve else ["--port", "auto"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rerun", *words, address],
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for the run
+    )  # fmt: skip
+    if serve:
+        say(f"watch the run at http://127.0.0.1:{web}/?url={address} while it lasts")
+    try:
+        yield port
+    finally:
+        if serve:
+            process.terminate()
+        elif process.poll():
+            say("the viewer could not be opened, or was closed; rerun opens the recording")
+
+
+def _free(first: int) -> int:
+    """The first port of loopback from `first` on that nobody uses."""
+    for port in range(first, first + 100):
+        with socket.socket() as tried:
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                tried.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
+    raise UsageError(f"no port from {first} to {first + 99} is free for the viewer; end another run")
