@@ -18,7 +18,7 @@ from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupan
 from recordings.sinks.overwrite import REPORT
 
 MAX_LOSSES = 100  # rows of the table
-_STYLE = Path(__file__).with_name("style.css")
+STYLE = Path(__file__).with_name("style.css")
 
 
 def write_report(path: Path, results: Sequence[Path]) -> None:
@@ -36,7 +36,7 @@ def write_report(path: Path, results: Sequence[Path]) -> None:
     parts = [
         f"<!doctype html>\n{REPORT}\n<html lang=en><head><meta charset=utf-8>",
         '<meta name=viewport content="width=device-width, initial-scale=1">',
-        f"<title>{escape(names)}</title><style>{_STYLE.read_text()}</style></head><body><h1>{escape(names)}</h1>",
+        f"<title>{escape(names)}</title><style>{STYLE.read_text()}</style></head><body><h1>{escape(names)}</h1>",
         _beside([_verdict(found) for found in facts]),
         _section("What differs", _differences(results)),
         _section("Map", _beside([_regional(found) for found in facts])),
@@ -62,7 +62,8 @@ def _differences(results: Sequence[Path]) -> str:
     return f"<pre>{escape(format_diff(diff(results[0], results[1])))}</pre>" if len(results) == 2 else ""
 
 
-def _table(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> str:
+def html_table(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> str:
+    """Rows of texts as an HTML table."""
     first = f"<tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr>" if head else ""
     body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
     return f"<table>{first}{body}</table>"
@@ -81,7 +82,7 @@ def _verdict(facts: RunFacts) -> str:
         *findings,
         ("version", facts.about.get("roverflow", "")),
     ]
-    return f'<p class="verdict {escape(verdict)}">{escape(verdict)}</p>{_table(rows)}'
+    return f'<p class="verdict {escape(verdict)}">{escape(verdict)}</p>{html_table(rows)}'
 
 
 def _regional(facts: RunFacts) -> str:
@@ -132,7 +133,7 @@ def _losses(facts: RunFacts) -> str:
         return "<p>Nothing was lost.</p>"
     left_out = len(facts.losses) - MAX_LOSSES
     more = f"<p>{counted(left_out, 'more loss', 'more losses')} in /nav/diagnostics.</p>" if left_out > 0 else ""
-    return _table(facts.losses[:MAX_LOSSES], ("stream", "stamp, ns", "reason", "detail")) + more
+    return html_table(facts.losses[:MAX_LOSSES], ("stream", "stamp, ns", "reason", "detail")) + more
 
 
 def _parameters(facts: RunFacts) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
@@ -27,6 +28,9 @@ ROWS = (
     "hazard cells (rock or over 20 deg): detected; called free, %",
     "visible cells left unknown; free cells that no camera could see, %",
 )
+
+
+SCORES = ("log", "density", "bad-0.5", "bad-1", "RMS px", "height cm", "missed", "false alarm")  # of `brief_row`
 
 
 def format_score(found: Score) -> str:
@@ -59,6 +63,26 @@ def format_brief(found: Score) -> str:
             f"rocks        {detected[0]} of 0.2 m and higher detected, {detected[1]} of 0.3 m and higher",
         ]
     return "\n".join([*lines, *_motion_lines(found)])
+
+
+def brief_figures(found: Score) -> list[float]:
+    """The values of `SCORES` of a score; NaN where the truth does not have it."""
+    seen = {} if found.disparity is None else found.disparity["whole_image"]["nonocc"]
+    ground = {} if found.terrain is None else found.terrain
+    stereo = [seen.get(name, math.nan) for name in ("density", "bad_0.5", "bad_1", "rmse")]
+    height = ground["heights"]["0-8 m"]["raw"]["rmse"] if ground else math.nan
+    return [
+        *stereo,
+        height,
+        *(ground["hazards"][name] if ground else math.nan for name in ("false_safe", "false_alarm")),
+    ]
+
+
+def brief_row(name: str, values: Sequence[float]) -> tuple[str, ...]:
+    """One row of `SCORES` as text."""
+    density, half, one, rms, height, missed, alarms = values
+    shares = [f"{100 * value:.2f} %" for value in (density, half, one, missed, alarms)]
+    return (name, *shares[:3], f"{rms:.3f}", f"{100 * height:.2f}", *shares[3:])
 
 
 def _frame_lines(found: Score) -> list[str]:

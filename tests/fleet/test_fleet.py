@@ -82,6 +82,13 @@ def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, c
     assert (out / "a-nav.mcap").is_file()
     assert roverflow("list", out, "--where", "verdict = 'COMPLETE'", "--sort", "frames DESC", "--json") == 0
     assert next(row["name"] for row in json.loads(capsys.readouterr().out)) == "b"
+    assert roverflow("score", out) == 0
+    table = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in table] == ["fast", "log", "a", "b", "site/c", "mean"]
+    assert roverflow("report", out) == 0
+    page = (out / "report.html").read_text()
+    assert "<td>site/c</td><td>COMPLETE</td><td>1 of 1</td>" in page
+    assert "<td>junk</td><td>unusable</td>" in page
     assert roverflow("list", out, "--where", "nonsense") == 2
     assert "its columns are name, log, bytes" in capsys.readouterr().err
 

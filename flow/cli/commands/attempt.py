@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -66,20 +65,14 @@ def _errors(paths: dict[str, Path], truth: Path) -> list[list[str]]:
     """A table of the errors against the truth of the log: a row for each variant; empty without truth."""
     from recordings.errors import LogError
     from recordings.scoring.score import score
+    from recordings.scoring.table import SCORES, brief_figures, brief_row
 
-    rows = [["", "known", "bad-0.5", "bad-1", "RMS px", "height cm", "missed", "false alarm"]]
+    rows = [["", *SCORES[1:]]]
     for label, path in paths.items():
         try:
-            found = score(path, truth)
+            rows.append([*brief_row(label, brief_figures(score(path, truth)))])
         except LogError:  # the log has no truth
             return []
-        seen = {} if found.disparity is None else found.disparity["whole_image"]["nonocc"]
-        ground = {} if found.terrain is None else found.terrain
-        figures = [seen.get(name, math.nan) for name in ("density", "bad_0.5", "bad_1", "rmse")]
-        height = ground["heights"]["0-8 m"]["raw"]["rmse"] if ground else math.nan
-        hazards = [ground["hazards"][name] if ground else math.nan for name in ("false_safe", "false_alarm")]
-        shares = [f"{100 * value:.2f} %" for value in (*figures[:3], *hazards)]
-        rows.append([label, *shares[:3], f"{figures[3]:.3f}", f"{100 * height:.2f}", *shares[3:]])
     return rows
 
 

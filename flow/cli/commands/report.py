@@ -9,11 +9,13 @@ from flow.cli.outputs import check_outputs
 from flow.cli.report import say
 from flow.errors import COMPLETE, UsageError
 
-HELP = "write one HTML page about a result log, or about two beside each other"
+HELP = "write one HTML page about a result log, two beside each other, or a fleet"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("results", nargs="+", type=Path, metavar="OUT.mcap", help="one or two result logs")
+    sub.add_argument(
+        "results", nargs="+", type=Path, metavar="OUT.mcap", help="one or two result logs, or the folder of a fleet"
+    )
     sub.add_argument("-o", "--out", type=Path, metavar="OUT.html", help="the page (OUT.html beside the first log)")
 
 
@@ -21,8 +23,15 @@ def run(options: argparse.Namespace) -> int:
     """Write the page."""
     if len(options.results) > 2:
         raise UsageError(f"give one or two result logs, not {len(options.results)}")
-    out = options.out or options.results[0].with_suffix(".html")
+    first = options.results[0]
+    out = options.out or (first / "report.html" if first.is_dir() else first.with_suffix(".html"))
     check_outputs({"report": out}, options.results)
+    if first.is_dir():
+        from flow.cli.fleet.page import write_fleet_page
+
+        write_fleet_page(out, first)
+        say(f"wrote {out}")
+        return COMPLETE
     from recordings.reporting.page import write_report
 
     write_report(out, options.results)
