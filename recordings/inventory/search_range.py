@@ -34,7 +34,7 @@ def ground_disparity(camera: StereoCamera, up: Array, height: float) -> float:
 
     Examples
     --------
-    >>> camera = StereoCamera(640, 480, fx=500, fy=500, cx=320, cy=240, cx_right=320, baseline=0.2, frame_id="left")
+    >>> camera = StereoCamera(fx=500, fy=500, cx=320, cy=240, baseline=0.2, width=640, height=480)
     >>> round(ground_disparity(camera, np.array([0.0, -1.0, 0.0]), height=1.0), 3)
     47.8
     """
