@@ -7,12 +7,14 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from flow.cli.fleet.catalogue import Catalogue
-from flow.cli.fleet.jobs import jobs_of
+from flow.cli.fleet.jobs import jobs_of, reason_to_run
+from flow.cli.fleet.task import Pipeline, Task, run_task
 from flow.errors import UsageError
 from recordings.simulator import Simulation, write_log
 from tests.conftest import roverflow
@@ -62,6 +64,24 @@ def rows_of(folder: Path) -> dict[str, dict]:
     return {row["name"]: row for row in Catalogue(folder).rows()}
 
 
+def test_a_task_writes_what_run_writes_and_is_not_repeated(logs, tmp_path):
+    (job,) = jobs_of([str(logs / "a.mcap")], tmp_path / "out")
+    pipeline = Pipeline.of("fast", ("disparities=48",))
+    task = Task(job.name, job.log, job.digest, job.result(tmp_path / "out"), pipeline, recording=False, workers=2)
+    row = run_task(task)
+    assert (row["state"], row["verdict"], row["frames"], row["result"]) == ("done", "COMPLETE", 1, "a-nav.mcap")
+    assert roverflow("run", logs / "a.mcap", *PIPELINE, "--no-rrd", "-o", tmp_path / "plain.mcap") == 0
+    assert task.result.read_bytes() == (tmp_path / "plain.mcap").read_bytes()
+    written = task.result.stat().st_mtime_ns
+    assert run_task(task) == row
+    assert task.result.stat().st_mtime_ns == written
+    assert reason_to_run(job, {**row, "result": row["result"]}, pipeline.digest, row["version"], tmp_path / "out") == ""
+    assert reason_to_run(job, row, "other", row["version"], tmp_path / "out") == "the pipeline changed"
+    broken = run_task(replace(task, log=logs / "junk.mcap", result=tmp_path / "out" / "junk-nav.mcap"))
+    assert (broken["state"], "is not an MCAP log" in broken["why"]) == ("unusable", True)
+
+
+@pytest.mark.slow
 def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, capsys):
     out, plain = tmp_path / "out", tmp_path / "plain.mcap"
     words = ("fleet", logs, "--out", out, *PIPELINE, "--processes", 1)

@@ -85,6 +85,7 @@ def test_compiled_and_loaded_kernels_give_the_same_bits(run):
     assert run(PLANES) == (first, "")
 
 
+@pytest.mark.slow
 def test_a_change_in_the_simulator_keeps_the_kernels_of_the_stages(run, tmp_path):
     matching, terrain, simulator = run(DIGESTS)[0].split()
     assert matching == terrain != simulator

@@ -316,7 +316,8 @@ print(hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).he
 """
 
 
-@pytest.mark.parametrize("processor", [pytest.param("haswell", marks=pytest.mark.slow), "nehalem"])
+@pytest.mark.slow
+@pytest.mark.parametrize("processor", ["haswell", "nehalem"])
 def test_processors_without_avx512_give_the_same_bits(processor):
     frame, _ = slanted_pair(height=64, width=100)
     results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
