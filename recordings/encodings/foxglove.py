@@ -17,6 +17,7 @@ from recordings.video.formats import VIDEO
 from stages.data import Array
 
 _DISTORTIONS = {"kannala_brandt": "equidistant", "rational_polynomial": "rational_polynomial"}
+_MAX_SECONDS = 1 << 32  # also of nanoseconds; ROS has 32 bits for each
 _PACKAGES = ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/")
 
 Adapter = Callable[[Any], Any]
@@ -55,7 +56,10 @@ def _time(time: Any) -> Any:
     """A builtin_interfaces/Time; JSON has sec and nsec, protobuf seconds and nanos."""
     for seconds, nanoseconds in (("seconds", "nanos"), ("sec", "nsec"), ("sec", "nanosec"), ("secs", "nsecs")):
         if hasattr(time, nanoseconds):
-            return SimpleNamespace(sec=int(getattr(time, seconds)), nanosec=int(getattr(time, nanoseconds)))
+            sec, nanosec = int(getattr(time, seconds)), int(getattr(time, nanoseconds))
+            if abs(sec) >= _MAX_SECONDS or abs(nanosec) >= _MAX_SECONDS:
+                raise LogError("its timestamp is damaged (its numbers have more than 32 bits)")
+            return SimpleNamespace(sec=sec, nanosec=nanosec)
     raise LogError("its timestamp has no seconds and nanoseconds")
 
 

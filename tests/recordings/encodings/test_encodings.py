@@ -108,13 +108,27 @@ def test_plain_angles_in_json_are_a_tilt_at_their_own_time(tmp_path, schema):
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000, b'{"a": [' + b"[]," * 4_000_000, b'{"a": "\\ud800"}'],
-    ids=["empty", "list", "cut", "other type", "deep", "large", "half a character"],
+    [b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000, b'{"a": [' + b"[]," * 4_000_000],
+    ids=["empty", "list", "cut", "other type", "deep", "large"],
 )
 def test_foreign_json_is_an_error_in_one_sentence(data):
     _, decode = decoder_of(Channel(1, "/image", "json", MessageSchema("foxglove.RawImage", "jsonschema", b"")))
     with pytest.raises((LogError, AttributeError)):
         decode(data)
+
+
+@pytest.mark.parametrize(
+    ("frame", "seconds", "sentence"),
+    [(r"\ud800", 1, "it is not JSON"), ("a", 1 << 40, "its timestamp is damaged")],
+    ids=["half a character", "large seconds"],
+)
+def test_json_values_that_no_result_could_contain_are_refused(frame, seconds, sentence):
+    _, decode = decoder_of(Channel(1, "/tf", "json", MessageSchema("foxglove.FrameTransforms", "jsonschema", b"")))
+    zero = dict.fromkeys("xyz", 0.0)
+    transform = {"timestamp": {"sec": seconds, "nsec": 0}, "parent_frame_id": "FRAME", "child_frame_id": "b",
+                 "translation": zero, "rotation": {**zero, "w": 1.0}}  # fmt: skip
+    with pytest.raises(LogError, match=sentence):
+        decode(json.dumps({"transforms": [transform]}).replace("FRAME", frame).encode())
 
 
 @pytest.mark.parametrize(
