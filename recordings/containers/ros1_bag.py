@@ -21,8 +21,9 @@ from rosbags.rosbag1.reader import Compression, Header, RecordType, decompressor
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
 from recordings.containers.timeline import Timeline
 from recordings.errors import LogError, sentence_of
+from recordings.mcap.chunk import max_unpacked
+from recordings.mcap.message_order import MAX_OPEN_BYTES
 
-_MAX_CHUNK_BYTES = 1 << 30
 _REINDEX = "`rosbag reindex` repairs a bag whose recorder was stopped"
 
 
@@ -71,6 +72,8 @@ class Ros1Bag:
         for chunk, offset, channel, log_time in entries[np.argsort(entries[:, 3], kind="stable")].tolist():
             if chunk not in chunks:
                 chunks[chunk] = self._unpacked(chunk)
+                while len(chunks) > 1 and sum(map(len, chunks.values())) > MAX_OPEN_BYTES:
+                    del chunks[next(iter(chunks))]  # it is unpacked again when due
             found = _message_at(chunks[chunk], chunk, offset)
             if isinstance(found, str):
                 yield LostMessage(channel, log_time, found)
@@ -78,7 +81,7 @@ class Ros1Bag:
                 yield RawMessage(channel, log_time, found)
             waiting[chunk] -= 1
             if not waiting[chunk]:
-                del chunks[chunk]
+                chunks.pop(chunk, None)
 
     def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
         """The messages of some channels; they have to be read as a whole."""
@@ -113,11 +116,14 @@ class Ros1Bag:
             assert self._bag.bio
             self._bag.bio.seek(chunk.datapos)
             packed = read_bytes(self._bag.bio, chunk.datasize)
+            limit, records = max_unpacked(len(packed)), packed
             if chunk.decompressor is decompressors[Compression.BZ2.value]:
-                packed = bz2.BZ2Decompressor().decompress(packed, _MAX_CHUNK_BYTES)
+                records = bz2.BZ2Decompressor().decompress(packed, limit + 1)
             elif chunk.decompressor is decompressors[Compression.LZ4.value]:
-                packed = lz4.frame.LZ4FrameDecompressor().decompress(packed, _MAX_CHUNK_BYTES)
-            return packed
+                records = lz4.frame.LZ4FrameDecompressor().decompress(packed, limit + 1)
+            if len(records) > limit:
+                raise ValueError(f"it unpacks from {len(packed)} to more than {limit} bytes")
+            return records
         except Exception as error:  # foreign bytes may fail a codec in any way
             return f"the chunk at byte {position} is broken and its messages are lost ({sentence_of(error)})"
 

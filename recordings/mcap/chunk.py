@@ -19,12 +19,21 @@ from mcap.opcode import Opcode
 from recordings.mcap.index import RECORD, read_at
 
 MAX_CHUNK_BYTES = 1 << 28  # of a chunk or message, unpacked; recorders make chunks of a few MB
+MAX_RATIO, _FREE_BYTES = (
+    200,
+    1 << 26,
+)  # of unpacked to packed bytes, beyond the free ones; only hostile files have more
 CHUNK_HEAD_BYTES = 128  # of a chunk record; they contain its length
 
 _CHUNK = struct.Struct("<QQQII")  # start time, end time, size, CRC, length of the compression's name
 _MAX_PADDING_BYTES = 64  # that may follow a chunk's stated content
 _BLOCK_BYTES = 1 << 20
 _CHUNK_PATTERN = re.compile(rb"\x06(?=.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}))", re.DOTALL)
+
+
+def max_unpacked(packed: int) -> int:
+    """The largest size, bytes, to which so many bytes may be unpacked."""
+    return min(MAX_CHUNK_BYTES, max(_FREE_BYTES, MAX_RATIO * packed))
 
 
 def is_chunk(head: bytes) -> bool:
@@ -105,8 +114,9 @@ def unpack_cut_chunk(content: bytes) -> bytes | memoryview:
 
 def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memoryview:
     """At most size + 1 bytes of the decompressed content."""
-    if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"it states an uncompressed size of {size} bytes; the limit is {MAX_CHUNK_BYTES}")
+    limit = max_unpacked(len(packed))
+    if size > limit:
+        raise ValueError(f"it states an uncompressed size of {size} bytes; the limit is {limit}")
     if not compression:
         return packed[: size + 1]
     if not packed:

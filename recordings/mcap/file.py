@@ -26,7 +26,7 @@ from recordings.containers.container import Channel, LostMessage, MessageSchema,
 from recordings.containers.timeline import MAX_LOG_TIME, Timeline
 from recordings.containers.unpacking import ZSTD_MAGIC
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.chunk import MAX_CHUNK_BYTES, chunk_heads, unpack_chunk
+from recordings.mcap.chunk import MAX_CHUNK_BYTES, MAX_RATIO, chunk_heads, unpack_chunk
 from recordings.mcap.index import (
     MESSAGE,
     PARSE_ERRORS,
@@ -37,10 +37,11 @@ from recordings.mcap.index import (
     opened,
     read_at,
 )
-from recordings.mcap.message_order import ChunkMessages, Ordered, in_log_time_order
+from recordings.mcap.message_order import ChunkMessages, OpenChunks, Ordered, in_log_time_order
 from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for
 
+_FREE_BYTES = 1 << 30  # to which any file may unpack; a larger one has a limited ratio
 HEAD_BYTES = 64  # of a message; they contain the stamp of its header
 
 
@@ -50,7 +51,7 @@ class _Queued(NamedTuple):
     log_time: int
     offset: int  # in the file; of messages outside chunks -1
     place: int
-    item: RawMessage | LostMessage | ChunkIndex
+    item: RawMessage | LostMessage | ChunkIndex | ChunkMessages
     following: Iterator[Ordered] = iter(())
 
 
@@ -102,6 +103,7 @@ class McapFile:
             for number in sorted(set(self.index.counted_channels) - self.channels.keys()):
                 unknown = counted(self.index.counted_channels.count(number), "message")
                 self.index.note_damage(f"{unknown} of channel {number} cannot be read: the log does not define it")
+            self._check_size()
             self.start, self.end = self._time_range()
         except BaseException:
             self._file.close()
@@ -122,12 +124,15 @@ class McapFile:
         """
         low, high = (0 if start is None else start), (1 << 64 if end is None else end)
         queue = self._queue(channels, places)
-        found = dict.fromkeys(channels, 0)
+        found, opened = dict.fromkeys(channels, 0), OpenChunks(self._unpacked)
         while queue and queue[0].log_time < high:
             first = heappop(queue)
             log_time, item, following = first.log_time, first.item, first.following
+            if isinstance(item, ChunkMessages):
+                item = item[first.place]
             if isinstance(item, ChunkIndex):
-                following = self._in_order(item, channels, places) if item.message_end_time >= low else following
+                is_due = item.message_end_time >= low
+                following = self._in_order(item, channels, places, opened) if is_due else following
             elif item.channel is None or item.channel in channels:
                 if item.channel is not None:
                     found[item.channel] += 1
@@ -151,7 +156,7 @@ class McapFile:
                 yield from list(self._chunk_heads(chunk, channels))
             except PARSE_ERRORS:
                 yield from (item for item in self._chunk_or_lost(chunk) if item.channel in channels)
-        yield from (item for _, _, item in self._unchunked(channels, None, HEAD_BYTES))
+        yield from (item for _, _, item in self._unchunked(channels, None, HEAD_BYTES) if isinstance(item, RawMessage))
         yield from (message for _, message in self.index.rescued if message.channel in channels)
         yield from self.index.lost
 
@@ -245,9 +250,11 @@ class McapFile:
         heapify(queue)
         return queue
 
-    def _in_order(self, chunk: ChunkIndex, channels: set[int], places: range | None) -> Iterator[Ordered]:
+    def _in_order(
+        self, chunk: ChunkIndex, channels: set[int], places: range | None, opened: OpenChunks
+    ) -> Iterator[Ordered]:
         """The messages of a chunk in log-time order, or those lost with it."""
-        inside = self._chunk_or_lost(chunk)
+        inside = self._chunk_or_lost(chunk, opened)
         first = self.index.places[chunk.chunk_start_offset].start
         own = range(len(inside)) if places is None else range(max(places.start - first, 0), max(places.stop - first, 0))
         if isinstance(inside, ChunkMessages):
@@ -275,10 +282,10 @@ class McapFile:
         chunks = sorted(self.index.chunks, key=lambda chunk: chunk.chunk_start_offset)
         return [c for c in chunks if not c.message_index_offsets or channels & c.message_index_offsets.keys()]
 
-    def _chunk_or_lost(self, chunk: ChunkIndex) -> ChunkMessages | list[LostMessage]:
+    def _chunk_or_lost(self, chunk: ChunkIndex, opened: OpenChunks | None = None) -> ChunkMessages | list[LostMessage]:
         """The messages of a chunk, or a `LostMessage` for each entry of its message index."""
         try:
-            return self._chunk_messages(chunk)
+            return ChunkMessages(chunk, opened or OpenChunks(self._unpacked))
         except PARSE_ERRORS as error:
             reason = lost_chunk(chunk.chunk_start_offset, error)
         channels = chunk.message_index_offsets
@@ -287,13 +294,14 @@ class McapFile:
         lost = [LostMessage(channel, log_time, reason) for channel, log_time in zip(*known, strict=True)]
         return lost or [LostMessage(None, chunk.message_start_time, reason)]
 
-    def _chunk_messages(self, chunk: ChunkIndex) -> ChunkMessages:
+    def _unpacked(self, chunk: ChunkIndex) -> bytes | memoryview:
+        """The records of a chunk."""
         length = chunk.chunk_length - RECORD.size
         head = read_at(self._file, chunk.chunk_start_offset, RECORD.size)
         if len(head) < RECORD.size or RECORD.unpack(head) != (int(Opcode.CHUNK), length):
             raise ValueError("there is no chunk at the offset in the index")
         content = read_at(self._file, chunk.chunk_start_offset + RECORD.size, min(length, MAX_CHUNK_BYTES))
-        return ChunkMessages(unpack_chunk(content))
+        return unpack_chunk(content)
 
     def _message_index(self, chunk: ChunkIndex) -> tuple[NDArray[np.uint16], NDArray[np.uint64], NDArray[np.uint64]]:
         """Channel, log time and offset of each message of a chunk, in file order; empty without a message index."""
@@ -319,6 +327,14 @@ class McapFile:
             if (stated := self.index.stated_counts.get(channel, count)) > count:
                 why = f"the log's statistics count {counted(stated, 'message')}, but the log contains {count}"
                 yield LostMessage(channel, self.end, why)
+
+    def _check_size(self) -> None:
+        """Refuse a file whose chunks unpack to more than a recording could."""
+        total = sum(chunk.uncompressed_size for chunk in self.index.chunks)
+        if total > max(_FREE_BYTES, MAX_RATIO * self.size):
+            raise LogError(
+                f"{self.path} unpacks to {total} bytes, {total // self.size} times its size: no recording does"
+            )
 
     def _time_range(self) -> tuple[int, int]:
         """Log time of the first and the last message, ns."""

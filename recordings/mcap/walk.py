@@ -138,12 +138,14 @@ def _note_message(index: Index, content: bytes, position: int, length: int, star
 
 def _note_chunk(index: Index, content: bytes, position: int) -> None:
     try:
-        inside = list(iter_records(unpack_chunk(content)))
+        records = unpack_chunk(content)
+        for _ in iter_records(records):  # a chunk with a cut record is broken as a whole
+            pass
     except PARSE_ERRORS as error:
         index.note_damage(lost_chunk(position, error), chunk_start_time(content))
         return
     offsets, times, first = {}, [], len(index.counted_times)
-    for opcode, record in inside:
+    for opcode, record in iter_records(records):
         if opcode == Opcode.MESSAGE:
             channel, _, log_time, _ = MESSAGE.unpack_from(record)
             offsets[channel] = 0
@@ -155,7 +157,7 @@ def _note_chunk(index: Index, content: bytes, position: int) -> None:
         chunk = ChunkIndex(
             chunk_length=RECORD.size + len(content), chunk_start_offset=position, compression="", compressed_size=0,
             message_end_time=max(times), message_index_length=0, message_index_offsets=offsets,
-            message_start_time=min(times), uncompressed_size=0,
+            message_start_time=min(times), uncompressed_size=len(records),
         )  # fmt: skip
         index.chunks.append(chunk)
         index.places[position] = range(first, first + len(times))

@@ -21,7 +21,7 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from recordings.errors import LogError
-from recordings.mcap.chunk import MAX_CHUNK_BYTES
+from recordings.mcap.chunk import MAX_CHUNK_BYTES, max_unpacked
 
 GRID_MAP = """\
 std_msgs/Header header
@@ -120,9 +120,12 @@ def plain(data: bytes | memoryview, size: int = MAX_CHUNK_BYTES) -> bytes | memo
     """At least the first `size` bytes of a message, decompressed if rosbag2 compressed it by itself (zstd)."""
     if data[: len(_ZSTD_MAGIC)] != _ZSTD_MAGIC:
         return data
-    whole = zstandard.frame_content_size(data)
+    whole, limit = zstandard.frame_content_size(data), max_unpacked(len(data))
     with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-        return bytes(stream.read(size if whole < 0 else min(size, whole)))
+        found = bytes(stream.read(min(size, limit + 1 if whole < 0 else whole, limit + 1)))
+    if len(found) > limit:
+        raise LogError(f"it unpacks from {len(data)} to more than {limit} bytes")
+    return found
 
 
 def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:

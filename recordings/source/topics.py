@@ -23,6 +23,8 @@ MAX_CHANNELS = 1000  # that are decoded; a rover has a tenth of it
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
 
+_MAX_WAITING_BYTES = 300_000_000  # of messages while calibrations and transforms are read ahead
+
 T = TypeVar("T")
 
 
@@ -149,8 +151,15 @@ def with_lookahead(
 ) -> Iterator[tuple[RawMessage | LostMessage, Any]]:
     """Each message with the result of its reader in `early`, which reads `lag` ns ahead."""
     waiting: deque[tuple[RawMessage | LostMessage, Any]] = deque()
+    size = 0
     for raw in raws:
+        size += _size(raw)
         waiting.append((raw, early[raw.channel](raw) if isinstance(raw, RawMessage) and raw.channel in early else None))
-        while waiting[0][0].log_time < raw.log_time - lag:
+        while waiting[0][0].log_time < raw.log_time - lag or (size > _MAX_WAITING_BYTES and len(waiting) > 1):
+            size -= _size(waiting[0][0])
             yield waiting.popleft()
     yield from waiting
+
+
+def _size(raw: RawMessage | LostMessage) -> int:
+    return len(raw.data) if isinstance(raw, RawMessage) else 0

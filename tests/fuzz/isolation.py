@@ -30,13 +30,16 @@ class Outcome:
     megabytes: float
 
 
-def isolated(work: Callable[[], object]) -> Outcome:
-    """Run `work`, which may raise the program's own errors but no others, end the process, hang or fill the memory."""
+def isolated(work: Callable[[], object], limited: bool = True) -> Outcome:
+    """Run `work`, which may raise the program's own errors but no others, end the process, hang or fill the memory.
+
+    limited: whether its time and memory are.
+    """
     reader, writer = os.pipe()
     child = os.fork()
     if not child:
         os.close(reader)
-        _run(work, writer)
+        _run(work, writer, limited)
     os.close(writer)
     with open(reader, "rb") as pipe:  # noqa: PTH123  # a descriptor
         base, _, told = pipe.read().decode("utf-8", "replace").partition("\n")
@@ -49,18 +52,20 @@ def isolated(work: Callable[[], object]) -> Outcome:
     if os.WEXITSTATUS(status):
         fault, _, where = told.partition("\n")
         return Outcome(fault or f"ended with exit code {os.WEXITSTATUS(status)}", where, seconds, megabytes)
-    return Outcome(f"took {megabytes:.0f} MB" if megabytes > MAX_MEGABYTES else "", "", seconds, megabytes)
+    is_large = limited and megabytes > MAX_MEGABYTES
+    return Outcome(f"took {megabytes:.0f} MB" if is_large else "", "", seconds, megabytes)
 
 
-def _run(work: Callable[[], object], writer: int) -> None:
+def _run(work: Callable[[], object], writer: int, limited: bool) -> None:
     """Run `work` in the child, and end it."""
     os.write(writer, f"{_status('VmRSS')}\n".encode())
-    limit = _status("VmSize") * 1000 + _STOP_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(2 * MAX_SECONDS)  # the machine may be busy
-    resource.setrlimit(resource.RLIMIT_CPU, (MAX_SECONDS, MAX_SECONDS + 1))
+    if limited:
+        limit = _status("VmSize") * 1000 + _STOP_BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        resource.setrlimit(resource.RLIMIT_CPU, (MAX_SECONDS, MAX_SECONDS + 1))
+        signal.alarm(2 * MAX_SECONDS)  # the machine may be busy
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 1)
     os.dup2(nothing, 2)

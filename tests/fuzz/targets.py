@@ -65,9 +65,14 @@ class Target:
 
 def read_log(path: Path) -> None:
     """Read a log as `info` and as a run does."""
+    read_info(path)
+    read_events(path)
+
+
+def read_info(path: Path) -> None:
+    """Describe a log."""
     options = parser().parse_args(["info", str(path)])
     options.command(options)
-    read_events(path)
 
 
 def read_events(path: Path, source: McapSource | None = None) -> None:

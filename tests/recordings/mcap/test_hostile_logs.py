@@ -1,0 +1,204 @@
+"""Small files that unpack to much, or state much, cost at most 500 MB and 20 s, and one sentence."""
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from recordings.errors import LogError
+from recordings.mcap import file, message_order
+from recordings.mcap.file import McapFile
+from recordings.ros2.cdr import make
+from tests.conftest import rewrite
+from tests.fuzz.isolation import isolated
+from tests.fuzz.targets import read_events, read_info, read_log
+from tests.recordings.sample_log import LEFT, START, TILT, essence, items_of, write_sample
+
+Extra = Callable[[Writer, dict[str, int]], object]
+NOTHING = b"\0\1\0\0" + bytes(8)
+
+
+def with_extra(extra: Extra, **options: Any) -> Callable[[Path], Path]:
+    """A function that writes the sample log with something more."""
+
+    def write(folder: Path) -> Path:
+        sample, path = write_sample(folder / "sample.mcap"), folder / "log.mcap"
+        with sample.open("rb") as stream, path.open("wb") as out:
+            writer, channels = Writer(out, **options), dict[str, int]()
+            writer.start(profile="ros2")
+            for schema, channel, message in make_reader(stream).iter_messages():
+                if channel.topic not in channels:
+                    known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.topic] = writer.register_channel(channel.topic, "cdr", known)
+                writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+            extra(writer, channels)
+            writer.finish()
+        return path
+
+    return write
+
+
+def images(data: bytes, size: int) -> Callable[[Path], Path]:
+    """The sample with a compressed image in place of each, and calibrations of its size."""
+
+    def edit(topic: str, number: int, message: Any) -> Any:
+        if topic.endswith("camera_info"):
+            message.width = message.height = size
+        elif topic.endswith("image_rect"):
+            pixels = np.frombuffer(data, np.uint8)
+            return make("sensor_msgs/msg/CompressedImage", header=message.header, format="png", data=pixels)
+        return message
+
+    return lambda folder: write_sample(folder / "log.mcap", edit)
+
+
+def png(size: int) -> bytes:
+    """A black picture."""
+
+    def part(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    packer, rows = zlib.compressobj(1), bytes((1 + size) * 100)
+    packed = b"".join(packer.compress(rows) for _ in range(size // 100)) + packer.flush()
+    head = struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", packed) + part(b"IEND", b"")
+
+
+def jpeg(size: int) -> bytes:
+    """A small picture that states another size."""
+    data = bytearray(cv2.imencode(".jpg", np.zeros((64, 64), np.uint8))[1].tobytes())
+    at = data.index(b"\xff\xc0")
+    data[at + 5 : at + 9] = struct.pack(">HH", size, size)
+    return bytes(data)
+
+
+def packed(megabytes: int, states_size: bool) -> bytes:
+    """Zeros."""
+    packer = zstandard.ZstdCompressor(level=1).compressobj(size=megabytes << 20 if states_size else -1)
+    return b"".join(packer.compress(bytes(1 << 20)) for _ in range(megabytes)) + packer.flush()
+
+
+def many_messages(writer: Writer, channels: dict[str, int], count: int) -> None:
+    schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+    channel = writer.register_channel("/tiny", "cdr", schema)
+    for number in range(count):
+        writer.add_message(channel, START + number, NOTHING, START)
+
+
+def many_topics(writer: Writer, channels: dict[str, int], count: int) -> None:
+    for number in range(count):
+        text = f"std_msgs/Header header\nfloat64 x{number}\n".encode()
+        schema = writer.register_schema(f"own_msgs/msg/T{number}", "ros2msg", text)
+        channel = writer.register_channel(f"/topics/{number}", "cdr", schema)
+        writer.add_message(channel, START + number, bytes(32), START)
+
+
+def large_channels(writer: Writer, channels: dict[str, int], count: int) -> None:
+    schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+    for number in range(count):
+        writer.register_channel(f"/large/{number}", "cdr", schema, metadata={"x": "y" * 100_000})
+
+
+def messages_of(data: bytes, count: int) -> Extra:
+    """More messages of the left camera."""
+    return lambda writer, channels: [
+        writer.add_message(channels[LEFT], START + number, data, START) for number in range(count)
+    ]
+
+
+def schema_of(text: str) -> Extra:
+    """A second Imu with this definition."""
+
+    def extra(writer: Writer, channels: dict[str, int]) -> None:
+        schema = writer.register_schema("sensor_msgs/msg/Imu", "ros2msg", text.encode())
+        writer.add_message(writer.register_channel("/imu2", "cdr", schema), START, bytes(100), START)
+
+    return extra
+
+
+def overlapping(count: int, megabytes: int) -> Callable[[Path], Path]:
+    """Chunks that begin and end together."""
+
+    def extra(writer: Writer, channels: dict[str, int]) -> None:
+        for number in range(count):
+            writer.add_message(channels[TILT], START, NOTHING, START)
+            writer.add_message(channels[LEFT], START + number, bytes(megabytes << 20), START)
+            writer.add_message(channels[TILT], START + 1_000_000_000, NOTHING, START)
+
+    return with_extra(extra, chunk_size=megabytes << 20)
+
+
+SMALL = {
+    "png of 6000x6000": lambda: images(png(6000), 6000),
+    "jpeg of 30000x30000": lambda: images(jpeg(30000), 30000),
+    "messages of 200 MB": lambda: with_extra(messages_of(packed(200, states_size=False), 2)),
+    "schema of 5 MB": lambda: with_extra(schema_of("".join(f"float64 f{number}\n" for number in range(300_000)))),
+    "channels of 20 MB": lambda: with_extra(lambda *to: large_channels(*to, 200)),
+}
+LARGE = {
+    "png of 30000x30000": lambda: images(png(30000), 30000),
+    "messages of 4 GB": lambda: with_extra(messages_of(packed(4000, states_size=False), 5)),
+    "messages that state 4 GB": lambda: with_extra(messages_of(packed(4000, states_size=True), 5)),
+    "comments of 5 MB": lambda: with_extra(schema_of("# x\n" * 1_300_000)),
+    "20000 topics": lambda: with_extra(lambda *to: many_topics(*to, 20_000)),
+    "channels of 200 MB": lambda: with_extra(lambda *to: large_channels(*to, 2000)),
+    "chunk of 2 GB": lambda: with_extra(messages_of(bytes(2000 << 20), 1), chunk_size=1 << 31),
+    "chunks of 60 MB that overlap": lambda: overlapping(40, 60),
+    "6 million messages": lambda: with_extra(lambda *to: many_messages(*to, 6_000_000)),
+    "6 million messages in one chunk": lambda: with_extra(
+        lambda *to: many_messages(*to, 6_000_000), chunk_size=1 << 31
+    ),
+    "6 million messages outside chunks": lambda: with_extra(
+        lambda *to: many_messages(*to, 6_000_000), use_chunking=False
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_hostile_log_costs_little(tmp_path, name):
+    path = SMALL[name]()(tmp_path)
+    assert isolated(lambda: read_log(path)).fault == ""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", LARGE)
+def test_a_large_hostile_log_costs_little(tmp_path, name):
+    assert isolated(lambda: LARGE[name]()(tmp_path), limited=False).fault == ""
+    path = tmp_path / "log.mcap"
+    faults = [isolated(lambda: read(path)).fault for read in (read_info, read_events)]  # noqa: B023
+    path.unlink()
+    assert faults == ["", ""]
+
+
+def test_a_log_that_unpacks_to_far_more_than_its_size_is_refused(tmp_path, monkeypatch):
+    path = with_extra(messages_of(bytes(1 << 20), 20))(tmp_path)
+    monkeypatch.setattr(file, "_FREE_BYTES", 1 << 20)
+    with pytest.raises(LogError, match="times its size: no recording does"):
+        McapFile(path)
+
+
+def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tmp_path, monkeypatch):
+    def shuffled(rows):
+        return rows[::3] + rows[1::3] + rows[2::3]
+
+    path = rewrite(sample, tmp_path / "log.mcap", order=shuffled, chunk_size=3000)
+    times = []
+    unpack = McapFile._unpacked
+    monkeypatch.setattr(McapFile, "_unpacked", lambda self, chunk: times.append(chunk) or unpack(self, chunk))
+    counts = []
+    for limit in (1 << 28, 1):
+        monkeypatch.setattr(message_order, "MAX_OPEN_BYTES", limit)
+        times.clear()
+        events = items_of(path)
+        assert [essence(item) for _, _, item in events] == [essence(item) for _, _, item in whole]
+        counts.append(len(times))
+    assert counts[1] > counts[0]
