@@ -28,11 +28,12 @@ def replay(
     every: Every | None = None,
     on_frame: Callable[[bool], None] | None = None,
     live_port: int = 0,
+    profile: str | None = None,
 ) -> dict[str, Any]:
     """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary.
 
     on_frame: called after each frame, with whether it is complete, in place of a progress bar; live_port: of loopback,
-    where a viewer can watch the run; 0: none.
+    where a viewer can watch the run; 0: none; profile: of the result log; None: as the pipeline says.
     """
     from tqdm import tqdm
 
@@ -42,9 +43,8 @@ def replay(
     from stages.kernel_loading import loading_kernels
 
     graph = pipelines.load(pipeline, overrides)
-    if live_port:
-        live = ((use, replace(s, live_port=live_port) if hasattr(s, "live_port") else s) for use, s in graph.sinks)
-        graph = replace(graph, sinks=tuple(live))
+    given = {"live_port": live_port, "profile": profile}
+    graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()
     with loading_kernels(), graph.source.open(log, start=start, end=end) as opened, one_thread_per_call():
@@ -74,6 +74,11 @@ def replay(
                 settings: dict[str, Any] = {"workers": workers, "every": every}
                 summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame or advance)
     return as_json(summary | {"overrides": list(overrides)})
+
+
+def _with(sink: Any, given: Mapping[str, Any]) -> Any:
+    """A sink with those of the given values that it has a field for."""
+    return replace(sink, **{name: value for name, value in given.items() if value and hasattr(sink, name)})
 
 
 def _frames(of_log: int | None, every: Every | None) -> int | None:

@@ -16,7 +16,7 @@ from recordings.containers.container import LostMessage
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 from recordings.ros2.cdr import decoder_for
-from recordings.scoring.result_log import about_run
+from recordings.scoring.result_log import about_run, check_profile
 
 _LATE = ("/tf", "/nav/diagnostics")  # they follow from the streams, so they are never the first to differ
 
@@ -123,6 +123,7 @@ def diff(one: Path, other: Path, on_change: Callable[[MessageDifference], None] 
     for path, facts in about.items():
         if not facts:
             raise LogError(f"{path} is not a result log; give two logs that roverflow run wrote")
+        check_profile(path, facts)
     found = Diff(facts=_facts(about[one], about[other]))
     with McapFile(one) as first, McapFile(other) as second:
         found.begin = first.start

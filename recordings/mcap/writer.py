@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mcap.writer import CompressionType, Writer
 
@@ -38,6 +38,15 @@ _LATCHED = f"""- history: keep_last
 _LATCHED_TYPES = ("grid_map_msgs/msg/GridMap", "nav_msgs/msg/OccupancyGrid")
 
 
+class MessageKind(NamedTuple):
+    """A type of messages. name: of the schema; text: the definition, which may be empty."""
+
+    name: str
+    message_encoding: str
+    schema_encoding: str
+    text: bytes
+
+
 class Ros2Writer:
     """Writes messages as `ros2msg` / CDR, with log time = publish time = stamp. Same calls, same bytes.
 
@@ -47,16 +56,19 @@ class Ros2Writer:
     none. Raises UnwritableError if the log cannot be written.
     """
 
+    profile = "ros2"
+
     def __init__(self, path: Path, keep: bool = False, compression: str = "zstd") -> None:
         self.path, self._keep = Path(path), keep
         self._partial = temporary_name(self.path)
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, tuple[int, str]] = {}
+        self._kinds: dict[str, MessageKind] = {}
+        self._schemas: dict[MessageKind, int] = {}
+        self._channels: dict[str, tuple[int, MessageKind]] = {}
         self._counts: dict[str, int] = {}
         with writing(self.path):
             self._file = self._partial.open("wb")
         self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=COMPRESSIONS[compression])
-        self._writer.start(profile="ros2", library="roverflow")
+        self._writer.start(profile=self.profile, library="roverflow")
 
     @property
     def closed(self) -> bool:
@@ -68,7 +80,13 @@ class Ros2Writer:
         kind = message.__msgtype__
         if not 0 <= stamp < LAST_STAMP:
             raise ValueError(f"{kind} for {topic}: the stamp {stamp} ns is outside ROS time; give ns since 1970")
-        data = TYPES.serialize_cdr(message, kind)
+        if kind not in self._kinds:
+            text, _ = TYPES.generate_msgdef(kind, ros_version=2)
+            self._kinds[kind] = MessageKind(kind, "cdr", "ros2msg", text.encode())
+        self.add(topic, self._kinds[kind], stamp, TYPES.serialize_cdr(message, kind))
+
+    def add(self, topic: str, kind: MessageKind, stamp: int, data: bytes | memoryview) -> None:
+        """Append one message as it is stored."""
         with self._reporting():
             channel = self._channel(topic, kind)
             count = self._counts[topic] = self._counts.get(topic, 0) + 1
@@ -78,6 +96,12 @@ class Ros2Writer:
             self._writer.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=count)
             if large:
                 self._writer.flush()
+
+    def attachment(self, name: str, media_type: str, content: bytes) -> None:
+        """Append a file."""
+        with self._reporting():
+            self._writer.flush()
+            self._writer.add_attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=content)
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append one metadata record, its keys in sorted order."""
@@ -111,17 +135,17 @@ class Ros2Writer:
         else:
             self.abort()
 
-    def _channel(self, topic: str, kind: str) -> int:
+    def _channel(self, topic: str, kind: MessageKind) -> int:
         if topic not in self._channels:
             if kind not in self._schemas:
-                text, _ = TYPES.generate_msgdef(kind, ros_version=2)
-                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
-            latched = kind in _LATCHED_TYPES or topic == "/tf_static"
-            offered = {"offered_qos_profiles": _LATCHED} if latched else {}
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], offered), kind
+                self._schemas[kind] = self._writer.register_schema(kind.name, kind.schema_encoding, kind.text)
+            latched = kind.name in _LATCHED_TYPES or topic == "/tf_static"
+            offered = {"offered_qos_profiles": _LATCHED} if latched and kind.message_encoding == "cdr" else {}
+            number = self._writer.register_channel(topic, kind.message_encoding, self._schemas[kind], offered)
+            self._channels[topic] = number, kind
         channel, have = self._channels[topic]
         if have != kind:
-            raise ValueError(f"topic {topic} has the type {have}, so {kind} cannot be written to it")
+            raise ValueError(f"topic {topic} has the type {have.name}, so {kind.name} cannot be written to it")
         return channel
 
     @contextmanager

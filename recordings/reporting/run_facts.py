@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
-from recordings.scoring.result_log import about_run
+from recordings.scoring.result_log import about_run, check_profile
 from stages.data import Cell
 
 TOPICS = (
@@ -53,6 +53,7 @@ def read_facts(path: Path) -> RunFacts:
     about = about_run(path)
     if not about:
         raise LogError(f"{path} is not a result log; give a log that roverflow run wrote")
+    check_profile(path, about)
     facts = RunFacts(path, about, _counts(path))
     for topic, stamp, message in iter_decoded(path, TOPICS):
         _add(facts, topic, stamp, message)

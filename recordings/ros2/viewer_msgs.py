@@ -35,8 +35,8 @@ def depth_messages(disparity: Disparity) -> Messages:
     }
 
 
-def left_messages(frame: StereoFrame, eight_bits: Array) -> Messages:
-    """Every n-th pixel of the left image as JPEG, with the CameraInfo of these pixels.
+def left_messages(frame: StereoFrame, eight_bits: Array, with_calibration: bool) -> Messages:
+    """Every n-th pixel of the left image as JPEG, with the CameraInfo of these pixels where it is wanted.
 
     eight_bits: the left image, (H, W) gray or (H, W, 3) RGB uint8.
     """
@@ -44,10 +44,10 @@ def left_messages(frame: StereoFrame, eight_bits: Array) -> Messages:
     stored = thinned if thinned.ndim == 2 else cv2.cvtColor(thinned, cv2.COLOR_RGB2BGR)
     _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     frame_id = frame.camera.frame_id
-    return {
-        "/left/image_rect/compressed": compressed_image(frame.stamp, frame_id, blob.reshape(-1), "jpeg"),
-        "/left/camera_info": camera_info(frame.stamp, frame_id, some),
-    }
+    messages = {"/left/image_rect/compressed": compressed_image(frame.stamp, frame_id, blob.reshape(-1), "jpeg")}
+    if with_calibration:
+        messages["/left/camera_info"] = camera_info(frame.stamp, frame_id, some)
+    return messages
 
 
 def code_image(stamp: int, frame_id: str, codes: Array, colors: Mapping[int, tuple[int, int, int]]) -> Any:

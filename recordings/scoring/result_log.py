@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -26,6 +26,12 @@ def about_run(result: Path) -> dict[str, str]:
         if isinstance(record, Metadata) and record.name == "roverflow":
             return dict(record.metadata)
     return {}
+
+
+def check_profile(path: Path, about: Mapping[str, str]) -> None:
+    """Raise LogError for a result log whose messages are not those of ROS 2. about: its facts by `about_run`."""
+    if about.get("profile", "ros2") != "ros2":
+        raise LogError(f"{path} has results in Foxglove's messages; run the log again with --profile ros2")
 
 
 def pipeline_of(result: Path) -> str:
@@ -57,6 +63,7 @@ def stamps_run(result: Path) -> set[int] | None:
 
 def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:
     """The error for a log without any of the result topics `wanted`; with the `remedy` if it has one of `instead`."""
+    check_profile(path, about_run(path))
     with McapFile(path) as log:
         topics = sorted({log.channels[n].topic for n in log.channels if log.count({n})})
     results = [topic for topic in topics if topic.startswith("/nav/")]

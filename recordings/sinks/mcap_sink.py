@@ -33,7 +33,7 @@ from recordings.sinks.map_cropping import cropped
 from recordings.sinks.own_types import leaves, plain_type, refusal
 from recordings.sinks.regional_steps import RegionalSteps, regional_maps
 from recordings.sinks.thinning import thinned
-from recordings.sinks.viewer_topics import viewer_messages
+from recordings.sinks.viewer_topics import rerun_root, viewer_messages
 from stages.data import (
     Disparity,
     ElevationMap,
@@ -97,12 +97,18 @@ class McapSink:
         "lz4", "of the log; zstd takes a fifth less room than lz4 and twice the time", choices=tuple(COMPRESSIONS)
     )
 
+    profile: str = parameter(
+        "ros2", "messages of the log; Foxglove draws its own without extensions, but score and export read only ros2",
+        choices=("ros2", "foxglove"),
+    )  # fmt: skip
+
     suffix = ".mcap"
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
     _writer: Ros2Writer = field(init=False, repr=False)
     _kinds: Mapping[str, Any] = field(default_factory=dict, init=False, repr=False)
     _owners: dict[str, tuple[str, ...]] = field(default_factory=dict, init=False, repr=False)
     _steps: RegionalSteps = field(init=False, repr=False)
+    _rooted: bool = field(default=False, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
     empty: bool = field(default=False, init=False, repr=False)  # whether none of the streams to write had an item
 
@@ -127,11 +133,12 @@ class McapSink:
 
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: facts of the run, kept as the metadata record "roverflow"."""
-        self._last_stamp, self.empty = None, any(stream in streams for stream in self._written)
+        self._rooted, self._last_stamp, self.empty = False, None, any(stream in streams for stream in self._written)
         self._kinds, self._owners, self._steps = dict(streams), {}, RegionalSteps(self.regional_step)
-        self._writer = Ros2Writer(Path(path), keep=True, compression=self.compression)
+        self._writer = self._writer_class()(Path(path), keep=True, compression=self.compression)
         try:
-            self._writer.metadata("roverflow", about)
+            self._writer.metadata("roverflow", about if self.profile == "ros2" else {**about, "profile": self.profile})
+            self._writer.attachment("pipeline.yaml", "application/yaml", _as_ran(about).encode())
         except BaseException:
             self._writer.abort()
             raise
@@ -150,6 +157,9 @@ class McapSink:
         transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)
+            if self.viewers and not self._rooted:
+                self._rooted = True
+                writer.write("/tf_static", transform_message([(rerun_root(list(transforms)), stamp)]), stamp)
         health = [_health(name, item) for name, item in record.items.items() if isinstance(item, TiltHealth)]
         maps = [(name, record.items.get(name)) for name in self._written]
         epochs = [
@@ -185,6 +195,13 @@ class McapSink:
     def discard(self) -> None:
         """Discard the log; an earlier file of its name stays."""
         self._writer.abort()
+
+    def _writer_class(self) -> type[Ros2Writer]:
+        if self.profile == "ros2":
+            return Ros2Writer
+        from recordings.foxglove.writer import FoxgloveWriter  # which takes a tenth of a second to load
+
+        return FoxgloveWriter
 
     @property
     def _written(self) -> tuple[str, ...]:
@@ -227,6 +244,12 @@ class McapSink:
                 return {"": odometry(leaf)}
             case _:
                 return {"": message_of(leaf, stamp, frame_id)}
+
+
+def _as_ran(about: Mapping[str, str]) -> str:
+    """The pipeline file of a run, with the changes of the command line as comments."""
+    changes = "".join(f"# --set {change}\n" for change in about.get("overrides", "").splitlines())
+    return changes + about.get("pipeline", "")
 
 
 def _topic_part(name: str) -> str:

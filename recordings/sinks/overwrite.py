@@ -6,7 +6,13 @@ import json
 import struct
 from pathlib import Path
 
-_HEADER = b"\x89MCAP0\r\n" + struct.pack("<BQI4sI9s", 1, 21, 4, b"ros2", 9, b"roverflow")  # with profile and library
+_HEADERS = tuple(  # with profile, ROS 2 or none, and library
+    b"\x89MCAP0\r\n\x01"
+    + struct.pack("<QI", 17 + len(profile), len(profile))
+    + profile
+    + struct.pack("<I9s", 9, b"roverflow")
+    for profile in (b"ros2", b"")
+)
 _ABOUT = 12, struct.pack("<I9s", 9, b"roverflow")  # the metadata record that follows it in result logs, and its name
 _RECORDING = b"RRF", b"/summary", b"# RUNNING"  # its magic, and its first summary
 _DIFFERENCE = b"roverflow_diff"  # the application of recordings of differences
@@ -40,9 +46,12 @@ def is_ours(path: Path, kind: str) -> bool:
     if kind == "difference":
         return start.startswith(_RECORDING[0]) and _DIFFERENCE in start
     code, name = _ABOUT
-    follows = start[len(_HEADER) :]
+    header = next((known for known in _HEADERS if start.startswith(known)), None)
+    if header is None:
+        return False
+    follows = start[len(header) :]
     result = follows[:1] == bytes([code]) and follows[9:].startswith(name)  # 8 bytes between them are its length
-    return start.startswith(_HEADER) and result == (kind == "result log")
+    return result == (kind == "result log")
 
 
 def _has_keys(path: Path, keys: set[str]) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from recordings.ros2.viewer_msgs import code_image, depth_messages, left_messages, terrain_points
 from recordings.sinks.colormaps import (
@@ -13,7 +15,9 @@ from recordings.sinks.colormaps import (
     elevation_colors,
     top_eight_bits,
 )  # fmt: skip
-from stages.data import Disparity, ElevationMap, NavigationMap, StereoFrame
+from stages.data import Disparity, ElevationMap, NavigationMap, StereoFrame, Transform
+
+_RERUN_ROOT = "tf#/"  # the frame in which rerun draws a log that it opens by itself
 
 
 def viewer_messages(items: Mapping[str, Any], written: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -34,12 +38,21 @@ def viewer_messages(items: Mapping[str, Any], written: Mapping[str, Any]) -> Ite
                 yield f"{topic}/points", terrain_points(item, elevation_colors(item))
             case NavigationMap():
                 colors = {code: rgb for code, (_, rgb) in REASON_LEGEND.items()}
-                picture = code_image(item.stamp, item.frame_id, birds_eye(item.reason), colors)
+                picture = code_image(item.stamp, "", birds_eye(item.reason), colors)
                 yield f"{topic}/reason/color/compressed", picture
     frames = [(stream, item) for stream, item in items.items() if isinstance(item, StereoFrame)]
     if frames:
         width = max(item.camera.width for _, item in frames)
         stream, frame = [known for known in frames if known[1].camera.width == width][-1]
         (left,) = top_eight_bits(frame.left)
-        for below, message in left_messages(frame, left).items():
+        # Two calibrations of one camera would be two parents of its image plane, which rerun refuses.
+        has_depth = any(isinstance(item, Disparity) and item.camera is not None for item in written.values())
+        for below, message in left_messages(frame, left, with_calibration=not has_depth).items():
             yield f"/nav/{stream}{below}", message
+
+
+def rerun_root(pairs: Sequence[tuple[str, str]]) -> Transform:
+    """The transform that joins the root of a tree to rerun's own root frame. pairs: (parent, child) of the tree."""
+    children = {child for _, child in pairs}
+    root = next((parent for parent, _ in pairs if parent not in children), pairs[0][0])
+    return Transform(_RERUN_ROOT, root, np.eye(3), np.zeros(3))

@@ -25,6 +25,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add_log(sub)
     add_pipeline_options(sub)
     sub.add_argument("-o", "--out", type=Path, metavar="OUT.mcap", help="result log (LOG-nav.mcap)")
+    sub.add_argument(
+        "--profile",
+        choices=("ros2", "foxglove"),
+        help="messages of the result log (ros2); score and export read only those",
+    )
     recording = sub.add_mutually_exclusive_group()
     recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
     recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
@@ -54,7 +59,8 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
     if rrd is None and (options.view or options.serve):
         raise UsageError("watching needs the recording; leave out --no-rrd")
-    settings: dict[str, Any] = {name: getattr(options, name) for name in ("workers", "start", "end", "every")}
+    names = ("workers", "start", "end", "every", "profile")
+    settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
         with watched(options.view, options.serve) as port:
             summary = replay(options.log, options.pipeline, out, rrd, overrides=options.set, live_port=port, **settings)

@@ -55,3 +55,10 @@ def test_maps_are_offered_to_late_subscribers(result):
         }
     maps = {topic for topic, offered in durability.items() if offered == [QosDurability.TRANSIENT_LOCAL]}
     assert maps == {topic for topic in durability if "map" in topic}
+
+
+def test_the_tree_of_frames_hangs_from_the_frame_in_which_rerun_draws_a_log(messages):
+    (root,) = messages["/tf_static"].transforms
+    parents = {item.header.frame_id for item in messages["/tf"].transforms}
+    children = {item.child_frame_id for item in messages["/tf"].transforms}
+    assert (root.header.frame_id, root.child_frame_id) == ("tf#/", *(parents - children))
