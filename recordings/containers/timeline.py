@@ -27,8 +27,9 @@ class Timeline:
     @classmethod
     def of(cls, channels: ArrayLike, log_times: ArrayLike) -> Timeline:
         """The timeline of two lists; a damaged log time becomes -1."""
-        times = np.array(log_times, np.uint64)
-        times[times > MAX_LOG_TIME] = (1 << 64) - 1
+        times = np.asarray(log_times, np.uint64)  # no copy: there may be millions
+        if (damaged := times > MAX_LOG_TIME).any():
+            times = np.where(damaged, np.uint64((1 << 64) - 1), times)
         return cls(np.asarray(channels, np.int32), times.view(np.int64))
 
     def __len__(self) -> int:
@@ -40,8 +41,8 @@ class Timeline:
         order = np.argsort(self.channels, kind="stable")
         if (self.log_times < 0).any():
             order = order[self.log_times[order] >= 0]
-        numbers, first = np.unique(self.channels[order], return_index=True)
-        return dict(zip(numbers.tolist(), np.split(order, first[1:]), strict=True)) if len(order) else {}
+        parts = np.split(order, np.flatnonzero(np.diff(self.channels[order])) + 1)
+        return {int(self.channels[places[0]]): places for places in parts if len(places)}
 
     def times_of(self, channels: set[int]) -> NDArray[np.int64]:
         """The sorted log times of some channels, ns."""

@@ -266,7 +266,7 @@ class McapFile:
         outside, offsets, sizes = self.index.unchunked
         if not outside:
             return
-        all_places = np.asarray(outside, np.int64)
+        all_places = np.frombuffer(outside, np.int64)  # no copy: there may be millions
         own, times = self.timeline.channels[all_places], np.asarray(self.index.counted_times, np.uint64)[all_places]
         kept = (
             range(len(outside)) if places is None else range(*np.searchsorted(all_places, [places.start, places.stop]))

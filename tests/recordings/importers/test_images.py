@@ -123,6 +123,7 @@ def test_no_image_is_left_out_silently(tmp_path, names, sentence):
         ({"baseline": None}, "lacks 'baseline'"),
         ({"focal": 3.0}, "has the unknown 'focal'"),
         ({"fx": "wide"}, r": fx must be a number in px, not 'wide'"),
+        ({"fx": 10**400}, r": fx must be a finite number in px"),
         ({"fx": 10**30}, r": fx must be at most 1e\+09 px, not 1e\+30 px"),
         ({"baseline": -0.2}, r": baseline must be at least .* not -20 cm"),
         ({"cx": 24.5}, "the calibration's centre .cx 24.5, cy 7.5. is outside"),

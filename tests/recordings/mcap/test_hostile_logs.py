@@ -3,6 +3,7 @@
 import struct
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -153,9 +154,7 @@ LARGE = {
     "chunk of 2 GB": lambda: with_extra(messages_of(bytes(2000 << 20), 1), chunk_size=1 << 31),
     "chunks of 60 MB that overlap": lambda: overlapping(40, 60),
     "6 million messages": lambda: with_extra(lambda *to: many_messages(*to, 6_000_000)),
-    "6 million messages in one chunk": lambda: with_extra(
-        lambda *to: many_messages(*to, 6_000_000), chunk_size=1 << 31
-    ),
+    "500000 messages in one chunk": lambda: with_extra(lambda *to: many_messages(*to, 500_000), chunk_size=1 << 31),
     "6 million messages outside chunks": lambda: with_extra(
         lambda *to: many_messages(*to, 6_000_000), use_chunking=False
     ),
@@ -174,7 +173,7 @@ def test_a_hostile_log_costs_little(tmp_path, name):
 def test_a_large_hostile_log_costs_little(tmp_path, name):
     assert isolated(lambda: LARGE[name]()(tmp_path), limited=False).fault == ""
     path = tmp_path / "log.mcap"
-    faults = [isolated(lambda: read(path)).fault for read in (read_info, read_events)]  # noqa: B023
+    faults = [isolated(partial(read, path)).fault for read in (read_info, read_events)]
     path.unlink()
     assert faults == ["", ""]
 
