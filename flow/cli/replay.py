@@ -29,11 +29,13 @@ def replay(
     on_frame: Callable[[bool], None] | None = None,
     live_port: int = 0,
     profile: str | None = None,
+    with_inputs: bool = False,
 ) -> dict[str, Any]:
     """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary.
 
     on_frame: called after each frame, with whether it is complete, in place of a progress bar; live_port: of loopback,
-    where a viewer can watch the run; 0: none; profile: of the result log; None: as the pipeline says.
+    where a viewer can watch the run; 0: none; profile: of the result log; None: as the pipeline says;
+    with_inputs: copy the messages of the log into the result log.
     """
     from tqdm import tqdm
 
@@ -43,7 +45,8 @@ def replay(
     from stages.kernel_loading import loading_kernels
 
     graph = pipelines.load(pipeline, overrides)
-    given = {"live_port": live_port, "profile": profile}
+    logs = (log,) if isinstance(log, Path) else tuple(log)
+    given = {"live_port": live_port, "profile": profile, "inputs": logs if with_inputs else ()}
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()

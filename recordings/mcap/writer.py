@@ -63,8 +63,8 @@ class Ros2Writer:
         self._partial = temporary_name(self.path)
         self._kinds: dict[str, MessageKind] = {}
         self._schemas: dict[MessageKind, int] = {}
-        self._channels: dict[str, tuple[int, MessageKind]] = {}
-        self._counts: dict[str, int] = {}
+        self._channels: dict[tuple[str, int | None], tuple[int, MessageKind]] = {}
+        self._counts: dict[int, int] = {}
         with writing(self.path):
             self._file = self._partial.open("wb")
         self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=COMPRESSIONS[compression])
@@ -85,11 +85,13 @@ class Ros2Writer:
             self._kinds[kind] = MessageKind(kind, "cdr", "ros2msg", text.encode())
         self.add(topic, self._kinds[kind], stamp, TYPES.serialize_cdr(message, kind))
 
-    def add(self, topic: str, kind: MessageKind, stamp: int, data: bytes | memoryview) -> None:
-        """Append one message as it is stored."""
+    def add(
+        self, topic: str, kind: MessageKind, stamp: int, data: bytes | memoryview, copy_of: int | None = None
+    ) -> None:
+        """Append one message as it is stored. copy_of: its channel in another log, which gets a channel of its own."""
         with self._reporting():
-            channel = self._channel(topic, kind)
-            count = self._counts[topic] = self._counts.get(topic, 0) + 1
+            channel = self._channel(topic, kind, copy_of)
+            count = self._counts[channel] = self._counts.get(channel, 0) + 1
             large = len(data) >= MIN_OWN_CHUNK_BYTES
             if large:
                 self._writer.flush()
@@ -135,15 +137,16 @@ class Ros2Writer:
         else:
             self.abort()
 
-    def _channel(self, topic: str, kind: MessageKind) -> int:
-        if topic not in self._channels:
+    def _channel(self, topic: str, kind: MessageKind, copy_of: int | None) -> int:
+        if (topic, copy_of) not in self._channels:
             if kind not in self._schemas:
-                self._schemas[kind] = self._writer.register_schema(kind.name, kind.schema_encoding, kind.text)
-            latched = kind.name in _LATCHED_TYPES or topic == "/tf_static"
+                known = bool(kind.name or kind.text)  # number 0 states that there is no schema
+                self._schemas[kind] = self._writer.register_schema(kind.name, *kind[2:]) if known else 0
+            latched = kind.name in _LATCHED_TYPES or topic.endswith("tf_static")
             offered = {"offered_qos_profiles": _LATCHED} if latched and kind.message_encoding == "cdr" else {}
             number = self._writer.register_channel(topic, kind.message_encoding, self._schemas[kind], offered)
-            self._channels[topic] = number, kind
-        channel, have = self._channels[topic]
+            self._channels[topic, copy_of] = number, kind
+        channel, have = self._channels[topic, copy_of]
         if have != kind:
             raise ValueError(f"topic {topic} has the type {have.name}, so {kind.name} cannot be written to it")
         return channel

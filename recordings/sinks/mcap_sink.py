@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 from flow.contracts import FrameRecord, Loss
 from flow.parameters import check_parameters, parameter
 from recordings.errors import LogError
+from recordings.mcap.input_copy import copy_inputs
 from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
 from recordings.ros2.plain import message_of
 from recordings.ros2.to_msg import (
@@ -102,12 +103,15 @@ class McapSink:
         choices=("ros2", "foxglove"),
     )  # fmt: skip
 
+    inputs: tuple[Path, ...] = ()  # the logs of the run, which are then copied beside the results
+
     suffix = ".mcap"
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
     _writer: Ros2Writer = field(init=False, repr=False)
     _kinds: Mapping[str, Any] = field(default_factory=dict, init=False, repr=False)
     _owners: dict[str, tuple[str, ...]] = field(default_factory=dict, init=False, repr=False)
     _steps: RegionalSteps = field(init=False, repr=False)
+    _about: Mapping[str, str] = field(default_factory=dict, init=False, repr=False)
     _rooted: bool = field(default=False, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
     empty: bool = field(default=False, init=False, repr=False)  # whether none of the streams to write had an item
@@ -135,6 +139,7 @@ class McapSink:
         """Start the log. about: facts of the run, kept as the metadata record "roverflow"."""
         self._rooted, self._last_stamp, self.empty = False, None, any(stream in streams for stream in self._written)
         self._kinds, self._owners, self._steps = dict(streams), {}, RegionalSteps(self.regional_step)
+        self._about = about
         self._writer = self._writer_class()(Path(path), keep=True, compression=self.compression)
         try:
             self._writer.metadata("roverflow", about if self.profile == "ros2" else {**about, "profile": self.profile})
@@ -178,7 +183,7 @@ class McapSink:
             self._write_items(due.maps, due.stamp)
         entries = list(summary.get("entries", ()))
         found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
-        findings = [_finding(stream, finding) for stream, finding in found]
+        findings = [_finding(stream, finding) for stream, finding in found] + self._copied_inputs()
         if entries or (findings and self._last_stamp is not None):
             latest = max([0, *(entry.stamp for entry in entries)])
             stamp = latest if self._last_stamp is None else self._last_stamp
@@ -195,6 +200,14 @@ class McapSink:
     def discard(self) -> None:
         """Discard the log; an earlier file of its name stays."""
         self._writer.abort()
+
+    def _copied_inputs(self) -> list[tuple[int, str, str, dict[str, str]]]:
+        """Copy the input logs; returns the diagnostic status of each reason why messages could not be copied."""
+        if not self.inputs:
+            return []
+        start, end = (float(text) if (text := self._about.get(name)) else None for name in ("start", "end"))
+        lost = copy_inputs(self._writer, self.inputs, start, end)
+        return [(_WARN, "inputs", f"not copied: {why}", {"times": str(times)}) for why, times in lost.items()]
 
     def _writer_class(self) -> type[Ros2Writer]:
         if self.profile == "ros2":

@@ -30,6 +30,9 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         choices=("ros2", "foxglove"),
         help="messages of the result log (ros2); score and export read only those",
     )
+    sub.add_argument(
+        "--with-inputs", action="store_true", help="copy the messages of the log into the result log, byte for byte"
+    )
     recording = sub.add_mutually_exclusive_group()
     recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
     recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
@@ -59,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
     if rrd is None and (options.view or options.serve):
         raise UsageError("watching needs the recording; leave out --no-rrd")
-    names = ("workers", "start", "end", "every", "profile")
+    names = ("workers", "start", "end", "every", "profile", "with_inputs")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
         with watched(options.view, options.serve) as port:

@@ -1,0 +1,59 @@
+"""Copies the messages of an input log into a result log, byte for byte, so that one file shows both.
+
+Small messages are collected, so that their chunks contain no images.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from recordings.containers.container import Channel, LostMessage, RawMessage
+from recordings.containers.opening import open_recording
+from recordings.containers.time_range import TimeRange
+from recordings.mcap.writer import MIN_OWN_CHUNK_BYTES, MessageKind, Ros2Writer
+
+_COLLECTED_BYTES = 1024 * 1024
+
+
+def copy_inputs(
+    writer: Ros2Writer, logs: Path | Sequence[Path], start: float | None = None, end: float | None = None
+) -> Counter[str]:
+    """Copy the messages from `start` to before `end`, s after the first one, and all static transforms.
+
+    Returns the reasons why messages could not be copied, with the number of times.
+    """
+    lost, small, size = Counter[str](), list[RawMessage](), 0
+    with open_recording(logs) as log:
+        part = TimeRange.after(log.start, start, end)
+        static = {number for number, channel in log.channels.items() if channel.topic.endswith("tf_static")}
+        ranges = [(static, None, None), (set(log.channels) - static, part.low, part.high)]
+        kinds = {number: _kind(channel) for number, channel in log.channels.items()}
+
+        def add(messages: Sequence[RawMessage]) -> None:
+            for message in messages:
+                topic = log.channels[message.channel].topic
+                writer.add(topic, kinds[message.channel], message.log_time, message.data, copy_of=message.channel)
+
+        for channels, low, high in ranges:
+            for item in log.messages(channels, low, high, allow_repeats=True):
+                if isinstance(item, LostMessage):
+                    lost[item.reason] += 1
+                elif len(item.data) >= MIN_OWN_CHUNK_BYTES:
+                    add([item])
+                else:
+                    small.append(item._replace(data=memoryview(bytes(item.data))))
+                    size += len(item.data)
+                if size >= _COLLECTED_BYTES:
+                    add(small)
+                    small, size = [], 0
+        add(small)
+    return lost
+
+
+def _kind(channel: Channel) -> MessageKind:
+    schema = channel.schema
+    if schema is None:
+        return MessageKind("", channel.message_encoding, "", b"")
+    return MessageKind(schema.name, channel.message_encoding, schema.encoding, schema.text)

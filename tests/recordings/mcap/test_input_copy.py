@@ -1,0 +1,47 @@
+"""Result logs that also contain the messages of the input."""
+
+from collections import defaultdict
+
+import pytest
+from mcap.reader import make_reader
+
+from tests.conftest import SMALL, roverflow
+
+
+def contents(path):
+    """(Topic, encoding, schema) -> its (log time, bytes)."""
+    found = defaultdict(list)
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            found[channel.topic, channel.message_encoding, schema.data].append((message.log_time, message.data))
+    return found
+
+
+@pytest.fixture(scope="module")
+def both(traverse, tmp_path_factory):
+    out = tmp_path_factory.mktemp("both") / "out.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
+    return out
+
+
+def test_a_result_log_contains_the_input_byte_for_byte_beside_the_results(both, traverse, result):
+    found, results = contents(both), contents(result)
+    for channel, messages in contents(traverse).items():
+        assert sorted(found[channel]) == sorted(messages + results.get(channel, [])), channel[0]
+    for channel, messages in results.items():
+        assert set(messages) <= set(found[channel]), channel[0]
+
+
+def test_chunks_with_small_messages_contain_no_images(both):
+    with both.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    topics = [
+        {summary.channels[number].topic for number in chunk.message_index_offsets} for chunk in summary.chunk_indexes
+    ]
+    assert any("/imu" in topic or "tilt" in topic or "incl" in topic for names in topics for topic in names)
+    assert all(len(names) == 1 for names in topics if any("image" in topic for topic in names))
+
+
+def test_score_and_export_read_its_results(both, traverse, tmp_path):
+    assert roverflow("score", both, "--truth", traverse) == 0
+    assert roverflow("export", both, tmp_path / "maps") == 0
