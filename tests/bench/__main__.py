@@ -2,10 +2,11 @@
 
 import argparse
 
-from tests.bench import matching, pipeline, refining, regional, terrain, weak_texture
+from tests.bench import decoding, matching, pipeline, refining, regional, terrain, weak_texture
 
 about = "All benchmarks, half an hour; python -m tests.bench.NAME runs one."
 argparse.ArgumentParser("python -m tests.bench", description=about).parse_args()
+decoding.main()
 matching.main()
 refining.main()
 pipeline.main()
