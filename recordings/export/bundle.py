@@ -35,6 +35,7 @@ POINTS = "/nav/points"
 _SCHEMAS = {"elevation": "grid_map_msgs/msg/GridMap", "navigation": "nav_msgs/msg/OccupancyGrid"}
 # The sun of other hillshades: in the north-west, 45 degrees high, where north is the picture's upper edge.
 _NORTH_WEST = np.array([-0.5, 0.5, np.sqrt(0.5)])
+_ALL = "all layers"  # the name of the file that contains them
 _MAX_NAME_BYTES = 100  # of a file that is named after a layer or a frame of reference
 
 
@@ -178,12 +179,14 @@ class _MapFiles:
         return self.navigation is None or self.navigation.close(like=bounds)
 
     def write(self, folder: Path, time: str) -> list[Path]:
-        """A GeoTIFF of each layer, the hillshade with its world file, and the navigation map with its YAML."""
+        """A GeoTIFF of each layer and one of all, the hillshade with its world file, the navigation map with its YAML."""
         files = []
         if (terrain := self.elevation) is not None:
             about = _about(terrain.frame_id, time, self.stamp)
-            for layer, name in file_names(terrain.fills).items():
-                files.append(_write(folder / f"{name}.tif", write_geotiff, terrain, layer, about))
+            names = file_names([*terrain.fills, _ALL])
+            for layer in terrain.fills:
+                files.append(_write(folder / f"{names[layer]}.tif", write_geotiff, terrain, [layer], about))
+            files.append(_write(folder / f"{names[_ALL]}.tif", write_geotiff, terrain, list(terrain.fills), about))
             files.append(_write(folder / "hillshade.png", _write_hillshade, terrain))
             files.append(_write(folder / "hillshade.pgw", _write_world_file, terrain))
         if self.navigation is not None:

@@ -1,4 +1,4 @@
-"""GeoTIFF: one layer of a map as float32, first row northmost (largest y), NaN where nothing is known.
+"""GeoTIFF: layers of a map as bands of float32, first row northmost (largest y), NaN where nothing is known.
 
 The frame of reference is a local one, in metres: the citation names it, and there is no projection. Cells are areas, so
 the tie point is the upper left corner of the first cell.
@@ -6,25 +6,27 @@ the tie point is the upper left corner of the first cell.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 import numpy as np
 import tifffile
 
+from recordings.export.layer_units import unit_and_meaning
 from recordings.export.mosaic import Mosaic
 from stages.data import Array
 
 TILE_CELLS = 256  # the unit that a reader decompresses
-# TIFF tags and GeoTIFF keys (OGC 19-008r4), and GDAL's own tag for a value that means no data
-PIXEL_SCALE, TIE_POINT, GEO_KEYS, GEO_TEXT, NO_DATA = 33550, 33922, 34735, 34737, 42113
+# TIFF tags and GeoTIFF keys (OGC 19-008r4), and GDAL's own tags for what bands contain and for no data
+PIXEL_SCALE, TIE_POINT, GEO_KEYS, GEO_TEXT, BANDS, NO_DATA = 33550, 33922, 34735, 34737, 42112, 42113
 MODEL_TYPE, RASTER_TYPE, CITATION, LINEAR_UNITS = 1024, 1025, 1026, 3076
 USER_DEFINED, PIXEL_IS_AREA, METRE = 32767, 1, 9001
 DOUBLE, SHORT, ASCII = 12, 3, 2
 
 
-def write_geotiff(path: Path, mosaic: Mosaic, layer: str, citation: str) -> None:
-    """Write a layer of a map; citation: its frame of reference and time, ASCII."""
+def write_geotiff(path: Path, mosaic: Mosaic, layers: Sequence[str], citation: str) -> None:
+    """Write layers of a map, a band each, with their units; citation: frame of reference and time, ASCII."""
     rows, cols = mosaic.shape
     left, bottom = mosaic.origin
     text = citation.encode("ascii", "replace").decode() + "|"
@@ -37,15 +39,33 @@ def write_geotiff(path: Path, mosaic: Mosaic, layer: str, citation: str) -> None
     ]  # fmt: skip
     scale = (mosaic.resolution, mosaic.resolution, 0.0)
     corner = (0.0, 0.0, 0.0, left, bottom + rows * mosaic.resolution, 0.0)
+    bands = _bands(layers)
+    tiles = (tile for layer in layers for tile in _tiles(mosaic, layer))
+    several = len(layers) > 1
     tifffile.imwrite(
-        path, _tiles(mosaic, layer), shape=(rows, cols), dtype=np.float32, tile=(TILE_CELLS, TILE_CELLS),
-        photometric="minisblack", compression="zlib", description=layer, metadata=None, software="roverflow",
+        path, tiles, shape=(len(layers), rows, cols) if several else (rows, cols), dtype=np.float32,
+        tile=(TILE_CELLS, TILE_CELLS),
+        photometric="minisblack", compression="zlib", description=", ".join(layers).encode("ascii", "replace"),
+        metadata=None, software="roverflow",
+        planarconfig="separate" if several else None,
         extratags=[
             (PIXEL_SCALE, DOUBLE, 3, scale, True), (TIE_POINT, DOUBLE, 6, corner, True),
             (GEO_KEYS, SHORT, len(keys), keys, True), (GEO_TEXT, ASCII, len(text) + 1, text, True),
-            (NO_DATA, ASCII, 4, "nan", True),
+            (BANDS, ASCII, len(bands) + 1, bands, True), (NO_DATA, ASCII, 4, "nan", True),
         ],
     )  # fmt: skip
+
+
+def _bands(layers: Sequence[str]) -> bytes:
+    """GDAL's description of the bands: the layer's name, its unit and its meaning."""
+    items = []
+    for number, layer in enumerate(layers):
+        unit, meaning = unit_and_meaning(layer)
+        described = {"DESCRIPTION": (layer, "description"), "UNITTYPE": (unit, "unittype"), "MEANING": (meaning, "")}
+        for name, (text, role) in described.items():
+            roles = f' role="{role}"' if role else ""
+            items += [f'<Item name="{name}" sample="{number}"{roles}>{escape(text)}</Item>'] if text else []
+    return f"<GDALMetadata>{''.join(items)}</GDALMetadata>".encode()
 
 
 def _tiles(mosaic: Mosaic, layer: str) -> Iterator[Array]:

@@ -93,8 +93,8 @@ def test_gdal_reads_every_height_at_its_place_and_no_data_in_the_hole(result, tm
 
 def test_every_layer_is_a_file_and_newer_windows_replace_older_ones(result, tmp_path):
     files = export(result, tmp_path / "out")
-    names = {"elevation.tif", "variance.tif", "last.tif", "hillshade.png", "hillshade.pgw", "points.ply",
-             "navigation_map.pgm", "navigation_map.yaml"}  # fmt: skip
+    names = {"elevation.tif", "variance.tif", "last.tif", "all-layers.tif", "hillshade.png", "hillshade.pgw",
+             "points.ply", "navigation_map.pgm", "navigation_map.yaml"}  # fmt: skip
     assert {file.name for file in files} == names == {file.name for file in (tmp_path / "out").iterdir()}
     with rasterio.open(tmp_path / "out" / "last.tif") as file:
         last = file.read(1)
@@ -102,6 +102,17 @@ def test_every_layer_is_a_file_and_newer_windows_replace_older_ones(result, tmp_
     assert np.all(last[:, 40:] == 1)
     assert np.all(last[:, 15:35] == 1)
     assert set(np.unique(last)) == {0, 1}
+
+
+def test_one_file_has_every_layer_as_a_band_with_its_name_and_unit(result, tmp_path):
+    export(result, tmp_path)
+    with rasterio.open(tmp_path / "all-layers.tif") as file:
+        assert (file.descriptions, file.units) == (("elevation", "variance", "last"), ("m", "m^2", "s"))
+        assert file.tags(1)["MEANING"] == "mean height"
+        for band, name in enumerate(file.descriptions, 1):
+            with rasterio.open(tmp_path / f"{name}.tif") as alone:
+                np.testing.assert_array_equal(file.read(band), alone.read(1))
+                assert (file.transform, file.crs, alone.units) == (alone.transform, alone.crs, (file.units[band - 1],))
 
 
 def test_the_rim_of_a_window_does_not_replace_the_middle_of_another(tmp_path):
