@@ -179,7 +179,7 @@ class _MapFiles:
         return self.navigation is None or self.navigation.close(like=bounds)
 
     def write(self, folder: Path, time: str) -> list[Path]:
-        """GeoTIFFs of each layer and of all, the hillshade with its world file, and the navigation map with its YAML."""
+        """GeoTIFFs of each layer and of all, hillshade with its world file, and navigation map with its YAML."""
         files = []
         if (terrain := self.elevation) is not None:
             about = _about(terrain.frame_id, time, self.stamp)
