@@ -46,7 +46,7 @@ def replay(
 
     graph = pipelines.load(pipeline, overrides)
     logs = (log,) if isinstance(log, Path) else tuple(log)
-    given = {"live_port": live_port, "profile": profile, "inputs": logs if with_inputs else ()}
+    given = {"live_port": live_port, "profile": profile, "inputs": tuple(map(str, logs)) if with_inputs else ()}
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()

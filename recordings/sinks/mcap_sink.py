@@ -103,7 +103,7 @@ class McapSink:
         choices=("ros2", "foxglove"),
     )  # fmt: skip
 
-    inputs: tuple[Path, ...] = ()  # the logs of the run, which are then copied beside the results
+    inputs: tuple[str, ...] = parameter((), "logs that are copied beside the results; `run --with-inputs` sets them")
 
     suffix = ".mcap"
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
@@ -206,7 +206,7 @@ class McapSink:
         if not self.inputs:
             return []
         start, end = (float(text) if (text := self._about.get(name)) else None for name in ("start", "end"))
-        lost = copy_inputs(self._writer, self.inputs, start, end)
+        lost = copy_inputs(self._writer, [Path(log) for log in self.inputs], start, end)
         return [(_WARN, "inputs", f"not copied: {why}", {"times": str(times)}) for why, times in lost.items()]
 
     def _writer_class(self) -> type[Ros2Writer]:
