@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import BinaryIO
 
 import lz4.frame
@@ -16,13 +17,12 @@ import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 
-from recordings.mcap.index import RECORD, read_at
+from recordings.errors import LogError
+from recordings.mcap.index import RECORD, Index, read_at
 
 MAX_CHUNK_BYTES = 1 << 28  # of a chunk or message, unpacked; recorders make chunks of a few MB
-MAX_RATIO, _FREE_BYTES = (
-    200,
-    1 << 26,
-)  # of unpacked to packed bytes, beyond the free ones; only hostile files have more
+MAX_RATIO = 200  # of unpacked to packed bytes; more is a hostile file
+_FREE_BYTES, _FREE_FILE_BYTES = 1 << 26, 1 << 30  # to which any chunk, and any file, may unpack
 CHUNK_HEAD_BYTES = 128  # of a chunk record; they contain its length
 
 _CHUNK = struct.Struct("<QQQII")  # start time, end time, size, CRC, length of the compression's name
@@ -34,6 +34,13 @@ _CHUNK_PATTERN = re.compile(rb"\x06(?=.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz
 def max_unpacked(packed: int) -> int:
     """The largest size, bytes, to which so many bytes may be unpacked."""
     return min(MAX_CHUNK_BYTES, max(_FREE_BYTES, MAX_RATIO * packed))
+
+
+def check_size(index: Index, path: Path, size: int) -> None:
+    """Raise LogError for a file whose chunks unpack to more than those of a recording could. size: of the file."""
+    total = sum(chunk.uncompressed_size for chunk in index.chunks)
+    if total > max(_FREE_FILE_BYTES, MAX_RATIO * size):
+        raise LogError(f"{path} unpacks to {total} bytes, {total // size} times its size: no recording does")
 
 
 def is_chunk(head: bytes) -> bool:

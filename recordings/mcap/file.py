@@ -26,7 +26,7 @@ from recordings.containers.container import Channel, LostMessage, MessageSchema,
 from recordings.containers.timeline import MAX_LOG_TIME, Timeline
 from recordings.containers.unpacking import ZSTD_MAGIC
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.chunk import MAX_CHUNK_BYTES, MAX_RATIO, chunk_heads, unpack_chunk
+from recordings.mcap.chunk import MAX_CHUNK_BYTES, check_size, chunk_heads, unpack_chunk
 from recordings.mcap.index import (
     MESSAGE,
     PARSE_ERRORS,
@@ -37,11 +37,10 @@ from recordings.mcap.index import (
     opened,
     read_at,
 )
-from recordings.mcap.message_order import ChunkMessages, OpenChunks, Ordered, in_log_time_order
+from recordings.mcap.message_order import ChunkMessages, LastTable, OpenChunks, Ordered, in_log_time_order
 from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for
 
-_FREE_BYTES = 1 << 30  # to which any file may unpack; a larger one has a limited ratio
 HEAD_BYTES = 64  # of a message; they contain the stamp of its header
 
 
@@ -96,6 +95,7 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self._file = opened(self.path)
+        self._last_table = LastTable()
         try:
             self.size = self.path.stat().st_size
             self.index = index_from_summary(self._file, self.size) or walk(self._file, self.size)
@@ -103,7 +103,7 @@ class McapFile:
             for number in sorted(set(self.index.counted_channels) - self.channels.keys()):
                 unknown = counted(self.index.counted_channels.count(number), "message")
                 self.index.note_damage(f"{unknown} of channel {number} cannot be read: the log does not define it")
-            self._check_size()
+            check_size(self.index, self.path, self.size)
             self.start, self.end = self._time_range()
         except BaseException:
             self._file.close()
@@ -284,8 +284,9 @@ class McapFile:
 
     def _chunk_or_lost(self, chunk: ChunkIndex, opened: OpenChunks | None = None) -> ChunkMessages | list[LostMessage]:
         """The messages of a chunk, or a `LostMessage` for each entry of its message index."""
+        opened = opened or OpenChunks(self._unpacked)
         try:
-            return ChunkMessages(chunk, opened or OpenChunks(self._unpacked))
+            return ChunkMessages(chunk, opened, self._last_table.of(chunk, opened))
         except PARSE_ERRORS as error:
             reason = lost_chunk(chunk.chunk_start_offset, error)
         channels = chunk.message_index_offsets
@@ -327,14 +328,6 @@ class McapFile:
             if (stated := self.index.stated_counts.get(channel, count)) > count:
                 why = f"the log's statistics count {counted(stated, 'message')}, but the log contains {count}"
                 yield LostMessage(channel, self.end, why)
-
-    def _check_size(self) -> None:
-        """Refuse a file whose chunks unpack to more than a recording could."""
-        total = sum(chunk.uncompressed_size for chunk in self.index.chunks)
-        if total > max(_FREE_BYTES, MAX_RATIO * self.size):
-            raise LogError(
-                f"{self.path} unpacks to {total} bytes, {total // self.size} times its size: no recording does"
-            )
 
     def _time_range(self) -> tuple[int, int]:
         """Log time of the first and the last message, ns."""

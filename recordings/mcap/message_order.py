@@ -46,39 +46,59 @@ class OpenChunks:
             total -= len(self._open.pop(next(iter(self._open))))
 
 
-class ChunkMessages(Sequence[RawMessage | LostMessage]):
-    """The messages of a chunk, in file order. Raises ValueError for a record that is cut."""
+class ChunkTable:
+    """Channel, log time and place of each message in the records of a chunk. Raises ValueError for a cut record."""
 
-    def __init__(self, chunk: ChunkIndex, opened: OpenChunks) -> None:
-        self._records, self._close = partial(opened.records, chunk), partial(opened.close, chunk)
-        self._offset = chunk.chunk_start_offset
-        self._channels, self._times, self._starts, self._ends = array("H"), array("Q"), array("Q"), array("Q")
-        records = memoryview(self._records())
-        position, size, message = 0, len(records), int(Opcode.MESSAGE)
+    def __init__(self, records: bytes | memoryview) -> None:
+        self.channels, self.times, self.starts, self.ends = array("H"), array("Q"), array("Q"), array("Q")
+        view = memoryview(records)
+        position, size, message = 0, len(view), int(Opcode.MESSAGE)
         while position < size:
             if position + RECORD.size > size:
                 raise ValueError("a record is longer than its section")
-            opcode, length = RECORD.unpack_from(records, position)
+            opcode, length = RECORD.unpack_from(view, position)
             start, position = position + RECORD.size, position + RECORD.size + length
             if position > size:
                 raise ValueError("a record is longer than its section")
             if opcode == message:
                 if length < MESSAGE.size:
                     raise ValueError("a message is cut short")
-                channel, _, log_time, _ = MESSAGE.unpack_from(records, start)
-                self._channels.append(channel)
-                self._times.append(log_time)
-                self._starts.append(start + MESSAGE.size)
-                self._ends.append(position)
+                channel, _, log_time, _ = MESSAGE.unpack_from(view, start)
+                self.channels.append(channel)
+                self.times.append(log_time)
+                self.starts.append(start + MESSAGE.size)
+                self.ends.append(position)
+
+
+class LastTable:
+    """The table of the chunk read last, for a large one that is read many times."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, ChunkTable] | None = None
+
+    def of(self, chunk: ChunkIndex, opened: OpenChunks) -> ChunkTable:
+        """The table of a chunk."""
+        last = self._last
+        if last is None or last[0] != chunk.chunk_start_offset:
+            last = self._last = chunk.chunk_start_offset, ChunkTable(opened.records(chunk))
+        return last[1]
+
+
+class ChunkMessages(Sequence[RawMessage | LostMessage]):
+    """The messages of a chunk, in file order."""
+
+    def __init__(self, chunk: ChunkIndex, opened: OpenChunks, table: ChunkTable) -> None:
+        self._records, self._close = partial(opened.records, chunk), partial(opened.close, chunk)
+        self._offset, self._table = chunk.chunk_start_offset, table
 
     def __len__(self) -> int:
-        return len(self._times)
+        return len(self._table.times)
 
     def __getitem__(self, number: int) -> RawMessage | LostMessage:  # type: ignore[override]  # no slices
-        channel, log_time = self._channels[number], self._times[number]
+        channel, log_time = self._table.channels[number], self._table.times[number]
         try:
             records = self._records()
-            data = memoryview(records)[self._starts[number] : self._ends[number]]
+            data = memoryview(records)[self._table.starts[number] : self._table.ends[number]]
             if 2 * len(data) < len(records):  # a message that waits keeps no chunk in memory
                 data = memoryview(bytes(data))
         except PARSE_ERRORS as error:  # it was unpacked before: the file has changed, or the memory is full
@@ -87,9 +107,9 @@ class ChunkMessages(Sequence[RawMessage | LostMessage]):
 
     def in_order(self, channels: set[int], places: range) -> Iterator[Ordered]:
         """The messages of some channels in log-time order, not read yet. places: those wanted of the chunk."""
-        own = np.frombuffer(self._channels, np.uint16) if len(self) else np.zeros(0, np.uint16)
-        for number in in_log_time_order(own, self._times, channels, places):
-            yield self._times[number], number, self
+        own = np.frombuffer(self._table.channels, np.uint16) if len(self) else np.zeros(0, np.uint16)
+        for number in in_log_time_order(own, self._table.times, channels, places):
+            yield self._table.times[number], number, self
         self._close()
 
 

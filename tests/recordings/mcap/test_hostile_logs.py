@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from recordings.errors import LogError
-from recordings.mcap import file, message_order
+from recordings.mcap import chunk, message_order
 from recordings.mcap.file import McapFile
 from recordings.ros2.cdr import make
 from tests.conftest import rewrite
@@ -154,7 +154,9 @@ LARGE = {
     "chunk of 2 GB": lambda: with_extra(messages_of(bytes(2000 << 20), 1), chunk_size=1 << 31),
     "chunks of 60 MB that overlap": lambda: overlapping(40, 60),
     "6 million messages": lambda: with_extra(lambda *to: many_messages(*to, 6_000_000)),
-    "500000 messages in one chunk": lambda: with_extra(lambda *to: many_messages(*to, 500_000), chunk_size=1 << 31),
+    "2 million messages in one chunk": lambda: with_extra(
+        lambda *to: many_messages(*to, 2_000_000), chunk_size=1 << 31
+    ),
     "6 million messages outside chunks": lambda: with_extra(
         lambda *to: many_messages(*to, 6_000_000), use_chunking=False
     ),
@@ -180,7 +182,7 @@ def test_a_large_hostile_log_costs_little(tmp_path, name):
 
 def test_a_log_that_unpacks_to_far_more_than_its_size_is_refused(tmp_path, monkeypatch):
     path = with_extra(messages_of(bytes(1 << 20), 20))(tmp_path)
-    monkeypatch.setattr(file, "_FREE_BYTES", 1 << 20)
+    monkeypatch.setattr(chunk, "_FREE_FILE_BYTES", 1 << 20)
     with pytest.raises(LogError, match="times its size: no recording does"):
         McapFile(path)
 
@@ -192,7 +194,7 @@ def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tm
     path = rewrite(sample, tmp_path / "log.mcap", order=shuffled, chunk_size=3000)
     times = []
     unpack = McapFile._unpacked
-    monkeypatch.setattr(McapFile, "_unpacked", lambda self, chunk: times.append(chunk) or unpack(self, chunk))
+    monkeypatch.setattr(McapFile, "_unpacked", lambda self, one: times.append(one) or unpack(self, one))
     counts = []
     for limit in (1 << 28, 1):
         monkeypatch.setattr(message_order, "MAX_OPEN_BYTES", limit)
