@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from flow.contracts import StageError
 from stages.cloud.kernels.depth_order import out_of_order
 from stages.cloud.kernels.outliers import SupportRule, median_slope, supported
-from stages.cloud.kernels.patches import connected_patches, depth_images, patch_sizes
+from stages.cloud.kernels.patches import connected_patches, depth_images, in_large_patches, patch_sizes
 from stages.data import Array, PointCloud
 from stages.stage import Stage, parameter
 
@@ -72,13 +72,16 @@ class Clean(Stage):
             raise StageError("Clean: the cloud has no image shape; set it, or use method: knn")
         if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < cloud.shape[0] * cloud.shape[1]:
             raise StageError(f"Clean: the cloud has pixel indices outside its image of shape {cloud.shape}")
-        kept = self._supported(cloud, cloud.measured, cloud.shape)
-        others = np.flatnonzero(~cloud.measured)
-        if len(others):
-            points = cloud.points.take(others, axis=0)
-            near = (points[:, 2] > 0) & (np.einsum("ij,ij->i", points, points) <= self._crop**2)
-            kept = np.sort(np.concatenate([kept, others[near]]))
-        return kept
+        measured = cloud.measured
+        kept = self._supported(cloud, measured, cloud.shape)
+        others = np.flatnonzero(~measured)
+        if not len(others):
+            return kept
+        points = cloud.points.take(others, axis=0)
+        near = (points[:, 2] > 0) & (np.einsum("ij,ij->i", points, points) <= self._crop**2)
+        chosen = np.zeros(len(measured), bool)
+        chosen[kept] = chosen[others[near]] = True
+        return np.flatnonzero(chosen)
 
     def _supported(self, cloud: PointCloud, measured: Array, shape: tuple[int, int]) -> Array:
         """Indices of the points kept of the measured ones.
@@ -93,8 +96,8 @@ class Clean(Stage):
         patch = connected_patches(inverse, tolerance, MAX_SLOPE_RATIO * median_slope(inverse))
         sizes = patch_sizes(patch)
         pixel = cloud.pixel.take(kept)
-        large = sizes.take(patch.ravel().take(pixel)) >= self.min_patch_share * len(kept)
-        return np.asarray(kept[large & ~out_of_order(inverse, patch, sizes).ravel().take(pixel)])
+        dropped = out_of_order(inverse, patch, sizes)
+        return in_large_patches(kept, pixel, patch, sizes, self.min_patch_share * len(kept), dropped)
 
     def _knn(self, cloud: PointCloud) -> Array:
         """Indices of the points kept by the mean distance to their nearest neighbours in space."""

@@ -100,6 +100,36 @@ def _count(patch, sizes):
             sizes[label] += 1
 
 
+def in_large_patches(kept: Array, pixel: Array, patch: Array, sizes: Array, min_points: float, dropped: Array) -> Array:
+    """Those of the points `kept` whose patch has `min_points` and whose pixel is not `dropped`, (K,) int64.
+
+    kept: (M,) int64; pixel: (M,) int32, flat index of each; patch: (H, W) int32, labels of `connected_patches`; sizes:
+    (H * W,) int32, points of each patch; dropped: (H, W) bool.
+    """
+    chosen = np.empty(len(kept), np.int64)
+    count = _in_large_patches(kept, pixel, patch.reshape(-1), sizes, float(min_points), dropped.reshape(-1), chosen)
+    return chosen[:count]
+
+
+@kernel
+def _in_large_patches(kept, pixel, patch, sizes, min_points, dropped, chosen):
+    count = 0
+    for k in range(kept.size):
+        at = pixel[k]
+        if sizes[patch[at]] >= min_points and not dropped[at]:
+            chosen[count] = kept[k]
+            count += 1
+    return count
+
+
+def in_large_patches_reference(
+    kept: Array, pixel: Array, patch: Array, sizes: Array, min_points: float, dropped: Array
+) -> Array:
+    """The same as `in_large_patches`, in plain numpy."""
+    large = sizes[patch.ravel()[pixel]] >= min_points
+    return np.asarray(kept[large & ~dropped.ravel()[pixel]])
+
+
 def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
     """The same as `connected_patches`: scipy's connected components of the graph of links."""
     present = inverse > 0

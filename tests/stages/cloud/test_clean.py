@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from stages.cloud.clean import Clean
 from stages.cloud.kernels.depth_order import out_of_order, out_of_order_reference
 from stages.cloud.kernels.outliers import SupportRule, supported, supported_reference
-from stages.cloud.kernels.patches import connected_patches, connected_patches_reference, patch_sizes
+from stages.cloud.kernels.patches import (
+    connected_patches,
+    connected_patches_reference,
+    in_large_patches,
+    in_large_patches_reference,
+    patch_sizes,
+)
 from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, PixelOrigin, PointCloud, Transform
 from tests.stages.terrain.terrain_scene import (
@@ -130,6 +136,19 @@ def test_patch_kernel_equals_scipy_connected_components() -> None:
     got, want = connected_patches(inverse, tolerance, 0.2), connected_patches_reference(inverse, tolerance, 0.2)
     assert len(np.unique(want)) > 8
     np.testing.assert_array_equal(got, want)
+
+
+def test_selection_of_large_patches_equals_the_reference() -> None:
+    random = np.random.default_rng(9)
+    patch = random.integers(0, 8, (30, 40)).astype(np.int32)
+    pixel = np.flatnonzero(random.random(patch.size) < 0.5).astype(np.int32)
+    kept = np.sort(random.choice(5000, len(pixel), replace=False))
+    sizes = np.zeros(patch.size, np.int32)
+    sizes[:8] = 20, 30, 31, 40, 5, 100, 0, 30
+    given = kept, pixel, patch, sizes, 30.5, random.random(patch.shape) < 0.3
+    got = in_large_patches(*given)
+    assert 0 < len(got) < len(kept)
+    np.testing.assert_array_equal(got, in_large_patches_reference(*given))
 
 
 def test_depth_order_kernel_equals_the_reference() -> None:
