@@ -18,7 +18,7 @@ TYPES = {np.float32: 7, np.uint8: 1, np.int8: 2}  # numpy type -> PackedElementF
 @pytest.fixture(scope="module")
 def foxglove(traverse, tmp_path_factory):
     out = tmp_path_factory.mktemp("foxglove") / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--profile", "foxglove") == 0
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--profile", "foxglove", "--every", 4) == 0
     return out
 
 
