@@ -142,7 +142,7 @@ def _messages(result: Path, lost: Counter[str] | None, *topics: str | None) -> I
 
 
 @dataclass(eq=False)
-class _MapFiles:
+class MapFiles:
     """Maps on one grid, as far as they have been read."""
 
     rim: float
@@ -197,21 +197,7 @@ class _MapFiles:
 
 def _export_region(result: Path, out: Path, lost: Counter[str] | None, topics: MapTopics) -> list[Path]:
     """The regional map in `out`; if it was reset, a folder in `out` for each frame of reference."""
-    regions: dict[str, _MapFiles] = {}
-    leading = topics.elevation or topics.navigation
-    for stamp, frame in _messages(result, lost, *topics, POINTS):
-        if leading in frame:
-            frame_id = frame[leading].header.frame_id
-            regions.setdefault(frame_id, _MapFiles(RIM_WIDTH)).add(result, topics, stamp, frame)
-        if "level" in frame and frame["level"].parent in regions:
-            regions[frame["level"].parent].color(result, frame)
-    if not regions:
-        _check_damage(result, lost)
-        remedy = "add --frames to export the maps of every frame"
-        raise without_results(result, (str(leading),), instead=(*map(str, FRAME), POINTS), remedy=remedy)
-    known = {name: region for name, region in regions.items() if region.close()}
-    if not known:
-        raise LogError(f"no cell of {leading} in {result} is known: there is nothing to export")
+    known = regions_of(result, lost, topics)
     folders = {next(iter(known)): ""} if len(known) == 1 else file_names(known)
     files = []
     for name, region in known.items():
@@ -223,13 +209,36 @@ def _export_region(result: Path, out: Path, lost: Counter[str] | None, topics: M
     return files
 
 
+def regions_of(result: Path, lost: Counter[str] | None, topics: MapTopics, colored: bool = True) -> dict[str, MapFiles]:
+    """Frame of reference -> the regional map in it, with the colours of points if `colored`.
+
+    Raises LogError if the log has none, or one without known cells.
+    """
+    regions: dict[str, MapFiles] = {}
+    leading = topics.elevation or topics.navigation
+    for stamp, frame in _messages(result, lost, *topics, POINTS if colored else None):
+        if leading in frame:
+            frame_id = frame[leading].header.frame_id
+            regions.setdefault(frame_id, MapFiles(RIM_WIDTH)).add(result, topics, stamp, frame)
+        if "level" in frame and frame["level"].parent in regions:
+            regions[frame["level"].parent].color(result, frame)
+    if not regions:
+        _check_damage(result, lost)
+        remedy = "add --frames to export the maps of every frame"
+        raise without_results(result, (str(leading),), instead=(*map(str, FRAME), POINTS), remedy=remedy)
+    known = {name: region for name, region in regions.items() if region.close()}
+    if not known:
+        raise LogError(f"no cell of {leading} in {result} is known: there is nothing to export")
+    return known
+
+
 def _export_frames(result: Path, out: Path, lost: Counter[str] | None, topics: MapTopics, points: bool) -> list[Path]:
     """The maps of every frame, and its points if `points`, in a folder each."""
     files: list[Path] = []
     number = 0
     for stamp, frame in _messages(result, lost, *topics, POINTS if points else None):
         folder, written_before = out / f"frame-{number:04d}-{stamp}", len(files)
-        maps = _MapFiles(0.0)
+        maps = MapFiles(0.0)
         maps.add(result, topics, stamp, {topic: frame[topic] for topic in topics if topic in frame})
         if maps.close():
             files += maps.write(folder, "at")

@@ -24,6 +24,10 @@ _LAYERS = {
     "first": ("s", "first time the cell was seen, after the map's epoch"),
     "last": ("s", "last time the cell was seen, after the map's epoch"),
     "frames": ("", "frames that saw the cell"),
+    "logs": ("", "logs that saw the cell"),
+    "best_log": ("", "number of the log with the least variance, as in merge.json"),
+    "disagreement": ("m", "largest difference of two logs' heights"),
+    "conflicts": ("", "pairs of logs whose heights differ by more than 3 sigma"),
     "contradictions": ("", "frames that contradicted the height"),
 }  # fmt: skip
 

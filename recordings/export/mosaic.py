@@ -102,6 +102,11 @@ class Mosaic:
         inside[max(0, -row) : max(0, self.shape[0] - row), max(0, -col) : max(0, self.shape[1] - col)] = True
         return np.where(inside & (cells["added"] > 0), cells[layer], self.fills[layer])
 
+    def tiles(self) -> Iterator[tuple[tuple[int, int], dict[str, Array]]]:
+        """Index of each tile of `TILE_SIDE` cells, counted from the origin of the frame, and its layers."""
+        for index, tile in self._cells.tiles.items():
+            yield index, {name: np.where(tile["added"] > 0, tile[name], fill) for name, fill in self.fills.items()}
+
     def strips(self, layer: str) -> Iterator[Array]:
         """The layer from its largest y on, in blocks (up to `STRIP_ROWS`, cols) whose first row is the uppermost."""
         for top in range(self.shape[0], 0, -STRIP_ROWS):

@@ -17,10 +17,11 @@ from stages.data.maps import LEVEL_FRAME, Cell, CellReason, ElevationMap, MatchF
 from stages.data.motion import CameraMotion, Mount, Pose, Tilt, TiltHealth, Transform
 from stages.data.pixel_validity import PixelOrigin, known
 from stages.data.rover import Rover
-from stages.data.tiles import Tiles
+from stages.data.tiles import TILE_SIDE, Tiles
 
 __all__ = [
     "LEVEL_FRAME",
+    "TILE_SIDE",
     "Array",
     "CameraImage",
     "CameraModel",

@@ -12,7 +12,7 @@ import numpy as np
 
 from stages.data.arrays import Array
 
-SIDE = 32  # cells: 1.6 m at 0.05 m a cell, so a track 20 m wide wastes a twelfth at its borders
+TILE_SIDE = 32  # cells: 1.6 m at 0.05 m a cell, so a track 20 m wide wastes a twelfth at its borders
 Span = tuple[slice, slice]
 
 
@@ -35,7 +35,7 @@ class Tiles:
         """Store the cells of `block` from (row, col) on, where `changed`, (rows, cols) bool, is set."""
         for index, inside, part in _parts(row, col, *block.shape):
             if changed[part].any():
-                tile = self.tiles.setdefault(index, np.zeros((SIDE, SIDE), self.dtype))
+                tile = self.tiles.setdefault(index, np.zeros((TILE_SIDE, TILE_SIDE), self.dtype))
                 np.copyto(tile[inside], block[part], where=changed[part])
 
 
@@ -47,6 +47,6 @@ def _parts(row: int, col: int, rows: int, cols: int) -> Iterator[tuple[tuple[int
 
 
 def _spans(start: int, length: int) -> Iterator[tuple[int, slice, slice]]:
-    for tile in range(start // SIDE, (start + length - 1) // SIDE + 1):
-        low, high = max(start, tile * SIDE), min(start + length, (tile + 1) * SIDE)
-        yield tile, slice(low - tile * SIDE, high - tile * SIDE), slice(low - start, high - start)
+    for tile in range(start // TILE_SIDE, (start + length - 1) // TILE_SIDE + 1):
+        low, high = max(start, tile * TILE_SIDE), min(start + length, (tile + 1) * TILE_SIDE)
+        yield tile, slice(low - tile * TILE_SIDE, high - tile * TILE_SIDE), slice(low - start, high - start)

@@ -16,19 +16,21 @@ HELP = "maps of a result log as GeoTIFF, PGM with YAML (map_server), PLY and PNG
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("result", type=Path, metavar="OUT.mcap")
+    several = "result log; several of them, or the folder of a fleet, with --merge"
+    sub.add_argument("results", type=Path, nargs="+", metavar="OUT.mcap", help=several)
     sub.add_argument("folder", type=Path, metavar="DIR", help="folder for the files, made where it is missing")
     sub.add_argument("--frames", action="store_true", help="maps and points of every frame, not the regional map")
     sub.add_argument(
         "--map", action="append", default=[], metavar="STREAM", dest="maps",
         help="an elevation or navigation map of the pipeline by its stream's name, not the regional one",
     )  # fmt: skip
+    one_map = "merge the regional maps of several logs, whose poses are in one frame, into one"
+    sub.add_argument("--merge", action="store_true", help=one_map)
 
 
 def run(options: argparse.Namespace) -> int:
     """Write the files."""
-    from recordings.export.bundle import export
-
+    results = _results(options)
     if options.folder.exists() and not options.folder.is_dir():
         raise UsageError(f"{options.folder} is a file; give the name of a folder")
     if options.folder.exists() and any(options.folder.iterdir()):
@@ -36,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     lost, made = Counter[str](), not options.folder.exists()
     try:
         with writing(options.folder):
-            files = export(options.result, options.folder, options.frames, lost, options.maps)
+            files, faults = _written(options, results, lost)
     except BaseException:  # a partial export looks like a whole one, and blocks the next attempt
         for part in [options.folder] if made else list(options.folder.iterdir()):
             if part.is_dir():
@@ -47,5 +49,39 @@ def run(options: argparse.Namespace) -> int:
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")
     for why in lost:
-        say(f"WARNING: {options.result}: {why}; the rest was exported")
-    return INCOMPLETE if lost else COMPLETE
+        say(f"WARNING: {results[0] if len(results) == 1 else 'merge'}: {why}; the rest was exported")
+    return INCOMPLETE if lost or faults else COMPLETE
+
+
+def _written(options: argparse.Namespace, results: list[Path], lost: Counter[str]) -> tuple[list[Path], int]:
+    """Write the files; returns them, and the number of pairs of logs that do not fit."""
+    if not options.merge:
+        from recordings.export.bundle import export
+
+        return export(results[0], options.folder, options.frames, lost, options.maps), 0
+    from recordings.export.merge import merge
+
+    merged = merge(results, options.folder, lost)
+    found = list(merged.sentences())
+    for fault, sentence in found:
+        say(f"{'WARNING: ' if fault else ''}{sentence}")
+    return merged.files, sum(fault for fault, _ in found)
+
+
+def _results(options: argparse.Namespace) -> list[Path]:
+    """The result logs; those of a fleet if its folder is given."""
+    if not options.merge:
+        if len(options.results) > 1:
+            raise UsageError("export takes one result log and a folder; add --merge to merge the maps of several logs")
+        return list(options.results)
+    if options.frames or options.maps:
+        raise UsageError("--merge merges regional maps; leave out --frames and --map")
+    from flow.cli.fleet.catalogue import Catalogue
+
+    results: list[Path] = []
+    for result in options.results:
+        rows = Catalogue(result).rows("state = 'done' AND result IS NOT NULL") if result.is_dir() else ()
+        results += [result / row["result"] for row in rows] if result.is_dir() else [result]
+    if not results:
+        raise UsageError(f"the fleet in {options.results[0]} has no result to merge; roverflow list says why")
+    return results

@@ -4,18 +4,18 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.data.tiles import SIDE, Tiles
+from stages.data.tiles import TILE_SIDE, Tiles
 
 DTYPE = np.dtype([("value", "f4"), ("mark", "u1")])
-places = st.integers(-3 * SIDE, 2 * SIDE)
-sizes = st.integers(1, 2 * SIDE)
+places = st.integers(-3 * TILE_SIDE, 2 * TILE_SIDE)
+sizes = st.integers(1, 2 * TILE_SIDE)
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(places, places, sizes, sizes, st.integers(0, 2**32 - 1)), max_size=4), places, places)
 def test_reads_equal_those_of_one_large_array(writes, row, col):
-    model = np.zeros((12 * SIDE, 12 * SIDE), DTYPE)
-    tiles, half = Tiles(DTYPE), 6 * SIDE
+    model = np.zeros((12 * TILE_SIDE, 12 * TILE_SIDE), DTYPE)
+    tiles, half = Tiles(DTYPE), 6 * TILE_SIDE
     for first_row, first_col, rows, cols, seed in writes:
         rng = np.random.default_rng(seed)
         block = np.zeros((rows, cols), DTYPE)
@@ -37,7 +37,7 @@ def test_a_read_block_is_a_copy():
 
 def test_unchanged_tiles_take_no_memory():
     tiles = Tiles(DTYPE)
-    changed = np.zeros((1, 100 * SIDE), bool)
+    changed = np.zeros((1, 100 * TILE_SIDE), bool)
     changed[0, [0, -1]] = True
     tiles.write(0, 0, np.ones(changed.shape, DTYPE), changed)
     assert len(tiles.tiles) == 2
