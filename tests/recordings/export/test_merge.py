@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ def test_two_drives_over_the_same_ground_fit_and_a_raised_pose_does_not(tmp_path
     for name, changes in drives.items():
         write_log(Simulation(frames=8, width=320, height=240, seed=3, **changes), tmp_path / f"{name}.mcap")
 
-    def raised(_: int, message: object) -> None:
+    def raised(_: int, message: Any) -> None:
         message.pose.pose.position.z += 0.2
 
     rewrite(tmp_path / "b.mcap", tmp_path / "c.mcap", edit_of("/odometry", "nav_msgs/msg/Odometry", raised))
