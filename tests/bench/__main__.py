@@ -2,7 +2,7 @@
 
 import argparse
 
-from tests.bench import decoding, matching, pipeline, refining, regional, terrain, weak_texture
+from tests.bench import decoding, fleet, matching, pipeline, refining, regional, terrain, weak_texture
 
 about = "All benchmarks, half an hour; python -m tests.bench.NAME runs one."
 argparse.ArgumentParser("python -m tests.bench", description=about).parse_args()
@@ -13,3 +13,4 @@ pipeline.main()
 weak_texture.main(["--frames", "1"])
 terrain.main(["--stride", "10"])
 regional.main()
+fleet.main([])

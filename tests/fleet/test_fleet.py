@@ -1,12 +1,6 @@
 """`roverflow fleet` and `roverflow list`: many logs, each once, with the bits of `roverflow run`."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,56 +136,3 @@ def test_logs_that_end_or_stop_their_workers_leave_the_others_alone(logs, tmp_pa
     capsys.readouterr()
     assert roverflow(*words) == 3
     assert "5 logs: 5 done before, 0 to run" in capsys.readouterr().out
-
-
-@contextmanager
-def started(*words: object):
-    process = subprocess.Popen(
-        [sys.executable, "-m", *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
-@pytest.mark.slow
-def test_a_cluster_of_other_processes_and_a_scheduler_that_dies(logs, tmp_path, capsys):
-    address, out = "tcp://127.0.0.1:18786", tmp_path / "out"
-    scheduler = ("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 18786, "--no-dashboard")
-    worker = ("distributed.cli.dask_worker", address, "--nworkers", 2, "--nthreads", 1, "--host", "127.0.0.1")
-    words = ("fleet", logs / "a.mcap", logs / "b.mcap", "--out", out, *PIPELINE, "--cluster", address)
-    with started(*scheduler), started(*worker):
-        time.sleep(8)
-        assert roverflow(*words) == 0
-    assert set(rows_of(out)) == {"a", "b"}
-    capsys.readouterr()
-    assert roverflow(*words[:-2], "--cluster", "tcp://127.0.0.1:1") == 0  # nothing is left to run
-    assert roverflow("fleet", logs / "site/c.mcap", "--out", out, *PIPELINE, "--cluster", "tcp://127.0.0.1:1") == 2
-    assert "no Dask scheduler answers at tcp://127.0.0.1:1" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_client_that_is_killed_is_continued_by_the_same_command(tmp_path):
-    home, out = tmp_path / "home", tmp_path / "out"
-    home.mkdir()
-    for number in range(6):
-        write_log(Simulation(frames=4, width=160, height=120, seed=number), home / f"log{number}.mcap")
-    words = [sys.executable, "-m", "flow", "fleet", str(home), "--out", str(out), *PIPELINE, "--processes", "2"]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    first = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True)
-    assert first.stdout is not None
-    for line in first.stdout:
-        if line.startswith("2 of 6"):
-            break
-    first.send_signal(signal.SIGKILL)
-    first.wait()
-    done = [name for name, row in rows_of(out).items() if row["state"] == "done"]
-    assert len(done) >= 2
-    times = {name: (out / f"{name}-nav.mcap").stat().st_mtime_ns for name in done}
-    second = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
-    assert second.returncode == 0, second.stderr
-    assert {row["state"] for row in rows_of(out).values()} == {"done"}
-    assert {name: (out / f"{name}-nav.mcap").stat().st_mtime_ns for name in done} == times
-    assert not list(out.glob("*.partial"))

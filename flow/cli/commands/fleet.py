@@ -5,13 +5,18 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flow.cli.arguments import count, workers
 from flow.cli.outputs import add_pipeline_options
 from flow.cli.report import say
 from flow.contracts import counted
 from flow.errors import COMPLETE, INCOMPLETE, UsageError
+
+if TYPE_CHECKING:
+    from flow.cli.fleet.catalogue import Catalogue
 
 HELP = "run many logs through a pipeline, and keep a catalogue of their results"
 WATCH_SECONDS = 2.0
@@ -81,18 +86,30 @@ def _verdict(rows: list[dict[str, object]], folder: Path) -> int:
     return COMPLETE if set(ended) <= {"COMPLETE"} else INCOMPLETE
 
 
-def _watch(catalogue: object) -> int:
-    """Print the states until nothing waits or runs."""
-    from flow.cli.fleet.catalogue import Catalogue
+def _watch(catalogue: Catalogue) -> int:
+    """Print each log that ends, and the states whenever they change, until nothing waits or runs."""
+    from flow.cli.fleet.engine import line_of
+    from recordings.containers.finding import RESULT_ENDING
 
-    assert isinstance(catalogue, Catalogue)  # the type is imported late
-    shown = ""
+    shown, known = "", {row["name"]: row["ended"] for row in catalogue.rows()}
     while True:
-        states = [str(row["state"]) for row in catalogue.rows()]
+        rows = catalogue.rows(sort="ended, name")
+        active = [row for row in rows if row["state"] in ("waiting", "running")]
+        for row in rows:
+            if row not in active and row["ended"] != known.get(row["name"]):
+                say(f"{row['name']}: {line_of(row)}")
+                known[row["name"]] = row["ended"]
+        frames = sum(row["frames"] or 0 for row in rows if row not in active)
+        for row in active:
+            with suppress(OSError, ValueError):  # it has not begun, or ends just now
+                progress = catalogue.path.parent / f"{row['name']}{RESULT_ENDING}.progress"
+                frames += int(progress.read_text()) - 1
+        states = [str(row["state"]) for row in rows]
         line = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(sorted(states)))
+        line += f"; {counted(frames, 'frame')} so far, {sum(row['bytes'] for row in active) / 1e9:.2f} GB left"
         if line != shown:
             say(line)
             shown = line
-        if not {"waiting", "running"} & set(states):
+        if not active:
             return COMPLETE
         time.sleep(WATCH_SECONDS)

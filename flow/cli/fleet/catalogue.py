@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from flow.errors import UsageError
+from recordings.atomic_write import unwritable
 
 NAME = "catalogue.sqlite"
 # state: waiting, running, done, unusable (a run refuses the log), failed, killed (it ends its workers), hung
 COLUMNS = {
     "name": "TEXT PRIMARY KEY", "log": "TEXT", "bytes": "INTEGER", "log_digest": "TEXT", "pipeline": "TEXT",
     "pipeline_digest": "TEXT", "version": "TEXT", "state": "TEXT", "verdict": "TEXT", "frames": "INTEGER",
-    "complete": "INTEGER", "losses": "TEXT", "findings": "TEXT", "seconds": "REAL", "cpu_seconds": "REAL",
-    "stage_seconds": "REAL", "node": "TEXT", "result": "TEXT", "why": "TEXT", "ended": "TEXT",
+    "complete": "INTEGER", "losses": "TEXT", "findings": "TEXT", "scores": "TEXT", "seconds": "REAL",
+    "cpu_seconds": "REAL", "stage_seconds": "REAL", "node": "TEXT", "result": "TEXT", "why": "TEXT", "ended": "TEXT",
 }  # fmt: skip
 ENDED = ("done", "unusable", "killed", "hung")  # states that a second call leaves, unless log or pipeline change
 
@@ -36,6 +37,8 @@ class Catalogue:
     ------
     UsageError
         If there is no catalogue, or the file is none.
+    UnwritableError
+        If it cannot be written, as on a full disk.
     """
 
     def __init__(self, folder: Path, create: bool = False) -> None:
@@ -46,6 +49,9 @@ class Catalogue:
             if create:
                 columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
                 database.execute(f"CREATE TABLE IF NOT EXISTS logs ({columns})")
+                known = {row["name"] for row in database.execute("PRAGMA table_info(logs)")}
+                for name in COLUMNS.keys() - known:  # of a catalogue of an earlier version
+                    database.execute(f"ALTER TABLE logs ADD COLUMN {name} {COLUMNS[name]}")
 
     def rows(self, where: str = "", sort: str = "name") -> list[dict[str, Any]]:
         """The rows that fulfil an SQL condition, sorted by SQL columns. Raises UsageError for wrong SQL."""
@@ -61,12 +67,19 @@ class Catalogue:
 
     def put(self, name: str, values: Mapping[str, Any]) -> None:
         """Change columns of a row, or add it."""
-        known = {"name": name, **values}
-        names, marks = ", ".join(known), ", ".join("?" * len(known))
-        updates = ", ".join(f"{column} = excluded.{column}" for column in values)
-        query = f"INSERT INTO logs ({names}) VALUES ({marks}) ON CONFLICT (name) DO UPDATE SET {updates}"
+        self.put_all({name: values})
+
+    def put_all(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
+        """Change columns of rows, or add them, all or none."""
+        if not rows:
+            return
         with self._opened(write=True) as database:
-            database.execute(query, [_plain(value) for value in known.values()])
+            for name, values in rows.items():
+                known = {"name": name, **values}
+                names, marks = ", ".join(known), ", ".join("?" * len(known))
+                updates = ", ".join(f"{column} = excluded.{column}" for column in values)
+                query = f"INSERT INTO logs ({names}) VALUES ({marks}) ON CONFLICT (name) DO UPDATE SET {updates}"
+                database.execute(query, [_plain(value) for value in known.values()])
 
     @contextmanager
     def _opened(self, write: bool = False) -> Iterator[sqlite3.Connection]:
@@ -79,6 +92,8 @@ class Catalogue:
         except sqlite3.DatabaseError as error:
             if "not a database" in str(error):
                 raise UsageError(f"{self.path} is no catalogue; remove it or choose another folder") from error
+            if write:
+                raise unwritable(self.path, str(error)) from error
             raise
         finally:
             database.close()

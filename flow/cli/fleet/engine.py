@@ -14,7 +14,7 @@ from typing import Any
 from flow.cli.fleet.catalogue import Catalogue
 from flow.cli.fleet.jobs import Job
 from flow.cli.fleet.task import Task, about_worker, run_task
-from flow.errors import RoverflowError, UsageError
+from flow.errors import INCOMPLETE, RoverflowError, UsageError
 
 POLL_SECONDS = 1.0
 WORKER_DEATHS = 1  # of a log that is tried once more; the next death sets it aside
@@ -22,6 +22,8 @@ WORKER_DEATHS = 1  # of a log that is tried once more; the next death sets it as
 
 class ClusterLostError(RoverflowError):
     """The scheduler is gone; what has ended is in the catalogue."""
+
+    exit_code = INCOMPLETE
 
 
 @dataclass
@@ -34,31 +36,48 @@ class Fleet:
     say: Callable[[str], None]
     stall_seconds: float = 600.0
     left: set[str] = field(default_factory=set)
+    _again: set[str] = field(default_factory=set)  # whose workers died
     _seen: dict[str, tuple[str, float]] = field(default_factory=dict)  # name -> progress and when it was new
+    _begun: float = 0.0
+    _bytes_left: int = 0
+    _frames: int = 0
 
     def run(self, client: Any) -> None:
         """Run all tasks, the largest first; raises ClusterLostError where the scheduler is gone."""
         from distributed import as_completed
 
         self._check(client)
-        futures = {}
-        for place, (name, (job, task)) in enumerate(self.tasks.items()):
-            self.catalogue.put(name, task.identity() | _row_of(job, task) | {"state": "waiting", "why": None})
-            key = f"roverflow-{task.log_digest}-{task.pipeline.digest}-{time.time_ns()}"
-            futures[client.submit(run_task, task, key=key, priority=-place, pure=False)] = name
-        self.left = set(self.tasks)
-        ended = as_completed(futures)
+        same = next(iter(self.tasks.values()))[1].identity() | {"state": "waiting", "why": None, "scores": None}
+        waiting = {name: same | _row_of(job, task) for name, (job, task) in self.tasks.items()}
+        self.catalogue.put_all(waiting)
+        self.left, self._begun = set(self.tasks), time.monotonic()
+        self._bytes_left = sum(job.size for job, _ in self.tasks.values())
+        futures = {self._submit(client, name, place): name for place, name in enumerate(self.tasks)}
+        ended, looked = as_completed(futures), 0.0
         while self.left:
             try:
                 for future in ended.next_batch(block=False):
-                    self._end(futures[future], future)
-                self._watch(client, futures)
+                    if again := self._end(client, futures.pop(future), future):
+                        futures[again[0]] = again[1]
+                        ended.add(again[0])
+                if time.monotonic() > looked + POLL_SECONDS:
+                    self._watch(client, futures)
+                    looked = time.monotonic()
             except (OSError, TimeoutError, RuntimeError) as error:
                 raise ClusterLostError(f"the cluster does not answer: {error}; the same command continues") from error
-            if client.status not in ("running", "connecting"):
+            if client.status != "running":
                 raise ClusterLostError("the scheduler is gone; the same command continues where this one ended")
             if self.left:
                 time.sleep(POLL_SECONDS / 5)
+
+    def _submit(self, client: Any, name: str, place: int) -> Any:
+        """The future of a task; the smallest place runs first."""
+        task = self.tasks[name][1]
+        with suppress(OSError):  # of a worker that died
+            task.progress.unlink()
+        self._seen.pop(name, None)
+        key = f"roverflow-{task.log_digest}-{time.time_ns()}"
+        return client.submit(run_task, task, key=key, priority=-place, pure=False)
 
     def _check(self, client: Any) -> None:
         """Refuse workers of another version, pipeline or machine, and logs that a worker does not see."""
@@ -75,16 +94,22 @@ class Fleet:
             if not about["log"]:
                 raise UsageError(f"the worker {worker} has no {task.log}; paths must mean the same on all machines")
 
-    def _end(self, name: str, future: Any) -> None:
-        """Write the row of a task that has ended, and say so."""
+    def _end(self, client: Any, name: str, future: Any) -> tuple[Any, str] | None:
+        """Write the row of a task that has ended; returns its future and name if it is tried once more."""
         if name not in self.left:
-            return
+            return None
         job, _ = self.tasks[name]
         if future.status == "finished":
             row = dict(future.result())
+        elif future.status != "error":  # the scheduler forgot it
+            raise ClusterLostError("the scheduler lost its tasks; the same command continues where this one ended")
         else:
             error = future.exception()
             dead = type(error).__name__ == "KilledWorker"
+            if dead and name not in self._again:
+                self._again.add(name)
+                self.say(f"{name}: its workers died; it is tried once more after the others")
+                return self._submit(client, name, len(self.tasks)), name
             why = (
                 "its workers died, by memory or a fault of the machine" if dead else f"{type(error).__name__}: {error}"
             )
@@ -92,52 +117,71 @@ class Fleet:
         if row.get("result"):
             row["result"] = job.result(self.folder).relative_to(self.folder).as_posix()
         self._note(name, row)
+        return None
 
     def _note(self, name: str, row: dict[str, Any]) -> None:
         """Write a row for good, and say what is left."""
         self.left.discard(name)
         self.catalogue.put(name, row | {"ended": datetime.now(UTC).isoformat(timespec="seconds")})
-        size = sum(self.tasks[other][0].size for other in self.left) / 1e9
-        done = f"{len(self.tasks) - len(self.left)} of {len(self.tasks)}"
-        self.say(f"{done}: {line_of(name, row)}" + (f"; {size:.1f} GB left" if self.left else ""))
+        self._bytes_left -= self.tasks[name][0].size
+        self._frames += row.get("frames") or 0
+        done = sum(job.size for job, _ in self.tasks.values()) - self._bytes_left
+        line = f"{len(self.tasks) - len(self.left)} of {len(self.tasks)}: {name}: {line_of(row)}"
+        if self.left:
+            seconds = (time.monotonic() - self._begun) * self._bytes_left / max(done, 1)
+            line += f"; {self._frames} frames so far, {self._bytes_left / 1e9:.2f} GB left, about {duration(seconds)}"
+        self.say(line)
 
     def _watch(self, client: Any, futures: dict[Any, str]) -> None:
         """Note which tasks run, and set aside those without progress."""
-        now = time.monotonic()
-        for future, name in futures.items():
-            if name not in self.left:
-                continue
+        now, running = time.monotonic(), dict[str, dict[str, Any]]()
+        for future, name in list(futures.items()):
             try:
                 progress = self.tasks[name][1].progress.read_text()
             except OSError:
                 continue  # it has not begun, or it ends just now
             if name not in self._seen:
-                self.catalogue.put(name, {"state": "running"})
+                running[name] = {"state": "running"}
             if self._seen.get(name, ("", 0.0))[0] != progress:
                 self._seen[name] = (progress, now)
-            elif now - self._seen[name][1] > self.stall_seconds:
-                holders = [worker for worker, keys in client.processing().items() if future.key in map(str, keys)]
-                future.cancel(force=True)
-                if holders:
-                    with suppress(Exception):  # the worker may die on its own
-                        client.restart_workers(holders, timeout=30, raise_for_error=False)
-                with suppress(OSError):
-                    self.tasks[name][1].progress.unlink()
-                why = f"no frame in {self.stall_seconds:g} s, after frame {int(progress) - 1}"
-                self._note(name, {"state": "hung", "why": why})
+            elif now - self._seen[name][1] > self.stall_seconds and name in self.left:
+                self._set_aside(client, name, future, progress)
+        self.catalogue.put_all({name: row for name, row in running.items() if name in self.left})
+
+    def _set_aside(self, client: Any, name: str, future: Any, progress: str) -> None:
+        """Restart the worker of a task without progress; one that waits for a worker again is left."""
+        holders = [worker for worker, keys in client.processing().items() if future.key in map(str, keys)]
+        with suppress(OSError):
+            self.tasks[name][1].progress.unlink()
+        if not holders:
+            self._seen.pop(name, None)
+            return
+        future.cancel(force=True)
+        with suppress(Exception):  # the worker may die on its own
+            client.restart_workers(holders, timeout=30, raise_for_error=False)
+        frame = f", after frame {int(progress) - 1}" if progress.isdigit() else ""
+        self._note(name, {"state": "hung", "why": f"no frame in {self.stall_seconds:g} s{frame}"})
 
 
-def line_of(name: str, row: dict[str, Any]) -> str:
+def duration(seconds: float) -> str:
+    """A time that is left, in its natural unit."""
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def line_of(row: dict[str, Any]) -> str:
     """One line about a log that has ended."""
     if row["state"] != "done":
-        return f"{name}: {row['state']}: {row['why']}"
+        return f"{row['state']}: {row['why']}"
     why = f", {row['why']}" if row.get("why") else ""
     frames = f"{row['complete']} of {row['frames']} frames{why}"
-    return f"{name}: {row['verdict']}, {frames}; {row['seconds']:.0f} s on {row['node']}"
+    return f"{row['verdict']}, {frames}; {row['seconds']:.0f} s on {row['node']}"
 
 
 def _row_of(job: Job, task: Task) -> dict[str, Any]:
-    return {"log": str(job.log), "bytes": job.size, "pipeline": task.pipeline.name}
+    return {"log": str(job.log), "log_digest": job.digest, "bytes": job.size, "pipeline": task.pipeline.name}
 
 
 @contextmanager
@@ -155,11 +199,12 @@ def cluster(address: str | None, processes: int, memory: str, dashboard: bool) -
     except ImportError as error:
         raise UsageError("a fleet needs dask.distributed; install roverflow[fleet]") from error
     for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
-        logging.getLogger(name).setLevel(logging.ERROR)  # each has a level of its own
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # each has a level of its own
     dask.config.set(
         {
             "distributed.scheduler.allowed-failures": WORKER_DEATHS,
             "distributed.scheduler.default-task-durations": {"roverflow": "30m"},
+            "distributed.scheduler.worker-saturation": 1.0,  # no log waits at a worker that may die
             "distributed.worker.memory.target": False, "distributed.worker.memory.spill": False,
             "distributed.worker.memory.pause": False,
         }

@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from flow.cli.fleet.catalogue import Catalogue
+from flow.cli.fleet.catalogue import NAME, Catalogue
 from flow.contracts import counted
 from recordings.atomic_write import written
 from recordings.errors import LogError
@@ -43,14 +43,18 @@ def write_fleet_page(path: Path, folder: Path) -> None:
 
 
 def score_rows(folder: Path) -> dict[str, list[tuple[str, ...]]]:
-    """Pipeline -> rows of `SCORES` of the logs that have truth, and their mean."""
+    """Pipeline -> rows of `SCORES` of the logs that have truth, and their mean; the catalogue keeps the scores."""
     by_pipeline = dict[str, list[tuple[str, list[float]]]]()
-    for row in Catalogue(folder).rows("state = 'done' AND result IS NOT NULL"):
+    catalogue = Catalogue(folder, create=(folder / NAME).is_file())
+    for row in catalogue.rows("state = 'done' AND result IS NOT NULL"):
         try:
             found = score(folder / row["result"], Path(row["log"]))
         except LogError:  # the log has no truth, or is gone
             continue
-        by_pipeline.setdefault(row["pipeline"], []).append((row["name"], brief_figures(found)))
+        figures = brief_figures(found)
+        known = {name: value for name, value in zip(SCORES[1:], figures, strict=True) if not math.isnan(value)}
+        catalogue.put(row["name"], {"scores": known})
+        by_pipeline.setdefault(row["pipeline"], []).append((row["name"], figures))
     table = {}
     for pipeline, logs in by_pipeline.items():
         mean = [_mean([values[place] for _, values in logs]) for place in range(len(SCORES) - 1)]

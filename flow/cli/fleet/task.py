@@ -99,11 +99,14 @@ def run_task(task: Task) -> dict[str, Any]:
     """
     if (found := _finished(task)) is not None:
         return found
+    node = {"node": f"{platform.node()}:{os.getpid()}"}
+    if not task.log.exists():  # no fault of the log
+        why = f"{platform.node()} has no {task.log}; paths must mean the same on all machines"
+        return task.identity() | node | {"state": "failed", "why": why}
     task.result.parent.mkdir(parents=True, exist_ok=True)
     for stale in task.result.parent.glob(f"{task.result.name}.*.partial"):  # of a worker that died
         with suppress(OSError):
             stale.unlink()
-    node = {"node": f"{platform.node()}:{os.getpid()}"}
     try:
         summary = _run(task)
     except Exception as error:  # the log, a stage of the user's own, or the disk

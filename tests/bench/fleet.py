@@ -1,0 +1,80 @@
+"""A fleet of logs of different length: two worker processes beside one, the overhead of a log, the share of stages.
+
+Fleets of one process, two processes, and one process with a third of the logs alternate; figures are of the fastest of
+each. A fleet's time is that of starting, of its runs, and of an overhead for each log. So two fleets of one process
+with different numbers of logs give the overhead and the time of starting.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from flow.cli.fleet.catalogue import Catalogue
+from recordings.simulator import Simulation, write_log
+
+LOGS, FEW = 12, 4
+SETTINGS = ("-p", "rover", "--set", "disparities=64", "--workers-per-log", "1")
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Seconds of a whole fleet, of its runs, and of the CPU of their stages and sinks."""
+
+    seconds: float
+    runs: float
+    stages: float
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser("python -m tests.bench.fleet", description=__doc__)
+    parser.add_argument("--rounds", type=int, default=2, help="fleets of each kind (2)")
+    rounds = parser.parse_args(arguments).rounds
+    with tempfile.TemporaryDirectory() as folder:
+        logs = Path(folder) / "logs"
+        logs.mkdir()
+        for number in range(LOGS):
+            simulation = Simulation(frames=4 + 3 * number, width=320, height=240, seed=number)
+            write_log(simulation, logs / f"log{number:02d}.mcap")
+        every, few = sorted(logs.iterdir()), sorted(logs.iterdir())[:FEW]
+        _fleet(few, Path(folder) / "warm", 1)  # fills the cache of kernels
+        kinds = {"one": (every, 1), "two": (every, 2), "few": (few, 1)}
+        found: dict[str, list[Fleet]] = {name: [] for name in kinds}
+        for turn in range(rounds):
+            for name, (chosen, processes) in kinds.items():
+                found[name].append(_fleet(chosen, Path(folder) / f"{name}{turn}", processes))
+    _print(*(min(fleets, key=lambda fleet: fleet.seconds) for fleets in found.values()))
+
+
+def _print(one: Fleet, two: Fleet, few: Fleet) -> None:
+    beside = {fleet: fleet.seconds - fleet.runs for fleet in (one, few)}
+    overhead = (beside[one] - beside[few]) / (LOGS - FEW)
+    print(f"\nfleet of {LOGS} logs of 4 to {4 + 3 * (LOGS - 1)} frames, 320x240, rover, one thread a log")
+    for name, value in {
+        "one process, s": one.seconds,
+        "two processes, s": two.seconds,
+        "two processes over one": two.seconds / one.seconds,
+        "starting and ending a fleet, s": beside[one] - LOGS * overhead,
+        "overhead of a log beside its run, s": overhead,
+        "CPU of stages and sinks over a worker's time": one.stages / (one.runs + LOGS * overhead),
+    }.items():
+        print(f"  {name:46} {value:9.3f}")
+
+
+def _fleet(logs: list[Path], out: Path, processes: int) -> Fleet:
+    """Run the logs, and read the catalogue."""
+    words = ["fleet", *map(str, logs), "--out", str(out), *SETTINGS, "--processes", str(processes)]
+    begun = time.perf_counter()
+    subprocess.run([sys.executable, "-m", "flow", *words], check=True, stdout=subprocess.DEVNULL)
+    seconds, rows = time.perf_counter() - begun, Catalogue(out).rows()
+    return Fleet(seconds, sum(row["seconds"] for row in rows), sum(row["stage_seconds"] for row in rows))
+
+
+if __name__ == "__main__":
+    main()

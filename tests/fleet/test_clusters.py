@@ -1,0 +1,147 @@
+"""Fleets on clusters of processes that start and die on their own; the same command ends with all results."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import psutil
+import pytest
+
+from recordings.simulator import Simulation, write_log
+from tests.conftest import roverflow
+from tests.fleet.test_fleet import PIPELINE, rows_of
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve logs of different length."""
+    folder = tmp_path_factory.mktemp("campaign")
+    for number in range(12):
+        write_log(Simulation(frames=2 + number, width=160, height=120, seed=number), folder / f"log{number:02d}.mcap")
+    return folder
+
+
+@contextmanager
+def cluster(port: int) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Address and scheduler of `dask scheduler` and two `dask worker`, started by their own commands."""
+    address = f"tcp://127.0.0.1:{port}"
+    scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    worker = ("worker", address, "--nthreads", 1, "--host", "127.0.0.1", "--no-dashboard")
+    started = []
+    for words in (scheduler, worker, worker):
+        command = [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *map(str, words[1:])]
+        started.append(subprocess.Popen(command, stderr=subprocess.DEVNULL, env=ENVIRONMENT))
+    try:
+        yield address, started[0]
+    finally:
+        for process in reversed(started):
+            process.terminate()
+        for process in started:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(20)
+            process.kill()
+
+
+def command(home: Path, out: Path, *more: object) -> list[str]:
+    return [sys.executable, "-m", "flow", "fleet", str(home), "--out", str(out), *PIPELINE, *map(str, more)]
+
+
+def until(words: list[str], beginning: str) -> subprocess.Popen[str]:
+    """A fleet that has printed a line with that beginning."""
+    fleet = subprocess.Popen(words, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert fleet.stdout is not None
+    assert any(line.startswith(beginning) for line in fleet.stdout)
+    return fleet
+
+
+def ended(home: Path, out: Path, *more: object) -> str:
+    """What a fleet prints that ends with all results."""
+    done = subprocess.run(command(home, out, *more), env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert {row["state"] for row in rows_of(out).values()} == {"done"}
+    assert sorted(rows_of(out)) == sorted(log.stem for log in home.glob("*.mcap"))
+    assert not list(out.glob("*.partial"))
+    return done.stdout
+
+
+def times(out: Path) -> dict[str, int]:
+    done = [name for name, row in rows_of(out).items() if row["state"] == "done"]
+    return {name: (out / f"{name}-nav.mcap").stat().st_mtime_ns for name in done}
+
+
+@pytest.mark.slow
+def test_processes_and_clusters_write_the_bytes_of_run(home, tmp_path):
+    for processes in (1, 2):
+        ended(home, tmp_path / f"out{processes}", "--processes", processes, "--workers-per-log", 1)
+    with cluster(18786) as (address, _):
+        ended(home, tmp_path / "cluster", "--cluster", address)
+    for log in sorted(home.glob("*.mcap")):
+        assert roverflow("run", log, *PIPELINE, "--no-rrd", "-o", tmp_path / "plain.mcap") == 0
+        plain = (tmp_path / "plain.mcap").read_bytes()
+        for out in ("out1", "out2", "cluster"):
+            assert (tmp_path / out / f"{log.stem}-nav.mcap").read_bytes() == plain, (out, log.stem)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_killed_is_continued_by_the_same_command(home, tmp_path):
+    out = tmp_path / "out"
+    with cluster(18787) as (address, scheduler):
+        fleet = until(command(home, out, "--cluster", address), "2 of 12")
+        scheduler.kill()
+        said = fleet.communicate(timeout=60)[1]
+    assert fleet.returncode == 3
+    assert "the same command continues" in said
+    assert "Traceback" not in said
+    before = times(out)
+    assert 2 <= len(before) < 12
+    with cluster(18787) as (address, _):
+        printed = ended(home, out, "--cluster", address)
+    assert f"12 logs: {len(before)} done before" in printed
+    assert {name: times(out)[name] for name in before} == before
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_every_few_seconds_loses_no_log(home, tmp_path):
+    out, killed = tmp_path / "out", 0
+    fleet = until(command(home, out, "--processes", 2), "12 logs")
+    while fleet.poll() is None:
+        time.sleep(4)
+        with suppress(psutil.Error):
+            workers = [
+                child
+                for child in psutil.Process(fleet.pid).children(recursive=True)
+                if "spawn_main" in " ".join(child.cmdline())
+            ]
+            if fleet.poll() is None and workers:
+                workers[killed % len(workers)].kill()
+                killed += 1
+    said = fleet.communicate()
+    assert fleet.returncode == 0, said
+    assert killed >= 2
+    assert "12 logs: 12 done before" in ended(home, out)
+
+
+@pytest.mark.slow
+def test_a_client_that_is_killed_is_continued_by_the_same_command(home, tmp_path):
+    out = tmp_path / "out"
+    fleet = until(command(home, out, "--processes", 2), "2 of 12")
+    fleet.send_signal(signal.SIGKILL)
+    fleet.communicate()
+    before = times(out)
+    assert len(before) >= 2
+    ended(home, out, "--processes", 2)
+    assert {name: times(out)[name] for name in before} == before
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_not_there_is_named(home, tmp_path, capsys):
+    words = ("fleet", home / "log00.mcap", "--out", tmp_path / "out", *PIPELINE, "--cluster", "tcp://127.0.0.1:1")
+    assert roverflow(*words) == 2
+    assert "no Dask scheduler answers at tcp://127.0.0.1:1" in capsys.readouterr().err
