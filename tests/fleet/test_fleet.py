@@ -73,6 +73,8 @@ def test_a_task_writes_what_run_writes_and_is_not_repeated(logs, tmp_path):
     assert reason_to_run(job, row, "other", row["version"], tmp_path / "out") == "the pipeline changed"
     broken = run_task(replace(task, log=logs / "junk.mcap", result=tmp_path / "out" / "junk-nav.mcap"))
     assert (broken["state"], "is not an MCAP log" in broken["why"]) == ("unusable", True)
+    absent = run_task(replace(task, log=logs / "nix.mcap", result=tmp_path / "out" / "nix-nav.mcap"))
+    assert (absent["state"], "paths must mean the same on all machines" in absent["why"]) == ("failed", True)
 
 
 @pytest.mark.slow
@@ -99,6 +101,9 @@ def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, c
     assert roverflow("score", out) == 0
     table = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in table] == ["fast", "log", "a", "b", "site/c", "mean"]
+    assert json.loads(rows_of(out)["a"]["scores"])["density"] > 0
+    assert roverflow("fleet", "--out", out, "--watch") == 0
+    assert "3 done, 1 unusable; 4 frames so far, 0.00 GB left" in capsys.readouterr().out
     assert roverflow("report", out) == 0
     page = (out / "report.html").read_text()
     assert "<td>site/c</td><td>COMPLETE</td><td>1 of 1</td>" in page
