@@ -37,7 +37,8 @@ class Reproject(Stage):
     include_filled: bool = parameter(False, "whether filled disparities, which no camera measured, become points")
     max_spacing: float = parameter(
         0.0,
-        "near points are thinned to every 2nd or 4th row and column, no farther apart than this; 0: all points",
+        "near points are thinned to every 2nd or 4th row, no farther apart than this, and to every 2nd or 4th column, "
+        "no farther apart than twice this; 0: all points",
         unit="m", low=0.0, high=1.0,
     )  # fmt: skip
     sigma_best: float = parameter(0.086, "disparity standard deviation at confidence 1", unit="px", low=1e-3)

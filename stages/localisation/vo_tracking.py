@@ -79,10 +79,13 @@ def vo_frame(frame: StereoFrame, disparity: Disparity) -> VoFrame:
 
 def _triangulated(pixels: Array, disparity: Disparity, camera: StereoCamera) -> Array:
     """Points (N, 3) of pixels (N, 2) of the left image; NaN where a neighbouring disparity is unknown or filled."""
-    seen = np.isin(disparity.source, (PixelOrigin.MEASURED, PixelOrigin.PLANE))
-    known = np.where(seen, disparity.pixels, np.float32(np.nan))
-    at = cv2.remap(known, pixels[:, 0].copy(), pixels[:, 1].copy(), cv2.INTER_LINEAR, borderValue=float("nan"))
-    shift = at.ravel().astype(np.float64) + (camera.cx_right - camera.cx)
+    last = np.array(disparity.pixels.shape[::-1]) - 1
+    corners = np.clip(pixels.astype(int) + np.array(list(np.ndindex(2, 2)))[:, None], 0, last)
+    origins = disparity.source[corners[..., 1], corners[..., 0]]
+    seen = np.isin(origins, (PixelOrigin.MEASURED, PixelOrigin.PLANE)).all(axis=0)
+    places = pixels[:, 0].copy(), pixels[:, 1].copy()
+    at = cv2.remap(disparity.pixels, *places, cv2.INTER_LINEAR, borderValue=float("nan")).ravel()
+    shift = np.where(seen, at.astype(np.float64), np.nan) + (camera.cx_right - camera.cx)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = camera.fx * camera.baseline / np.where(shift > 0, shift, np.nan)
     depth[~(depth <= MAX_DEPTH)] = np.nan

@@ -16,6 +16,7 @@ from stages.data import Array, Disparity, PixelOrigin, StereoCamera
 _FILLED = int(PixelOrigin.FILLED)
 _PLANE = int(PixelOrigin.PLANE)
 _UNKNOWN = int(PixelOrigin.UNKNOWN)
+COLUMN_SPACING = 2  # of columns over that of rows: ground ahead is foreshortened along the columns, not along the rows
 
 
 class DisparitySigma(NamedTuple):
@@ -39,7 +40,8 @@ def triangulate(
     """The points of a disparity image, in the left optical frame, in raster order.
 
     colors: (H, W) or (H, W, 3) uint8; max_depth: m; filled: whether pixels of origin FILLED become points; max_spacing:
-    m, only every 2nd or 4th row and column is used where these are no farther apart, across the ray; 0: all.
+    m, only every 2nd or 4th row is used where these are no farther apart, across the ray, and every 2nd or 4th column
+    where these are no farther apart than COLUMN_SPACING times that; 0: all.
 
     Returns points (N, 3) float32 m, colors (N, 3) uint8, depth standard deviation (N,) float32 m, pixel (N,) int32.
     """
@@ -58,10 +60,11 @@ def triangulate(
     )
 
 
-def _dense_limits(camera: StereoCamera, max_spacing: float) -> tuple[float, float, float, float]:
-    """The disparity, px, from which a pixel is left out, by the last two bits of its row or its column."""
+def _dense_limits(camera: StereoCamera, max_spacing: float) -> Array:
+    """The disparity, px, from which a pixel is left out, (4, 4) by the last two bits of its row and of its column."""
     every_2nd = 2 * camera.baseline / max_spacing if max_spacing > 0 else np.inf
-    return np.inf, every_2nd, 2 * every_2nd, every_2nd
+    rows = np.array([np.inf, every_2nd, 2 * every_2nd, every_2nd])
+    return np.asarray(np.minimum(rows[:, None], rows / COLUMN_SPACING))
 
 
 @kernel
@@ -80,7 +83,7 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
     log_best, log_worst, sigma_plane, sigma_filled = sigmas
     count = 0
     for i in range(disparity.size):
-        if disparity[i] + shift < dense[(i // width | i % width) & 3] and (
+        if disparity[i] + shift < dense[i // width & 3, i % width & 3] and (
             _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled) > 0.0
         ):
             count += 1
@@ -92,7 +95,7 @@ def _triangulate(disparity, source, confidence, colors, width, camera, max_depth
     n = 0
     for i in range(disparity.size):
         z = 0.0
-        if disparity[i] + shift < dense[(i // width | i % width) & 3]:
+        if disparity[i] + shift < dense[i // width & 3, i % width & 3]:
             z = _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled)
         if z > 0.0:
             points[n, 0] = (i % width - cx) * z / fx
@@ -129,7 +132,7 @@ def triangulate_reference(
     wanted = np.isfinite(effective) & (source != PixelOrigin.UNKNOWN) & (filled | (source != PixelOrigin.FILLED))
     wanted &= np.where(wanted, effective, 0) * max_depth >= camera.fx * camera.baseline
     rows, columns = np.indices(wanted.shape)
-    wanted &= effective < np.array(_dense_limits(camera, max_spacing))[(rows | columns) & 3]
+    wanted &= effective < _dense_limits(camera, max_spacing)[rows & 3, columns & 3]
     v, u = np.nonzero(wanted)
     z = camera.fx * camera.baseline / effective[v, u]
     points = np.column_stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z])
