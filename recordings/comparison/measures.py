@@ -139,7 +139,7 @@ def _changes(one: Array, other: Array, what: str, unit: str, scale: float) -> Me
         f"{what} known only in A": float(np.sum(np.isfinite(one) & ~both)),
         f"{what} known only in B": float(np.sum(np.isfinite(other) & ~both)),
         f"median {unit}": float(np.median(moved)) if moved.size else 0.0,
-        f"largest {unit}": float(moved.max()) if moved.size else 0.0,
+        f"largest {unit}": float(np.max(moved)) if moved.size else 0.0,
     }
 
 

@@ -77,7 +77,7 @@ def _judged(timeline: Timeline, jumps: list[tuple[int, int]], stamped: set[int],
         if change is not None and change * gap > 0 and abs(change) > max(MAX_JITTER_NS, abs(gap) // 2):
             shift = 0 if abs(shift - change) < MAX_JITTER_NS else shift - change
         elif gap < 0 and _repeats(timeline, place, stop):
-            repeats_until = max(repeats_until, int(timeline.log_times[:place].max()) + SETTLING_NS)
+            repeats_until = max(repeats_until, int(np.max(timeline.log_times[:place])) + SETTLING_NS)
         else:
             continue
         steps.append(ClockStep(place, shift, repeats_until, -gap))
@@ -117,14 +117,15 @@ def _repeats(timeline: Timeline, place: int, stop: int) -> bool:
         old, new = all_times[places < place], all_times[(places >= place) & (places < stop)]
         if not len(old) or not len(new):
             continue
-        low, high = new.min(), max(min(new.max(), old.max()), new.min())
+        low = int(np.min(new))
+        high = max(min(int(np.max(new)), int(np.max(old))), low)
         both = [times[(times >= low) & (times <= high)] for times in (old, new)]
         merged = np.unique(np.concatenate(both))
         recorded_twice = len(merged) <= 0.75 * sum(map(len, both))
         if not len(both[0]) or len(both[1]) < 2 or recorded_twice:
             continue
         interval = float(np.median(np.diff(np.unique(all_times))))
-        density.append((len(merged) - 1) * interval / float(high - low))
+        density.append((len(merged) - 1) * interval / (high - low))
         spreads.append(_spread(merged) - max(_spread(_around(times, low, high)) for times in (old, new)))
     return bool(density) and bool(np.median(density) > _DENSE or np.median(spreads) > _IRREGULAR)
 

@@ -43,7 +43,7 @@ class Db3File:
             if not times.size:
                 damage = f" that can be read: {self.lost[0].reason}" if self.lost else "; record it again"
                 raise LogError(f"{path} contains no messages{damage}")
-            self.start, self.end = int(times.min()), int(times.max())
+            self.start, self.end = int(np.min(times)), int(np.max(times))
             self._note_unwritten()
         except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:  # a column may have any type
             self.close()

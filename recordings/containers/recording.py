@@ -78,7 +78,7 @@ class _Part:
         if self.whole:
             return self.file.start + self.step.shift
         times = self.file.timeline.log_times[self.places.start : self.places.stop]
-        return int(times[times >= 0].min(initial=self.file.end)) + self.step.shift
+        return int(np.min(times[times >= 0], initial=self.file.end)) + self.step.shift
 
     def times(self, channels: set[int], allow_repeats: bool) -> NDArray[np.int64]:
         """The log times of some channels of the recording, ns, in any order."""
@@ -300,7 +300,7 @@ class Recording:
             return clock_steps(timelines[0], self._stamped, stamps)
         channels = list[NDArray[np.int32]]()
         for file, timeline in zip(self.files, timelines, strict=True):
-            topic_of = np.full(timeline.channels.max(initial=0) + 1, len(topics), np.int32)
+            topic_of = np.full(np.max(timeline.channels, initial=0) + 1, len(topics), np.int32)
             for number, channel in file.channels.items():
                 topic_of[number : number + 1] = topics[channel.topic]
             channels.append(topic_of[timeline.channels])

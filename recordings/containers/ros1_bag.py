@@ -49,7 +49,8 @@ class Ros1Bag:
             }
             if not len(self.timeline):
                 raise LogError(f"{path} contains no messages; record it again")
-            self.start, self.end = int(self.timeline.log_times.min()), int(self.timeline.log_times.max())
+            times = self.timeline.log_times
+            self.start, self.end = int(np.min(times)), int(np.max(times))
         except BaseException:
             self.close()
             raise

@@ -89,7 +89,8 @@ def disparity_image(disparity: Disparity, step: float = 0.0) -> Any:
     if camera is not None and camera.cx_right != camera.cx:
         pixels = pixels + np.float32(camera.cx_right - camera.cx)
     pixels = to_multiples(pixels, step)
-    low, high = (extreme.reduce(pixels, axis=None, initial=np.nan) for extreme in (np.fmin, np.fmax))  # without NaN
+    extremes: tuple[Any, ...] = np.fmin, np.fmax  # without NaN
+    low, high = (extreme.reduce(pixels, axis=None) for extreme in extremes)
     height, width = pixels.shape
     return make(
         "stereo_msgs/msg/DisparityImage", header=header(disparity.stamp, frame_id),

@@ -138,7 +138,7 @@ def _slabs(rng: np.random.Generator) -> Array:
     number[places[:, 0], places[:, 1]] = np.arange(SLABS_IN_TILE)
     padded = np.pad(mask, margin, mode="wrap")
     _, label = cv2.distanceTransformWithLabels(padded, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    seed_of = np.zeros(int(label.max()) + 1, np.int64)
+    seed_of = np.zeros(int(np.max(label)) + 1, np.int64)
     seed_of[label[padded == 0]] = np.pad(number, margin, mode="wrap")[padded == 0]
     ragged = (4 * _band(rng, 1.6, 6, 160), 4 * _band(rng, 1.6, 6, 160))
     row, column = np.indices((TILE, TILE)) + np.rint(ragged).astype(int)

@@ -123,7 +123,7 @@ def shrunk(image: Array, max_width: int) -> Array:
 def every_nth_cell(terrain: ElevationMap, max_cells: int) -> ElevationMap:
     """The terrain at every n-th row and column, with about `max_cells` known elevations at most."""
     elevation = terrain.layers["elevation"]
-    step = math.ceil(math.sqrt(max(1.0, np.count_nonzero(np.isfinite(elevation)) / max_cells)))
+    step = math.ceil(math.sqrt(max(1.0, int(np.count_nonzero(np.isfinite(elevation))) / max_cells)))
     if step == 1:
         return terrain
     first, pitch = step // 2, step * terrain.resolution
