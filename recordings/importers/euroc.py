@@ -16,7 +16,7 @@ from flow.contracts import counted
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.calibration.yaml_files import numbers, read_yaml
 from recordings.errors import LogError
-from recordings.importers.files import nanoseconds, numbers_of, read_rows
+from recordings.importers.files import exists, nanoseconds, numbers_of, read_rows
 from recordings.importers.recording import (
     IMU,
     LEFT,
@@ -93,7 +93,7 @@ def _pairs(folder: Path, left: str, right: str, notes: list[str]) -> list[ImageP
             nanoseconds(row[0], where): folder / camera / "data" / row[1]
             for where, row in read_rows(folder / camera / "data.csv", 2, ",")
         }
-        there = {stamp: path for stamp, path in listed.items() if path.exists()}
+        there = {stamp: path for stamp, path in listed.items() if exists(path)}
         if missing := [path.name for stamp, path in listed.items() if stamp not in there]:
             names = f"{missing[0]}{' and others' if len(missing) > 1 else ''}"
             notes.append(f"{camera}/data.csv lists {counted(len(missing), 'image')} that {camera}/data lacks: {names}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -9,6 +10,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
 from recordings.ros2.cdr import LAST_STAMP
@@ -16,6 +18,7 @@ from recordings.ros2.image_from_msg import stated_size, unpacked_pixels
 from stages.data import Array
 
 ENCODED = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg"}  # first bytes of the files that a log contains unchanged
+MAX_ROUNDING = 0.01  # of the products of a rotation's axes; some files have two digits
 _TIME = re.compile(r"(\d{4})[-_](\d\d)[-_](\d\d)[ T_](\d\d)[:_](\d\d)[:_](\d\d)(?:[._](\d{1,9}))?(Z|[-+]\d\d:?\d\d)?$")
 
 
@@ -25,6 +28,11 @@ def read_bytes(path: Path) -> bytes:
         return Path(path).read_bytes()
     except OSError as error:
         raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def exists(path: Path) -> bool:
+    """Whether a file is there; a name that is too long is not."""
+    return os.path.exists(path)  # noqa: PTH110  # Path.exists raises OSError for such a name
 
 
 def read_lines(path: Path) -> Iterator[tuple[str, str]]:
@@ -56,6 +64,13 @@ def numbers_of(values: list[str], where: str) -> Array:
     if not np.isfinite(found).all():
         raise LogError(f"{where} contains a number that is not finite; get the file again")
     return found
+
+
+def orthonormal(matrix: Array, where: str) -> Array:
+    """The rotation (3, 3) that a matrix of rounded numbers stands for. Raises LogError if it stands for none."""
+    if not np.abs(matrix @ matrix.T - np.eye(3)).max() <= MAX_ROUNDING or np.linalg.det(matrix) < 0:
+        raise LogError(f"{where} contains no rotation: its axes are not orthonormal; get the file again")
+    return np.asarray(Rotation.from_matrix(matrix).as_matrix())
 
 
 def whole_number(text: str, where: str) -> int:

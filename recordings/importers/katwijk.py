@@ -8,12 +8,13 @@ any that `source.calibration` reads. Times have no zone and count as UTC. The Pa
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
 from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
@@ -93,11 +94,12 @@ def _time(text: str, where: str) -> int:
 def _structs(path: Path, size: tuple[int, int]) -> StereoCalibration:
     """The calibration in a MATLAB file of structs (toStruct of stereoParameters)."""
     try:
-        found: Any = loadmat(path, simplify_cells=True)["stereoParams"]
+        with ProcessPoolExecutor(1, get_context("spawn")) as apart:  # a damaged file ends scipy's process
+            found: Any = apart.submit(loadmat, path, simplify_cells=True).result()["stereoParams"]
         models = [_model(found[f"CameraParameters{number}"], size) for number in (1, 2)]
         rotation = np.asarray(found["RotationOfCamera2"], np.float64).reshape(3, 3)
         shift = np.asarray(found["TranslationOfCamera2"], np.float64).reshape(3) / 1000
-    except (OSError, ValueError, KeyError, TypeError, IndexError, NotImplementedError, MatReadError) as error:
+    except Exception as error:  # scipy raises many kinds
         raise LogError(
             f"{path} has no struct 'stereoParams' of numbers ({error}); save toStruct(stereoParams) with MATLAB, or "
             "give a calibration of OpenCV, Kalibr or ROS"

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import from_seconds, numbers_of, read_lines
+from recordings.importers.files import from_seconds, numbers_of, orthonormal, read_lines
 from recordings.importers.recording import (
     BASE,
     FIRST_STAMP,
@@ -112,6 +112,6 @@ def _track(path: Path, stamps: list[int], mount: Transform, shift: Array) -> Tra
             raise LogError(f"{where} has {row.size} numbers, not 12; get the file again")
         pose = row.reshape(3, 4)
         place = mount.rotation @ (pose[:, 3] - pose[:, :3] @ shift)
-        turn = Rotation.from_matrix(mount.rotation @ Rotation.from_matrix(pose[:, :3]).as_matrix())
+        turn = Rotation.from_matrix(mount.rotation @ orthonormal(pose[:, :3], where))
         poses.append((stamp, place, turn.as_quat()))
     return Track.of(LEFT, poses, path)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from tokenize import TokenError
 
 import cv2
 import numpy as np
@@ -109,5 +110,5 @@ def _depth(path: Path) -> Array:
             return np.asarray(np.load(path, allow_pickle=False), np.float32)
         content = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
         return np.ascontiguousarray(content).view("<f4")[:, :, 0]
-    except (ValueError, IndexError, TypeError, cv2.error) as error:
+    except (ValueError, IndexError, TypeError, EOFError, OSError, SyntaxError, TokenError, cv2.error) as error:
         raise LogError(f"{path} is not a depth image of four bytes a pixel; get it again") from error

@@ -205,7 +205,7 @@ def _rectify_pair(left: CameraModel, right: CameraModel, right_in_left: Transfor
             left.k, left.d, right.k, right.d, size, inverse.rotation, moved,
             flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
         )  # fmt: skip
-    if not made[2][0, 0] > MIN_RECTIFIED_SCALE * left.k[0, 0]:
+    if not MIN_RECTIFIED_SCALE * left.k[0, 0] < made[2][0, 0] < np.inf:
         raise LogError(
             f"no image of {left.width}x{left.height} px can be rectified with these lenses: the distortion D has no "
             "inverse at the corners; check the calibration"

@@ -27,6 +27,7 @@ from recordings.ros2.image_from_msg import pixels_of
 from recordings.source.joints import read_joints
 from recordings.video.decoder import VideoDecoder
 from tests.conftest import rewrite
+from tests.fuzz import folders
 from tests.fuzz.mutations import Mutate, mutated_bytes, mutated_messages, mutated_schemas, mutated_text
 from tests.recordings.calibration import test_calibration_files as calibrations
 from tests.recordings.containers.forms import rows_of, write_bag, write_rosbag2
@@ -200,5 +201,6 @@ TARGETS = {
     "images calibration": Target(
         lambda folder: [CALIBRATION.encode()], mutated_text, _read_images_calibration, ".yaml"
     ),
+    "folders": Target(folders.seeds, folders.mutated, folders.read, ".folder"),
     "metadata": Target(_metadata, mutated_text, _read_metadata, ".yaml"),
 }

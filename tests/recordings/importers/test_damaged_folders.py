@@ -1,0 +1,52 @@
+"""Damaged files of data sets that were once a traceback, the end of the process, or a wrong rotation."""
+
+import re
+
+import pytest
+
+from tests.conftest import roverflow
+from tests.fuzz.folders import LAYOUTS
+
+
+def turned(content: bytes) -> bytes:
+    """A transform whose rotation mirrors."""
+    return content.replace(b"R: ", b"R: -")
+
+
+CASES = {
+    "a mirror as a rotation": ("drive", "calib_velo_to_cam.txt", turned, "no rotation"),
+    "a mirror as a pose": ("sequence", "poses/05.txt", lambda _: b"-1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "no rotation"),
+    "a camera that cannot be rectified": (
+        "euroc", "room/mav0/cam0/sensor.yaml", lambda content: re.sub(rb", [0-9.]+\] #fu", b", 0.0] #fu", content),
+        "no image of 160x120 px can be rectified"),
+    "MATLAB's file cut off": (
+        "katwijk", "P1/LocCam_calibstruct.mat", lambda content: content[:700], "no struct 'stereoParams'"),
+    "numpy's header without an end": (
+        "tartanair", "P0/depth_left/000000_left_depth.npy", lambda content: content.replace(b"'shape'", b"(((((((", 1),
+        "not a depth image"),
+}  # fmt: skip
+
+
+def imported(kind, name, change, home):
+    """Import a folder with one file changed; returns the exit code."""
+    write, words = LAYOUTS[kind]
+    write(home)
+    (home / name).write_bytes(change((home / name).read_bytes()))
+    words = [str(home / word) if (home / word).exists() else word for word in words]
+    return roverflow("import", *words[:2], home / "out.mcap", *words[2:])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_damaged_file_is_named_in_one_sentence(case, tmp_path, capsys):
+    kind, name, change, sentence = CASES[case]
+    assert imported(kind, name, change, tmp_path) == 2
+    said = capsys.readouterr().err
+    assert sentence in said
+    assert len(said.splitlines()) == 1
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_listed_image_whose_name_is_too_long_is_missing(tmp_path, capsys):
+    name = "room/mav0/cam0/data.csv"
+    assert imported("euroc", name, lambda content: content + b"1700086409000000000," + b"9" * 400, tmp_path) == 0
+    assert "lists 2 images that cam0/data lacks" in capsys.readouterr().out
