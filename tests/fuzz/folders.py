@@ -72,7 +72,7 @@ def read(path: Path) -> None:
     """Import a copy of the folder with the changed file."""
     place, _, rest = path.read_bytes().partition(b"\n")
     kind, _, name = place.decode().partition("/")
-    home = path.with_suffix("")
+    home = path.with_suffix(".copy")
     shutil.copytree(_homes[kind], home, copy_function=os.symlink)
     (home / name).unlink()
     (home / name).write_bytes(rest)
