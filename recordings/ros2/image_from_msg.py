@@ -126,7 +126,7 @@ def unpacked_pixels(data: Array, mosaic: int | None = None) -> Array | None:
 
     mosaic: OpenCV's conversion of a Bayer pattern in a single channel.
     """
-    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size and _has_whole_chunks(data) else None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         return None
     if pixels.ndim == 2:
@@ -150,6 +150,17 @@ def stated_size(content: bytes) -> tuple[int, int] | None:
         else:
             position += 2 + length
     return None
+
+
+def _has_whole_chunks(data: Array) -> bool:
+    """Whether a file that is a PNG contains its chunks: OpenCV reserves as much memory as a chunk's head states."""
+    position = 8
+    while data[:4].tobytes() == b"\x89PNG" and position + 12 <= data.size:
+        length, kind = struct.unpack_from(">I4s", data.data, position)
+        position += 12 + length
+        if kind == b"IEND":
+            break
+    return position <= data.size
 
 
 def _converted(pixels: Array, conversion: int | None) -> Array:

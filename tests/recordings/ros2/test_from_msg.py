@@ -59,6 +59,14 @@ def raw_image(encoding: str, rows: np.ndarray, width: int, big: bool = False) ->
     return message
 
 
+def test_a_chunk_that_states_more_than_the_file_has_is_refused_before_decoding(monkeypatch):
+    png = bytearray(cv2.imencode(".png", picture(3))[1].tobytes())
+    png[33:37] = b"\x60\0\0\0"  # the length of the first chunk after the header: 1.6 GB
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
+    with pytest.raises(LogError, match="cannot be decoded"):
+        pixels_of(compressed(bytes(png), "png"))
+
+
 @pytest.mark.parametrize("padding", [0, 5])
 @pytest.mark.parametrize(
     ("encoding", "order"),
