@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from resource import RLIMIT_DATA, setrlimit
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,7 @@ CAMERA_ON_IMU = Transform(
 )
 GPS_ON_IMU = Transform(IMU, GPS, np.diag([-1.0, -1.0, 1.0]), np.array([0.2209, -0.0515, 1.5785]))
 PREFIX = "LocCam_"
+MAX_MAT_BYTES = 400 << 20  # of the process that reads a calibration
 
 
 def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> ImportedRecording:
@@ -94,7 +96,9 @@ def _time(text: str, where: str) -> int:
 def _structs(path: Path, size: tuple[int, int]) -> StereoCalibration:
     """The calibration in a MATLAB file of structs (toStruct of stereoParameters)."""
     try:
-        with ProcessPoolExecutor(1, get_context("spawn")) as apart:  # a damaged file ends scipy's process
+        # A damaged file may end the process of scipy's reader, or fill its memory.
+        limit = RLIMIT_DATA, (MAX_MAT_BYTES, MAX_MAT_BYTES)
+        with ProcessPoolExecutor(1, get_context("spawn"), setrlimit, limit) as apart:
             found: Any = apart.submit(loadmat, path, simplify_cells=True).result()["stereoParams"]
         models = [_model(found[f"CameraParameters{number}"], size) for number in (1, 2)]
         rotation = np.asarray(found["RotationOfCamera2"], np.float64).reshape(3, 3)
