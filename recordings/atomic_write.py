@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from resource import RLIM_INFINITY, RLIMIT_FSIZE, getrlimit
+from shutil import disk_usage
 
 from recordings.errors import UnwritableError
 
@@ -58,6 +60,14 @@ def unwritable(path: Path, reason: str, kept: str = "") -> UnwritableError:
     """The error for a file that cannot be written. kept: a note about what was kept."""
     remedy = "choose another place for the output or make room there"
     return UnwritableError(f"cannot write {path}: {reason}{kept}; {remedy}")
+
+
+def room_to_grow(file: Path) -> int:
+    """How many bytes a file may still grow, by the disk's free space and the process' limit."""
+    free, (allowed, _) = disk_usage(file.parent).free, getrlimit(RLIMIT_FSIZE)
+    if allowed == RLIM_INFINITY:
+        return free
+    return min(free, allowed - (file.stat().st_size if file.exists() else 0))
 
 
 def _flush_to_disk(path: Path) -> None:

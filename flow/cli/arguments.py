@@ -7,6 +7,7 @@ import math
 
 from flow.runtime.frame_selection import Every
 
+DESKS = ("overview", "matching", "terrain", "runtime", "tilt")  # of `recordings.sinks.blueprint`, loaded only when used
 _MAX_WORKERS = 1024
 _MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
 

@@ -16,22 +16,19 @@ from types import ModuleType
 from typing import Any
 
 from flow.cli.commands import (
-    attempt,
     demo,
-    diff,
     export,
     fleet,
     graph,
     info,
     listing,
     pipeline,
-    report,
     run,
     score,
     simulate,
     stages,
-    why,
 )
+from flow.cli.debugging import attempt, desk, diff, report, why
 from flow.cli.importers import devon, euroc, images, katwijk, kitti, lusnar, middlebury, tartanair
 from flow.cli.replay import product_version
 from flow.errors import FAILED, INTERRUPTED, UNUSABLE, RoverflowError
@@ -50,6 +47,7 @@ COMMANDS: dict[str, ModuleType] = {
     "try": attempt,
     "why": why,
     "report": report,
+    "desk": desk,
     "export": export,
     "fleet": fleet,
     "list": listing,

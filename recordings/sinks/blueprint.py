@@ -1,25 +1,31 @@
-"""The rerun blueprint: how the views of a recording are laid out in the viewer.
+"""The rerun blueprints: how the views of a recording are laid out in the viewer, a desk for each kind of question.
 
-Images are at the left in the order of the method, 3-D views in the middle, maps at the right, plots and the ledger
-below. Its one trick: the layout is made from the entities that were really logged, so no view is ever empty.
+The desk `overview` has images at the left in the order of the method, 3-D views in the middle, maps at the right, plots
+and the ledger below. A layout is made from the entities that were really logged, so no view is ever empty.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import astuple, dataclass
 from enum import Enum
+from pathlib import Path
 
+import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumnKind, TimelineColumn
 
+from recordings.errors import LogError
 from stages.data import LEVEL_FRAME
 
 CLOCK = "log clock"  # the timeline of the frames' stamps
 FRAME = "frame"  # the timeline that counts frames
 
 LEDGER, FRAMES, SUMMARY, SECONDS, QUEUES = "ledger", "frames", "summary", "seconds", "queues"
+LAYOUT = "layout"  # the text from which other desks are made
 MAX_LEGEND_LINES = 4  # the legend of more lines would hide the plot
+SHOWN_LAYERS = ("step", "slope", "roughness", "variance")  # side by side on the desk `terrain`; the others are tabs
 
 Specs = tuple["ViewSpec", ...]
 _Part = rrb.View | rrb.Container
@@ -28,8 +34,17 @@ _Part = rrb.View | rrb.Container
 # The places of the layout. Derived images have another size than the camera's; OWN_... are of the user's own types.
 Panel = Enum(
     "Panel",
-    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE SIGMA CLOUD VOXELS TERRAIN CAMERA TRAJECTORY "
-    "RELIEF LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE OWN_IMAGE OWN_NUMBER OWN_TEXT OWN_BARS OWN_TENSOR",
+    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE CONFIDENCE SIGMA CLOUD VOXELS TERRAIN CAMERA "
+    "TRAJECTORY RELIEF LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE OWN_IMAGE OWN_NUMBER "
+    "OWN_TEXT OWN_BARS OWN_TENSOR",
+)
+
+MATCHED = "matched (%)"
+SENSOR_PLOTS = (
+    (Panel.ANGLE, "tilt (degrees)"),
+    (Panel.HEALTH, "tilt check (degrees)"),
+    (Panel.MATCHES, MATCHED),
+    (Panel.FEATURES, "odometry"),
 )
 
 
@@ -52,23 +67,106 @@ class ViewSpec:
         return f"{self.stream}/{self.part}" if self.part else self.stream
 
 
-def blueprint(views: Iterable[ViewSpec], slowest: Sequence[str] = ()) -> rrb.Blueprint:
-    """The layout of the entities logged so far, in the order in which each was first logged.
+@dataclass(frozen=True)
+class Layout:
+    """What the desks of a recording are made from.
 
-    slowest: the stages whose times are plotted with their names.
+    views: of the entities logged so far, in the order in which each was first logged; slowest: the stages whose times
+    are plotted with their names.
     """
-    drawn = tuple(views)
-    columns: list[tuple[_Part, float]] = []
-    for part, share in ((_images(drawn), 6.4), (_space(drawn), 5.6), (_maps(drawn), 4.0)):
-        if part is not None:
-            columns.append((part, share))
+
+    application_id: str
+    views: Specs
+    slowest: tuple[str, ...] = ()
+
+    def blueprint(self, desk: str = "overview") -> rrb.Blueprint:
+        """The blueprint of one of DESKS."""
+        body = DESKS[desk](self.views, self.slowest)
+        return rrb.Blueprint(body, rrb.TimePanel(state="collapsed", timeline=CLOCK), collapse_panels=True)
+
+    def as_json(self) -> str:
+        """The text that a recording keeps."""
+        views = [[spec.panel.name, *astuple(spec)[1:]] for spec in self.views]
+        return json.dumps({"application_id": self.application_id, "slowest": self.slowest, "views": views})
+
+
+def read_layout(recording: Path) -> Layout:
+    """The layout that a recording of `RerunSink` keeps. Raises LogError."""
+    try:
+        for chunk in rr.chunk.RrdReader(str(recording)).stream():
+            if chunk.entity_path == f"/{LAYOUT}":
+                (text,) = chunk.to_record_batch().column("TextDocument:text").to_pylist()[-1]
+                found = json.loads(text)
+                views = tuple(ViewSpec(Panel[panel], *rest) for panel, *rest in found["views"])
+                return Layout(found["application_id"], views, tuple(found["slowest"]))
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        raise LogError(f"cannot read {recording} as a recording: {error}; run the log again") from error
+    raise LogError(f"{recording} keeps no layout: its run was cut short, or another program made it; run the log again")
+
+
+def _overview(drawn: Specs, slowest: Sequence[str]) -> _Part:
+    """All of it: images, space, maps, plots and the ledger."""
+    above = _row((_images(drawn), 6.4), (_space(drawn), 5.6), (_maps(drawn), 4.0))
     below = _below(drawn, slowest)
-    if not columns:
-        body: _Part = below
-    else:
-        above = rrb.Horizontal(*[part for part, _ in columns], column_shares=[share for _, share in columns])
-        body = rrb.Vertical(above, below, row_shares=[3.1, 1.0])
-    return rrb.Blueprint(body, rrb.TimePanel(state="collapsed", timeline=CLOCK), collapse_panels=True)
+    return below if above is None else rrb.Vertical(above, below, row_shares=[3.1, 1.0])
+
+
+def _matching(drawn: Specs, slowest: Sequence[str]) -> _Part:
+    """Both images, the disparity of each step, and what is known of its errors."""
+    disparities = _flat_views(drawn, Panel.DISPARITY)
+    parts = [
+        *_image_tabs(drawn), _tabs(disparities[-1:]), _tabs(disparities[-2::-1]),
+        _tabs(reversed(_flat_views(drawn, Panel.SOURCE))), _tabs(reversed(_superpixels(drawn))),
+        *_flat_views(drawn, Panel.CONFIDENCE, Panel.SIGMA), _plot(_at(drawn, Panel.MATCHES), MATCHED),
+    ]  # fmt: skip
+    return _grid(parts, 3) or _ledger(drawn)
+
+
+def _terrain(drawn: Specs, slowest: Sequence[str]) -> _Part:
+    """The maps, their reasons and layers, and the surface."""
+    layers = _flat_views(drawn, Panel.LAYER)
+    shown = [view for view in layers if view.name in SHOWN_LAYERS]
+    flat = [
+        *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.RELIEF, Panel.MAP, Panel.REASON)), *shown,
+        _tabs(view for view in layers if view not in shown),
+    ]  # fmt: skip
+    return _row((_grid(flat, 4), 5.0), (_space(drawn), 3.0)) or _ledger(drawn)
+
+
+def _runtime(drawn: Specs, slowest: Sequence[str]) -> _Part:
+    """Times of stages and sinks, queues, and all that was lost."""
+    plots = _stack(part for part, _ in _stage_plots(drawn, slowest))
+    texts = _stack([*_texts(drawn)[:2], _summary()])
+    return _row((plots, 3.0), (texts, 2.0)) or _ledger(drawn)
+
+
+def _tilt(drawn: Specs, slowest: Sequence[str]) -> _Part:
+    """The readings, what the images say of them, and the cloud that is levelled by them."""
+    plots = [_plot(_at(drawn, panel), title) for panel, title in SENSOR_PLOTS]
+    space = _stack([*_image_tabs(drawn)[:1], _tabs(_spaces(drawn, Panel.CLOUD, "cloud")), _tabs(_trajectories(drawn))])
+    return _row((space, 2.0), (_stack([*plots[:2], plots[3], _ledger(drawn)]), 3.0)) or _ledger(drawn)
+
+
+DESKS: dict[str, Callable[[Specs, Sequence[str]], _Part]] = {
+    "overview": _overview,
+    "matching": _matching,
+    "terrain": _terrain,
+    "runtime": _runtime,
+    "tilt": _tilt,
+}
+
+
+def _row(*columns: tuple[_Part | None, float]) -> _Part | None:
+    """Parts beside each other, each with its share of the width."""
+    present = [(part, share) for part, share in columns if part is not None]
+    if not present:
+        return None
+    return rrb.Horizontal(*[part for part, _ in present], column_shares=[share for _, share in present])
+
+
+def _grid(parts: Iterable[_Part | None], columns: int) -> _Part | None:
+    present = [part for part in parts if part is not None]
+    return rrb.Grid(*present, grid_columns=columns) if present else None
 
 
 def _at(drawn: Specs, *panels: Panel) -> list[ViewSpec]:
@@ -109,19 +207,22 @@ def _images(drawn: Specs) -> _Part | None:
     Of several stereo streams the last one of the camera's size is shown (the rectified one), of other streams the last.
     The others are tabs behind it. The last disparity has a view of its own beside the tabs of the earlier ones.
     """
-    left, right = _flat_views(drawn, Panel.LEFT), _flat_views(drawn, Panel.RIGHT)
     disparities = _flat_views(drawn, Panel.DISPARITY)
     parts = [
-        _tabs([*reversed(left), *_flat_views(drawn, Panel.LEFT_DERIVED)]),
-        _tabs([*reversed(right), *_flat_views(drawn, Panel.RIGHT_DERIVED)]),
+        *_image_tabs(drawn),
         _tabs(disparities[-2::-1]),
         _tabs(disparities[-1:]),
         _tabs(reversed(_superpixels(drawn))),
-        _tabs([*reversed(_flat_views(drawn, Panel.SOURCE)), *_flat_views(drawn, Panel.SIGMA)]),
+        _tabs([*reversed(_flat_views(drawn, Panel.SOURCE)), *_flat_views(drawn, Panel.CONFIDENCE, Panel.SIGMA)]),
         _tabs(_flat_views(drawn, Panel.OWN_IMAGE)),
     ]
-    present = [part for part in parts if part is not None]
-    return rrb.Grid(*present, grid_columns=2) if present else None
+    return _grid(parts, 2)
+
+
+def _image_tabs(drawn: Specs) -> list[_Part | None]:
+    """The left and the right images, the last ones in front."""
+    sides = ((Panel.LEFT, Panel.LEFT_DERIVED), (Panel.RIGHT, Panel.RIGHT_DERIVED))
+    return [_tabs([*reversed(_flat_views(drawn, own)), *_flat_views(drawn, derived)]) for own, derived in sides]
 
 
 def _superpixels(drawn: Specs) -> list[rrb.View]:
@@ -182,8 +283,18 @@ def _plot(specs: Iterable[ViewSpec], title: str) -> rrb.View | None:
 
 def _below(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """Plots of stage times, queues, angles and own numbers; the ledger with the run's summary behind it."""
-    plots: list[_Part] = []
-    shares: list[float] = []
+    plots = _stage_plots(drawn, slowest)
+    for tabs in (_tabs(_plot(_at(drawn, panel), title) for panel, title in SENSOR_PLOTS), _tabs(_own_plots(drawn))):
+        if tabs is not None:
+            plots.append((tabs, 1.1))
+    ledger, *texts = _texts(drawn)
+    text = rrb.Tabs(ledger, _summary(), *texts, active_tab=0)
+    return rrb.Horizontal(*[part for part, _ in plots], text, column_shares=[*(share for _, share in plots), 2.0])
+
+
+def _stage_plots(drawn: Specs, slowest: Sequence[str]) -> list[tuple[_Part, float]]:
+    """The times of the stages and their queues, each with its share of the width."""
+    plots: list[tuple[_Part, float]] = []
     named = [spec for spec in _at(drawn, Panel.STAGE) if spec.stream == SECONDS and spec.title in slowest]
     for root, title in ((SECONDS, "stage time (s)"), (QUEUES, "queue depth (frames)")):
         lines = sum(spec.stream == root for spec in _at(drawn, Panel.STAGE))
@@ -192,26 +303,26 @@ def _below(drawn: Specs, slowest: Sequence[str]) -> _Part:
             name = title if few else f"{title}: hover for names"
             every = rrb.TimeSeriesView(origin=root, name=name, plot_legend=rrb.PlotLegend("LeftTop", visible=few))
             first = _plot(named, "slowest stages (s)") if root == SECONDS and not few else None
-            plots.append(_tabs([first, every]) or every)
-            shares.append(1.4)
-    panels = (
-        (Panel.ANGLE, "tilt (degrees)"),
-        (Panel.HEALTH, "tilt check (degrees)"),
-        (Panel.MATCHES, "matched (%)"),
-        (Panel.FEATURES, "odometry"),
-    )
-    for tabs in (_tabs(_plot(_at(drawn, panel), title) for panel, title in panels), _tabs(_own_plots(drawn))):
-        if tabs is not None:
-            plots.append(tabs)
-            shares.append(1.1)
+            plots.append((_tabs([first, every]) or every, 1.4))
+    return plots
+
+
+def _texts(drawn: Specs) -> list[rrb.View]:
+    """The ledger, a line for each frame, and own texts."""
     shown = rrb.TextLogColumns(
         timeline_columns=[TimelineColumn(CLOCK, visible=False), TimelineColumn(FRAME)],
         text_log_columns=[TextLogColumnKind.LogLevel, TextLogColumnKind.Body],
     )
     texts = [(LEDGER, LEDGER), (FRAMES, FRAMES), *((spec.path, spec.title) for spec in _at(drawn, Panel.OWN_TEXT))]
-    logs = [rrb.TextLogView(origin=path, name=title, columns=shown) for path, title in texts]
-    text = rrb.Tabs(logs[0], rrb.TextDocumentView(origin=SUMMARY, name="run"), *logs[1:], active_tab=0)
-    return rrb.Horizontal(*plots, text, column_shares=[*shares, 2.0])
+    return [rrb.TextLogView(origin=path, name=title, columns=shown) for path, title in texts]
+
+
+def _ledger(drawn: Specs) -> rrb.View:
+    return _texts(drawn)[0]
+
+
+def _summary() -> rrb.View:
+    return rrb.TextDocumentView(origin=SUMMARY, name="run")
 
 
 def _own_plots(drawn: Specs) -> list[rrb.View | None]:

@@ -103,12 +103,8 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     if not {*np.flatnonzero(counts).tolist()} <= {PixelOrigin.UNKNOWN, PixelOrigin.MEASURED}:
         view = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
         canvas.log_labels(view, colormaps.every_nth(disparity.source, width), colormaps.SOURCE_LEGEND, beside=True)
-    if disparity.sigma is not None and stream in canvas.full_size:
-        view = ViewSpec(Panel.SIGMA, stream, "sigma", f"{stream}: sigma")
-        sigma = np.where(np.isfinite(disparity.pixels), disparity.sigma, np.nan)
-        thinned = colormaps.every_nth(sigma, canvas.max_width * 3 // 8)
-        canvas.log_values(thinned.astype(np.float16), (0.0, MAX_SIGMA), view)
-        canvas.log_scale(f"{view.path}/scale", thinned.shape, 0.0, MAX_SIGMA, "px", cv2.COLORMAP_TURBO)
+    if stream in canvas.full_size:
+        _log_errors(canvas, stream, disparity)
     if disparity.segments is not None:
         # They lie over the left image. Edges of fewer pixels are denser, so they are fainter.
         segments, step = disparity.segments, colormaps.stride(disparity.segments.shape[1], canvas.max_width)
@@ -119,6 +115,21 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
         view = ViewSpec(Panel.SUPERPIXELS, stream, "superpixels", f"{stream}: superpixels")
         canvas.log(view.path, overlay, view)
     return caption
+
+
+def _log_errors(canvas: Canvas, stream: str, disparity: Disparity) -> None:
+    """What the disparities state of their errors: confidence and standard deviation of every n-th pixel."""
+    width = canvas.max_width * 3 // 8
+    unknown = np.isnan(colormaps.every_nth(disparity.pixels, width))
+    view = ViewSpec(Panel.CONFIDENCE, stream, "confidence", f"{stream}: confidence")
+    confidence = np.where(unknown, np.float32(0), 100 * colormaps.every_nth(disparity.confidence, width))
+    canvas.log_values(np.rint(confidence).astype(np.uint8), (0.0, 100.0), view)
+    canvas.log_scale(f"{view.path}/scale", unknown.shape, 0.0, 100.0, "%", cv2.COLORMAP_TURBO)
+    if disparity.sigma is not None:
+        view = ViewSpec(Panel.SIGMA, stream, "sigma", f"{stream}: sigma")
+        sigma = np.where(unknown, np.float32(np.nan), colormaps.every_nth(disparity.sigma, width))
+        canvas.log_values(sigma.astype(np.float16), (0.0, MAX_SIGMA), view)
+        canvas.log_scale(f"{view.path}/scale", unknown.shape, 0.0, MAX_SIGMA, "px", cv2.COLORMAP_TURBO)
 
 
 def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int) -> None:

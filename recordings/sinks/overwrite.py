@@ -15,6 +15,7 @@ _HEADERS = tuple(  # with profile, ROS 2 or none, and library
 )
 _ABOUT = 12, struct.pack("<I9s", 9, b"roverflow")  # the metadata record that follows it in result logs, and its name
 _RECORDING = b"RRF", b"/summary", b"# RUNNING"  # its magic, and its first summary
+_DESK = b"roverflow"  # the application of layouts
 _DIFFERENCE = b"roverflow_diff"  # the application of recordings of differences
 PICTURE = b"Software\x00roverflow"  # the text chunk of its PNG files
 REPORT = "<!-- roverflow report -->"  # the second line of its HTML files
@@ -28,8 +29,8 @@ _KEYS = {
 def is_ours(path: Path, kind: str) -> bool:
     """Whether the file `path` is an earlier output of roverflow of that kind, or empty, so that another may replace it.
 
-    kind: "input log", as simulator and imports make them, "result log", "recording", "difference", "picture", "report",
-    "summary" or "score".
+    kind: "input log", as simulator and imports make them, "result log", "recording", "desk", "difference", "picture",
+    "report", "summary" or "score".
     """
     with path.open("rb") as file:
         start = file.read(_BEGINNING)
@@ -45,6 +46,8 @@ def is_ours(path: Path, kind: str) -> bool:
         return start.startswith(b"\x89PNG") and PICTURE in start
     if kind == "difference":
         return start.startswith(_RECORDING[0]) and _DIFFERENCE in start
+    if kind == "desk":
+        return start.startswith(_RECORDING[0]) and _DESK in start and _RECORDING[1] not in start
     code, name = _ABOUT
     header = next((known for known in _HEADERS if start.startswith(known)), None)
     if header is None:

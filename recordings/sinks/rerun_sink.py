@@ -13,8 +13,6 @@ from dataclasses import dataclass, is_dataclass
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
-from resource import RLIM_INFINITY, RLIMIT_FSIZE, getrlimit
-from shutil import disk_usage
 from typing import Any
 
 import numpy as np
@@ -23,20 +21,22 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from flow.contracts import FrameRecord, Loss, counted
 from flow.parameters import check_parameters, parameter
-from recordings.atomic_write import give_name, temporary_name, unwritable, writing
+from recordings.atomic_write import give_name, room_to_grow, temporary_name, unwritable, writing
 from recordings.errors import LogError
 from recordings.sinks.blueprint import (
     CLOCK,
+    DESKS,
     FRAME,
     FRAMES,
+    LAYOUT,
     LEDGER,
     MAX_LEGEND_LINES,
     QUEUES,
     SECONDS,
     SUMMARY,
+    Layout,
     Panel,
     ViewSpec,
-    blueprint,
 )  # fmt: skip
 from recordings.sinks.canvas import Canvas
 from recordings.sinks.loggers import LOGGERS, same_view
@@ -85,6 +85,7 @@ class RerunSink:
     )  # fmt: skip
     live_port: int = parameter(0, "port of loopback where a viewer can watch the run; 0: none", low=0, high=65535)
     without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
+    desk: str = parameter("overview", "layout that the viewer opens with", choices=tuple(DESKS))
 
     suffix = ".rrd"
 
@@ -139,7 +140,7 @@ class RerunSink:
 
     def _check_room(self) -> None:
         """Raise LogError before the disk is full: rerun's writer never returns from a full one."""
-        if _room(self._partial) < RESERVED_BYTES:
+        if room_to_grow(self._partial) < RESERVED_BYTES:
             raise unwritable(self._path, f"less than {RESERVED_BYTES >> 20} MB more can be written there")
 
     def _begin(self) -> None:
@@ -222,6 +223,7 @@ class RerunSink:
         if self.without:
             pictures["not drawn"] = ", ".join(self.without)
         self._recording.log(SUMMARY, _document(verdict, self._about, facts, pictures), static=True)
+        self._recording.log(LAYOUT, rr.TextDocument(self._layout().as_json()), static=True)
         self._views = -1  # the slowest stages are known now
         self._send_blueprint()
 
@@ -320,8 +322,11 @@ class RerunSink:
         """Send the blueprint again if the frame added a view."""
         if len(self._canvas.views) != self._views:
             self._views = len(self._canvas.views)
-            slowest = [stage for stage, _ in self._work.most_common(MAX_LEGEND_LINES)]
-            self._recording.send_blueprint(blueprint(self._canvas.views.values(), slowest))
+            self._recording.send_blueprint(self._layout().blueprint(self.desk))
+
+    def _layout(self) -> Layout:
+        slowest = [stage for stage, _ in self._work.most_common(MAX_LEGEND_LINES)]
+        return Layout(self.application_id, tuple(self._canvas.views.values()), tuple(slowest))
 
 
 def _is(kind: Any, wanted: type) -> bool:
@@ -390,11 +395,3 @@ def _document(verdict: str, *tables: Mapping[str, Any]) -> rr.TextDocument:
     texts = [f"## {key}\n```\n{value}\n```" for key, value in values if "\n" in str(value)]
     text = "\n".join([f"# {verdict}", "", "| | |", "|---|---|", *rows, "", *texts])
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-
-
-def _room(file: Path) -> int:
-    """How many bytes a file may still grow, by the disk's free space and the process' limit."""
-    free, (allowed, _) = disk_usage(file.parent).free, getrlimit(RLIMIT_FSIZE)
-    if allowed == RLIM_INFINITY:
-        return free
-    return min(free, allowed - (file.stat().st_size if file.exists() else 0))

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flow.cli.arguments import every, seconds, workers
+from flow.cli.arguments import DESKS, every, seconds, workers
 from flow.cli.outputs import add_log, add_pipeline_options, check_outputs, default_result, write_text
 from flow.cli.replay import as_json, replay
 from flow.cli.report import exit_code, headline, report, say
@@ -36,6 +36,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     recording = sub.add_mutually_exclusive_group()
     recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
     recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
+    sub.add_argument("--desk", choices=DESKS, help="layout that the viewer opens the recording with (overview)")
     watching = sub.add_mutually_exclusive_group()
     watching.add_argument("--view", action="store_true", help="open the viewer and watch the run")
     watching.add_argument(
@@ -62,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
     if rrd is None and (options.view or options.serve):
         raise UsageError("watching needs the recording; leave out --no-rrd")
-    names = ("workers", "start", "end", "every", "profile", "with_inputs")
+    names = ("workers", "start", "end", "every", "profile", "desk", "with_inputs")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
         with watched(options.view, options.serve) as port:

@@ -2,7 +2,13 @@
 
 from typing import Any
 
-from recordings.sinks.blueprint import Panel, ViewSpec, blueprint
+import pytest
+
+from flow.cli.arguments import DESKS as NAMES
+from recordings.errors import LogError
+from recordings.sinks.blueprint import DESKS, Layout, Panel, ViewSpec, read_layout
+from tests.conftest import roverflow
+from tests.recordings.sinks.recorded_scene import entities
 
 
 def views(part: Any) -> list[Any]:
@@ -10,12 +16,16 @@ def views(part: Any) -> list[Any]:
     return [view for inner in part.contents for view in views(inner)] if hasattr(part, "grid_columns") else [part]
 
 
+def container(specs: list[ViewSpec], desk: str = "overview") -> Any:
+    return Layout("roverflow", tuple(specs)).blueprint(desk).root_container
+
+
 def test_the_blueprint_has_a_view_for_each_entity_and_no_empty_one():
     specs = [
         ViewSpec(Panel.LEFT, "rectified", "left", "left"),
         ViewSpec(Panel.DISPARITY, "matched", "pixels", "matched"),
     ]
-    names = [view.name for view in views(blueprint(specs).root_container)]
+    names = [view.name for view in views(container(specs))]
     assert sorted(names) == ["frames", "ledger", "left", "matched", "run"]
 
 
@@ -24,7 +34,7 @@ def test_two_streams_of_one_type_have_tabs_of_two_names():
         panels = ((Panel.RELIEF, "relief"), (Panel.LAYER, "elevation"), (Panel.LAYER, "slope"))
         specs = [ViewSpec(panel, stream, title, title) for stream in streams for panel, title in panels]
         specs.append(ViewSpec(Panel.RELIEF, "regional", "relief", "relief (odom)"))
-        return [view.name for view in views(blueprint(specs).root_container)][:-3]
+        return [view.name for view in views(container(specs))][:-3]
 
     assert names("sparse") == ["relief", "relief (odom)", "elevation", "slope"]
     assert names("maps/sparse", "dense") == [
@@ -36,7 +46,50 @@ def test_two_streams_of_one_type_have_tabs_of_two_names():
 def test_a_plot_of_many_lines_has_no_legend():
     for stages in (2, 25):
         specs = [ViewSpec(Panel.STAGE, root, str(n), str(n)) for root in ("seconds", "queues") for n in range(stages)]
-        plots = views(blueprint(specs).root_container)[:2]
+        plots = views(container(specs))[:2]
         shown = [plot.properties["PlotLegend"].visible.as_arrow_array().to_pylist() for plot in plots]
         assert shown == [[stages == 2]] * 2
         assert [plot.name.endswith("hover for names") for plot in plots] == [stages == 25] * 2
+
+
+def test_the_command_line_names_the_desks_in_their_order():
+    assert tuple(DESKS) == NAMES
+
+
+@pytest.mark.parametrize("desk", NAMES)
+def test_a_desk_shows_only_what_a_recording_has(desk, rrd):
+    layout = read_layout(rrd)
+    logged = entities(rrd) - {"/layout"}
+    shown = [str(path) for view in views(layout.blueprint(desk).root_container) for path in view_paths(view)]
+    assert shown
+    assert all(any(entity.startswith(path) for entity in logged) for path in shown)
+
+
+def view_paths(view: Any) -> list[str]:
+    """The entities that a view shows."""
+    if view.contents == "$origin/**" or not isinstance(view.contents, list):
+        return [f"/{view.origin.lstrip('/')}"]
+    return [line.removeprefix("+ ").removesuffix("/**") for line in view.contents]
+
+
+@pytest.mark.parametrize("desk", NAMES)
+def test_a_desk_of_nothing_is_the_ledger(desk):
+    assert "ledger" in {view.name for view in views(container([], desk))} | {container([], desk).name}
+
+
+def test_the_desks_of_a_recording_are_files_for_the_viewer(rrd, tmp_path, capsys):
+    assert roverflow("desk", rrd, "--out", tmp_path) == 0
+    assert sorted(tmp_path.iterdir()) == sorted(tmp_path / f"{rrd.stem}-{name}.rbl" for name in NAMES)
+    assert all(path.read_bytes().startswith(b"RRF2") for path in tmp_path.iterdir())
+    assert roverflow("desk", rrd, "--out", tmp_path, "--desk", "tilt") == 0  # again
+    assert roverflow("desk", tmp_path / f"{rrd.stem}-tilt.rbl", "--desk", "tilt", "--out", tmp_path) == 2
+    (tmp_path / f"{rrd.stem}-tilt.rbl").write_text("mine")
+    assert roverflow("desk", rrd, "--out", tmp_path, "--desk", "tilt") == 2
+    assert "exists and is no desk of roverflow" in capsys.readouterr().err
+
+
+def test_what_is_no_recording_has_no_desk(tmp_path):
+    (tmp_path / "a.rrd").write_text("nothing")
+    for path in (tmp_path / "a.rrd", tmp_path / "b.rrd"):
+        with pytest.raises(LogError, match=path.name):
+            read_layout(path)

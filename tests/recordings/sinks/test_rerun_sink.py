@@ -193,7 +193,7 @@ def test_an_unwritable_path_is_named(tmp_path):
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path, monkeypatch):
     """rerun reports an unexpected full disk only in its log, so the sink checks for it."""
-    monkeypatch.setattr("recordings.sinks.rerun_sink._room", lambda file: RESERVED_BYTES)
+    monkeypatch.setattr("recordings.sinks.rerun_sink.room_to_grow", lambda file: RESERVED_BYTES)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = opened(tmp_path / "run.rrd")
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))

@@ -1,0 +1,36 @@
+"""`roverflow desk`: writes the layouts of a recording as files that its viewer opens."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from flow.cli.arguments import DESKS
+from flow.cli.outputs import check_outputs
+from flow.cli.report import say
+from flow.errors import COMPLETE
+from recordings.atomic_write import written
+
+HELP = "write layouts of a recording, one for each kind of question"
+
+
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("recording", type=Path, metavar="OUT.rrd", help="recording of roverflow run")
+    sub.add_argument("--desk", action="append", choices=DESKS, help="one of the layouts (all of them)")
+    sub.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the files (that of the recording)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write a file for each desk."""
+    from recordings.sinks.blueprint import read_layout
+
+    folder = options.out or options.recording.parent
+    paths = {name: folder / f"{options.recording.stem}-{name}.rbl" for name in options.desk or DESKS}
+    for path in paths.values():
+        check_outputs({"desk": path}, [options.recording])
+    layout = read_layout(options.recording)
+    for name, path in paths.items():
+        with written(path) as temporary:
+            layout.blueprint(name).save(layout.application_id, str(temporary))
+        say(f"wrote {path}; rerun {options.recording} {path} shows it")
+    return COMPLETE
