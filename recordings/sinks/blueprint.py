@@ -141,7 +141,7 @@ def _runtime(drawn: Specs, slowest: Sequence[str]) -> _Part:
 
 
 def _tilt(drawn: Specs, slowest: Sequence[str]) -> _Part:
-    """The readings, what the images say of them, and the cloud that is levelled by them."""
+    """The readings, their residuals in the images, and the cloud that is levelled by them."""
     plots = [_plot(_at(drawn, panel), title) for panel, title in SENSOR_PLOTS]
     space = _stack([*_image_tabs(drawn)[:1], _tabs(_spaces(drawn, Panel.CLOUD, "cloud")), _tabs(_trajectories(drawn))])
     return _row((space, 2.0), (_stack([*plots[:2], plots[3], _ledger(drawn)]), 3.0)) or _ledger(drawn)
