@@ -15,8 +15,6 @@ from typing import Any, Union, get_args, get_origin
 
 from flow.units import as_written, check_bare, quantity
 
-MAX_BITS = 1000  # of a whole number; beyond 1023 there is no float of it
-
 
 def parameter(
     default: Any,
@@ -122,8 +120,6 @@ def _option(value: Any, options: Sequence[Any]) -> Any:
 def _number(value: Any, kind: type, known: Field[Any]) -> float | int:
     """A number of the pipeline file in the parameter's unit, within its range."""
     unit, given = known.metadata.get("unit", ""), value
-    if isinstance(value, int) and value.bit_length() > MAX_BITS:
-        raise ValueError("the number has too many digits")
     if isinstance(value, str):
         value = quantity(value, unit)
         if kind is int and float(value).is_integer():
