@@ -125,7 +125,7 @@ def read_rig(path: Path | None, entries: Collection[str]) -> Rig:
             raise LogError(f"{path} has the entry '{name}', which is not used; it may have {', '.join(known)}")
         try:
             values = {**values, name: coerced(value, hints[name], known[name])}
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             raise LogError(f"{path}: '{name}': {error}") from error
     rig = Rig(**values)
     object.__setattr__(rig, "where", str(path))

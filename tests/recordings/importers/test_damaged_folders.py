@@ -16,7 +16,7 @@ def turned(content: bytes) -> bytes:
 CASES = {
     "a mirror as a rotation": ("drive", "calib_velo_to_cam.txt", turned, "no rotation"),
     "a number without a float": (
-        "sequence", "rig.yaml", lambda content: content + b"roll: " + b"9" * 400, "too many digits"),
+        "sequence", "rig.yaml", lambda content: content + b"roll: " + b"9" * 400, "too large"),
     "a mirror as a pose": ("sequence", "poses/05.txt", lambda _: b"-1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "no rotation"),
     "a camera that cannot be rectified": (
         "euroc", "room/mav0/cam0/sensor.yaml", lambda content: re.sub(rb", [0-9.]+\] #fu", b", 0.0] #fu", content),
