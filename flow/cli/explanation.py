@@ -200,7 +200,7 @@ def instant(result: Path, at: float, log: Path | None = None) -> tuple[Mapping[s
     with TemporaryDirectory(prefix="roverflow-why-") as folder:
         file = Path(folder) / f"{pipeline_of(result)}.yaml"
         file.write_text(about["pipeline"], encoding="utf-8")
-        graph = load(str(file), about["overrides"].splitlines())
+        graph = load(str(file), about["overrides"].splitlines(), with_sinks=False)
     with graph.source.open(given) as opened:
         part = part_of(opened, at, frames=1, before=0)
     kept = _Keep()

@@ -7,7 +7,7 @@ the dataclasses and annotations of the stages. An error names the file, the line
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ _KEYS = ("settings", "source", "templates", "streams", "sinks")
 _BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"
 
 
-def load(name: str, overrides: Iterable[str] = ()) -> Graph:
+def load(name: str, overrides: Iterable[str] = (), with_sinks: bool = True) -> Graph:
     """The checked graph of a pipeline.
 
     Parameters
@@ -44,6 +44,8 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     overrides
         Changes as of `--set`: "setting=value", "stream.parameter=value", "source.parameter=value" or
         "McapSink.parameter=value". The parameter may be a path of keys, as in "source.pitch.sign=-1".
+    with_sinks
+        Whether the graph has the sinks of the file; some take long to import.
 
     Raises
     ------
@@ -63,7 +65,8 @@ def load(name: str, overrides: Iterable[str] = ()) -> Graph:
     streams = mapping(tree.value["streams"], "'streams'")
     library = Library(path, SHIPPED, own)
     expansion = expand(streams, library, changes)
-    return _graph(path.stem, text + library.comments(), tree.value, expansion)
+    sinks = tree.value["sinks"].value if with_sinks else []
+    return _graph(path.stem, text + library.comments(), tree.value, sinks, expansion)
 
 
 def _text(path: Path) -> str:
@@ -110,11 +113,11 @@ def _check_parts(tree: Value) -> None:
         raise sinks.place.error("'sinks' must be a list of at least one sink")
 
 
-def _graph(name: str, text: str, parts: Mapping[str, Value], expansion: Expansion) -> Graph:
-    """The checked graph of the expanded streams."""
+def _graph(name: str, text: str, parts: Mapping[str, Value], listed: Sequence[Value], expansion: Expansion) -> Graph:
+    """The checked graph of the expanded streams; listed: its sinks."""
     from_source = NodeSpec.read(parts["source"], "the source", "source")
     source = from_source.made()
-    to_sinks = [NodeSpec.read(item, "a sink", "sink") for item in parts["sinks"].value]
+    to_sinks = [NodeSpec.read(item, "a sink", "sink") for item in listed]
     sinks = tuple((entry.use, entry.made()) for entry in to_sinks)
     for entry in to_sinks:
         if [use for use, _ in sinks].count(entry.use) > 1:
