@@ -73,6 +73,13 @@ def orthonormal(matrix: Array, where: str) -> Array:
     return np.asarray(Rotation.from_matrix(matrix).as_matrix())
 
 
+def rotation_of(quaternion: Array, where: str) -> Array:
+    """The rotation (3, 3) of a quaternion x, y, z, w. Raises LogError unless its length is 1."""
+    if not abs((length := float(np.linalg.norm(quaternion))) - 1) <= MAX_ROUNDING:
+        raise LogError(f"{where} has a quaternion of the length {length:g}; get the file again")
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix())
+
+
 def whole_number(text: str, where: str) -> int:
     """A number of an image. Raises LogError."""
     if not text.isdecimal():

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import nanoseconds, numbers_of, read_lines
+from recordings.importers.files import nanoseconds, numbers_of, read_lines, rotation_of
 from recordings.importers.recording import (
     BASE,
     LEFT,
@@ -70,6 +70,6 @@ def _track(path: Path, rig: Rig) -> Track:
         if len(row) < 8:
             raise LogError(f"{where} has {len(row)} columns, but at least 8 are needed; get the file again")
         values = numbers_of(row[1:8], where)
-        turn = upright @ Rotation.from_quat(np.roll(values[3:], -1)).as_matrix() @ axes
+        turn = upright @ rotation_of(np.roll(values[3:], -1), where) @ axes
         poses.append((nanoseconds(row[0], where), upright @ values[:3], Rotation.from_matrix(turn).as_quat()))
     return Track.of(BASE, poses, path)

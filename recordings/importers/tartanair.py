@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import numbers_of, read_bytes, read_rows
+from recordings.importers.files import numbers_of, read_bytes, read_rows, rotation_of
 from recordings.importers.recording import (
     FIRST_STAMP,
     LEFT,
@@ -80,8 +80,7 @@ def _track(path: Path) -> Track:
     poses = []
     for number, (where, row) in enumerate(read_rows(path, 7)):
         values = numbers_of(row[:7], where)
-        body = Rotation.from_quat(values[3:]).as_matrix() if values[3:].any() else np.eye(3)
-        turn = Rotation.from_matrix(_DOWN @ body @ _DOWN @ BODY_FROM_OPTICAL).as_quat()
+        turn = Rotation.from_matrix(_DOWN @ rotation_of(values[3:], where) @ _DOWN @ BODY_FROM_OPTICAL).as_quat()
         poses.append((FIRST_STAMP + number * PERIOD_NS, _DOWN @ values[:3], turn))
     return Track.of(LEFT, poses, path)
 

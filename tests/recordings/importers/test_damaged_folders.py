@@ -15,6 +15,8 @@ def turned(content: bytes) -> bytes:
 
 CASES = {
     "a mirror as a rotation": ("drive", "calib_velo_to_cam.txt", turned, "no rotation"),
+    "a quaternion of zeros": (
+        "tartanair", "P0/pose_left.txt", lambda content: b"0 0 0 0 0 0 0\n" + content, "line 1 has a quaternion"),
     "a number without a float": (
         "sequence", "rig.yaml", lambda content: content + b"roll: " + b"9" * 400, "too large"),
     "a mirror as a pose": ("sequence", "poses/05.txt", lambda _: b"-1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "no rotation"),
