@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from itertools import chain, count, groupby
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import cv2
@@ -20,6 +21,7 @@ import numpy as np
 
 from recordings.atomic_write import written
 from recordings.errors import LogError, sentence_of
+from recordings.export.georeference import Georeference
 from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM_WIDTH, STRIP_ROWS, Mosaic
@@ -51,7 +53,12 @@ FRAME = MapTopics("/nav/elevation_map", "/nav/navigation_map")
 
 
 def export(
-    result: Path, out: Path, frames: bool = False, lost: Counter[str] | None = None, maps: Collection[str] = ()
+    result: Path,
+    out: Path,
+    frames: bool = False,
+    lost: Counter[str] | None = None,
+    maps: Collection[str] = (),
+    places: Mapping[str, Georeference] = MappingProxyType({}),
 ) -> list[Path]:
     """Write maps of a result log into a folder: GeoTIFF, PNG hillshade, PGM with YAML, PLY.
 
@@ -68,6 +75,8 @@ def export(
     maps
         Streams to write instead of the regional map: an elevation map, a navigation map or one of each on the same
         grid. Maps in frame `level` are written for every frame.
+    places
+        Frame of reference -> where it is; GeoTIFF and hillshade of regional maps in it are placed there.
 
     Returns
     -------
@@ -93,7 +102,7 @@ def export(
     poses = [] if maps else write_tum(result, out / "poses.tum", lost)
     if frames:
         return _export_frames(result, out, lost, topics, points=not maps) + poses
-    return _export_region(result, out, lost, topics) + poses
+    return _export_region(result, out, lost, topics, places) + poses
 
 
 def _topics_of(result: Path, maps: Collection[str]) -> MapTopics:
@@ -150,6 +159,7 @@ class MapFiles:
     navigation: Mosaic | None = None
     colors: Tiles = field(default_factory=lambda: Tiles(CELL_COLOR))
     stamp: int = 0
+    place: Georeference | None = None
 
     def add(self, result: Path, topics: MapTopics, stamp: int, frame: dict[str, Any]) -> None:
         """Add the maps of a frame."""
@@ -185,22 +195,26 @@ class MapFiles:
             about = _about(terrain.frame_id, time, self.stamp)
             names = file_names([*terrain.fills, _ALL])
             for layer in terrain.fills:
-                files.append(_write(folder / f"{names[layer]}.tif", write_geotiff, terrain, [layer], about))
-            files.append(_write(folder / f"{names[_ALL]}.tif", write_geotiff, terrain, list(terrain.fills), about))
+                files.append(_write(folder / f"{names[layer]}.tif", write_geotiff, terrain, [layer], about, self.place))
+            every = list(terrain.fills), about, self.place
+            files.append(_write(folder / f"{names[_ALL]}.tif", write_geotiff, terrain, *every))
             files.append(_write(folder / "hillshade.png", _write_hillshade, terrain))
-            files.append(_write(folder / "hillshade.pgw", _write_world_file, terrain))
+            files.append(_write(folder / "hillshade.pgw", _write_world_file, terrain, self.place))
         if self.navigation is not None:
             files.append(_write(folder / "navigation_map.pgm", write_pgm, self.navigation, "cells"))
             files.append(_write(folder / "navigation_map.yaml", write_yaml, "navigation_map.pgm", self.navigation))
         return files
 
 
-def _export_region(result: Path, out: Path, lost: Counter[str] | None, topics: MapTopics) -> list[Path]:
+def _export_region(
+    result: Path, out: Path, lost: Counter[str] | None, topics: MapTopics, places: Mapping[str, Georeference]
+) -> list[Path]:
     """The regional map in `out`; if it was reset, a folder in `out` for each frame of reference."""
     known = regions_of(result, lost, topics)
     folders = {next(iter(known)): ""} if len(known) == 1 else file_names(known)
     files = []
     for name, region in known.items():
+        region.place = places.get(name)
         files += region.write(out / folders[name], "up to")
         if region.elevation is not None:
             about = _about(name, "up to", region.stamp)
@@ -311,8 +325,11 @@ def _write_hillshade(path: Path, terrain: Mosaic) -> None:
     path.write_bytes(blob.tobytes())
 
 
-def _write_world_file(path: Path, terrain: Mosaic) -> None:
-    """Six lines: cell sizes, and the centre of the upper left cell."""
+def _write_world_file(path: Path, terrain: Mosaic, place: Georeference | None) -> None:
+    """Six lines: the steps from a cell to the next one and to the next row, and the centre of the upper left cell."""
     (x, y), step, rows = terrain.origin, terrain.resolution, terrain.shape[0]
     lines = (step, 0.0, 0.0, -step, x + step / 2, y + (rows - 0.5) * step)
+    if place is not None:
+        a, b, _, east, d, e, _, north, *_ = place.matrix(step, *lines[4:])
+        lines = (a, d, b, e, east, north)
     path.write_text("".join(f"{value:.9f}\n" for value in lines))

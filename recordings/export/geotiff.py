@@ -1,44 +1,48 @@
 """GeoTIFF: layers of a map as bands of float32, first row northmost (largest y), NaN where nothing is known.
 
-The frame of reference is a local one, in metres: the citation names it, and there is no projection. Cells are areas, so
-the tie point is the upper left corner of the first cell.
+The frame of reference is a local one, in metres: the citation names it. A georeference turns and shifts it into a zone
+of UTM, without resampling. Cells are areas, so the tie point is the upper left corner of the first cell.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 import tifffile
 
+from recordings.export.georeference import Georeference
 from recordings.export.layer_units import unit_and_meaning
 from recordings.export.mosaic import Mosaic
 from stages.data import Array
 
 TILE_CELLS = 256  # the unit that a reader decompresses
 # TIFF tags and GeoTIFF keys (OGC 19-008r4), and GDAL's own tags for what bands contain and for no data
-PIXEL_SCALE, TIE_POINT, GEO_KEYS, GEO_TEXT, BANDS, NO_DATA = 33550, 33922, 34735, 34737, 42112, 42113
-MODEL_TYPE, RASTER_TYPE, CITATION, LINEAR_UNITS = 1024, 1025, 1026, 3076
-USER_DEFINED, PIXEL_IS_AREA, METRE = 32767, 1, 9001
+PIXEL_SCALE, TIE_POINT, TRANSFORMATION, GEO_KEYS, GEO_TEXT, BANDS, NO_DATA = (
+    33550, 33922, 34264, 34735, 34737, 42112, 42113
+)  # fmt: skip
+MODEL_TYPE, RASTER_TYPE, CITATION, PROJECTED_CRS, LINEAR_UNITS = 1024, 1025, 1026, 3072, 3076
+USER_DEFINED, PROJECTED, PIXEL_IS_AREA, METRE = 32767, 1, 1, 9001
 DOUBLE, SHORT, ASCII = 12, 3, 2
 
 
-def write_geotiff(path: Path, mosaic: Mosaic, layers: Sequence[str], citation: str) -> None:
+def write_geotiff(
+    path: Path, mosaic: Mosaic, layers: Sequence[str], citation: str, place: Georeference | None = None
+) -> None:
     """Write layers of a map, a band each, with their units; citation: frame of reference and time, ASCII."""
     rows, cols = mosaic.shape
-    left, bottom = mosaic.origin
     text = citation.encode("ascii", "replace").decode() + "|"
     keys = [
-        1, 1, 0, 4,
-        MODEL_TYPE, 0, 1, USER_DEFINED,
+        1, 1, 0, 4 if place is None else 5,
+        MODEL_TYPE, 0, 1, USER_DEFINED if place is None else PROJECTED,
         RASTER_TYPE, 0, 1, PIXEL_IS_AREA,
         CITATION, GEO_TEXT, len(text), 0,
+        *([] if place is None else [PROJECTED_CRS, 0, 1, place.epsg]),
         LINEAR_UNITS, 0, 1, METRE,
     ]  # fmt: skip
-    scale = (mosaic.resolution, mosaic.resolution, 0.0)
-    corner = (0.0, 0.0, 0.0, left, bottom + rows * mosaic.resolution, 0.0)
     bands = _bands(layers)
     tiles = (tile for layer in layers for tile in _tiles(mosaic, layer))
     several = len(layers) > 1
@@ -49,11 +53,20 @@ def write_geotiff(path: Path, mosaic: Mosaic, layers: Sequence[str], citation: s
         metadata=None, software="roverflow",
         planarconfig="separate" if several else None,
         extratags=[
-            (PIXEL_SCALE, DOUBLE, 3, scale, True), (TIE_POINT, DOUBLE, 6, corner, True),
+            *_placement(mosaic, place),
             (GEO_KEYS, SHORT, len(keys), keys, True), (GEO_TEXT, ASCII, len(text) + 1, text, True),
             (BANDS, ASCII, len(bands) + 1, bands, True), (NO_DATA, ASCII, 4, "nan", True),
         ],
     )  # fmt: skip
+
+
+def _placement(mosaic: Mosaic, place: Georeference | None) -> list[tuple[Any, ...]]:
+    """The tags that lead from a pixel to its place."""
+    left, top = mosaic.origin[0], mosaic.origin[1] + mosaic.shape[0] * mosaic.resolution
+    if place is not None:
+        return [(TRANSFORMATION, DOUBLE, 16, place.matrix(mosaic.resolution, left, top), True)]
+    scale = (mosaic.resolution, mosaic.resolution, 0.0)
+    return [(PIXEL_SCALE, DOUBLE, 3, scale, True), (TIE_POINT, DOUBLE, 6, (0.0, 0.0, 0.0, left, top, 0.0), True)]
 
 
 def _bands(layers: Sequence[str]) -> bytes:

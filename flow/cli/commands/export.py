@@ -6,11 +6,15 @@ import argparse
 import shutil
 from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flow.cli.report import say
 from flow.contracts import counted
 from flow.errors import COMPLETE, INCOMPLETE, UsageError
 from recordings.atomic_write import writing
+
+if TYPE_CHECKING:
+    from recordings.export.georeference import Georeference
 
 HELP = "maps of a result log as GeoTIFF, PGM with YAML (map_server), PLY and PNG"
 
@@ -24,6 +28,9 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         "--map", action="append", default=[], metavar="STREAM", dest="maps",
         help="an elevation or navigation map of the pipeline by its stream's name, not the regional one",
     )  # fmt: skip
+    sub.add_argument("--crs", metavar="CRS", help="place the regional map by GNSS fixes: utm, or a zone as EPSG:32633")
+    fixes = "log with the fixes (the result itself, or its input beside it)"
+    sub.add_argument("--fixes", type=Path, metavar="LOG", help=fixes)
     one_map = "merge the regional maps of several logs, whose poses are in one frame, into one"
     sub.add_argument("--merge", action="store_true", help=one_map)
 
@@ -58,7 +65,8 @@ def _written(options: argparse.Namespace, results: list[Path], lost: Counter[str
     if not options.merge:
         from recordings.export.bundle import export
 
-        return export(results[0], options.folder, options.frames, lost, options.maps), 0
+        places = _places(options, results[0])
+        return export(results[0], options.folder, options.frames, lost, options.maps, places), 0
     from recordings.export.merge import merge
 
     merged = merge(results, options.folder, lost)
@@ -66,6 +74,23 @@ def _written(options: argparse.Namespace, results: list[Path], lost: Counter[str
     for fault, sentence in found:
         say(f"{'WARNING: ' if fault else ''}{sentence}")
     return merged.files, sum(fault for fault, _ in found)
+
+
+def _places(options: argparse.Namespace, result: Path) -> dict[str, Georeference]:
+    """The place of each frame of reference, if it is wanted."""
+    if options.crs is None:
+        return {}
+    from recordings.export.georeference import georeferences
+    from recordings.scoring.result_log import about_run
+
+    if options.frames:
+        raise UsageError("--crs places regional maps; leave out --frames")
+    beside = result.with_name(about_run(result).get("log") or result.name)
+    logs = [options.fixes] if options.fixes else [result, *([beside] if beside.exists() else [])]
+    places = georeferences(result, logs, options.crs)
+    for name, place in places.items():
+        say(place.sentence(name))
+    return places
 
 
 def _results(options: argparse.Namespace) -> list[Path]:
