@@ -12,8 +12,8 @@ from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
 from recordings.source.cameras import CAMERAS, CalibrationTopic
 from recordings.source.topics import DecodedTopics
-from recordings.source.transforms import TransformTree
-from stages.data import Array, CameraModel, Transform
+from recordings.source.transforms import TransformTree, rigid
+from stages.data import CameraModel
 
 INCLINOMETER = "inclinometer"  # the frame of a tilt whose messages name none
 
@@ -46,13 +46,9 @@ def _join(calibration: StereoCalibration, frames: list[str], inclinometer: str, 
     """Add the transforms of the files to a tree."""
     left, right = frames
     if calibration.right_in_left is not None:
-        tree.join(_transform(left, right, calibration.right_in_left))
+        tree.join(rigid(left, right, calibration.right_in_left))
     if calibration.camera_from_imu is not None:
-        tree.join(_transform(left, inclinometer, calibration.camera_from_imu))
-
-
-def _transform(parent: str, child: str, matrix: Array) -> Transform:
-    return Transform(parent, child, matrix[:3, :3], matrix[:3, 3])
+        tree.join(rigid(left, inclinometer, calibration.camera_from_imu))
 
 
 def _sized(model: CameraModel, messages: DecodedTopics, topic: str) -> CameraModel:

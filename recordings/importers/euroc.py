@@ -24,13 +24,13 @@ from recordings.importers.recording import (
     ImagePair,
     ImportedRecording,
     Logged,
-    between,
     common_size,
     raw_models,
 )
 from recordings.importers.rig import Rig
 from recordings.importers.track import Track
 from recordings.ros2.to_msg import raw_imu
+from recordings.source.transforms import rigid
 
 # Relative to mav0. Position, then quaternion w, x, y, z, of the body in a world with z up.
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt")
@@ -54,7 +54,7 @@ def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> Impo
     if calibrated.camera_from_imu is None or calibrated.right_in_left is None:
         raise LogError(f"{calibration[0]} lacks the transform between Imu and camera; give the file of imu and cameras")
     camera_from_imu = calibrated.camera_from_imu @ _imu_in_body(folder / "imu0" / "sensor.yaml")
-    mounts = [between(LEFT, RIGHT, calibrated.right_in_left), between(LEFT, IMU, camera_from_imu)]
+    mounts = [rigid(LEFT, RIGHT, calibrated.right_in_left), rigid(LEFT, IMU, camera_from_imu)]
     pairs = _pairs(folder, left, right, notes)
     truth = next((path for name in TRUTHS if (path := folder / name / "data.csv").exists()), None)
     return ImportedRecording(

@@ -18,7 +18,7 @@ from recordings.ros2.image_from_msg import stated_size, unpacked_pixels
 from stages.data import Array
 
 ENCODED = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg"}  # first bytes of the files that a log contains unchanged
-MAX_ROUNDING = 0.01  # of the products of a rotation's axes; some files have two digits
+MAX_ROUNDING = 0.01  # of the length of a quaternion
 _TIME = re.compile(r"(\d{4})[-_](\d\d)[-_](\d\d)[ T_](\d\d)[:_](\d\d)[:_](\d\d)(?:[._](\d{1,9}))?(Z|[-+]\d\d:?\d\d)?$")
 
 
@@ -64,13 +64,6 @@ def numbers_of(values: list[str], where: str) -> Array:
     if not np.isfinite(found).all():
         raise LogError(f"{where} contains a number that is not finite; get the file again")
     return found
-
-
-def orthonormal(matrix: Array, where: str) -> Array:
-    """The rotation (3, 3) that a matrix of rounded numbers stands for. Raises LogError if it stands for none."""
-    if not np.abs(matrix @ matrix.T - np.eye(3)).max() <= MAX_ROUNDING or np.linalg.det(matrix) < 0:
-        raise LogError(f"{where} contains no rotation: its axes are not orthonormal; get the file again")
-    return np.asarray(Rotation.from_matrix(matrix).as_matrix())
 
 
 def rotation_of(quaternion: Array, where: str) -> Array:

@@ -30,7 +30,6 @@ from recordings.importers.recording import (
     ImagePair,
     ImportedRecording,
     Logged,
-    between,
     common_size,
     fix,
     raw_models,
@@ -38,6 +37,7 @@ from recordings.importers.recording import (
 from recordings.importers.rig import MOUNT, Rig
 from recordings.importers.track import upright
 from recordings.ros2.to_msg import imu, raw_imu
+from recordings.source.transforms import rigid
 from stages.data import Array, CameraModel, Transform
 
 GPS = "gps_link"
@@ -68,7 +68,7 @@ def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> Impor
         CAMERA_ON_IMU.inverse(), GPS_ON_IMU,
     ]  # fmt: skip
     if calibrated.right_in_left is not None:  # else the projections contain the baseline
-        mounts.append(between(LEFT, RIGHT, calibrated.right_in_left))
+        mounts.append(rigid(LEFT, RIGHT, calibrated.right_in_left))
     return ImportedRecording(
         raw_models(calibrated, size), False, pairs, [mount for mount in mounts if mount is not None],
         [_sensors(source / "imu.txt"), _places(source / "gps-utm31.txt", notes)], notes=notes,

@@ -27,7 +27,6 @@ from recordings.importers.recording import (
     ImportedRecording,
     Logged,
     beside,
-    between,
     common_size,
     fix,
     rectified_models,
@@ -35,6 +34,7 @@ from recordings.importers.recording import (
 from recordings.importers.rig import Rig
 from recordings.importers.track import Track, mercator
 from recordings.ros2.to_msg import imu
+from recordings.source.transforms import rigid
 from stages.data import Array, CameraModel, Transform
 
 IMU_HEIGHT = 0.93  # m above the road, by KITTI's description of its car
@@ -63,7 +63,7 @@ def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording
     rectified = size == tuple(_entry(cameras, f"S_rect_{left}", 2).astype(int))
     read = _rectified if rectified else _raw
     models, right_in_left, left_from_first = read(cameras, left, right)
-    to_imu = between(LEFT, IMU, left_from_first @ camera_from_imu)
+    to_imu = rigid(LEFT, IMU, left_from_first @ camera_from_imu)
     base = rig.mount
     if base is None:
         base = Transform(BASE, IMU, np.eye(3), np.array([0.0, 0.0, IMU_HEIGHT])).after(to_imu.inverse())
@@ -129,7 +129,7 @@ def _raw(values: dict[str, Array], left: str, right: str) -> tuple[Any, Transfor
         p, d = np.column_stack([k, np.zeros(3)]), _entry(values, f"D_{number}", 5)
         models.append(CameraModel(int(width), int(height), k=k, d=d, r=np.eye(3), p=p))
     first, second = (_rigid(values, f"R_{number}", f"T_{number}") for number in (left, right))
-    return tuple(models), between(LEFT, RIGHT, first @ np.linalg.inv(second)), first
+    return tuple(models), rigid(LEFT, RIGHT, first @ np.linalg.inv(second)), first
 
 
 def _readings(oxts: Path) -> tuple[list[int], Array]:

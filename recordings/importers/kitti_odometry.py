@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import from_seconds, numbers_of, orthonormal, read_lines
+from recordings.importers.files import from_seconds, numbers_of, read_lines
 from recordings.importers.recording import (
     BASE,
     FIRST_STAMP,
@@ -30,6 +30,7 @@ from recordings.importers.recording import (
 from recordings.importers.rig import Rig
 from recordings.importers.track import Track
 from recordings.ros2.to_msg import imu
+from recordings.source.transforms import orthonormal
 from stages.data import Array, StereoCamera, Transform
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from flow.contracts import counted
 from recordings.calibration.formats import StereoCalibration
 from recordings.errors import LogError
-from recordings.importers.files import encoding_of, image_size, orthonormal, read_bytes, read_pixels
+from recordings.importers.files import encoding_of, image_size, read_bytes, read_pixels
 from recordings.importers.track import WORLD, Track, upright
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
@@ -200,12 +200,6 @@ def _completed(model: CameraModel, size: tuple[int, int]) -> CameraModel:
     p = model.p if np.any(model.p) else np.column_stack([model.k, np.zeros(3)])
     width, height = (model.width, model.height) if model.width and model.height else size
     return replace(model, p=p, width=width, height=height)
-
-
-def between(parent: str, child: str, matrix: Any) -> Transform:
-    """The transform of a (4, 4) matrix, its rotation made orthonormal. Raises LogError."""
-    whole = np.asarray(matrix)
-    return Transform(parent, child, orthonormal(whole[:3, :3], f"the matrix from {child} to {parent}"), whole[:3, 3])
 
 
 def beside(camera: StereoCamera) -> Transform:

@@ -1,16 +1,19 @@
 """The code of README and docs runs as it stands."""
 
 import importlib
+import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from flow.contracts import Severity
-from recordings.simulator import Simulation
+from recordings.simulator import Simulation, write_log
 from stages import ElevationMap, NavigationMap
+from tests.conftest import roverflow
 from tests.docs import pages
 
 
@@ -54,6 +57,29 @@ def test_two_images_become_a_picture_of_the_terrain(tmp_path):
     )  # fmt: skip
     assert int(done.stdout.split()[0]) > 4000
     assert cv2.imread(str(tmp_path / "dem.png")).shape == (240, 240, 3)
+
+
+def test_the_notebook_finds_a_hazards_pixels(tmp_path, monkeypatch, capsys):
+    notebook = json.loads((pages.ROOT / "docs" / "examples" / "debugging.ipynb").read_text())
+    assert not any(cell.get("outputs") for cell in notebook["cells"])
+    write_log(Simulation(scene="gravel", frames=3, width=320, height=240), tmp_path / "drive.mcap")
+    monkeypatch.chdir(tmp_path)
+    assert roverflow("run", "drive.mcap", "--set", "disparities=96", "--no-rrd") == 0
+    shown = list[bytes]()
+    stub = SimpleNamespace(Image=lambda data: data, display=shown.append)
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(display=stub))
+    monkeypatch.setitem(sys.modules, "IPython.display", stub)
+    capsys.readouterr()
+    names: dict[str, object] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    said = capsys.readouterr().out
+    assert "hazard cells at" in said
+    assert "HAZARD by" in said
+    assert "limit" in said
+    assert len(shown) == 3
+    assert all(picture.startswith(b"\x89PNG") for picture in shown)
 
 
 def test_flow_runs_without_a_rover(tmp_path):

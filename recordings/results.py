@@ -1,0 +1,112 @@
+"""Reads a result log as data types, frame by frame: for notebooks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recordings.errors import LogError
+from recordings.mcap.file import McapFile, iter_decoded
+from recordings.ros2 import from_msg as ros2
+from recordings.scoring.result_log import about_run, check_profile
+from stages.data import Disparity
+
+
+@dataclass(frozen=True, eq=False)
+class ResultFrame:
+    """What a result log contains at one stamp.
+
+    Attributes
+    ----------
+    stamp : int
+        Nanoseconds.
+    items : dict
+        Stream -> `Disparity`, `ElevationMap`, `NavigationMap` or `Pose`; of a cloud its fields, name -> (N,) array.
+    """
+
+    stamp: int
+    items: Mapping[str, Any]
+
+
+def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[ResultFrame]:
+    """The frames of a result log, in their order.
+
+    Parameters
+    ----------
+    path : Path
+        A log that `roverflow run` wrote.
+    streams : collection of str, optional
+        Names such as "elevation_map" or "pose"; all by default.
+
+    Yields
+    ------
+    ResultFrame
+        A log keeps no confidence, so that of disparities is NaN. Regional maps come once a step of the rover.
+
+    Raises
+    ------
+    LogError
+        If the log is no result log or damaged, or has no such stream.
+
+    Examples
+    --------
+    >>> from recordings.results import read_result
+    >>> for frame in read_result("out.mcap", ["navigation_map"]):  # doctest: +SKIP
+    ...     print(frame.stamp, (frame.items["navigation_map"].cells == 100).sum())
+    """
+    path = Path(path)
+    about = about_run(path)
+    if not about:
+        raise LogError(f"{path} is not a result log; give a log that roverflow run wrote")
+    check_profile(path, about)
+    with McapFile(path) as log:
+        schemas = {channel.topic: getattr(channel.schema, "name", "") for channel in log.channels.values()}
+    known = {
+        topic.removeprefix("/nav/"): topic
+        for topic, schema in sorted(schemas.items())
+        if topic.startswith("/nav/") and schema in (*_JOINED, *_READERS) and not topic.endswith("/reason")
+    }
+    if missing := sorted(set(streams) - known.keys()):
+        raise LogError(f"{path} has no stream '{missing[0]}', only {', '.join(known)}")
+    chosen = {known[name] for name in streams or known}
+    parts = {f"{topic}/{part}" for topic in chosen for part, _ in _JOINED.values()} & schemas.keys()
+    for stamp, group in groupby(iter_decoded(path, sorted(chosen | parts)), key=lambda item: item[1]):
+        messages = {topic: message for topic, _, message in group}
+        yield ResultFrame(stamp, dict(_items(messages, chosen, schemas)))
+
+
+def _items(
+    messages: Mapping[str, Any], chosen: Collection[str], schemas: Mapping[str, str]
+) -> Iterator[tuple[str, Any]]:
+    """(Stream, item) of the messages of a stamp."""
+    for topic in sorted(messages.keys() & set(chosen)):
+        message, name, schema = messages[topic], topic.removeprefix("/nav/"), schemas[topic]
+        if schema in _JOINED:
+            part, read = _JOINED[schema]
+            yield name, read(message, messages.get(f"{topic}/{part}"))
+        else:
+            yield name, _READERS[schema](message)
+
+
+def _disparity(message: Any, origins: Any) -> Disparity:
+    pixels = ros2.read_disparity(message)
+    unstated = np.full(pixels.shape, np.nan, np.float32)
+    source = np.isfinite(pixels).astype(np.uint8) if origins is None else np.asarray(origins.data).reshape(pixels.shape)
+    return Disparity(ros2.stamp_of(message.header), pixels, source, unstated)
+
+
+# Schema -> the part of the topic that belongs to its messages, and what reads both
+_JOINED: dict[str, tuple[str, Callable[[Any, Any], Any]]] = {
+    "stereo_msgs/msg/DisparityImage": ("source", _disparity),
+    "nav_msgs/msg/OccupancyGrid": ("reason", ros2.read_occupancy_grid),
+}
+_READERS: dict[str, Callable[[Any], Any]] = {
+    "grid_map_msgs/msg/GridMap": ros2.read_grid_map,
+    "nav_msgs/msg/Odometry": lambda message: ros2.pose_of(message, 0, "base_link"),
+    "sensor_msgs/msg/PointCloud2": ros2.read_point_cloud,
+}

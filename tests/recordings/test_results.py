@@ -1,0 +1,36 @@
+"""A result log is read back as the data types that the run made."""
+
+import numpy as np
+import pytest
+
+from recordings.errors import LogError
+from recordings.results import read_result
+from stages.data import Disparity, ElevationMap, NavigationMap, PixelOrigin, Pose, known
+
+
+def test_each_stream_is_read_as_its_type(result):
+    frames = list(read_result(result))
+    assert len(frames) == 4
+    assert [frame.stamp for frame in frames] == sorted(frame.stamp for frame in frames)
+    items = frames[-1].items
+    kinds = {"disparity": Disparity, "elevation_map": ElevationMap, "navigation_map": NavigationMap, "pose": Pose,
+             "regional_map": ElevationMap, "regional_navigation_map": NavigationMap, "points": dict}  # fmt: skip
+    assert {name: type(items[name]) for name in kinds} == kinds
+    assert all(item.stamp == frames[-1].stamp for item in items.values() if not isinstance(item, dict))
+
+
+def test_disparities_have_their_origins_and_maps_their_reasons(result):
+    frame = next(read_result(result, ["disparity", "navigation_map"]))
+    disparity, navigation = frame.items["disparity"], frame.items["navigation_map"]
+    assert set(frame.items) == {"disparity", "navigation_map"}
+    np.testing.assert_array_equal(np.isfinite(disparity.pixels), known(disparity.source))
+    assert (disparity.source == PixelOrigin.OUT_OF_VIEW).any()
+    assert np.isnan(disparity.confidence).all()
+    assert len(np.unique(navigation.reason)) > 3
+
+
+def test_other_logs_and_unknown_streams_are_refused(result, traverse):
+    with pytest.raises(LogError, match="is not a result log"):
+        next(read_result(traverse))
+    with pytest.raises(LogError, match="no stream 'depth', only disparity, "):
+        next(read_result(result, ["depth"]))
