@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from flow.cli.explanation import why
+from flow.cli.regional_explanation import why_regional
 from flow.cli.what_if import part_of
 from recordings import McapSource
 from recordings.mcap.file import iter_decoded
-from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
+from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from stages.data import Cell
 from tests.conftest import SMALL, roverflow
 
@@ -97,3 +98,25 @@ def test_what_cannot_be_explained_is_refused(traverse, fast_result, capsys):
     assert "is outside the image of 320x240" in refusal("--pixel", "999,1", "--log", traverse)
     other = refusal("--cell", "1,1", "--log", traverse, "--map", "nix")
     assert "no navigation map 'nix', only navigation_map, regional_navigation_map" in other
+
+
+def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, capsys):
+    grids = messages(fast_result, "/nav/regional_navigation_map")
+    end, grid = max(grids), read_occupancy_grid(grids[max(grids)])
+    layers = read_grid_map(messages(fast_result, "/nav/regional_map")[end]).layers
+    seen = np.where(grid.cells == Cell.FREE, layers["count"], np.nan)
+    row, col = np.unravel_index(np.nanargmax(seen), seen.shape)
+    x, y = ((place + 0.5) * grid.resolution + start for place, start in zip((col, row), grid.origin, strict=True))
+    late = ("--at", 60, f"--cell={x},{y}", "--map", "regional_navigation_map", "--log", traverse)
+    assert roverflow("why", fast_result, *late) == 0
+    said = capsys.readouterr().out
+    assert f"cell ({x:.3f}, {y:.3f}) m in 'odom', map of {end} ns: free, reason clear" in said
+    found = why_regional(fast_result, 60, (x, y), log=traverse)
+    assert found.layers["frames"] == len(found.frames) == 4
+    assert all(abs(frame.height - found.layers["elevation"]) < 0.05 for frame in found.frames)
+    assert said.count(" points, height ") == 4
+    assert len(why_regional(fast_result, 0, (x, y), log=traverse).frames) == 1
+    assert roverflow("why", fast_result, *late[:2], "--pixel", "9,9", *late[3:]) == 2
+    assert "is a regional map: give --cell" in capsys.readouterr().err
+    assert roverflow("why", fast_result, *late[:2], "--cell", "999,1", *late[3:]) == 2
+    assert "outside the regional map in 'odom'" in capsys.readouterr().err

@@ -146,7 +146,7 @@ def why(
     if cloud is None:
         raise UsageError(f"the frame has no points in frame '{navigation.frame_id}', so nothing leads to the pixels")
     x, y = cell if cell is not None else _place(cloud, pixel)
-    place = _index(navigation, x, y)
+    place = index_of(navigation, x, y)
     if place is None:
         raise UsageError(f"({x:g}, {y:g}) is outside the map, which has {_extent(navigation)}")
     x, y = (navigation.origin[axis] + (place[1 - axis] + 0.5) * navigation.resolution for axis in (0, 1))
@@ -188,8 +188,22 @@ def instant(result: Path, at: float, log: Path | None = None) -> tuple[Mapping[s
     UsageError
         If the input log is not there, or no frame goes through.
     """
-    from recordings.scoring.result_log import about_run, pipeline_of
     from stages.kernel_loading import loading_kernels
+
+    graph, given = graph_of(result, log)
+    with graph.source.open(given) as opened:
+        part = part_of(opened, at, frames=1, before=0)
+    kept = _Keep()
+    with loading_kernels(), graph.source.open(given, start=part.start, end=part.end) as opened, one_thread_per_call():
+        run(replace(graph, sinks=(("keep", kept),)), opened, {"keep": Path("memory")})
+    if not kept.records:
+        raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.start:.3f} says why")
+    return kept.records[0].items, graph
+
+
+def graph_of(result: Path, log: Path | None = None) -> tuple[Graph, Path]:
+    """The pipeline of a result log as it ran, without its sinks, and its input. Raises UsageError."""
+    from recordings.scoring.result_log import about_run, pipeline_of
 
     about = about_run(result)
     if not about:
@@ -200,15 +214,7 @@ def instant(result: Path, at: float, log: Path | None = None) -> tuple[Mapping[s
     with TemporaryDirectory(prefix="roverflow-why-") as folder:
         file = Path(folder) / f"{pipeline_of(result)}.yaml"
         file.write_text(about["pipeline"], encoding="utf-8")
-        graph = load(str(file), about["overrides"].splitlines(), with_sinks=False)
-    with graph.source.open(given) as opened:
-        part = part_of(opened, at, frames=1, before=0)
-    kept = _Keep()
-    with loading_kernels(), graph.source.open(given, start=part.start, end=part.end) as opened, one_thread_per_call():
-        run(replace(graph, sinks=(("keep", kept),)), opened, {"keep": Path("memory")})
-    if not kept.records:
-        raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.start:.3f} says why")
-    return kept.records[0].items, graph
+        return load(str(file), about["overrides"].splitlines(), with_sinks=False), given
 
 
 @dataclass
@@ -257,7 +263,7 @@ def _place(cloud: PointCloud, pixel: tuple[int, int] | None) -> tuple[float, flo
     return float(cloud.points[nearest, 0]), float(cloud.points[nearest, 1])
 
 
-def _index(navigation: NavigationMap, x: float, y: float) -> tuple[int, int] | None:
+def index_of(navigation: NavigationMap, x: float, y: float) -> tuple[int, int] | None:
     """Row and column of the cell at (x, y); None outside the map."""
     offsets = (y - navigation.origin[1], x - navigation.origin[0])
     row, col = (math.floor(offset / navigation.resolution) for offset in offsets)
@@ -285,6 +291,6 @@ def _recorded(result: Path, stream: str, stamp: int, x: float, y: float) -> Cell
     for _, time, message in iter_decoded(result, [f"/nav/{stream}"]):
         if time == stamp:
             navigation = read_occupancy_grid(message)
-            place = _index(navigation, x, y)
+            place = index_of(navigation, x, y)
             return None if place is None else Cell(int(navigation.cells[place]))
     return None

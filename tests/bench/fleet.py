@@ -19,7 +19,7 @@ from flow.cli.fleet.catalogue import Catalogue
 from recordings.simulator import Simulation, write_log
 
 LOGS, FEW = 12, 4
-SETTINGS = ("-p", "rover", "--set", "disparities=64", "--workers-per-log", "1")
+SETTINGS = ("-p", "rover", "--set", "disparities=96", "--workers-per-log", "1")
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
         logs = Path(folder) / "logs"
         logs.mkdir()
         for number in range(LOGS):
-            simulation = Simulation(frames=4 + 3 * number, width=320, height=240, seed=number)
+            simulation = Simulation(frames=6 + 4 * number, width=640, height=480, seed=number)
             write_log(simulation, logs / f"log{number:02d}.mcap")
         every, few = sorted(logs.iterdir()), sorted(logs.iterdir())[:FEW]
         _fleet(few, Path(folder) / "warm", 1)  # fills the cache of kernels
@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
 def _print(one: Fleet, two: Fleet, few: Fleet) -> None:
     beside = {fleet: fleet.seconds - fleet.runs for fleet in (one, few)}
     overhead = (beside[one] - beside[few]) / (LOGS - FEW)
-    print(f"\nfleet of {LOGS} logs of 4 to {4 + 3 * (LOGS - 1)} frames, 320x240, rover, one thread a log")
+    print(f"\nfleet of {LOGS} logs of 6 to {6 + 4 * (LOGS - 1)} frames, 640x480, rover, one thread a log")
     for name, value in {
         "one process, s": one.seconds,
         "two processes, s": two.seconds,

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 from flow.cli.arguments import pair, seconds
 from flow.cli.outputs import check_outputs
 from flow.cli.report import say
-from flow.errors import COMPLETE
+from flow.errors import COMPLETE, UsageError
 
 if TYPE_CHECKING:
     from flow.cli.explanation import Explanation
+    from flow.cli.regional_explanation import RegionalExplanation
 
 HELP = "explain a cell of a navigation map: its pixels, its limits, and what would turn its verdict"
 MAX_TURNS = 5  # changes of parameters that are listed
@@ -39,6 +40,8 @@ def run(options: argparse.Namespace) -> int:
     from flow.cli.explanation import why
     from recordings.comparison.marked_pixels import write_marked
 
+    if _is_regional(options.result, options.map):
+        return _regional(options)
     pixel = None if options.pixel is None else (round(options.pixel[0]), round(options.pixel[1]))
     found = why(options.result, options.at, cell=options.cell, pixel=pixel, log=options.log, stream=options.map)
     say("\n".join(lines_of(found)))
@@ -49,25 +52,57 @@ def run(options: argparse.Namespace) -> int:
     return COMPLETE
 
 
+def _is_regional(result: Path, stream: str) -> bool:
+    """Whether a navigation map of a result log is in another frame than `level`."""
+    from recordings.mcap.file import iter_decoded
+    from stages.data import LEVEL_FRAME
+
+    first = next(iter_decoded(result, [f"/nav/{stream}"]), None)
+    return first is not None and first[2].header.frame_id != LEVEL_FRAME
+
+
+def _regional(options: argparse.Namespace) -> int:
+    """Print the explanation of a cell of a regional map."""
+    from flow.cli.regional_explanation import why_regional
+
+    if options.cell is None or options.out is not None:
+        raise UsageError(f"'{options.map}' is a regional map: give --cell in its frame; it has no picture of pixels")
+    found = why_regional(options.result, options.at, options.cell, log=options.log, stream=options.map)
+    verdict, reason = found.verdict.name.lower(), found.reason.name.lower()
+    place = f"({found.x:.3f}, {found.y:.3f}) m in '{found.frame_id}'"
+    lines = [f"cell {place}, map of {found.stamp} ns: {verdict}, reason {reason}", *_cell_lines(found)]
+    conflicts = found.layers.get("contradictions", 0.0)
+    more = f"; {conflicts:.0f} contradicted the height" if conflicts > 0 else ""
+    lines.append(f"frames with points in the cell: {len(found.frames)}{more}")
+    lines += [f"  {frame.stamp} ns  {frame.points:4} points, height {frame.height:.3f} m" for frame in found.frames]
+    say("\n".join(lines))
+    return COMPLETE
+
+
 def lines_of(found: Explanation) -> list[str]:
     """The explanation for a terminal."""
     verdict, reason = found.verdict.name.lower(), found.reason.name.lower()
     lines = [f"cell ({found.x:.3f}, {found.y:.3f}) m at {found.stamp} ns: {verdict}, reason {reason}"]
     if found.recorded is not None and found.recorded != found.verdict:
         lines.append(f"the result has {found.recorded.name.lower()} here: from earlier frames, or by another version")
-    layers = found.layers
+    return [*lines, *_cell_lines(found), *_pixel_lines(found), *_tilt_lines(found)]
+
+
+def _cell_lines(found: Explanation | RegionalExplanation) -> list[str]:
+    """Height, limits and turns."""
+    layers, lines = found.layers, list[str]()
     if math.isfinite(layers.get("elevation", math.nan)):
         sigma = f" +- {math.sqrt(layers['variance']):.3f} m" if layers.get("variance", -1.0) >= 0 else ""
         points = f", {layers['count']:.0f} points" if "count" in layers else ""
         lines.append(f"height: {layers['elevation']:.3f} m{sigma}{points}")
     lines.append("limits:")
     lines += [f"  {name:<24} {_against(*values)}" for name, values in found.limits.items()]
-    lines += [
+    turns = [
         f"{turn.verdict.name.lower()} with {turn.parameter} = {_shown(turn.needed, turn.unit)} "
         f"instead of {_shown(turn.now, turn.unit)}"
         for turn in found.turns[:MAX_TURNS]
-    ] or ["no single parameter of the hazard rule turns the verdict"]
-    return [*lines, *_pixel_lines(found), *_tilt_lines(found)]
+    ]
+    return [*lines, *(turns or ["no single parameter of the hazard rule turns the verdict"])]
 
 
 def _pixel_lines(found: Explanation) -> list[str]:

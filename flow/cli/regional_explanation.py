@@ -1,0 +1,174 @@
+"""Why a cell of a regional map has its verdict: the frames that saw it, its layers and limits.
+
+Everything is in the result log, so nothing runs again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flow.cli.explanation import graph_of, index_of
+from flow.errors import UsageError
+from recordings.containers.opening import open_recording
+from recordings.mcap.file import iter_decoded
+from recordings.results import read_result
+from recordings.ros2.from_msg import read_point_cloud, transform_of
+from stages import Binarise
+from stages.data import LEVEL_FRAME, Array, Cell, CellReason, ElevationMap, NavigationMap, Transform
+from stages.terrain.verdict_limits import Turn, limits_at, turns_at
+
+
+class Contribution(NamedTuple):
+    """Points of one frame in a cell: its stamp, ns, their number and their mean height, m."""
+
+    stamp: int
+    points: int
+    height: float
+
+
+@dataclass(frozen=True, eq=False)
+class RegionalExplanation:
+    """What made a cell of a regional map.
+
+    Attributes
+    ----------
+    stamp : int
+        Of the map, ns.
+    x, y : float
+        Centre of the cell, m, in the map's frame.
+    frame_id : str
+        The map's frame.
+    verdict : Cell
+        Free, hazard or unknown.
+    reason : CellReason
+        Why.
+    layers : dict
+        Layer of the regional map -> its value in the cell; NaN is unknown.
+    limits : dict
+        Quantity -> (value, limit, unit): the rule compares value with limit.
+    turns : list of Turn
+        The smallest change of each parameter that would turn the verdict.
+    frames : list of Contribution
+        The frames with points in the cell, up to the map's stamp; the points are the thinned ones of the log.
+    """
+
+    stamp: int
+    x: float
+    y: float
+    frame_id: str
+    verdict: Cell
+    reason: CellReason
+    layers: Mapping[str, float]
+    limits: Mapping[str, tuple[float, float, str]]
+    turns: list[Turn]
+    frames: list[Contribution]
+
+
+def why_regional(
+    result: Path,
+    at: float,
+    cell: tuple[float, float],
+    *,
+    log: Path | None = None,
+    stream: str = "regional_navigation_map",
+) -> RegionalExplanation:
+    """Explain a cell of the first regional map from an instant on, or of the last one.
+
+    Parameters
+    ----------
+    result : Path
+        The result log of a run.
+    at : float
+        Instant, seconds after the first message of the input log.
+    cell : (float, float)
+        x and y in the map's frame, m.
+    log : Path, optional
+        The input log; by default the one that the result names, beside it.
+    stream : str
+        The navigation map.
+
+    Returns
+    -------
+    RegionalExplanation
+        What made the cell.
+
+    Raises
+    ------
+    UsageError
+        If the input log is not there, the result has no such map, or the cell is outside of it.
+    """
+    graph, given = graph_of(result, log)
+    node = next((node for node in graph.nodes if node.name == stream and isinstance(node.actor, Binarise)), None)
+    if node is None:
+        raise UsageError(f"the pipeline of {result} has no navigation map '{stream}'")
+    rule: Any = node.actor
+    with open_recording(given) as recording:
+        stamp = recording.start + round(at * 1e9)
+    navigation, terrain = _maps(result, stamp, stream, node.inputs["elevation"])
+    place = index_of(navigation, *cell)
+    if place is None:
+        raise UsageError(f"({cell[0]:g}, {cell[1]:g}) is outside the regional map in '{navigation.frame_id}'")
+    x, y = (navigation.origin[axis] + (place[1 - axis] + 0.5) * navigation.resolution for axis in (0, 1))
+    return RegionalExplanation(
+        stamp=navigation.stamp,
+        x=round(x, 6),
+        y=round(y, 6),
+        frame_id=navigation.frame_id,
+        verdict=Cell(int(navigation.cells[place])),
+        reason=CellReason(int(navigation.reason[place])),
+        layers={name: float(layer[place]) for name, layer in terrain.layers.items()},
+        limits=limits_at(rule, terrain, *place),
+        turns=turns_at(rule, terrain, *place),
+        frames=_contributions(result, navigation, (x, y)),
+    )
+
+
+def _maps(result: Path, at: int, stream: str, elevation: str) -> tuple[NavigationMap, ElevationMap]:
+    """The maps of the first frame from `at` on that has both, else of the last one."""
+    found = None
+    for frame in read_result(result, [stream, elevation]):
+        if stream in frame.items and elevation in frame.items:
+            found = frame.items[stream], frame.items[elevation]
+            if frame.stamp >= at:
+                break
+    if found is None:
+        raise UsageError(f"{result} has no message with both {stream} and {elevation}")
+    return found
+
+
+def _contributions(result: Path, navigation: NavigationMap, centre: tuple[float, float]) -> list[Contribution]:
+    """The points of each frame up to the map's stamp that lie in a cell."""
+    found = []
+    for stamp, group in groupby(iter_decoded(result, ["/nav/points", "/tf"]), key=lambda item: item[1]):
+        if stamp > navigation.stamp:
+            break
+        messages = {topic: message for topic, _, message in group}
+        level = _level(messages.get("/tf"), navigation.frame_id)
+        if level is None or "/nav/points" not in messages:
+            continue
+        heights = _heights(read_point_cloud(messages["/nav/points"]), level, centre, navigation.resolution)
+        if heights.size:
+            found.append(Contribution(stamp, len(heights), float(heights.mean())))
+    return found
+
+
+def _level(transforms: object, parent: str) -> Transform | None:
+    """Frame `level` in the map's frame."""
+    for item in getattr(transforms, "transforms", ()):
+        if item.child_frame_id == LEVEL_FRAME and item.header.frame_id == parent:
+            return transform_of(item)
+    return None
+
+
+def _heights(fields: Mapping[str, Array], level: Transform, centre: tuple[float, float], resolution: float) -> Array:
+    """The heights, m, of those points (in frame `level`) that lie in a cell of the map."""
+    points = level(np.column_stack([fields[axis] for axis in "xyz"]).astype(np.float64))
+    inside = np.all(np.abs(points[:, :2] - centre) <= resolution / 2, axis=1)
+    return np.asarray(points[inside, 2])
+
