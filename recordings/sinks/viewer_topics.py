@@ -38,7 +38,7 @@ def viewer_messages(items: Mapping[str, Any], written: Mapping[str, Any]) -> Ite
                 yield f"{topic}/points", terrain_points(item, elevation_colors(item))
             case NavigationMap():
                 colors = {code: rgb for code, (_, rgb) in REASON_LEGEND.items()}
-                picture = code_image(item.stamp, "", birds_eye(item.reason), colors)
+                picture = code_image(item.stamp, item.frame_id, birds_eye(item.reason), colors)
                 yield f"{topic}/reason/color/compressed", picture
     frames = [(stream, item) for stream, item in items.items() if isinstance(item, StereoFrame)]
     if frames:
