@@ -29,6 +29,7 @@ from stages.data import (
     Cell,
     CellReason,
     Disparity,
+    ElevationMap,
     NavigationMap,
     PixelOrigin,
     PointCloud,
@@ -41,27 +42,45 @@ REACH_PX = 10.0  # from a pixel to the nearest one that has a point
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
-    """What made a cell.
+class CellExplanation:
+    """The verdict of a cell, and how it follows from the map.
 
     Attributes
     ----------
     stamp : int
-        Of the frame, ns.
+        Of the map, ns.
     x, y : float
         Centre of the cell, m, in the map's frame.
     verdict : Cell
         Free, hazard or unknown.
     reason : CellReason
         Why.
-    recorded : Cell or None
-        The verdict in the result; None where the result does not have the cell.
     layers : dict
         Layer of the elevation map -> its value in the cell; NaN is unknown.
     limits : dict
         Quantity -> (value, limit, unit): the rule compares value with limit.
     turns : list of Turn
         The smallest change of each parameter that would turn the verdict.
+    """
+
+    stamp: int
+    x: float
+    y: float
+    verdict: Cell
+    reason: CellReason
+    layers: Mapping[str, float]
+    limits: Mapping[str, tuple[float, float, str]]
+    turns: list[Turn]
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation(CellExplanation):
+    """What made a cell of one frame's map.
+
+    Attributes
+    ----------
+    recorded : Cell or None
+        The verdict in the result; None where the result does not have the cell.
     pixels : (N,) ndarray
         The points' pixels, as indices into the flattened left image.
     disparities, sigmas : (N,) ndarray
@@ -76,15 +95,7 @@ class Explanation:
         The left image.
     """
 
-    stamp: int
-    x: float
-    y: float
-    verdict: Cell
-    reason: CellReason
     recorded: Cell | None
-    layers: Mapping[str, float]
-    limits: Mapping[str, tuple[float, float, str]]
-    turns: list[Turn]
     pixels: Array
     disparities: Array
     sigmas: Array
@@ -149,24 +160,36 @@ def why(
     place = index_of(navigation, x, y)
     if place is None:
         raise UsageError(f"({x:g}, {y:g}) is outside the map, which has {_extent(navigation)}")
-    x, y = (navigation.origin[axis] + (place[1 - axis] + 0.5) * navigation.resolution for axis in (0, 1))
+    x, y = centre_of(navigation, place)
     inside = _members(cloud, navigation, *place)
     frame, origin = _last(items, StereoFrame), np.zeros(3) if cloud.sensor is None else cloud.sensor.translation
     return Explanation(
-        stamp=navigation.stamp,
-        x=round(x, 6),
-        y=round(y, 6),
-        verdict=Cell(int(navigation.cells[place])),
-        reason=CellReason(int(navigation.reason[place])),
+        **verdict_at(node.actor, navigation, terrain, place),
         recorded=_recorded(result, stream, navigation.stamp, x, y),
-        layers={name: float(layer[place]) for name, layer in terrain.layers.items()},
-        limits=limits_at(node.actor, terrain, *place),
-        turns=turns_at(node.actor, terrain, *place),
         distance=float(np.median(np.linalg.norm(cloud.points[inside] - origin, axis=1))) if inside.any() else math.nan,
         tilt=_last(items, Tilt),
         image=np.zeros((0, 0), np.uint8) if frame is None else frame.left,
         **_pixels(_last(items, Disparity), cloud.pixel[inside]),
     )
+
+
+def verdict_at(
+    rule: Binarise, navigation: NavigationMap, terrain: ElevationMap, place: tuple[int, int]
+) -> dict[str, Any]:
+    """The fields of `CellExplanation` of a cell, by row and column."""
+    x, y = centre_of(navigation, place)
+    return {
+        "stamp": navigation.stamp, "x": round(x, 6), "y": round(y, 6),
+        "verdict": Cell(int(navigation.cells[place])), "reason": CellReason(int(navigation.reason[place])),
+        "layers": {name: float(layer[place]) for name, layer in terrain.layers.items()},
+        "limits": limits_at(rule, terrain, *place), "turns": turns_at(rule, terrain, *place),
+    }  # fmt: skip
+
+
+def centre_of(navigation: NavigationMap, place: tuple[int, int]) -> tuple[float, float]:
+    """x and y, m, of a cell by row and column."""
+    x, y = (navigation.origin[axis] + (place[1 - axis] + 0.5) * navigation.resolution for axis in (0, 1))
+    return x, y
 
 
 def _pixels(disparity: Disparity | None, pixels: Array) -> dict[str, Any]:

@@ -13,15 +13,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flow.cli.explanation import graph_of, index_of
+from flow.cli.explanation import CellExplanation, centre_of, graph_of, index_of, verdict_at
 from flow.errors import UsageError
 from recordings.containers.opening import open_recording
 from recordings.mcap.file import iter_decoded
 from recordings.results import read_result
 from recordings.ros2.from_msg import read_point_cloud, transform_of
 from stages import Binarise
-from stages.data import LEVEL_FRAME, Array, Cell, CellReason, ElevationMap, NavigationMap, Transform
-from stages.terrain.verdict_limits import Turn, limits_at, turns_at
+from stages.data import LEVEL_FRAME, Array, ElevationMap, NavigationMap, Transform
 
 
 class Contribution(NamedTuple):
@@ -33,40 +32,18 @@ class Contribution(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RegionalExplanation:
+class RegionalExplanation(CellExplanation):
     """What made a cell of a regional map.
 
     Attributes
     ----------
-    stamp : int
-        Of the map, ns.
-    x, y : float
-        Centre of the cell, m, in the map's frame.
     frame_id : str
         The map's frame.
-    verdict : Cell
-        Free, hazard or unknown.
-    reason : CellReason
-        Why.
-    layers : dict
-        Layer of the regional map -> its value in the cell; NaN is unknown.
-    limits : dict
-        Quantity -> (value, limit, unit): the rule compares value with limit.
-    turns : list of Turn
-        The smallest change of each parameter that would turn the verdict.
     frames : list of Contribution
         The frames with points in the cell, up to the map's stamp; the points are the thinned ones of the log.
     """
 
-    stamp: int
-    x: float
-    y: float
     frame_id: str
-    verdict: Cell
-    reason: CellReason
-    layers: Mapping[str, float]
-    limits: Mapping[str, tuple[float, float, str]]
-    turns: list[Turn]
     frames: list[Contribution]
 
 
@@ -114,18 +91,10 @@ def why_regional(
     place = index_of(navigation, *cell)
     if place is None:
         raise UsageError(f"({cell[0]:g}, {cell[1]:g}) is outside the regional map in '{navigation.frame_id}'")
-    x, y = (navigation.origin[axis] + (place[1 - axis] + 0.5) * navigation.resolution for axis in (0, 1))
     return RegionalExplanation(
-        stamp=navigation.stamp,
-        x=round(x, 6),
-        y=round(y, 6),
+        **verdict_at(rule, navigation, terrain, place),
         frame_id=navigation.frame_id,
-        verdict=Cell(int(navigation.cells[place])),
-        reason=CellReason(int(navigation.reason[place])),
-        layers={name: float(layer[place]) for name, layer in terrain.layers.items()},
-        limits=limits_at(rule, terrain, *place),
-        turns=turns_at(rule, terrain, *place),
-        frames=_contributions(result, navigation, (x, y)),
+        frames=_contributions(result, navigation, centre_of(navigation, place)),
     )
 
 
