@@ -28,8 +28,11 @@ def checked(returned: Any) -> Finding | None:
     return returned
 
 
-def findings(graph: Graph, states: Mapping[str, Any]) -> dict[str, Finding]:
-    """Stream -> finding at the end of a run: why it was left out, or what `finding(state)` of its stage returns."""
+def findings(graph: Graph, states: Mapping[str, Any], surveys: Mapping[str, Finding]) -> dict[str, Finding]:
+    """Stream -> finding at the end of a run: why it was left out, or what `finding(state)` of its stage returns.
+
+    surveys: stream -> finding of its pre-pass.
+    """
     found: dict[str, Finding | None] = {name: Finding(f"left out: {why}") for name, why in graph.left_out.items()}
     for node in graph.stages:
         if node.stateful and hasattr(node.actor, "finding"):
@@ -37,12 +40,13 @@ def findings(graph: Graph, states: Mapping[str, Any]) -> dict[str, Finding]:
                 found[node.name] = checked(node.actor.finding(states[node.name]))
             except Exception as error:  # must not leave the outputs open
                 found[node.name] = warning(failure(error))
-    return explained({name: finding for name, finding in found.items() if finding is not None})
+    return explained({name: finding for name, finding in found.items() if finding is not None}, surveys)
 
 
-def explained(found: dict[str, Finding]) -> dict[str, Finding]:
-    """The findings, with notes in place of the warnings that a fault may explain."""
-    faults = {finding.about: name for name, finding in found.items() if finding.severity is Severity.FAULT}
+def explained(found: dict[str, Finding], surveys: Mapping[str, Finding]) -> dict[str, Finding]:
+    """The findings, with notes in place of the warnings that a fault in them or in the surveys may explain."""
+    every = [*found.items(), *surveys.items()]
+    faults = {finding.about: name for name, finding in every if finding.severity is Severity.FAULT}
     for name, finding in found.items():
         if finding.severity is Severity.WARNING and finding.assumes and finding.assumes in faults:
             cause = f"The fault that {faults[finding.assumes]} reports may be the cause."

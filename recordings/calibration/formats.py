@@ -229,6 +229,8 @@ def _rigid(content: Mapping[str, Any], name: str, where: str) -> Array:
     """A transform (4, 4)."""
     matrix = numbers(content, name, (4, 4), where)
     _check_rigid(matrix, name, where)
+    if not np.allclose(matrix[3], (0, 0, 0, 1), rtol=0, atol=1e-6):
+        raise LogError(f"the last row of '{name}' of {where} is {matrix[3].tolist()}, not 0, 0, 0, 1")
     return matrix
 
 

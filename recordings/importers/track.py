@@ -36,9 +36,11 @@ class Track:
         ordered = sorted({stamp: (place, turn) for stamp, place, turn in poses}.items())
         turns = np.array([turn for _, (_, turn) in ordered])
         lengths = np.linalg.norm(turns, axis=1)
-        if (wrong := np.flatnonzero(np.abs(lengths - 1) > 1e-2)).size:
+        if (wrong := np.flatnonzero(~(np.abs(lengths - 1) <= 1e-2))).size:
             raise LogError(f"{where}: the quaternion at {ordered[wrong[0]][0]} ns has the length {lengths[wrong[0]]:g}")
         places = np.array([place for _, (place, _) in ordered])
+        if (wrong := np.flatnonzero(~np.isfinite(places).all(axis=1))).size:
+            raise LogError(f"{where}: the position at {ordered[wrong[0]][0]} ns is {places[wrong[0]].tolist()}")
         return Track(body, np.array([stamp for stamp, _ in ordered]), places, Rotation.from_quat(turns))
 
     def at(self, stamp: int) -> Transform | None:
@@ -61,7 +63,8 @@ def mercator(latitude: Array, longitude: Array) -> Array:
     """(n, 2) m east and north of the first of n places, deg, as KITTI's development kit maps them."""
     scale = np.cos(np.radians(latitude[0]))
     east = scale * EARTH_RADIUS * np.radians(longitude)
-    north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
+    with np.errstate(invalid="ignore"):  # the track names a latitude beyond the poles
+        north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
     return np.column_stack([east - east[0], north - north[0]])
 
 

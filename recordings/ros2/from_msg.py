@@ -5,6 +5,7 @@ The functions raise LogError for a message with invalid content.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -82,13 +83,17 @@ def _finite(vector: Any, what: str) -> Array:
 
 def rotation_of(quaternion: Any, what: str) -> Rotation:
     """The rotation of a geometry_msgs/Quaternion of length 1, within 1 %."""
-    values = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
-    length = float(np.linalg.norm(values))
+    return Rotation.from_quat(unit_quaternion(quaternion, what))
+
+
+def unit_quaternion(quaternion: Any, what: str) -> tuple[float, float, float, float]:
+    """x, y, z and w of a geometry_msgs/Quaternion of length 1, within 1 %; the length is then 1."""
+    values = (float(quaternion.x), float(quaternion.y), float(quaternion.z), float(quaternion.w))
+    length = math.hypot(*values)
     if not abs(length - 1) < 1e-2:
-        raise LogError(
-            f"the quaternion of {what} is not a rotation: {values.tolist()} has the length {length:.3g}, not 1"
-        )
-    return Rotation.from_quat(values)
+        raise LogError(f"the quaternion of {what} is not a rotation: {[*values]} has the length {length:.3g}, not 1")
+    x, y, z, w = values
+    return x / length, y / length, z / length, w / length
 
 
 def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:

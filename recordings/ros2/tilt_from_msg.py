@@ -6,7 +6,9 @@ become a direction by the model in the pipeline file; accelerations at rest are 
 
 from __future__ import annotations
 
+import math
 from dataclasses import MISSING, dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +16,7 @@ import numpy as np
 from flow.parameters import check_parameters, parameter
 from recordings.errors import LogError
 from recordings.inertial.blocks import InertialSample
-from recordings.ros2.from_msg import frame_of, pose_of, rotation_of, stamp_or
+from recordings.ros2.from_msg import frame_of, pose_of, stamp_or, unit_quaternion
 from stages.data import Array, Tilt
 
 Vector = tuple[float, float, float]
@@ -33,7 +35,8 @@ def tilt_of(message: Any, log_time: int) -> Tilt:
     if covariance is not None and covariance[0] == -1:
         raise LogError("the Imu marks its orientation as absent (orientation_covariance[0] is -1)")
     quaternion = next((q for name in ("orientation", "quaternion") if (q := getattr(message, name, None))), message)
-    up = rotation_of(quaternion, "the inclinometer").as_matrix()[2]
+    x, y, z, w = unit_quaternion(quaternion, "the inclinometer")
+    up = np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
     return _tilt(message, log_time, up, None if covariance is None else _stated_sigma(covariance))
 
 
@@ -92,13 +95,19 @@ def _finite_vector(values: list[Any], name: str) -> Vector:
 def _tilt(message: Any, log_time: int, up: Array, sigma: float | None = None) -> Tilt:
     header = getattr(message, "header", None)
     stamp = stamp_or(header, log_time) if header is not None else log_time
-    return Tilt(stamp, up / np.linalg.norm(up), frame_of(message) or "inclinometer", sigma)
+    return Tilt(stamp, up / math.hypot(*up), frame_of(message) or "inclinometer", sigma)
 
 
 def _stated_sigma(covariance: Array) -> float | None:
     """Standard deviation, rad, about the two axes that are surer than the third, which is the heading's; None for zeros
     (unknown) and for what is no covariance of a tilt."""
-    matrix = np.asarray(covariance, np.float64).reshape(3, 3)
+    return _sigma_of(np.asarray(covariance, np.float64).tobytes())
+
+
+@lru_cache(maxsize=64)
+def _sigma_of(covariance: bytes) -> float | None:
+    """The same from the bytes of 9 float64, which most logs repeat in every message."""
+    matrix = np.frombuffer(covariance).reshape(3, 3)
     if not np.isfinite(matrix).all():
         return None
     variance = float(np.mean(np.linalg.eigvalsh((matrix + matrix.T) / 2)[:2]))

@@ -6,10 +6,9 @@ shows. All of them are errors of a tilt between two readings.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field, replace
-
-import numpy as np
 
 from stages.data import Tilt
 
@@ -36,7 +35,7 @@ class TiltNoise:
         if len(self.squares) < MIN_READINGS - 2:
             return tilt
         kept = sorted(self.squares)[: max(int(KEPT_SHARE * len(self.squares)), 1)]
-        shown = float(np.sqrt(np.mean(kept) / KEPT_MEAN / 2))
+        shown = math.sqrt(sum(kept) / len(kept) / KEPT_MEAN / 2)
         return replace(tilt, sigma=max(shown, tilt.sigma or 0.0))
 
     def _compare(self) -> None:

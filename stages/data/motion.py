@@ -89,7 +89,7 @@ class Tilt:
         publish_vector(self, "up", (3,))
         if self.sigma is not None and not 0 <= self.sigma < np.inf:
             raise StageError(f"Tilt.sigma must be at least 0 and finite, not {self.sigma}")
-        if not abs(float(np.linalg.norm(self.up)) - 1.0) < 1e-6:
+        if not abs(math.hypot(*self.up) - 1.0) < 1e-6:
             raise StageError(f"Tilt.up must be a unit vector, not {self.up.tolist()}")
 
     def interpolated(self, later: Tilt, stamp: int) -> Tilt:

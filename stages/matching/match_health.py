@@ -57,4 +57,5 @@ class CheckMatches(Stage):
             "that ground is closer than the search range, increase `disparities`; otherwise check for dark, blurred or "
             "textureless images, or swapped cameras.",
             Severity.WARNING,
+            assumes="cameras",
         )

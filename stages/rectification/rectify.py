@@ -129,7 +129,7 @@ class Rectify(Stage):
                 "right are swapped, or the calibration is not that of these images; exchange 'left' and 'right' of the "
                 "source"
             )
-            return replace(self, row_offset=0.0), Finding(swapped, Severity.WARNING)
+            return replace(self, row_offset=0.0), Finding(swapped, Severity.FAULT, about="cameras")
         terms = tuple(round(term, 4) for term in offset.terms)
         found = (
             f"left and right rows are offset by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, "
@@ -153,9 +153,9 @@ class Rectify(Stage):
 
 
 def _joined(found: Sequence[Finding]) -> Finding | None:
-    """Several findings as one, None for none."""
-    worst = Severity.WARNING if any(each.severity == Severity.WARNING for each in found) else Severity.NOTE
-    return Finding("; ".join(each.sentence for each in found), worst) if found else None
+    """Several findings as one with the worst severity, None for none."""
+    worst = max(found, key=lambda each: list(Severity).index(each.severity), default=None)
+    return None if worst is None else replace(worst, sentence="; ".join(each.sentence for each in found))
 
 
 def _infinity(camera: StereoCamera) -> float:

@@ -2,11 +2,12 @@
 
 import argparse
 
-from tests.bench import decoding, fleet, matching, pipeline, refining, regional, terrain, weak_texture
+from tests.bench import decoding, fleet, large_log, matching, pipeline, refining, regional, terrain, weak_texture
 
-about = "All benchmarks, half an hour; python -m tests.bench.NAME runs one."
+about = "All benchmarks, over half an hour; python -m tests.bench.NAME runs one."
 argparse.ArgumentParser("python -m tests.bench", description=about).parse_args()
 decoding.main()
+large_log.main([])
 matching.main()
 refining.main()
 pipeline.main()

@@ -147,7 +147,7 @@ def _finding(judged: Diagnosis, where: str = "") -> Finding:
     severity = Severity.FAULT if judged.fault else Severity.NOTE
     if judged.fault == OFF_GROUND:
         severity = Severity.WARNING
-    return Finding(judged.sentence + where, severity, about="tilt")
+    return Finding(judged.sentence + where, severity, about="tilt", assumes="cameras")
 
 
 def _diagnosis(state: TiltMemory) -> Diagnosis:

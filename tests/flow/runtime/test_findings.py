@@ -36,11 +36,12 @@ def test_a_fault_makes_the_verdict_incomplete_and_is_printed_last(tmp_path, caps
 def test_a_warning_that_assumes_what_has_a_fault_becomes_a_note():
     fault = Finding("The mount is wrong.", Severity.FAULT, about="tilt")
     blamed, other = (Finding("The pose leans.", Severity.WARNING, assumes=assumed) for assumed in ("tilt", ""))
-    found = explained({"pose": blamed, "wheels": other, "health": fault})
+    found = explained({"pose": blamed, "wheels": other, "health": fault}, {})
     assert found["pose"].severity is Severity.NOTE
     assert found["pose"].sentence == "The pose leans. The fault that health reports may be the cause."
     assert (found["wheels"], found["health"]) == (other, fault)
-    assert explained({"pose": blamed}) == {"pose": blamed}
+    assert explained({"pose": blamed}, {}) == {"pose": blamed}
+    assert explained({"pose": blamed}, {"rectified": fault})["pose"].severity is Severity.NOTE
 
 
 def verdict_line(**changes):

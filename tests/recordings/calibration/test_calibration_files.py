@@ -157,6 +157,10 @@ def test_a_swapped_pair_and_one_without_baseline_are_named(tmp_path, shift, sent
             lambda cams: cams["cam1"].update(T_cn_cnm1=[[1] * 4] * 4),
             "'T_cn_cnm1' of cam1 .* is not a rotation",
         ),
+        (
+            lambda cams: cams["cam1"]["T_cn_cnm1"][3].reverse(),
+            "the last row of 'T_cn_cnm1' of cam1 .* is .*, not 0, 0, 0",
+        ),
         (lambda cams: cams["cam1"].update(T_cn_cnm1=rigid([0, 0, 0], [-110.0, 0, 0]).tolist()), "write it in metres"),
         (lambda cams: cams.pop("cam1"), "is no calibration of a known format"),
     ],

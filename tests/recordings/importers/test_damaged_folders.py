@@ -23,6 +23,8 @@ CASES = {
     "a camera that cannot be rectified": (
         "euroc", "room/mav0/cam0/sensor.yaml", lambda content: re.sub(rb", [0-9.]+\] #fu", b", 0.0] #fu", content),
         "no image of 160x120 px can be rectified"),
+    "a position that is no number": (
+        "drive", "2011_09_26_drive_0001_sync/oxts/data/0000000001.txt", lambda content: b"9" + content, "nan"),
     "MATLAB's file cut off": (
         "katwijk", "P1/LocCam_calibstruct.mat", lambda content: content[:700], "no struct 'stereoParams'"),
     "numpy's header without an end": (

@@ -241,13 +241,13 @@ def test_a_survey_measures_what_its_frames_have_in_common(rectified):
     (20.0, True, "100% of the features that both images show look farther than infinity: left and right are swapped"),
     (20.0, False, "so much is unusual: are the images rectified"),
 ])  # fmt: skip
-def test_a_survey_warns_of_swapped_and_of_unrectified_images(rows, swapped, words):
+def test_a_survey_finds_swapped_and_unrectified_images(rows, swapped, words):
     left, right = a_pair((rows,), size=LARGE)
     pair = (right, left) if swapped else (left, right)
     _, found = Rectify().survey([StereoFrame(1, *pair, StereoCamera(500, 500, 320, 240, 0.1, *LARGE))])
     assert words in found.sentence
     assert ("swapped" in found.sentence, "are offset by" in found.sentence) == (swapped, not swapped)
-    assert found.severity == "warning"
+    assert (found.severity, found.about) == (("fault", "cameras") if swapped else ("warning", ""))
 
 
 def test_a_principal_point_offset_is_not_reported_as_swapped_images():
