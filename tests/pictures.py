@@ -1,9 +1,9 @@
-"""The pictures of docs/terrain.md and of the Devon Island pairs in docs/refinement.md: `make pictures` draws them.
+"""The pictures of docs/terrain.md, and those of real images in other pages: `make pictures` draws them.
 
 terrain.jpg: for three frames the left image, the elevation, the reasons of the navigation map, and the truth in the
 visible cells. region.jpg: the regional map of a traverse and its navigation map. Both are of simulated traverses.
-devon.jpg, if ROVERFLOW_DATA is set: disparity, source and shaded disparities of each pair; the images may not be
-reprinted.
+devon.jpg and euroc.jpg, if ROVERFLOW_DATA is set: disparity, source and shaded disparities of each Devon Island pair,
+and the depth of a frame of EuRoC. The images themselves may not be reprinted.
 """
 
 import os
@@ -15,8 +15,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tifffile
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from flow.cli.main import main as roverflow
+from flow.errors import COMPLETE, INCOMPLETE
 from recordings.simulator import Simulation
 from recordings.sinks import colormaps
 from stages.data import Array, Cell, CellReason, ElevationMap
@@ -38,6 +41,7 @@ SHOWN = (
 WIDTH, HEIGHT = 440, 330  # px of each panel
 TRAVERSE = ("--frames", "40", "--seed", "12", "--rocks", "0.1")
 ZOOM = 2
+NEAREST = 1.0  # m
 INK = (225, 225, 225)
 
 
@@ -47,7 +51,9 @@ def main(folder: Path) -> None:
     _write(folder / "terrain.jpg", terrain_picture())
     _write(folder / "region.jpg", region_picture())
     if "ROVERFLOW_DATA" in os.environ:
-        _write(folder / "devon.jpg", devon_picture(Path(os.environ["ROVERFLOW_DATA"])))
+        data = Path(os.environ["ROVERFLOW_DATA"])
+        _write(folder / "devon.jpg", devon_picture(data))
+        _write(folder / "euroc.jpg", euroc_picture(data))
 
 
 def terrain_picture() -> Array:
@@ -78,8 +84,7 @@ def region_picture() -> Array:
         traverse, result, maps = (Path(place) / name for name in ("log.mcap", "out.mcap", "maps"))
         for command in (("simulate", traverse, *TRAVERSE), ("run", traverse, "-o", result, "--no-rrd"),
                         ("export", result, maps)):  # fmt: skip
-            if roverflow([str(word) for word in command]):
-                raise RuntimeError(f"roverflow {command[0]} failed")
+            _run(*command)
         elevation = tifffile.imread(maps / "elevation.tif")
         gray = cv2.imread(str(maps / "navigation_map.pgm"), cv2.IMREAD_UNCHANGED)
     terrain = ElevationMap(0, {"elevation": elevation[::-1].copy()}, 0.05, (0.0, 0.0), "odom")
@@ -110,6 +115,28 @@ def devon_picture(data: Path) -> Array:
                 )
             )
     return np.vstack(rows)
+
+
+def euroc_picture(data: Path) -> Array:
+    """Depth of the first frame of the EuRoC sequence, read from the result log as viewers do, RGB.
+
+    Colours are by inverse depth, from `NEAREST`, red, to infinity, blue. Unknown pixels are gray.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        log, result = (Path(place) / name for name in ("log.mcap", "out.mcap"))
+        _run("import", "euroc", data / "euroc", log)
+        _run("run", log, "-o", result, "--every", 20, "--no-rrd", "--set", "McapSink.viewers=true")
+        with result.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            *_, message = next(reader.iter_decoded_messages(["/nav/disparity/depth/image_rect"]))
+    depth = np.frombuffer(message.data, np.float32).reshape(message.height, message.width)
+    return colormaps.apply_palette(NEAREST / depth, 0, 1, cv2.COLORMAP_TURBO)
+
+
+def _run(*command: object) -> None:
+    """Run roverflow; a fault of the log is no reason to stop."""
+    if roverflow([str(word) for word in command]) not in (COMPLETE, INCOMPLETE):
+        raise RuntimeError(f"roverflow {command[0]} failed")
 
 
 def _shaded(pixels: Array) -> Array:
