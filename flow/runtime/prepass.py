@@ -6,6 +6,7 @@ part of the log that is run.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -24,11 +25,15 @@ Excerpts = Callable[[int, set[str]], Iterable[Iterable[Event]]]  # (number, sour
 
 @dataclass(frozen=True)
 class Prepass:
-    """A graph ready to run. findings: by stream; fixed: "stream.parameter" -> the value that the pre-pass gave it."""
+    """A graph ready to run.
+
+    findings: by stream; fixed: "stream.parameter" -> the value that the pre-pass gave it; cpu_seconds: of surveys.
+    """
 
     graph: Graph
     findings: dict[str, Finding] = field(default_factory=dict)
     fixed: dict[str, Any] = field(default_factory=dict)
+    cpu_seconds: float = 0.0
 
 
 def prepass(graph: Graph, excerpts: Excerpts) -> Prepass:
@@ -47,17 +52,19 @@ def prepass(graph: Graph, excerpts: Excerpts) -> Prepass:
             raise node.place.error(f"'{node.name}' has state, so no stage that depends on it can survey the log")
     samples = _samples(replace(graph, nodes=tuple(needed)), excerpts)
     nodes = {node.name: node for node in graph.nodes}
-    findings, fixed = dict[str, Finding](), dict[str, Any]()
+    findings, fixed, cpu_seconds = dict[str, Finding](), dict[str, Any](), 0.0
     for node in needed:
         if _surveys(node):
+            begun = time.process_time()
             actor, finding = _survey(node, samples)
+            cpu_seconds += time.process_time() - begun
             nodes[node.name] = replace(node, actor=actor)
             fixed |= {f"{node.name}.{name}": value for name, value in _changed(node.actor, actor).items()}
             if finding is not None:
                 findings[node.name] = finding
         if not node.aligns and any(node.name in other.inputs.values() for other in needed):
             _advance(nodes[node.name], samples)
-    return Prepass(replace(graph, nodes=tuple(nodes.values())), findings, fixed)
+    return Prepass(replace(graph, nodes=tuple(nodes.values())), findings, fixed, cpu_seconds)
 
 
 def _survey(node: Node, samples: Sequence[Sample]) -> tuple[Any, Finding | None]:

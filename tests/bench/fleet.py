@@ -2,7 +2,8 @@
 
 Fleets of one process, two processes, and one process with a third of the logs alternate; figures are of the fastest of
 each. A fleet's time is that of starting, of its runs, and of an overhead for each log. So two fleets of one process
-with different numbers of logs give the overhead and the time of starting.
+with different numbers of logs give the overhead and the time of starting. Two commands `roverflow run` at once, over
+the same two one after the other, show what the machine itself gains by a second process.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ SETTINGS = ("-p", "rover", "--set", "disparities=96", "--workers-per-log", "1")
 
 @dataclass(frozen=True)
 class Fleet:
-    """Seconds of a whole fleet, of its runs, and of the CPU of their stages and sinks."""
+    """Seconds of a whole fleet, of its runs, and of the CPU of their stages, surveys and sinks."""
 
     seconds: float
     runs: float
@@ -49,10 +50,11 @@ def main(arguments: list[str] | None = None) -> None:
         for turn in range(rounds):
             for name, (chosen, processes) in kinds.items():
                 found[name].append(_fleet(chosen, Path(folder) / f"{name}{turn}", processes))
-    _print(*(min(fleets, key=lambda fleet: fleet.seconds) for fleets in found.values()))
+        gain = min(_at_once(every[-1], Path(folder) / f"plain{turn}") for turn in range(rounds))
+    _print(*(min(fleets, key=lambda fleet: fleet.seconds) for fleets in found.values()), gain)
 
 
-def _print(one: Fleet, two: Fleet, few: Fleet) -> None:
+def _print(one: Fleet, two: Fleet, few: Fleet, gain: float) -> None:
     beside = {fleet: fleet.seconds - fleet.runs for fleet in (one, few)}
     overhead = (beside[one] - beside[few]) / (LOGS - FEW)
     print(f"\nfleet of {LOGS} logs of 6 to {6 + 4 * (LOGS - 1)} frames, 640x480, rover, one thread a log")
@@ -60,11 +62,31 @@ def _print(one: Fleet, two: Fleet, few: Fleet) -> None:
         "one process, s": one.seconds,
         "two processes, s": two.seconds,
         "two processes over one": two.seconds / one.seconds,
+        "two plain runs at once over one after the other": gain,
         "starting and ending a fleet, s": beside[one] - LOGS * overhead,
         "overhead of a log beside its run, s": overhead,
-        "CPU of stages and sinks over a worker's time": one.stages / (one.runs + LOGS * overhead),
+        "CPU of stages, surveys and sinks over a worker's time": one.stages / (one.runs + LOGS * overhead),
     }.items():
-        print(f"  {name:46} {value:9.3f}")
+        print(f"  {name:48} {value:9.3f}")
+
+
+def _at_once(log: Path, out: Path) -> float:
+    """Time of two commands `roverflow run` at once, over that of two one after the other."""
+    out.mkdir()
+    words = (sys.executable, "-m", "flow", "run", str(log), "-p", "rover", "--set", "disparities=96", "--workers", "1")
+    times = []
+    for number, waits in enumerate((True, False)):
+        begun = time.perf_counter()
+        running = []
+        for name in ("a", "b"):
+            result = str(out / f"{name}{number}.mcap")
+            running.append(subprocess.Popen([*words, "--no-rrd", "-o", result], stdout=subprocess.DEVNULL))
+            if waits:
+                running[-1].wait()
+        if any(process.wait() for process in running):
+            raise RuntimeError("roverflow run failed")
+        times.append(time.perf_counter() - begun)
+    return times[1] / times[0]
 
 
 def _fleet(logs: list[Path], out: Path, processes: int) -> Fleet:

@@ -151,7 +151,7 @@ def _columns(summary: Mapping[str, Any]) -> dict[str, Any]:
         "state": "failed" if interrupted else "done", "verdict": summary["verdict"], "frames": summary["frames_in"],
         "complete": summary["frames_out"], "losses": summary["drops"], "findings": faults,
         "seconds": summary["wall_seconds"], "cpu_seconds": summary["cpu_seconds"],
-        "stage_seconds": sum(summary.get("cpu_seconds_of", {}).values()),
+        "stage_seconds": sum(summary["cpu_seconds_of"].values()) + summary["survey_cpu_seconds"],
         "why": "" if summary["verdict"] == Verdict.COMPLETE else drops,
         "result": Path(summary["outputs"][0]).name if summary["outputs"] else None,
     }  # fmt: skip

@@ -82,6 +82,7 @@ def test_a_survey_sees_the_first_complete_frame_of_each_excerpt(tmp_path):
     assert survey_sentence(summary) == f"mean {2 * (1 + 5 + 7) / 3:g} of 3"
     assert sink.values("centred")[1] == pytest.approx(2 - 26 / 3)
     assert (summary["verdict"], summary["frames_in"]) == ("COMPLETE", 8)
+    assert 0 < summary["survey_cpu_seconds"] < summary["cpu_seconds"]
     assert log.asked == [(9, {"left", "right"})]
 
 
