@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from flow.cli.fleet.catalogue import Catalogue
+from flow.cli.fleet.engine import Fleet
 from flow.cli.fleet.jobs import jobs_of, reason_to_run
 from flow.cli.fleet.task import Pipeline, Task, run_task
 from flow.errors import UsageError
@@ -110,6 +111,16 @@ def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, c
     assert "<td>junk</td><td>unusable</td>" in page
     assert roverflow("list", out, "--where", "nonsense") == 2
     assert "its columns are name, log, bytes" in capsys.readouterr().err
+
+
+def test_a_progress_file_that_is_just_being_written_is_no_stall(logs, tmp_path):
+    (job,) = jobs_of([str(logs / "a.mcap")], tmp_path)
+    task = Task(job.name, job.log, job.digest, job.result(tmp_path), Pipeline.of("fast", ()), False, workers=1)
+    fleet = Fleet(tmp_path, Catalogue(tmp_path, create=True), {"a": (job, task)}, print, left={"a"})
+    task.progress.touch()
+    for _ in range(2):
+        fleet._watch(None, {object(): "a"})
+        assert {name: row["state"] for name, row in rows_of(tmp_path).items()} == {"a": "running"}
 
 
 def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):

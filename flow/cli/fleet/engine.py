@@ -140,11 +140,12 @@ class Fleet:
                 progress = self.tasks[name][1].progress.read_text()
             except OSError:
                 continue  # it has not begun, or it ends just now
-            if name not in self._seen:
+            seen = self._seen.get(name)
+            if seen is None:
                 running[name] = {"state": "running"}
-            if self._seen.get(name, ("", 0.0))[0] != progress:
+            if seen is None or seen[0] != progress:
                 self._seen[name] = (progress, now)
-            elif now - self._seen[name][1] > self.stall_seconds and name in self.left:
+            elif now - seen[1] > self.stall_seconds and name in self.left:
                 self._set_aside(client, name, future, progress)
         self.catalogue.put_all({name: row for name, row in running.items() if name in self.left})
 
