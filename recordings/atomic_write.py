@@ -18,13 +18,14 @@ from recordings.errors import UnwritableError
 _numbers = count()
 
 
-def temporary_name(path: Path) -> Path:
-    """A unique temporary name beside `path`. Raises UnwritableError if no file can have the name `path`."""
+def temporary_name(path: Path, mark: str = "") -> Path:
+    """A temporary name beside `path`, unique without a mark. Raises UnwritableError if no file can have the name
+    `path`."""
     if path.is_dir():
         raise UnwritableError(f"cannot write {path}: it is a folder; give a file name")
     if path.exists() and not path.is_file():
         raise UnwritableError(f"cannot write {path}: it is not a regular file; give a file name")
-    return path.with_name(f"{path.name}.{os.getpid()}-{next(_numbers)}.partial")
+    return path.with_name(f"{path.name}.{mark or f'{os.getpid()}-{next(_numbers)}'}.partial")
 
 
 def give_name(temporary: Path, path: Path) -> None:

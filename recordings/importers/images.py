@@ -72,6 +72,7 @@ def import_images(
     rate: float = 1.0,
     attitudes: Path | None = None,
     progress: Callable[[int], None] = lambda done: None,
+    report: Callable[[str], None] = lambda sentence: None,
 ) -> int:
     """Write rectified image pairs as a log.
 
@@ -96,6 +97,8 @@ def import_images(
         left image) or stamp (ns), pitch_down and maybe roll and yaw (to the left), deg.
     progress : callable
         Called with the pairs written so far.
+    report : callable
+        Called with a sentence if there is the unfinished log of an interrupted import.
 
     Returns
     -------
@@ -127,7 +130,7 @@ def import_images(
     moving = None
     if attitudes is not None:
         paired, moving = read_attitudes(attitudes, paired, rig)
-    write_recording(standing(paired, camera, rig, moving), out, progress)
+    write_recording(standing(paired, camera, rig, moving), out, progress, report)
     return len(left)
 
 

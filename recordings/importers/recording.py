@@ -1,13 +1,17 @@
 """Writes a recording from other people's files as a log: calibration, mounts, images, sensors and truth.
 
 Images of PNG and JPEG files are logged with their bytes unchanged. Messages keep the stamps of the files, and are in
-their order. The log gets its name when it is complete; an import that was interrupted leaves none, and starts again.
+their order. The log gets its name when it is complete. An import that was interrupted is continued by the next one of
+the same images: it does not read those again that the unfinished log contains.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
+from hashlib import sha256
 from heapq import merge
 from itertools import chain
 from operator import itemgetter
@@ -22,7 +26,7 @@ from recordings.calibration.formats import StereoCalibration
 from recordings.errors import LogError
 from recordings.importers.files import encoding_of, image_size, read_bytes, read_pixels
 from recordings.importers.track import WORLD, Track, upright
-from recordings.mcap.writer import Ros2Writer
+from recordings.mcap.resumable import ResumableWriter
 from recordings.ros2 import to_msg as ros2
 from recordings.ros2.cdr import make
 from recordings.source.calibration import Camera, calibrated_pair, pinhole
@@ -31,6 +35,7 @@ from stages.data import CameraModel, Pose, StereoCamera, Transform
 
 BASE, LEFT, RIGHT, IMU = "base_link", "left_camera_optical", "right_camera_optical", "imu_link"
 SIDES = ("left", "right")
+ENDINGS = "", "/compressed"  # of the topic of an image
 FIRST_STAMP = 1_000_000_000  # ns, where the files have no time; a stamp of zero means "not stamped" in ROS
 
 Logged = tuple[int, str, Any]
@@ -68,12 +73,16 @@ class ImportedRecording:
 
 
 def write_recording(
-    recording: ImportedRecording, out: Path, progress: Callable[[int], None] = lambda done: None
+    recording: ImportedRecording,
+    out: Path,
+    progress: Callable[[int], None] = lambda done: None,
+    report: Callable[[str], None] = lambda sentence: None,
 ) -> tuple[int, list[str]]:
-    """Write the log; returns its number of frames and the notes. progress: called with the frames done so far.
+    """Write the log, or continue it; returns its number of frames and the notes.
 
-    A pair with a file that is no image of the calibration's size, or with the time of the pair before it, is left out
-    with a note. Raises LogError if no log can be made.
+    progress: called with the frames done so far; report: called with a sentence about an interrupted import. A pair
+    with a file that is no image of the calibration's size, or with the time of the pair before it, is left out with a
+    note. Raises LogError if no log can be made.
     """
     tree = TransformTree()
     for mount in recording.mounts:
@@ -83,13 +92,24 @@ def write_recording(
     if not recording.pairs:
         raise LogError("no pair of images was found; check the folder")
     unreadable: list[str] = []
-    frames = _frames(recording, cameras[0], tree, topics, unreadable, progress)
-    events = merge(*recording.sensors, frames, key=itemgetter(0))
-    start = next(events)
-    with Ros2Writer(out) as writer:
+
+    def resumed(whole: bool) -> None:
+        if not whole:
+            report(f"{out}: an interrupted import of other files or with other options is not continued")
+            return
+        done = sum(len(writer.contained.get(topics[1] + ending, ())) for ending in ENDINGS)
+        report(f"{out}: continues the interrupted import after {counted(done, 'frame')}")
+
+    with ResumableWriter(out, _mark(recording.pairs), resumed) as writer:
+        frames = _frames(recording, cameras[0], tree, topics, writer, unreadable, progress)
+        events = merge(*recording.sensors, frames, key=itemgetter(0))
+        start = next(events)
         writer.write("/tf_static", ros2.transform_message((mount, start[0]) for mount in recording.mounts), start[0])
         for stamp, topic, message in chain([start], events):
-            writer.write(topic, message, stamp)
+            if not isinstance(message, partial):
+                writer.write(topic, message, stamp)
+            elif not writer.skip(topic, stamp):
+                writer.write(topic, message(), stamp)
         if recording.metadata is not None:
             writer.metadata(*recording.metadata)
         if len(unreadable) == len(recording.pairs):
@@ -103,39 +123,68 @@ def _frames(
     camera: Camera,
     tree: TransformTree,
     topics: Sequence[str],
+    writer: ResumableWriter,
     unreadable: list[str],
     progress: Callable[[int], None],
 ) -> Iterator[Logged]:
-    """The messages of each frame; the reasons why a pair is left out go into `unreadable`."""
+    """The messages of each frame, as a partial those of images that the unfinished log contains.
+
+    The reasons why a pair is left out go into `unreadable`.
+    """
     before = -1
     for number, pair in enumerate(recording.pairs):
         stamp = pair.stamp
         try:
             if stamp == before:
                 raise LogError(f"{pair.left} has the same time as the image before it, {stamp} ns")
-            sides = zip((LEFT, RIGHT), (pair.left, pair.right), recording.cameras, strict=True)
-            files = [_image(stamp, frame, path, model) for frame, path, model in sides]
+            images = _images(pair, recording.cameras, topics, writer.contained)
         except LogError as error:
             unreadable.append(str(error))
             continue
         before = stamp
         for side, frame, model in zip(SIDES, (LEFT, RIGHT), recording.cameras, strict=True):
             yield stamp, f"/stereo/{side}/camera_info", ros2.camera_info(stamp, frame, model)
-        yield from ((stamp, topic + ending, message) for topic, (ending, message) in zip(topics, files, strict=True))
+        yield from images
         if recording.truth is not None:
             yield from _true_pose(recording, stamp, camera, tree)
         yield from recording.more(number)
         progress(number + 1)
 
 
-def _image(stamp: int, frame: str, path: Path, model: CameraModel) -> tuple[str, Any]:
-    """The ending of the topic, and the message of an image file. Raises LogError if it does not fit the calibration."""
+def _images(
+    pair: ImagePair, cameras: Sequence[CameraModel], topics: Sequence[str], contained: Mapping[str, Collection[int]]
+) -> list[Logged]:
+    """The messages of a pair; if an unfinished log contains both, partials that make them. Raises LogError."""
+    sides = zip((LEFT, RIGHT), (pair.left, pair.right), cameras, strict=True)
+    makers = [partial(_image, pair.stamp, *side) for side in sides]
+    possible = [topic + ending for topic in topics for ending in ENDINGS]
+    named = [topic for topic in possible if pair.stamp in contained.get(topic, ())]
+    if len(named) == len(makers):
+        return [(pair.stamp, topic, make) for topic, make in zip(named, makers, strict=True)]
+    messages = [make() for make in makers]
+    named = [topic + ENDINGS[hasattr(message, "format")] for topic, message in zip(topics, messages, strict=True)]
+    return [(pair.stamp, topic, message) for topic, message in zip(named, messages, strict=True)]
+
+
+def _image(stamp: int, frame: str, path: Path, model: CameraModel) -> Any:
+    """The message of an image file. Raises LogError if it does not fit the calibration."""
     if (size := image_size(path)) != (model.width, model.height):
         raise LogError(f"{path} is {size[0]}x{size[1]}, but the calibration is for {model.width}x{model.height}")
     content = read_bytes(path)
     if encoding := encoding_of(content):
-        return "/compressed", ros2.compressed_image(stamp, frame, np.frombuffer(content, np.uint8), encoding)
-    return "", ros2.image(stamp, frame, read_pixels(path))
+        return ros2.compressed_image(stamp, frame, np.frombuffer(content, np.uint8), encoding)
+    return ros2.image(stamp, frame, read_pixels(path))
+
+
+def _mark(pairs: Sequence[ImagePair]) -> str:
+    """What stands for the content of the images: names, sizes and times of change."""
+    digest = sha256()
+    for pair in pairs:
+        for path in (pair.left, pair.right):
+            with suppress(OSError):  # it is left out later
+                state = path.stat()
+                digest.update(f"{path.name} {state.st_size} {state.st_mtime_ns}\n".encode(errors="surrogateescape"))
+    return digest.hexdigest()[:12]
 
 
 def _true_pose(recording: ImportedRecording, stamp: int, camera: Camera, tree: TransformTree) -> Iterator[Logged]:

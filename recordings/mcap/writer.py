@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, Self
 
 from mcap.writer import CompressionType, Writer
 
@@ -60,13 +60,13 @@ class Ros2Writer:
 
     def __init__(self, path: Path, keep: bool = False, compression: str = "zstd") -> None:
         self.path, self._keep = Path(path), keep
-        self._partial = temporary_name(self.path)
         self._kinds: dict[str, MessageKind] = {}
         self._schemas: dict[MessageKind, int] = {}
         self._channels: dict[tuple[str, int | None], tuple[int, MessageKind]] = {}
         self._counts: dict[int, int] = {}
+        self._partial = self._temporary_name()
         with writing(self.path):
-            self._file = self._partial.open("wb")
+            self._file = self._open()
         self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=COMPRESSIONS[compression])
         self._writer.start(profile=self.profile, library="roverflow")
 
@@ -117,8 +117,9 @@ class Ros2Writer:
             return
         with self._reporting():
             self._writer.finish()
-            self._file.close()
+            self._file.flush()
             give_name(self._partial, self.path)
+            self._file.close()
 
     def abort(self) -> None:
         """Discard the log; an earlier file at `path` stays. After `close`, does nothing."""
@@ -128,7 +129,7 @@ class Ros2Writer:
             self._file.close()
         self._partial.unlink(missing_ok=True)
 
-    def __enter__(self) -> Ros2Writer:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, *raised: object) -> None:
@@ -136,6 +137,12 @@ class Ros2Writer:
             self.close()
         else:
             self.abort()
+
+    def _temporary_name(self) -> Path:
+        return temporary_name(self.path)
+
+    def _open(self) -> BinaryIO:
+        return self._partial.open("wb")
 
     def _channel(self, topic: str, kind: MessageKind, copy_of: int | None) -> int:
         if (topic, copy_of) not in self._channels:
@@ -153,17 +160,20 @@ class Ros2Writer:
 
     @contextmanager
     def _reporting(self) -> Iterator[None]:
-        """Turn an OSError into UnwritableError, and close the unfinished log; with `keep`, one with messages stays."""
+        """Turn an OSError into UnwritableError, and close the unfinished log."""
         try:
             yield
         except OSError as error:
-            held = 0
             with suppress(OSError):  # the unflushed rest is lost
                 self._file.close()
-            if self._keep:
-                with suppress(LogError), McapFile(self._partial) as log:
-                    held = log.count(set(log.channels))
-            if not held:
-                self._partial.unlink(missing_ok=True)
-            kept = f" (its first {counted(held, 'message')} are in {self._partial})" if held else ""
-            raise unwritable(self.path, error.strerror or str(error), kept) from error
+            raise unwritable(self.path, error.strerror or str(error), self._kept()) from error
+
+    def _kept(self) -> str:
+        """A note about what stays of the unfinished log: with `keep`, one with messages."""
+        held = 0
+        if self._keep:
+            with suppress(LogError), McapFile(self._partial) as log:
+                held = log.count(set(log.channels))
+        if not held:
+            self._partial.unlink(missing_ok=True)
+        return f" (its first {counted(held, 'message')} are in {self._partial})" if held else ""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,20 +30,40 @@ def import_recording(
     options: argparse.Namespace, entries: Collection[str], read: Callable[[Rig], ImportedRecording]
 ) -> int:
     """Read and write a recording, and print notes, frames and size. entries: that the rig file may have."""
-    from tqdm import tqdm
-
     from recordings.importers.recording import write_recording
     from recordings.importers.rig import read_rig
 
     check_outputs({"input log": options.out}, [path for path in [options.rig] if path is not None])
     recording = read(read_rig(options.rig, entries))
-    with tqdm(total=len(recording.pairs), unit="frame", disable=not sys.stderr.isatty()) as bar:
+    with progress_bar(options.out, len(recording.pairs)) as shown:
+        frames, notes = write_recording(recording, options.out, *shown)
+    for note in notes:
+        say(f"{options.source}: {note}")
+    return complete(options.out, frames)
+
+
+@contextmanager
+def progress_bar(out: Path, frames: int) -> Iterator[tuple[Callable[[int], None], Callable[[str], None]]]:
+    """Yield what shows the frames done so far, and what prints a sentence; an interrupt prints how to continue."""
+    from tqdm import tqdm
+
+    with tqdm(total=frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
 
         def progress(done: int) -> None:
             bar.update(done - bar.n)
 
-        frames, notes = write_recording(recording, options.out, progress)
-    for note in notes:
-        say(f"{options.source}: {note}")
-    say(f"{options.out}: {counted(frames, 'stereo frame')} ({options.out.stat().st_size / 1e6:.1f} MB)")
+        def report(sentence: str) -> None:
+            with tqdm.external_write_mode():
+                say(sentence)
+
+        try:
+            yield progress, report
+        except KeyboardInterrupt:
+            report(f"{out}: not complete; the same command continues the import")
+            raise
+
+
+def complete(out: Path, frames: int) -> int:
+    """Print frames and size of a log; returns the exit code."""
+    say(f"{out}: {counted(frames, 'stereo frame')} ({out.stat().st_size / 1e6:.1f} MB)")
     return COMPLETE

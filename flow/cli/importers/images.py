@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
+from flow.cli.importers.common import complete, progress_bar
 from flow.cli.outputs import check_outputs
-from flow.cli.report import say
-from flow.contracts import counted
-from flow.errors import COMPLETE
 
 HELP = "a folder of rectified left and right images"
 
@@ -31,8 +28,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the log."""
-    from tqdm import tqdm
-
     from recordings.importers.images import import_images
     from recordings.importers.pairing import pair_images
 
@@ -41,11 +36,8 @@ def run(options: argparse.Namespace) -> int:
     check_outputs({"input log": options.out}, [*files, *left, *right])
     given = {name: getattr(options, name) for name in ("roll", "height", "rate", "attitudes")}
     given["pitch_down"] = options.pitch_down or 0.0
-    with tqdm(total=len(left), unit="pair", disable=not sys.stderr.isatty()) as bar:
-
-        def progress(done: int) -> None:
-            bar.update(done - bar.n)
-
-        frames = import_images(left, right, options.calibration, options.out, **given, progress=progress)
-    say(f"{options.out}: {counted(frames, 'stereo frame')} ({options.out.stat().st_size / 1e6:.1f} MB)")
-    return COMPLETE
+    with progress_bar(options.out, len(left)) as shown:
+        frames = import_images(
+            left, right, options.calibration, options.out, **given, progress=shown[0], report=shown[1]
+        )
+    return complete(options.out, frames)

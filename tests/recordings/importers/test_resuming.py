@@ -1,0 +1,181 @@
+"""An interrupted import is continued by the same command, and gives the bytes of one that was not interrupted."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from recordings.importers import recording
+from recordings.importers.files import read_bytes
+from recordings.mcap.resumable import ResumableWriter
+from tests.conftest import roverflow
+
+PAIRS = 6
+ROOT = Path(__file__).parents[3]
+# A process that gets a signal when it reads its n-th image.
+CHILD = """
+import os, sys
+from flow.cli.__main__ import program
+from recordings.importers import recording
+reads, read = [], recording.read_bytes
+last, number = map(int, sys.argv[1:3])
+
+def interrupted(path):
+    reads.append(path)
+    if len(reads) == last:
+        os.kill(os.getpid(), number)
+    return read(path)
+
+recording.read_bytes = interrupted
+sys.argv[1:3] = []
+sys.exit(program())
+"""
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """Pairs of noise, too large to share a chunk, and the log of an import without interruption."""
+    home, random = tmp_path_factory.mktemp("source"), np.random.default_rng(5)
+    (home / "pairs").mkdir()
+    for number in range(PAIRS):
+        for side in ("left", "right"):
+            pixels = random.integers(0, 255, (240, 320), np.uint8)
+            assert cv2.imwrite(str(home / "pairs" / f"{number}-{side}.png"), pixels)
+    camera = {"fx": 200.0, "cx": 160.0, "cy": 120.0, "baseline": 0.2}
+    (home / "camera.yaml").write_text(yaml.safe_dump(camera))
+    assert roverflow(*importing(home, home / "whole.mcap")) == 0
+    return home
+
+
+def importing(source, out, pitch_down=15):
+    given = "--calibration", source / "camera.yaml", "--pitch-down", pitch_down, "--height", 0.9
+    return "import", "images", source / "pairs", out, *given
+
+
+@pytest.fixture
+def logged(monkeypatch):
+    """The names of the image files that are read for the log."""
+    found = []
+    monkeypatch.setattr(recording, "read_bytes", lambda path: found.append(path.name) or read_bytes(path))
+    return found
+
+
+@pytest.fixture
+def interrupted(source, tmp_path, monkeypatch, capsys):
+    """The unfinished log of an import that was interrupted at its fourth pair."""
+    found = []
+
+    def until_the_fourth(path):
+        found.append(path)
+        if len(found) > 6:
+            raise KeyboardInterrupt
+        return read_bytes(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recording, "read_bytes", until_the_fourth)
+        assert roverflow(*importing(source, tmp_path / "out.mcap")) == 130
+    capsys.readouterr()
+    (left,) = tmp_path.iterdir()
+    return left
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_the_import_of_a_process_that_was_ended_is_continued(source, tmp_path, number, capsys, logged):
+    out = tmp_path / "out.mcap"
+    command = [sys.executable, "-c", CHILD, "8", str(int(number)), *map(str, importing(source, out))]
+    child = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert child.returncode == (-number if number == signal.SIGKILL else 130), child.stderr
+    if number != signal.SIGKILL:
+        assert f"{out}: not complete; the same command continues the import" in child.stdout
+    (left,) = tmp_path.iterdir()
+    assert left.suffix == ".partial"
+    capsys.readouterr()
+    assert roverflow(*importing(source, out)) == 0
+    assert f"{out}: continues the interrupted import after 3 frames" in capsys.readouterr().out
+    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == ["out.mcap"]
+    assert {name[0] for name in logged} == {"3", "4", "5"}  # the others are not read again
+
+
+def test_the_import_that_a_full_disk_ended_is_continued(source, tmp_path, capsys):
+    out, whole = tmp_path / "out.mcap", (source / "whole.mcap").read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) // 2, limits[1]))
+        assert roverflow(*importing(source, out)) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    (left,) = tmp_path.iterdir()
+    assert f"what was written is in {left}, and the same command continues it" in capsys.readouterr().err
+    assert roverflow(*importing(source, out)) == 0
+    assert "continues the interrupted import after" in capsys.readouterr().out
+    assert out.read_bytes() == whole
+
+
+def test_wherever_the_log_was_cut_or_damaged_the_result_is_the_same(source, interrupted):
+    whole, out = (source / "whole.mcap").read_bytes(), interrupted.with_name("out.mcap")
+    places = np.random.default_rng(1).integers(0, len(whole), 12).tolist()
+    for place in [0, 1, 60, 500, *places, len(whole) - 30, len(whole)]:
+        zeros = bytes(min(4096, len(whole) - place))  # a block that never reached the disk
+        for content in (whole[:place], whole[:place] + zeros + whole[place + len(zeros) :]):
+            interrupted.write_bytes(content)
+            assert roverflow(*importing(source, out)) == 0
+            assert out.read_bytes() == whole, place
+
+
+def test_an_import_with_other_options_is_not_continued(source, interrupted, capsys):
+    out, fresh = interrupted.with_name("out.mcap"), interrupted.with_name("fresh.mcap")
+    assert roverflow(*importing(source, fresh, pitch_down=20)) == 0
+    assert roverflow(*importing(source, out, pitch_down=20)) == 0
+    said = capsys.readouterr().out
+    assert f"{out}: an interrupted import of other files or with other options is not continued" in said
+    assert out.read_bytes() == fresh.read_bytes()
+    assert sorted(path.name for path in out.parent.iterdir()) == ["fresh.mcap", "out.mcap"]
+
+
+def test_a_log_is_continued_as_far_as_its_messages_are_the_same(source, interrupted, tmp_path, logged):
+    out, fresh, rolls = tmp_path / "out.mcap", tmp_path / "fresh.mcap", tmp_path / "attitudes.csv"
+    (options := [*importing(source, out)])[-4:-2] = ["--attitudes", rolls]
+    rows = [f"{number}-left,15,{number}\n" for number in range(PAIRS)]
+    rolls.write_text("name,pitch_down,roll\n" + "".join(rows))
+    assert roverflow(*options) == 0
+    out.rename(interrupted)
+    rolls.write_text("name,pitch_down,roll\n" + "".join([*rows[:3], "3-left,15,0\n", *rows[4:]]))
+    logged.clear()
+    assert roverflow(*options) == 0
+    assert {name[0] for name in logged} == {"3", "4", "5"}
+    options[3] = fresh
+    assert roverflow(*options) == 0
+    assert out.read_bytes() == fresh.read_bytes()
+
+
+def test_an_import_of_an_image_that_changed_is_not_continued(source, interrupted, capsys):
+    out, image = interrupted.with_name("out.mcap"), source / "pairs" / "0-left.png"
+    state, whole = image.stat(), (source / "whole.mcap").read_bytes()
+    try:
+        os.utime(image, ns=(state.st_atime_ns, state.st_mtime_ns + 1))
+        assert roverflow(*importing(source, out)) == 0
+    finally:
+        os.utime(image, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert "is not continued" in capsys.readouterr().out
+    assert out.read_bytes() == whole
+    assert [path.name for path in out.parent.iterdir()] == ["out.mcap"]
+
+
+def test_two_imports_of_one_log_do_not_mix(source, interrupted, capsys):
+    out = interrupted.with_name("out.mcap")
+    mark = interrupted.name.removeprefix("out.mcap.import-").removesuffix(".partial")
+    with ResumableWriter(out, mark) as other:
+        assert roverflow(*importing(source, out)) == 1
+        assert "is being written by another import" in capsys.readouterr().err
+        other.abort()
+    assert interrupted.exists()  # as it was not changed yet
+    assert roverflow(*importing(source, out)) == 0
+    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
