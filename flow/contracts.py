@@ -53,6 +53,11 @@ class Absent:
 
 
 @dataclass(frozen=True)
+class Unchanged:
+    """Takes the place of an item in a frame in which a stage returned None: its last item stays valid."""
+
+
+@dataclass(frozen=True)
 class FrameRecord:
     """One frame, as a sink gets it.
 
@@ -63,13 +68,15 @@ class FrameRecord:
     stamp
         ns of the log's clock.
     items
-        Stream -> item, without the lost ones.
+        Stream -> item, without the lost and the unchanged ones.
     entries
         The losses of this frame, and those of the log since the frame before.
     seconds
         Stage -> wall time.
     queues
         Stage -> frames in its inbox when this frame was delivered.
+    unchanged
+        Streams without a new item and without a loss in this frame: their last items stay valid.
     """
 
     index: int
@@ -78,6 +85,7 @@ class FrameRecord:
     entries: tuple[Loss, ...]
     seconds: Mapping[str, float]
     queues: Mapping[str, int]
+    unchanged: frozenset[str] = frozenset()
 
 
 class Severity(StrEnum):

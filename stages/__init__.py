@@ -20,6 +20,7 @@ from stages.data import (
     PixelOrigin,
     PointCloud,
     Pose,
+    Region,
     Rover,
     StereoCamera,
     StereoFrame,
@@ -45,6 +46,7 @@ from stages.terrain.binarise import Binarise
 from stages.terrain.dem import Voxelise
 from stages.terrain.features import TerrainFeatures
 from stages.terrain.fuse import Fuse
+from stages.terrain.map_region import MapRegion
 
 __all__ = [
     "Binarise",
@@ -63,6 +65,7 @@ __all__ = [
     "ImageNoise",
     "LeftRightCheck",
     "Level",
+    "MapRegion",
     "Match",
     "MatchFailure",
     "MatchHealth",
@@ -77,6 +80,7 @@ __all__ = [
     "Rectify",
     "Refine",
     "RefinePaper",
+    "Region",
     "Reproject",
     "Rover",
     "StereoCamera",

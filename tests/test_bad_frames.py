@@ -17,7 +17,7 @@ from tests.conftest import FRAMES, edit_of, rewrite, roverflow
 
 BAD = 1  # the frame that is made bad
 MAPS = ("/nav/elevation_map", "/nav/navigation_map", "/nav/regional_map")
-SETTINGS = ("--set", "disparities=64", "--set", "McapSink.regional_step=0")  # maps of every frame
+SETTINGS = ("--set", "disparities=64", "--set", "regional_elevation.step=0")  # maps of every frame
 Change = Callable[[str, int, bytes], bytes | None]
 
 

@@ -9,7 +9,12 @@ that take its output have room; only the oldest frame in flight may enter a full
 the engine cannot deadlock. Downstream work goes first, and few frames are in flight at a time.
 
 A stage that is `large` needs much memory while it works. At most every second worker is in one, so that the memory is
-needed fewer times; the others find other work. A sink may `prepare` items one by one, which any worker does as soon as
+needed fewer times; the others find other work.
+
+A stage may return None, where nothing is new; then `Unchanged` passes through everything downstream. A stage that can
+`flush` takes a frame when the next one is there, or none will come: so it can flush with the last frame.
+
+A sink may `prepare` items one by one, which any worker does as soon as
 an item is there. The engine then keeps what it returned in place of the item.
 """
 
@@ -23,16 +28,18 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from flow.contracts import Absent, FrameRecord, Loss, LossReason, Sink
+from flow.contracts import Absent, FrameRecord, Loss, LossReason, Sink, Unchanged
 from flow.runtime.bottleneck import READING, bottleneck
 from flow.runtime.graph import Node, is_item, start
 from flow.runtime.ledger import Ledger, failure
 
+_NO_ITEM = (Absent, Unchanged)
+
 
 @dataclass(eq=False)
 class _Frame:
-    """A frame in flight. values: stream -> item, Absent, or None where the item was freed; coming: its streams that are
-    there or being made; begun, done: the work on it."""
+    """A frame in flight. values: stream -> item, Absent, Unchanged, or None where the item was freed; coming: its
+    streams that are there or being made; begun, done: the work on it."""
 
     index: int
     stamp: int
@@ -49,8 +56,9 @@ class _Work:
     """A stage, or a sink (`output` is then None).
 
     inputs: the streams that must be there before it starts; reads: those of them whose items it uses; sink: the name of
-    the sink that it belongs to; large: whether it needs much memory; consumers: what waits for its output; inbox:
-    indices of frames; next: the frame that an ordered work takes next; seconds, cpu_seconds: its time so far.
+    the sink that it belongs to; large: whether it needs much memory; flushes: whether it must know the last frame;
+    consumers: what waits for its output; inbox: indices of frames; next: the frame that an ordered work takes next;
+    seconds, cpu_seconds: its time so far.
     """
 
     name: str
@@ -61,6 +69,7 @@ class _Work:
     run: Callable[[_Frame], Any]
     sink: str = ""
     large: bool = False
+    flushes: bool = False
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     consumers: list[_Work] = field(default_factory=list)
@@ -72,8 +81,8 @@ class Engine:
     """Runs stages and sinks over frames.
 
     stages: in topological order; sinks: name -> (sink, the streams it gets); ledger: gets an entry for every loss;
-    workers: threads; capacity: frames that an inbox holds; max_frames: in flight; on_frame: called
-    after every frame, with whether all of its streams are there.
+    workers: threads; capacity: frames that an inbox holds, and one more where a stage flushes; max_frames: in flight,
+    at least 2 if a stage flushes; on_frame: called after every frame, with whether it lost nothing.
     """
 
     def __init__(
@@ -87,11 +96,12 @@ class Engine:
         on_frame: Callable[[bool], None] = lambda complete: None,
     ) -> None:
         self._ledger, self._on_frame = ledger, on_frame
-        self._capacity, self._max_frames, self._max_large = capacity, max_frames, max(1, workers // 2)
+        self._capacity, self._max_large = capacity, max(1, workers // 2)
         self._condition = threading.Condition()
         self._frames: deque[_Frame] = deque()
         self.states = start(stages)  # stream -> state of its stage, of this run
         self._work = [self._stage_work(node) for node in stages]
+        self._max_frames = max(max_frames, 2) if any(work.flushes for work in self._work) else max_frames
         for name, (sink, streams) in sinks.items():
             self._work += self._sink_work(name, sink, streams)
         for work in self._work:
@@ -100,7 +110,7 @@ class Engine:
         for work in self._work:
             for stream in work.reads:
                 self._readers.setdefault(stream, []).append(work)
-        self._closed = self._over = False
+        self._ending = self._closed = self._over = False  # _ending: no frame is admitted any more
         self._writing = 0  # workers inside a sink
         self._in_large = 0  # workers inside a large stage
         self._reporting = threading.Lock()
@@ -149,6 +159,8 @@ class Engine:
         After `stop()`, only workers inside a sink may finish; what the others still do is lost.
         """
         with self._condition:
+            self._ending = True
+            self._condition.notify_all()
             while self._frames and not self.failure and not stop():
                 self._condition.wait(0.1)
             self._closed = True
@@ -254,13 +266,15 @@ class Engine:
     def _ready(self, work: _Work, frame: _Frame) -> bool:
         if frame.index not in work.inbox or (work.ordered and frame.index != work.next):
             return False
+        if work.flushes and frame is self._frames[-1] and not self._ending:
+            return False
         return all(stream in frame.values for stream in work.inputs)
 
     def _has_room(self, consumers: Iterable[_Work], frame: _Frame) -> bool:
         """Whether the inboxes of all `consumers` have room for `frame`; the oldest frame always has right of way."""
         if not self._frames or frame is self._frames[0]:
             return True
-        return all(len(c.inbox) < self._capacity or frame.index in c.inbox for c in consumers)
+        return all(len(c.inbox) < self._capacity + c.flushes or frame.index in c.inbox for c in consumers)
 
     def _expect(self, frame: _Frame, nodes: Iterable[_Work]) -> None:
         """Put `frame` into the inboxes of those nodes whose inputs are all there or being made."""
@@ -280,7 +294,7 @@ class Engine:
         if work.output:
             frame.values[work.output] = value
         self._complete(work, frame)
-        if isinstance(value, Absent):
+        if isinstance(value, _NO_ITEM):
             self._pass_absence(frame)
         return list(self._retire())
 
@@ -291,22 +305,22 @@ class Engine:
             work.next += 1
 
     def _free(self, frame: _Frame, streams: Iterable[str]) -> None:
-        """Let go of the items that no work on the frame will read any more. An Absent stays, to mark the frame."""
+        """Let go of the items that no work on the frame will read any more. What marks a missing item stays."""
         for stream in streams:
             unread = frame.done.issuperset(self._readers.get(stream, ()))
-            if unread and stream in frame.values and not isinstance(frame.values[stream], Absent):
+            if unread and stream in frame.values and not isinstance(frame.values[stream], _NO_ITEM):
                 frame.values[stream] = None
 
     def _pass_absence(self, frame: _Frame) -> None:
-        """Make the output of every stage with an absent input absent (stages are in topological order)."""
+        """Make the output of every stage with an absent input absent, unless it flushes (in topological order)."""
         for work in self._work:
-            if work.output is None or work in frame.begun:
+            if work.output is None or work.flushes or work in frame.begun:
                 continue
-            lost = [frame.values[s] for s in work.inputs if isinstance(frame.values.get(s), Absent)]
-            if lost:
+            missing = _missing(frame.values.get(stream) for stream in work.inputs)
+            if missing:
                 frame.begun.add(work)
                 work.inbox.discard(frame.index)
-                frame.values[work.output] = lost[0]
+                frame.values[work.output] = missing
                 frame.coming.add(work.output)
                 self._complete(work, frame)
         self._expect(frame, self._work)
@@ -324,16 +338,22 @@ class Engine:
 
     def _stage_work(self, node: Node) -> _Work:
         state = {"state": self.states[node.name]} if node.stateful else {}
-        streams = tuple(node.inputs.values())
+        streams, flushes = tuple(node.inputs.values()), hasattr(node.actor, "flush")
 
         def run(frame: _Frame) -> Any:
-            value = node.actor(**{port: frame.values[stream] for port, stream in node.inputs.items()}, **state)
+            given = {port: frame.values[stream] for port, stream in node.inputs.items()}
+            missing = _missing(given.values())
+            value = None if missing else node.actor(**given, **state)
+            if value is None and flushes and self._ending and frame is self._frames[-1]:
+                value = node.actor.flush(**state)
+            if value is None and (missing or node.sparse):
+                return missing or Unchanged()
             if not is_item(value, node.output):
                 raise TypeError(f"{node.use} returned {type(value).__name__}, not {node.output.__name__}")
             return value
 
         large = bool(getattr(node.actor, "large", False))
-        return _Work(node.name, streams, streams, node.name, node.stateful, run, large=large)
+        return _Work(node.name, streams, streams, node.name, node.stateful, run, large=large, flushes=flushes)
 
     def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> list[_Work]:
         """The work of a sink: what it prepares, and the writing."""
@@ -344,12 +364,14 @@ class Engine:
         order = {work.name: index for index, work in enumerate(self._work)}
 
         def run(frame: _Frame) -> None:
-            items = {s: frame.values[key] for s, key in given.items() if not isinstance(frame.values[key], Absent)}
+            values = {stream: frame.values[key] for stream, key in given.items()}
+            items = {stream: value for stream, value in values.items() if not isinstance(value, _NO_ITEM)}
+            unchanged = frozenset(stream for stream, value in values.items() if isinstance(value, Unchanged))
             entries = tuple(sorted(frame.entries, key=lambda entry: (order.get(entry.stage, -1), entry.stamp)))
             with self._condition:
                 seconds = dict(frame.seconds)
                 queues = {work.name: len(work.inbox) for work in stages}
-            sink.write(FrameRecord(frame.index, frame.stamp, items, entries, seconds, queues))
+            sink.write(FrameRecord(frame.index, frame.stamp, items, entries, seconds, queues, unchanged))
 
         # A sink waits for every stream of the frame, even those it does not get: only then are the entries complete.
         every = tuple(dict.fromkeys([*given.values(), *(work.name for work in stages)]))
@@ -363,3 +385,9 @@ class Engine:
             return prepare(stream, frame.values[stream])
 
         return _Work(key, (stream,), (stream,), key, False, run, sink=sink)
+
+
+def _missing(values: Iterable[Any]) -> Absent | Unchanged | None:
+    """What stands for the first lost item among these, else for the first unchanged one; None if all are there."""
+    found = [value for value in values if isinstance(value, _NO_ITEM)]
+    return next((value for value in found if isinstance(value, Absent)), found[0] if found else None)

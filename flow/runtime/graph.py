@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
 from numbers import Real
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from flow.contracts import Sink, unaliased
@@ -66,6 +66,11 @@ class Node:
     def stateful(self) -> bool:
         """Whether the actor is a stage with state; it gets frames one at a time, in stamp order."""
         return not self.aligns and has_state(type(self.actor))
+
+    @property
+    def sparse(self) -> bool:
+        """Whether the actor is a stage that may return None, where a frame has nothing new."""
+        return not self.aligns and NoneType in get_args(_returned(type(self.actor)))
 
 
 @dataclass(frozen=True)
@@ -192,8 +197,9 @@ def ports_of(kind: type) -> tuple[dict[str, Any], set[str]]:
     state = next((parameter for parameter in parameters if parameter.name == "state"), None)
     if has_state(kind) and (state is None or state.kind is not Parameter.KEYWORD_ONLY):
         raise TypeError(f"{kind.__name__} has 'start', so its __call__ must take 'state' by keyword only (after '*')")
-    if not has_state(kind) and (state is not None or hasattr(kind, "finding")):
-        what = "finding" if state is None else "__call__"
+    users = [name for name in ("finding", "flush") if hasattr(kind, name)]
+    if not has_state(kind) and (state is not None or users):
+        what = users[0] if state is None else "__call__"
         raise TypeError(f"{kind.__name__}.{what} needs a 'state', so {kind.__name__} must have 'start', which makes it")
     parameters = [parameter for parameter in parameters if parameter.name != "state"]
     for parameter in parameters:
@@ -215,7 +221,7 @@ def hints_of(annotated: Any) -> dict[str, Any]:
 
 def accepts(wanted: Any, given: type) -> bool:
     """Whether a port annotated `wanted` takes items of type `given`."""
-    if get_origin(wanted) in (Union, UnionType):
+    if _is_union(wanted):
         return any(accepts(option, given) for option in get_args(wanted))
     wanted, given = get_origin(wanted) or wanted, get_origin(given) or given
     return wanted is Any or (isinstance(wanted, type) and issubclass(given, wanted))
@@ -231,17 +237,29 @@ def is_item(value: Any, kind: Any) -> bool:
 
 
 def output_of(actor: Any, kinds: dict[str, type], place: YamlLocation) -> type:
-    """The type of the stream that `actor` makes from inputs of these types."""
+    """The type of the stream that `actor` makes from inputs of these types; X for a stage that returns X | None."""
     if is_aligner(type(actor)):
         try:
             return actor.output(kinds)  # type: ignore[no-any-return]
         except TypeError as error:
             raise place.error(f"{error}") from error
-    returned: Any = hints_of(type(actor).__call__).get("return")
+    returned = _returned(type(actor))
+    if _is_union(returned):
+        items = [option for option in get_args(returned) if option is not NoneType]
+        returned = items[0] if len(items) == 1 else returned
     origin = get_origin(returned) or returned  # of `NDArray[...]` and `dict[str, float]` the class
     if not isinstance(origin, type) or origin is UnionType:
         raise place.error(f"{type(actor).__name__}.__call__ does not say which one type it returns")
     return returned  # type: ignore[no-any-return]
+
+
+def _returned(kind: type) -> Any:
+    """The return annotation of a stage class."""
+    return hints_of(kind.__call__).get("return")
+
+
+def _is_union(kind: Any) -> bool:
+    return get_origin(kind) in (Union, UnionType)
 
 
 def clock_of(name: str, actor: Any, clocks: dict[str, str], place: YamlLocation) -> str:

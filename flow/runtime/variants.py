@@ -84,7 +84,8 @@ class VariantSink:
         """Write what the variant has of a frame."""
         items = {self.names[stream]: item for stream, item in record.items.items() if stream in self.names}
         entries = tuple(loss for loss in record.entries if "@" not in loss.stage or loss.stage in self.names)
-        self.sink.write(replace(record, items=items, entries=entries))
+        unchanged = frozenset(self.names[stream] for stream in record.unchanged if stream in self.names)
+        self.sink.write(replace(record, items=items, entries=entries, unchanged=unchanged))
 
     def close(self, summary: Mapping[str, Any]) -> None:
         """Finish the output of the variant."""

@@ -32,7 +32,6 @@ from recordings.ros2.to_msg import (
 )
 from recordings.sinks.map_cropping import cropped
 from recordings.sinks.own_types import leaves, plain_type, refusal
-from recordings.sinks.regional_steps import RegionalSteps, regional_maps
 from recordings.sinks.thinning import thinned
 from recordings.sinks.viewer_topics import rerun_root, viewer_messages
 from stages.data import (
@@ -41,6 +40,7 @@ from stages.data import (
     NavigationMap,
     PointCloud,
     Pose,
+    Region,
     StereoFrame,
     TiltHealth,
     Transform,
@@ -87,10 +87,6 @@ class McapSink:
         0.01, "largest relative error by which variances, slopes, roughness and sigmas are rounded; 0: exact", low=0,
         high=0.1,
     )  # fmt: skip
-    regional_step: float = parameter(
-        1.0, "path of the rover, or of the place 4 m ahead of it, between the regional maps that are written; 0: one a "
-        "frame", unit="m", low=0, high=1.5,
-    )  # fmt: skip
     viewers: bool = parameter(
         False, "also write depth, left image, coloured terrain and codes as colours, which viewers draw without plugins"
     )
@@ -110,7 +106,6 @@ class McapSink:
     _writer: Ros2Writer = field(init=False, repr=False)
     _kinds: Mapping[str, Any] = field(default_factory=dict, init=False, repr=False)
     _owners: dict[str, tuple[str, ...]] = field(default_factory=dict, init=False, repr=False)
-    _steps: RegionalSteps = field(init=False, repr=False)
     _about: Mapping[str, str] = field(default_factory=dict, init=False, repr=False)
     _rooted: bool = field(default=False, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
@@ -122,8 +117,8 @@ class McapSink:
     def wants(self, stream: str, kind: Any) -> bool:
         """Whether the sink writes a stream of this name and type."""
         plain = plain_type(kind)
-        drawn = (TiltHealth, StereoFrame) if self.viewers else TiltHealth
-        return stream in self._written or (isinstance(plain, type) and issubclass(plain, drawn))
+        used = (TiltHealth, Region, StereoFrame) if self.viewers else (TiltHealth, Region)
+        return stream in self._written or (isinstance(plain, type) and issubclass(plain, used))
 
     def unwritable(self, stream: str, kind: Any) -> str:
         """Why the sink cannot write a stream that it is to write, in a sentence; empty where it can."""
@@ -138,8 +133,7 @@ class McapSink:
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: facts of the run, kept as the metadata record "roverflow"."""
         self._rooted, self._last_stamp, self.empty = False, None, any(stream in streams for stream in self._written)
-        self._kinds, self._owners, self._steps = dict(streams), {}, RegionalSteps(self.regional_step)
-        self._about = about
+        self._kinds, self._owners, self._about = dict(streams), {}, about
         self._writer = self._writer_class()(Path(path), keep=True, compression=self.compression)
         try:
             self._writer.metadata("roverflow", about if self.profile == "ros2" else {**about, "profile": self.profile})
@@ -151,10 +145,7 @@ class McapSink:
     def write(self, record: FrameRecord) -> None:
         """Write a frame."""
         writer, stamp = self._writer, record.stamp
-        regional = regional_maps(stamp, record.items, self._written)
-        for due in self._steps.due(regional) if regional.maps else ():
-            self._write_items(due.maps, due.stamp)
-        kept = {name: record.items[name] for name in self._written if name in record.items.keys() - regional.maps}
+        kept = {name: record.items[name] for name in self._written if name in record.items}
         self._write_items(kept, stamp)
         if self.viewers:
             for topic, message in viewer_messages(record.items, kept):
@@ -179,8 +170,6 @@ class McapSink:
         writer = self._writer
         if writer.closed:  # a write failed and raised
             return
-        for due in self._steps.rest():
-            self._write_items(due.maps, due.stamp)
         entries = list(summary.get("entries", ()))
         found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
         findings = [_finding(stream, finding) for stream, finding in found] + self._copied_inputs()
@@ -271,7 +260,7 @@ def _topic_part(name: str) -> str:
 
 
 def _transforms(items: Iterable[Any]) -> Iterator[Transform]:
-    """The poses of the sensors of clouds, and of frame `level` in regional maps."""
+    """The poses of the sensors of clouds, and of frame `level` in regions and in maps."""
     for item in items:
         known = item.sensor if isinstance(item, PointCloud) else getattr(item, "level", None)
         if isinstance(known, Transform):  # a type of the user's own may have another `level`

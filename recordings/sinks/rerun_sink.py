@@ -42,8 +42,7 @@ from recordings.sinks.canvas import Canvas
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import NUMBERS, plain_type
-from recordings.sinks.regional_steps import RegionalMaps, regional_maps, way_between
-from stages.data import Array, Disparity, ElevationMap, Mount, Pose, StereoFrame
+from stages.data import Array, Disparity, ElevationMap, Mount, Pose, Region, StereoFrame
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
@@ -79,10 +78,6 @@ class RerunSink:
         "often each time that half of the remaining room is used",
         low=0, unit="MB",
     )  # fmt: skip
-    regional_step: float = parameter(
-        0.5, "path of the rover, or of the place 4 m ahead of it, between the regional maps that are drawn; 0: one a "
-        "frame", unit="m", low=0,
-    )  # fmt: skip
     live_port: int = parameter(0, "port of loopback where a viewer can watch the run; 0: none", low=0, high=65535)
     without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
     desk: str = parameter("overview", "layout that the viewer opens with", choices=tuple(DESKS))
@@ -98,7 +93,7 @@ class RerunSink:
         if any(fnmatchcase(stream, pattern) for pattern in self.without):
             return False
         plain = plain_type(kind)
-        if not isinstance(plain, type) or issubclass(plain, Mount):
+        if not isinstance(plain, type) or issubclass(plain, Mount | Region):
             return False
         known = (wanted for kinds in LOGGERS for wanted in kinds)
         return issubclass(plain, (*known, str, *NUMBERS, np.ndarray, Mapping)) or is_dataclass(plain)
@@ -132,8 +127,6 @@ class RerunSink:
             sized=frozenset(sized),
             counts_bytes=self.max_megabytes > 0,
         )
-        self._region: RegionalMaps | None = None  # the last one drawn
-        self._held: tuple[int, dict[str, Any]] | None = None  # number and regional maps of the last frame, if not drawn
         self._interval, self._rest = self.every, 1e6 * self.max_megabytes
         self._drawn = 0  # frames with images
         self._closed = False
@@ -164,7 +157,9 @@ class RerunSink:
         with catch_and_log_exceptions(strict=True):
             self._set_clocks(record.stamp, self._frames)
             self._choose_pictures(record.items)
-            captions = self._draw(self._without_held(record))
+            for stream in record.unchanged:
+                self._canvas.keep_all(stream)
+            captions = self._draw(record.items)
             self._plot(record)
             self._canvas.clear_missing()
             text = "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions])
@@ -199,9 +194,6 @@ class RerunSink:
     def _conclude(self, summary: Mapping[str, Any]) -> None:
         """Log the verdict, the remaining losses and the findings."""
         self._send_plots()
-        if self._held is not None:
-            self._set_clocks(self._stamp, self._held[0])
-            self._draw(self._held[1])
         verdict = str(summary.get("verdict", "INCOMPLETE"))
         last = max(0, self._frames - 1)
         drops = [f"{count} {reason}" for reason, count in dict(summary.get("drops", {})).items()]
@@ -255,17 +247,6 @@ class RerunSink:
         canvas.pictures = self._frames % self._interval == 0
         self._drawn += canvas.pictures
         canvas.full_size = frozenset([*self._last_disparity, *_last_of(StereoFrame, items)])
-
-    def _without_held(self, record: FrameRecord) -> dict[str, Any]:
-        """The items of a frame, without regional maps if the rover has not moved on by a step: the last ones stay."""
-        region, self._held = regional_maps(record.stamp, record.items, self._streams), None
-        if self._region is None or way_between(self._region, region) >= self.regional_step:
-            self._region = region if region.maps else self._region
-            return dict(record.items)
-        self._held = self._frames, dict(region.maps)
-        for stream in region.maps:
-            self._canvas.keep_all(stream)
-        return {stream: item for stream, item in record.items.items() if stream not in region.maps}
 
     def _draw(self, items: Mapping[str, Any]) -> list[str]:
         """Log the items of a frame; returns their captions."""

@@ -16,6 +16,7 @@ from stages.data.disparity import Disparity, MatchHealth
 from stages.data.maps import LEVEL_FRAME, Cell, CellReason, ElevationMap, MatchFailure, NavigationMap
 from stages.data.motion import CameraMotion, Mount, Pose, Tilt, TiltHealth, Transform
 from stages.data.pixel_validity import PixelOrigin, known
+from stages.data.region import Region
 from stages.data.rover import Rover
 from stages.data.tiles import TILE_SIDE, Tiles
 
@@ -38,6 +39,7 @@ __all__ = [
     "PixelOrigin",
     "PointCloud",
     "Pose",
+    "Region",
     "Rover",
     "StereoCamera",
     "StereoFrame",

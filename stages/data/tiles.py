@@ -23,6 +23,10 @@ class Tiles:
     dtype: np.dtype[np.void]
     tiles: dict[tuple[int, int], Array] = field(default_factory=dict)
 
+    def snapshot(self) -> Tiles:
+        """The cells as they are now. `write` replaces a tile and does not change it, so this copies no cells."""
+        return Tiles(self.dtype, dict(self.tiles))
+
     def read(self, row: int, col: int, rows: int, cols: int) -> Array:
         """A copy of the (rows, cols) cells from (row, col) on."""
         block = np.zeros((rows, cols), self.dtype)
@@ -35,8 +39,10 @@ class Tiles:
         """Store the cells of `block` from (row, col) on, where `changed`, (rows, cols) bool, is set."""
         for index, inside, part in _parts(row, col, *block.shape):
             if changed[part].any():
-                tile = self.tiles.setdefault(index, np.zeros((TILE_SIDE, TILE_SIDE), self.dtype))
+                old = self.tiles.get(index)
+                tile = np.zeros((TILE_SIDE, TILE_SIDE), self.dtype) if old is None else old.copy()
                 np.copyto(tile[inside], block[part], where=changed[part])
+                self.tiles[index] = tile
 
 
 def _parts(row: int, col: int, rows: int, cols: int) -> Iterator[tuple[tuple[int, int], Span, Span]]:

@@ -1,4 +1,4 @@
-"""Fuse: local clouds into one regional elevation map in the pose's frame, by inverse variance.
+"""Fuse: local clouds into the cells of one regional map in the pose's frame, by inverse variance.
 
 Nothing is resampled: a levelled cloud is rotated to its heading in the pose's frame and shifted by less than a cell
 before it is binned, so its cells are cells of the map. Errors of a frame's tilt and of the pose's height are a plane.
@@ -12,15 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from flow.contracts import Finding, Severity, StageError, counted
-from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
+from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Pose, Region
 from stages.stage import Stage, check_cells, parameter
-from stages.terrain.fused_map import FusedMap, Observation, layers_of, merged, variance_of, with_ceiling
+from stages.terrain.fused_map import FusedMap, Observation, merged, variance_of, with_ceiling
 from stages.terrain.height_alignment import fit_plane, plane_height
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
 from stages.terrain.map_levelling import MapLevelling, StatedErrors
 from stages.terrain.map_registration import FrameGrid, frame_grid, register, with_plane
 
-WINDOW_MARGIN = 1.5  # m; the slope and step of a cell depend on cells this near
 MIN_OVERLAP_CELLS = 100  # of a frame and the map, for their heights to show a jump
 MAX_JUMP = 5.0  # standard deviations of the aligning plane from one frame to the next
 MAX_REJECTED = 3  # frames in succession that do not align; then the map is reset
@@ -30,11 +29,9 @@ MAX_GRADIENT = 3.0  # rise per run of a cell in the variance of misplaced frames
 
 @dataclass(frozen=True)
 class Fuse(Stage):
-    """Merges levelled clouds into a regional map, and returns its part around the rover.
+    """Merges levelled clouds into the cells of a region, which `MapRegion` turns into maps.
 
-    The returned map is a square of `window` around the rover with its sides along the axes of the pose's frame. It
-    contains all cells that the frame changed, so the maps of a run laid over each other are the whole region. A new map
-    begins if the pose's frame changes. docs/terrain.md describes its layers, alignment and variance.
+    The region starts again if the pose's frame changes. docs/terrain.md describes its alignment and variance.
 
     Examples
     --------
@@ -43,17 +40,15 @@ class Fuse(Stage):
     ...                    "camera")
     >>> level = Level()(cloud, Tilt(0, [0.0, -1.0, 0.0], "camera"))
     >>> fuse, pose = Fuse(), Pose(0, [5, 0, 1], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
-    >>> terrain = fuse(level, pose, state=fuse.start())
-    >>> row, col = np.argwhere(np.isfinite(terrain.layers["elevation"]))[0]
-    >>> round(terrain.origin[0] + 0.05 * (float(col) + 0.5), 3), round(float(terrain.layers["elevation"][row, col]), 3)
-    (8.025, 0.0)
+    >>> region = fuse(level, pose, state=fuse.start())
+    >>> region.frame_id, region.level.translation.tolist()
+    ('odom', [5.0, 0.0, 0.0])
     """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
     max_range: float = parameter(
         8.0, "horizontal range from the rover that a frame adds to the map", unit="m", low=0.1, high=200.0
     )
-    window: float = parameter(20.0, "width of the map returned with each frame", unit="m", low=0.5, high=400.0)
     tilt_sigma: float = parameter(0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0)
     height_sigma: float = parameter(0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0)
     attitude_sigma: float = parameter(
@@ -75,20 +70,14 @@ class Fuse(Stage):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_cells("Fuse.window", self.window, self.resolution)
-        min_window = 2 * (self.max_range + WINDOW_MARGIN)
-        if self.window < min_window:
-            raise ValueError(
-                f"Fuse.window must be at least {min_window:g} m, not {self.window:g} m: it contains all that a frame "
-                f"changes (max_range, {self.max_range:g} m) and {WINDOW_MARGIN:g} m around it"
-            )
+        check_cells("Fuse.max_range", self.max_range, self.resolution, 2)
 
     def start(self) -> FusedMap:
         """An empty map, the state of one run."""
         return FusedMap()
 
-    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> ElevationMap:
-        """The regional map around the rover, in the pose's frame, with a cloud in frame `level` merged in.
+    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> Region:
+        """The region in the pose's frame, with a cloud in frame `level` merged in.
 
         `mount` may be left out if the pose is the camera's.
         """
@@ -106,7 +95,10 @@ class Fuse(Stage):
         cells[hidden] = with_ceiling(cells[hidden], ceiling)
         state.cells.write(frame.row, frame.col, cells, known | hidden)
         state.last, state.has_ceiling = cloud.stamp, "ceiling" in frame.terrain.layers
-        return self._window(cloud.stamp, with_plane(frame.level, plane), state)
+        changed = frame.row, frame.col, frame.row + cells.shape[0], frame.col + cells.shape[1]
+        level = with_plane(frame.level, plane)
+        now = state.cells.snapshot()
+        return Region(cloud.stamp, now, self.resolution, level, state.epoch, changed, state.has_ceiling)
 
     def finding(self, state: FusedMap) -> Finding | None:
         """A warning if the map was reset within one frame of the pose, or if that frame leans."""
@@ -206,11 +198,3 @@ class Fuse(Stage):
                 "unlike the frames before; its pose or its tilt has jumped, and it is left out of the regional map"
             )
         return True
-
-    def _window(self, stamp: int, level: Transform, state: FusedMap) -> ElevationMap:
-        """The map around the rover."""
-        half = int(np.ceil(self.window / 2 / self.resolution - 1e-9))
-        col, row = (int(np.floor(position / self.resolution)) - half for position in level.translation[:2])
-        layers = layers_of(state.cells.read(row, col, 2 * half, 2 * half), state.has_ceiling)
-        origin = (col * self.resolution, row * self.resolution)
-        return ElevationMap(stamp, layers, self.resolution, origin, level.parent, level, state.epoch)

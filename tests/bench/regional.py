@@ -44,7 +44,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Region:
+class RegionFigures:
     """Figures of the regional map of a traverse. seams: (frames - 1, 2) m, placed and fused; errors: (n,) m, of cells
     that frames changed; sigmas: (n,) m, stated for them; contradicted: share of cells; seconds: by stream."""
 
@@ -119,13 +119,13 @@ def drift(simulation: Simulation, folder: Path) -> tuple[float, float, float]:
     return float(np.hypot(*plane[1:])), float(plane[0]), max(heights, key=abs)
 
 
-def region(simulation: Simulation, folder: Path) -> Region:
+def region(simulation: Simulation, folder: Path) -> RegionFigures:
     """The regional map of a traverse, by the command line's default pipeline."""
     log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
     _run(simulation, folder)
     frames = _frames(out)
     errors = _errors(simulation, [frame["/nav/regional_map"] for frame in frames.values()])
-    return Region(_seams(simulation, log, frames), *errors, json.loads(summary.read_text())["seconds"])
+    return RegionFigures(_seams(simulation, log, frames), *errors, json.loads(summary.read_text())["seconds"])
 
 
 def _run(simulation: Simulation, folder: Path) -> Path:
@@ -133,18 +133,18 @@ def _run(simulation: Simulation, folder: Path) -> Path:
     log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
     write_log(simulation, log)
     command = [sys.executable, "-m", "flow", "run", log, "-o", out, "--no-rrd", "--summary", summary]
-    command += ["--set", "McapSink.regional_step=0"]  # a map a frame
+    command += ["--set", "regional_elevation.step=0"]  # a map a frame
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return out
 
 
-def shares_within(regions: list[Region]) -> tuple[float, float]:
+def shares_within(regions: list[RegionFigures]) -> tuple[float, float]:
     """Shares of the cells of all regions that are within one and two stated standard deviations."""
     sigmas = np.concatenate([np.abs(found.errors) / found.sigmas for found in regions])
     return float(np.mean(sigmas <= 1)), float(np.mean(sigmas <= 2))
 
 
-def within(regions: list[Region]) -> str:
+def within(regions: list[RegionFigures]) -> str:
     """The same, in percent."""
     return ", ".join(f"{100 * share:.1f}" for share in shares_within(regions))
 

@@ -262,7 +262,7 @@ def own(field="int", takes="couple: Couple", returns="Couple"):
     (own(takes="couple: Nix"), SCALE, "Own, couple: both",
      "5: the annotations of Own.__call__ cannot be read: name 'Nix' is not defined"),
     (own(takes="*couple: Couple"), SCALE, "Own, couple: both", "5: Own.__call__ must take each input by its name"),
-    (own(returns="Couple | None"), SCALE, "Own, couple: both",
+    (own(returns="Couple | Number"), SCALE, "Own, couple: both",
      "5: Own.__call__ does not say which one type it returns"),
     (IDLE, ADD, "Own", "6: 'sum' has no input"),
     (ODD, ADD, "Own, a: twice, b: height", "6: KeyError: 'nix' (MODULE.py, line 7; --debug"),

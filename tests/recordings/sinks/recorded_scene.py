@@ -56,6 +56,7 @@ class Record:
     entries: tuple[Loss, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=lambda: {"matched": 0.25, "disparity": 0.5})
     queues: Mapping[str, int] = field(default_factory=lambda: {"matched": 3, "disparity": 1})
+    unchanged: frozenset[str] = frozenset()
 
 
 def scene(stamp: int = START) -> dict[str, Any]:

@@ -119,20 +119,17 @@ def test_a_regional_map_is_drawn_in_its_own_frame_of_reference(tmp_path):
     assert spots[names.index("rover")] == [15.0, 30.0]
 
 
-def test_regional_maps_are_drawn_once_a_step_and_at_the_end(tmp_path):
+def test_what_is_unchanged_in_a_frame_stays_drawn(tmp_path):
     def frame(number):
         items = scene(START + number)
-        level = Transform("odom", LEVEL_FRAME, np.eye(3), [0.2 * number, 0.0, 0.0])
-        region = replace(items["elevation_map"], frame_id="odom", level=level)
-        return Record(START + number, items | {"regional_map": region})
+        terrain = items.pop("elevation_map")
+        if number in (0, 3):
+            return Record(START + number, items | {"elevation_map": terrain})
+        return Record(START + number, items, unchanged=frozenset({"elevation_map"} if number < 3 else ()))
 
-    records = [frame(number) for number in range(6)]
-    streams = {name: type(item) for name, item in records[0].items.items()}
-    for step, drawn in ((0.5, [0, 3, 5]), (0.0, [0, 1, 2, 3, 4, 5])):
-        path = record_of(tmp_path / f"{step}.rrd", records, streams=streams, regional_step=step)
-        reliefs = rows(path, "/regional_map/relief", "EncodedImage:blob")
-        assert [stamp - START for stamp, _, blob in reliefs] == drawn
-        assert [number for _, number, _ in reliefs] == drawn
+    path = record_of(tmp_path / "run.rrd", [frame(number) for number in range(5)])
+    reliefs = rows(path, "/elevation_map/relief", "EncodedImage:blob")
+    assert [number for _, number, _ in reliefs] == [0, 3, 4]  # emptied in the last frame, which lacks it
 
 
 def test_the_camera_is_drawn_at_the_sensor_of_the_cloud(rrd):

@@ -18,19 +18,19 @@ from recordings.ros2.from_msg import (
     read_point_cloud,
     stamp_of,
 )
-from stages import Fuse
 from stages.data import (
+    LEVEL_FRAME,
     Disparity,
     ElevationMap,
     NavigationMap,
     PointCloud,
+    Region,
     StereoCamera,
     TiltHealth,
     Transform,
 )  # fmt: skip
 from tests.recordings.sinks.recorded_scene import Loss, Record
-from tests.stages.running import Running
-from tests.stages.terrain.region_scene import MOUNT, SECOND, drive
+from tests.stages.terrain.region_scene import MOUNT, SECOND, Fusing, drive
 from tests.stages.terrain.region_scene import START as DRIVE
 
 START = 1_700_000_000_000_000_000
@@ -120,7 +120,7 @@ def test_losses_are_in_the_diagnostics_of_their_frame_or_at_the_end(tmp_path):
 
 
 def test_the_diagnostics_contain_the_epoch_of_a_regional_map(tmp_path):
-    fuse, sink = Running(Fuse()), McapSink()
+    fuse, sink = Fusing(), McapSink()
     sink.open(tmp_path / "out.mcap", {"regional_map": ElevationMap}, ABOUT)
     for frame in range(3):
         cloud, pose = drive(frame)
@@ -224,38 +224,36 @@ def test_tilt_health_and_findings_are_in_the_diagnostics(tmp_path):
     ]  # fmt: skip
 
 
-def drive_log(path: Path, frames: int, entries: tuple[Loss, ...] = (), **parameters: float) -> Path:
-    """The log of a drive whose rover moves by a quarter of a metre from frame to frame, ended after some frames."""
-    fuse, sink = Running(Fuse()), McapSink(**parameters)
-    sink.open(path, {"regional_map": ElevationMap}, ABOUT)
-    for frame in range(frames):
-        cloud, pose = drive(frame, at=(0.25 * frame, 0.0, 0.0))
-        sink.write(Record(cloud.stamp, {"regional_map": fuse(cloud, pose, MOUNT)}))
-    sink.close({"verdict": "INCOMPLETE", "interrupted": True, "entries": entries})
-    return path
-
-
-def regional_maps_of(path: Path) -> dict[int, ElevationMap]:
-    return {stamp: read_grid_map(message) for _, stamp, message in iter_decoded(path, ["/nav/regional_map"])}
-
-
-@pytest.mark.parametrize("frames", [1, 4, 6])
-def test_an_interrupted_run_ends_with_its_last_regional_map(tmp_path, frames):
-    every = regional_maps_of(drive_log(tmp_path / "every.mcap", frames, regional_step=0.0))
-    lost = (Loss("points", DRIVE + 99 * SECOND, "level", "abandoned", "the run was stopped"),)
-    path = drive_log(tmp_path / "out.mcap", frames, lost)
-    some = regional_maps_of(path)
-    assert len(every) == frames
-    assert max(some) == max(every)
-    assert len(some) < frames or frames == 1
-    for stamp, found in some.items():
-        assert (found.shape, found.origin) == (every[stamp].shape, every[stamp].origin)
-        np.testing.assert_array_equal(found.layers["elevation"], every[stamp].layers["elevation"])
+def test_frame_level_is_placed_in_frames_without_a_regional_map(tmp_path):
+    fuse, sink, places = Fusing(), McapSink(), {}
+    sink.open(tmp_path / "out.mcap", {"regional_cells": Region, "regional_map": ElevationMap}, ABOUT)
+    for frame in range(4):
+        cloud, pose = drive(frame)
+        terrain = fuse(cloud, pose, MOUNT)
+        items = {"regional_cells": fuse.region} | ({"regional_map": terrain} if frame == 2 else {})
+        sink.write(Record(cloud.stamp, items))
+        places[cloud.stamp] = fuse.region.level.translation.tolist()
+    sink.close({})
+    moved = {}
+    for topic, stamp, message in iter_decoded(tmp_path / "out.mcap", ["/tf", "/nav/regional_map"]):
+        if topic == "/tf":
+            at = message.transforms[0]
+            assert (at.header.frame_id, at.child_frame_id, stamp_of(at.header)) == ("odom", LEVEL_FRAME, stamp)
+            moved[stamp] = [at.transform.translation.x, at.transform.translation.y, at.transform.translation.z]
+        else:
+            assert stamp == DRIVE + 2 * SECOND
+    assert moved == places
 
 
 def test_equal_drives_give_equal_bytes(tmp_path):
-    one, other = (drive_log(tmp_path / name, 6).read_bytes() for name in ("a.mcap", "b.mcap"))
-    assert one == other
+    for name in ("a.mcap", "b.mcap"):
+        fuse, sink = Fusing(), McapSink()
+        sink.open(tmp_path / name, {"regional_map": ElevationMap}, ABOUT)
+        for frame in range(3):
+            cloud, pose = drive(frame)
+            sink.write(Record(cloud.stamp, {"regional_map": fuse(cloud, pose, MOUNT)}))
+        sink.close({})
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
 def test_no_rounding_keeps_every_bit(tmp_path):

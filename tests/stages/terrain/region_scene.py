@@ -7,12 +7,27 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages import Mount, PointCloud, Pose, Transform
+from stages import ElevationMap, Fuse, MapRegion, Mount, PointCloud, Pose, Region, Transform
+from tests.stages.running import Running
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 LOOKING = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 MOUNT = Mount(START, np.eye(3), Transform("base_link", "camera", LOOKING, np.array([0.4, 0.1, 1.0])))
+
+
+class Fusing(Running):
+    """`Fuse` as the engine calls it, with the map of every frame; region: of the last frame."""
+
+    region: Region
+
+    def __init__(self, window: float = 20.0, **parameters: float) -> None:
+        super().__init__(Fuse(**parameters))
+        self._maps = Running(MapRegion(window=window))
+
+    def __call__(self, *inputs: object, **named: object) -> ElevationMap:
+        self.region = super().__call__(*inputs, **named)
+        return self._maps(self.region)
 
 
 def rolling(x, y):
