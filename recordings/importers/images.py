@@ -1,4 +1,4 @@
-"""Makes a log from stereo image files and a known camera attitude, for `roverflow import`.
+"""Makes a log from stereo image files, rectified or with their calibration, and a known camera attitude.
 
 The log contains what a rover's own log would: calibration, the mount of the camera, and an inclinometer. The rover
 stands level and the camera is mounted on it pitched and rolled. So the attitude is in /tf_static, or on /tf if each
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +17,30 @@ import numpy as np
 
 from flow.contracts import counted
 from flow.parameters import check_parameters, is_required, parameter
+from recordings.calibration.formats import read_calibration
 from recordings.calibration.yaml_files import read_yaml
 from recordings.errors import LogError
 from recordings.importers.attitudes import read_attitudes
-from recordings.importers.files import read_pixels
+from recordings.importers.files import image_size, read_pixels
 from recordings.importers.recording import (
     BASE,
     FIRST_STAMP,
     IMU,
     LEFT,
+    RIGHT,
     ImagePair,
     ImportedRecording,
     Logged,
     beside,
+    raw_models,
     rectified_models,
     write_recording,
 )
 from recordings.importers.rig import Rig
 from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.to_msg import imu, transform_message
-from stages.data import StereoCamera, StereoFrame, Transform
+from recordings.source.transforms import rigid
+from stages.data import CameraModel, StereoCamera, StereoFrame, Transform
 
 TILT_OFFSET_NS = 10_000_000  # before and after each pair there is a tilt, so that one is on both sides of it
 _POSITIVE: dict[str, Any] = {"low": 1e-6, "high": 1e9}
@@ -63,7 +67,7 @@ class ImageCalibration:
 def import_images(
     left: Sequence[Path],
     right: Sequence[Path],
-    calibration: Path | Mapping[str, Any],
+    calibration: Path | Sequence[Path] | Mapping[str, Any],
     out: Path,
     *,
     pitch_down: float,
@@ -74,14 +78,15 @@ def import_images(
     progress: Callable[[int], None] = lambda done: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> int:
-    """Write rectified image pairs as a log.
+    """Write image pairs as a log.
 
     Parameters
     ----------
     left, right : sequence of Path
         Image files, in pairs.
-    calibration : Path or mapping
-        YAML file or mapping with fx, cx, cy (px) and baseline (m); optionally fy, cx_right, width, height.
+    calibration : Path, mapping or sequence of Path
+        Of rectified images: YAML file or mapping with fx, cx, cy (px) and baseline (m); optionally fy, cx_right, width,
+        height. Else one file or more of OpenCV, Kalibr or ROS.
     out : Path
         The log.
     pitch_down : float
@@ -110,7 +115,6 @@ def import_images(
     LogError
         If a file cannot be read or does not fit the calibration.
     """
-    values = _calibration(calibration)
     if len(left) != len(right) or not left:
         raise LogError(f"{len(left)} left and {len(right)} right images are not pairs; give equal numbers")
     if not 0 < height < math.inf:
@@ -124,31 +128,60 @@ def import_images(
         )
     period = round(1e9 / rate)
     rig = Rig(height=height, pitch_down=math.radians(pitch_down), roll=math.radians(roll))
-    camera = [read_frame(0, pair, values).camera for pair in zip(left, right, strict=True)][-1]
+    files = [calibration] if isinstance(calibration, Path) else calibration
+    if isinstance(files, Mapping) or (len(files) == 1 and _is_of_rectified(files[0])):
+        values = _calibration(files if isinstance(files, Mapping) else files[0])
+        camera = [read_frame(0, pair, values).camera for pair in zip(left, right, strict=True)][-1]
+        rectified, cameras, beside_it = True, rectified_models(camera), beside(camera)
+    else:
+        rectified, (cameras, beside_it) = False, _raw(files, [*left, *right])
     numbered = enumerate(zip(left, right, strict=True))
     paired = [ImagePair(FIRST_STAMP + number * period, *pair) for number, pair in numbered]
     moving = None
     if attitudes is not None:
         paired, moving = read_attitudes(attitudes, paired, rig)
-    write_recording(standing(paired, camera, rig, moving), out, progress, report)
+    recording = standing(paired, cameras, beside_it, rig, moving)
+    write_recording(replace(recording, rectified=rectified), out, progress, report)
     return len(left)
 
 
 def standing(
-    pairs: Sequence[ImagePair], camera: StereoCamera, rig: Rig, moving: Sequence[Transform] | None = None
+    pairs: Sequence[ImagePair],
+    cameras: tuple[CameraModel, CameraModel],
+    right: Transform,
+    rig: Rig,
+    moving: Sequence[Transform] | None = None,
 ) -> ImportedRecording:
-    """The recording of a rectified camera on a rover that stands level.
+    """The recording of a rectified pair of cameras on a rover that stands level.
 
-    moving: the mount of the camera at each pair, else it is that of the rig.
+    right: left camera <- right camera; moving: the mount at each pair, else it is that of the rig.
     """
     stamps = [pair.stamp for pair in pairs]
     offset = min([TILT_OFFSET_NS, *(np.diff(stamps) // 4).tolist()])
     level, sensors = Transform(BASE, IMU, np.eye(3), np.zeros(3)), [_level_tilts(stamps, offset)]
     if moving is None:
-        mounts = [*filter(None, [rig.mount]), beside(camera), level]
-        return ImportedRecording(rectified_models(camera), True, pairs, mounts, sensors)
+        return ImportedRecording(cameras, True, pairs, [*filter(None, [rig.mount]), right, level], sensors)
     turns = ((stamp, "/tf", transform_message([(mount, stamp)])) for stamp, mount in zip(stamps, moving, strict=True))
-    return ImportedRecording(rectified_models(camera), True, pairs, [beside(camera), level], [*sensors, turns])
+    return ImportedRecording(cameras, True, pairs, [right, level], [*sensors, turns])
+
+
+def _is_of_rectified(path: Path) -> bool:
+    """Whether a calibration file has entries of `ImageCalibration`, or none at all."""
+    content = read_yaml(path)
+    return not isinstance(content, Mapping) or any(known.name in content for known in fields(ImageCalibration))
+
+
+def _raw(files: Sequence[Path], images: Sequence[Path]) -> tuple[tuple[CameraModel, CameraModel], Transform]:
+    """The cameras of images before rectification, and left <- right camera. Raises LogError, also for other sizes."""
+    calibrated, size = read_calibration(files), image_size(images[0])
+    cameras = raw_models(calibrated, size)
+    if calibrated.right_in_left is None:
+        raise LogError(f"{files[0]} lacks the transform between the cameras; give the files of the stereo calibration")
+    for path in images:
+        if (found := image_size(path)) != (cameras[0].width, cameras[0].height):
+            expected = f"{cameras[0].width}x{cameras[0].height}"
+            raise LogError(f"{path} is {found[0]}x{found[1]}, but the calibration or the first image is {expected}")
+    return cameras, rigid(LEFT, RIGHT, calibrated.right_in_left)
 
 
 def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:

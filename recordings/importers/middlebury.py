@@ -19,7 +19,15 @@ import numpy as np
 from recordings.errors import LogError
 from recordings.importers.files import read_bytes
 from recordings.importers.images import read_frame, standing
-from recordings.importers.recording import FIRST_STAMP, LEFT, ImagePair, Logged, write_recording
+from recordings.importers.recording import (
+    FIRST_STAMP,
+    LEFT,
+    ImagePair,
+    Logged,
+    beside,
+    rectified_models,
+    write_recording,
+)
 from recordings.importers.rig import Rig
 from recordings.ros2.to_msg import disparity_image, image
 from recordings.scoring.stereo_metrics import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns
@@ -63,7 +71,8 @@ def import_scene(folder: Path, out: Path) -> str:
     """
     scene = read_scene(folder)
     pair = ImagePair(scene.frame.stamp, folder / IMAGES[0], folder / IMAGES[1])
-    recording = standing([pair], scene.frame.camera, Rig(height=HEIGHT, pitch_down=0.0))
+    camera, rig = scene.frame.camera, Rig(height=HEIGHT, pitch_down=0.0)
+    recording = standing([pair], rectified_models(camera), beside(camera), rig)
     metadata = ("middlebury", {"scene": scene.name, **scene.calibration})
     write_recording(replace(recording, more=lambda number: _truth(scene), metadata=metadata), out)
     if scene.truth is None:

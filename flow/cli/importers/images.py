@@ -1,4 +1,4 @@
-"""`roverflow import images`: makes a log from a folder of rectified image pairs."""
+"""`roverflow import images`: makes a log from a folder of image pairs."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from pathlib import Path
 from flow.cli.importers.common import complete, progress_bar
 from flow.cli.outputs import check_outputs
 
-HELP = "a folder of rectified left and right images"
+HELP = "a folder of left and right images"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
     sub.add_argument("out", type=Path, metavar="OUT.mcap")
-    camera = "rectified pair: fx, cx, cy (px), baseline (m); optionally fy, cx_right, width, height"
-    sub.add_argument("--calibration", type=Path, required=True, metavar="CAM.yaml", help=camera)
+    camera = (
+        "of rectified pairs a YAML file: fx, cx, cy (px), baseline (m); optionally fy, cx_right, width, height; "
+        "of others the files of OpenCV, Kalibr or ROS"
+    )
+    sub.add_argument("--calibration", type=Path, nargs="+", required=True, metavar="FILE", help=camera)
     pitch = "angle of the camera below the horizon"
     attitude = sub.add_mutually_exclusive_group(required=True)
     attitude.add_argument("--pitch-down", type=float, metavar="DEG", help=pitch)
@@ -32,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
     from recordings.importers.pairing import pair_images
 
     left, right = pair_images(options.source)
-    files = [options.calibration, *filter(None, [options.attitudes])]
+    files = [*options.calibration, *filter(None, [options.attitudes])]
     check_outputs({"input log": options.out}, [*files, *left, *right])
     given = {name: getattr(options, name) for name in ("roll", "height", "rate", "attitudes")}
     given["pitch_down"] = options.pitch_down or 0.0

@@ -171,6 +171,33 @@ def test_the_calibration_may_be_a_file(tmp_path):
         import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
 
 
+def test_pairs_that_are_not_rectified_have_the_calibration_of_its_files(tmp_path):
+    folder = data_folder("polar")
+    files = [folder / "calib" / f"{name}.yml" for name in ("left_intrinsics", "right_intrinsics", "extrinsics")]
+    given = "--calibration", *files, "--pitch-down", 35, "--height", 1.35
+    assert roverflow("import", "images", folder, tmp_path / "polar.mcap", *given) == 0
+    images = {stream: item for _, stream, item in events(tmp_path / "polar.mcap") if stream in ("left", "right")}
+    camera = images["left"].pair_with(images["right"]).camera
+    assert camera.baseline == pytest.approx(0.3996, abs=1e-4)
+    assert camera.raw[0].k[0, 0] == pytest.approx(1452.71)
+    assert camera.raw[1].d[:2] == pytest.approx([-0.017925, -0.019475])
+
+
+def test_a_calibration_before_rectification_needs_both_cameras_and_their_size(tmp_path):
+    left, right = make_pairs(tmp_path, 1)
+    lens = {"D1": [[0.01, 0, 0, 0]], "D2": [[0.02, 0, 0, 0]], "R": np.eye(3).tolist(), "T": [-0.25, 0, 0]}
+    lens |= {name: [[20.0, 0, 11.5], [0, 20.0, 7.5], [0, 0, 1.0]] for name in ("M1", "M2")}
+    (file := tmp_path / "stereo.yaml").write_text(yaml.safe_dump(lens))
+    import_images(left, right, file, tmp_path / "out.mcap", pitch_down=10, height=1)
+    images = {stream: item for _, stream, item in events(tmp_path / "out.mcap") if stream in ("left", "right")}
+    camera = images["left"].pair_with(images["right"]).camera
+    assert camera.baseline == pytest.approx(0.25)
+    assert [model.d[0] for model in camera.raw] == [0.01, 0.02]
+    save(right[0], picture(0)[:8])
+    with pytest.raises(LogError, match="is 24x8, but the calibration or the first image is 24x16"):
+        import_images(left, right, file, tmp_path / "other.mcap", pitch_down=10, height=1)
+
+
 def test_images_of_two_sizes_and_other_files_are_refused(tmp_path):
     left, right = make_pairs(tmp_path, 1)
     save(right[0], picture(0)[:8])
