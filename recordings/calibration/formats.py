@@ -46,6 +46,14 @@ class StereoCalibration:
     camera_from_imu: Array | None = None
     topics: tuple[str, str] = ("", "")
 
+    @property
+    def baseline(self) -> float:
+        """How far the right camera is to the right of the left one, m."""
+        if self.right_in_left is not None:
+            return float(self.right_in_left[0, 3])
+        left, right = (float(model.p[0, 3] / model.p[0, 0]) if model.p[0, 0] else 0.0 for model in self.models)
+        return left - right
+
     def exchanged(self) -> StereoCalibration:
         """The calibration with left and right exchanged."""
         left, right = self.models
@@ -179,14 +187,6 @@ def _opencv(named: Sequence[tuple[str, Mapping[str, Any]]], where: str) -> Stere
         name = model or ("rational_polynomial" if coefficients.size >= 8 else "plumb_bob")
         models.append(CameraModel(*size, k=matrix, d=coefficients, r=np.eye(3), p=np.zeros((3, 4)), model=name))
     return StereoCalibration((models[0], models[1]), np.linalg.inv(left_to_right))
-
-
-def _opencv_names(content: Mapping[str, Any], what: str, where: str) -> tuple[str, str]:
-    """The names of a matrix of the left and of the right camera."""
-    for names in _OPENCV_NAMES[what]:
-        if set(names) <= content.keys():
-            return names
-    raise LogError(f"{where} is no calibration of a known format; give {_KNOWN}")
 
 
 def _opencv_size(content: Mapping[str, Any]) -> tuple[int, int]:

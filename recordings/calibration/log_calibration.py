@@ -32,11 +32,20 @@ def calibrations_of_files(
     topics = tuple(chosen[side] for side in CAMERAS)
     if calibration.topics == topics[::-1]:
         calibration = calibration.exchanged()
+    shown = " and ".join(map(str, paths))
+    if calibration.baseline < 0 and set(calibration.topics) != set(topics):
+        remedy = (
+            f"name {topics[0]} and {topics[1]} as 'rostopic' of its cameras"
+            if any(calibration.topics)
+            else "write the left camera first"
+        )
+        raise LogError(
+            f"the first camera of {shown} is the right one (baseline {calibration.baseline:.4g} m); {remedy}"
+        )
     frames = [messages.frame_of(topic) for topic in topics]
     if not all(frames) or frames[0] == frames[1]:
         frames = [f"{side}_camera" for side in CAMERAS]
     _join(calibration, frames, messages.frame_of(chosen.get("inclinometer", "")) or INCLINOMETER, tree)
-    shown = " and ".join(map(str, paths))
     models = (_sized(model, messages, topic) for model, topic in zip(calibration.models, topics, strict=True))
     sides = zip(CAMERAS, models, frames, strict=True)
     return {side: CalibrationTopic(shown, model, frame) for side, model, frame in sides}

@@ -19,6 +19,7 @@ from flow.contracts import counted
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
 from recordings.containers.timeline import Timeline
 from recordings.errors import LogError, sentence_of
+from recordings.mcap.chunk import MAX_CHUNK_BYTES
 
 
 class Db3File:
@@ -62,10 +63,10 @@ class Db3File:
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of some channels in log-time order; see `Container`."""
         timeline, kept = self.timeline, range(len(self.timeline)) if places is None else places
-        times = timeline.log_times[kept.start : kept.stop]
-        wanted = np.isin(timeline.channels[kept.start : kept.stop], sorted(channels)) & (times >= (start or 0))
-        wanted &= times < (end if end is not None else 1 << 62)
-        chosen = np.flatnonzero(wanted) + kept.start
+        chosen = timeline.places_of(channels)
+        times = timeline.log_times[chosen]
+        inside = (chosen >= kept.start) & (chosen < kept.stop)
+        chosen = chosen[inside & (times >= (start or 0)) & (times < (end if end is not None else 1 << 62))]
         for place in chosen[np.argsort(timeline.log_times[chosen], kind="stable")].tolist():
             channel, log_time = int(timeline.channels[place]), int(timeline.log_times[place])
             data = self._data_or_reason(int(self._rows[0][place]))
@@ -82,7 +83,7 @@ class Db3File:
 
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
-        return int(np.isin(self.timeline.channels, sorted(channels)).sum())
+        return self.timeline.count(channels)
 
     def close(self) -> None:
         """Close the file."""
@@ -133,9 +134,12 @@ class Db3File:
     def _data_or_reason(self, row: int) -> memoryview | str:
         """The bytes of the message in a row, or why it is lost."""
         try:
-            ((data,),) = self._database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchall()
+            bounded = "SELECT length(data), iif(length(data) > ?, NULL, data) FROM messages WHERE rowid = ?"
+            ((size, data),) = self._database.execute(bounded, (MAX_CHUNK_BYTES, row)).fetchall()
         except (sqlite3.Error, ValueError) as error:
             return f"row {row} of the file is broken ({sentence_of(error)})"
+        if data is None and size is not None:
+            return f"row {row} of the file has {size} bytes; the limit is {MAX_CHUNK_BYTES}"
         return memoryview(data) if isinstance(data, bytes) else f"row {row} of the file has no bytes"
 
     def _note_unwritten(self) -> None:

@@ -21,7 +21,7 @@ from rosbags.rosbag1.reader import Compression, Header, RecordType, decompressor
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
 from recordings.containers.timeline import Timeline
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.chunk import max_unpacked
+from recordings.mcap.chunk import MAX_CHUNK_BYTES, max_unpacked
 from recordings.mcap.message_order import MAX_OPEN_BYTES
 
 _REINDEX = "`rosbag reindex` repairs a bag whose recorder was stopped"
@@ -90,7 +90,7 @@ class Ros1Bag:
 
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
-        return int(np.isin(self.timeline.channels, sorted(channels)).sum())
+        return self.timeline.count(channels)
 
     def close(self) -> None:
         """Close the file."""
@@ -116,6 +116,8 @@ class Ros1Bag:
         try:
             assert self._bag.bio
             self._bag.bio.seek(chunk.datapos)
+            if chunk.datasize > MAX_CHUNK_BYTES:
+                raise ValueError(f"it has {chunk.datasize} bytes; the limit is {MAX_CHUNK_BYTES}")
             packed = read_bytes(self._bag.bio, chunk.datasize)
             limit, records = max_unpacked(len(packed)), packed
             if chunk.decompressor is decompressors[Compression.BZ2.value]:

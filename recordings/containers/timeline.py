@@ -44,7 +44,20 @@ class Timeline:
         parts = np.split(order, np.flatnonzero(np.diff(self.channels[order])) + 1)
         return {int(self.channels[places[0]]): places for places in parts if len(places)}
 
+    @cached_property
+    def _counts(self) -> dict[int, int]:
+        channels, counts = np.unique(self.channels, return_counts=True)
+        return dict(zip(channels.tolist(), counts.tolist(), strict=True))
+
+    def count(self, channels: set[int]) -> int:
+        """The number of messages of some channels, also of those with a damaged log time."""
+        return sum(self._counts.get(channel, 0) for channel in channels)
+
     def times_of(self, channels: set[int]) -> NDArray[np.int64]:
         """The sorted log times of some channels, ns."""
+        return np.sort(self.log_times[self.places_of(channels)])
+
+    def places_of(self, channels: set[int]) -> Places:
+        """The sorted places of the messages of some channels with a valid log time."""
         places = [self.by_channel[channel] for channel in sorted(channels & self.by_channel.keys())]
-        return np.sort(self.log_times[np.concatenate(places)]) if places else np.zeros(0, np.int64)
+        return np.sort(np.concatenate([np.zeros(0, np.int64), *places]))

@@ -75,8 +75,9 @@ def _frame_line(frames: dict[str, Any]) -> str:
         gap = f"{frames['tilt_gap_s'] * 1e3:g} ms"
         line += f"; {counted(frames['with_tilt'], 'left image')} with a tilt (readings at most {gap} apart)"
     if frames["delay_s"]:
-        least, median, most = (f"{1e3 * delay:.3g}" for delay in frames["delay_s"])
-        line += f"; left images were logged {median} ms after their stamps ({least} to {most} ms)"
+        unit, scale, form = ("ms", 1e3, ".3g") if max(map(abs, frames["delay_s"])) < 1 else ("s", 1.0, ".1f")
+        least, median, most = (format(scale * delay, form) for delay in frames["delay_s"])
+        line += f"; left images were logged {median} {unit} after their stamps ({least} to {most} {unit})"
     return line
 
 

@@ -197,7 +197,7 @@ class McapFile:
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels, from the file's statistics or the walk."""
         if self.index.walked:
-            return int(np.isin(self.timeline.channels, list(channels)).sum())
+            return self.timeline.count(channels)
         return sum(self.index.stated_counts.get(channel, 0) for channel in channels)
 
     @property

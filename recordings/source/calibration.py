@@ -161,11 +161,16 @@ def _validated(model: CameraModel, topic: str) -> CameraModel:
 
 def _right_in_left(names: tuple[str, str], tree: TransformTree) -> Transform:
     """The transform from the right camera to the left one. Raises LogError if there is none, or not along x."""
-    right_in_left = tree.between(*names)
-    if right_in_left is None or not np.any(right_in_left.translation):
+    right_in_left, why = tree.between(*names), "P[0,3] of the right CameraInfo is 0"
+    if right_in_left is None:
         raise LogError(
-            "the log does not contain the baseline: P[0,3] of the right CameraInfo is 0 and no static transform "
-            f"joins '{names[0]}' and '{names[1]}'; record the stereo calibration"
+            f"the log does not contain the baseline: {why} and no static transform joins '{names[0]}' and "
+            f"'{names[1]}'; record the stereo calibration"
+        )
+    if not np.any(right_in_left.translation):
+        raise LogError(
+            f"the baseline is 0 m: {why}, and '{names[0]}' and '{names[1]}' are at the same place by the static "
+            "transforms; record the stereo calibration"
         )
     translation = right_in_left.translation
     if abs(translation[0]) < 0.9 * np.linalg.norm(translation):

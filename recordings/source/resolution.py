@@ -19,7 +19,7 @@ from recordings.source.calibration import Camera, baseline_note, calibrated_pair
 from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_images, unreadable_images
 from recordings.source.joints import read_joints
 from recordings.source.mount import mount_of, pose_of_base
-from recordings.source.moving_mount import MovingMount, moving_mount
+from recordings.source.moving_mount import MovingMount, moving_mount, other_joints
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_reading import TiltReading
 from recordings.source.topics import DecodedTopics, attempt
@@ -171,6 +171,9 @@ class SourceResolution:
         else:
             mount = attempt(self.moving.first)
         if isinstance(mount, LogError):
+            if joints and (others := other_joints(self.messages, joints)):
+                unknown = f"{self.source.joints} has only joints that the log has no angles of"
+                self.refused |= {"joints": f"{unknown}; {others}"}
             quaternion = "with the rotation from inclinometer to left camera, x, y, z, w"
             self.remedies["mount"] = [Remedy({"camera_from_inclinometer": [0, 0, 0, 1]}, quaternion)]
             return frame, None, {"mount": str(mount)}

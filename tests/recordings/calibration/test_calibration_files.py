@@ -13,7 +13,7 @@ from recordings import McapSource
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
 from tests.recordings.calibration.euroc_bag import euroc_bag, kalibr_camchain
-from tests.recordings.sample_log import data_folder, dropped, items_of, write_sample
+from tests.recordings.sample_log import HEIGHT, LEFT, RIGHT, WIDTH, data_folder, dropped, items_of, write_sample
 
 INTRINSICS = [[458.6, 457.3, 367.2, 248.4], [457.6, 456.1, 379.9, 255.2]]
 K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in INTRINSICS]
@@ -137,13 +137,32 @@ def test_a_log_without_camera_info_runs_with_the_files_of_ros(whole, tmp_path):
     assert images[0].model.p[0, 3] == -5.0
 
 
-@pytest.mark.parametrize(
-    ("shift", "sentence"), [(5.0, "is the right camera; exchange"), (0.0, "does not contain the baseline")]
-)
-def test_a_swapped_pair_and_one_without_baseline_are_named(tmp_path, shift, sentence):
-    log, source = calibrated_by_ros(tmp_path, shift)
+def test_files_with_the_right_camera_first_and_a_pair_without_baseline_are_named(tmp_path):
+    log, source = calibrated_by_ros(tmp_path, 5.0)
+    with pytest.raises(LogError, match=r"the first camera of .* is the right one .*; write the left camera first"):
+        source.open(log)
+    with McapSource(calibration=source.calibration[::-1]).open(log) as opened:
+        assert not opened.missing.keys() & {"left", "right"}
+    log, source = calibrated_by_ros(tmp_path, 0.0)
     with source.open(log) as opened:
-        assert sentence in opened.missing["left"]
+        assert "does not contain the baseline" in opened.missing["left"]
+
+
+def test_a_camchain_with_the_right_camera_first_is_read_by_its_topics(tmp_path):
+    log = write_sample(tmp_path / "log.mcap", dropped("/stereo/left/camera_info", "/stereo/right/camera_info"))
+    (path,) = kalibr(tmp_path)
+    cams = yaml.safe_load(path.read_text())
+    cams["cam1"]["T_cn_cnm1"] = rigid([0, 0, 0], [0.25, 0, 0]).tolist()
+    for cam in cams.values():
+        cam.update(resolution=[WIDTH, HEIGHT], intrinsics=[20.0, 20.0, 11.5, 7.5], distortion_coeffs=[0.0] * 4)
+    written(path, cams)
+    with pytest.raises(LogError, match=f"name {LEFT} and {RIGHT} as 'rostopic' of its cameras"):
+        McapSource(calibration=str(path)).open(log)
+    for cam, topic in zip(cams.values(), (RIGHT, LEFT), strict=True):
+        cam["rostopic"] = topic
+    written(path, cams)
+    with McapSource(calibration=str(path)).open(log) as opened:
+        assert opened.resolution.cameras is not None
 
 
 @pytest.mark.parametrize(

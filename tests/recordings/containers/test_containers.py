@@ -57,6 +57,11 @@ def test_a_broken_row_loses_itself(database, sample):
     assert lost == ["row 3 of the file has no bytes", "the message is lost: its log time is damaged"]
 
 
+def test_a_message_that_no_recorder_writes_is_not_loaded(database):
+    edit(database, "UPDATE messages SET data = zeroblob(300000000) WHERE id = 3")
+    assert read(database)[1] == ["row 3 of the file has 300000000 bytes; the limit is 268435456"]
+
+
 def test_a_cut_database_is_read_as_far_as_it_goes(sample, tmp_path):
     written = [(row[0], row[1], row[2] + number, row[3]) for number in range(20) for row in rows_of(sample)]
     database = write_rosbag2(written, tmp_path / "bag", StoragePlugin.SQLITE3) / "bag_0.db3"

@@ -1,6 +1,7 @@
 """Calibration and transforms come from the log; contradictions and gaps are reported."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -322,3 +323,14 @@ def test_a_repeated_transform_is_no_contradiction(tmp_path):
     with McapSource().open(with_transforms(tmp_path / "log.mcap", *TRANSFORMS, TRANSFORMS[0].inverse())) as log:
         assert not [item for _, _, item in log.events() if isinstance(item, Exception)]
         assert log.resolution.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]
+
+
+def test_cameras_at_the_same_place_are_named(tmp_path):
+    def edit(topic, number, message):
+        if topic.endswith("right/camera_info"):
+            message.p[3] = 0.0
+        right = replace(TRANSFORMS[0], child="right_optical")
+        return transform_message([(each, START) for each in (*TRANSFORMS, right)]) if topic == "/tf_static" else message
+
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+        assert log.missing["left"].startswith("the baseline is 0 m: P[0,3] of the right CameraInfo is 0, and 'left")

@@ -205,3 +205,12 @@ def test_a_wrong_file_of_joints_is_refused(tmp_path, content, sentence):
         assert sentence in log.refused["joints"]
     with McapSource(joints=str(tmp_path / "none.yaml")).open(tmp_path / "log.mcap") as log:
         assert "cannot read the file of joints" in log.refused["joints"]
+
+
+def test_joints_that_the_log_has_no_angles_of_are_named(tmp_path):
+    file = tmp_path / "mast.yaml"
+    file.write_text("turret: {parent: base_link, child: mast, axis: [0, 0, 1]}")
+    with McapSource(joints=str(file)).open(written(tmp_path / "log.mcap", angles)) as log:
+        assert log.refused["joints"].endswith("no angles of; it has those of wheel, pan")
+    with McapSource(joints=str(file)).open(written(tmp_path / "none.mcap", lambda stamp: None)) as log:
+        assert log.refused["joints"].endswith("it has no sensor_msgs/JointState")
