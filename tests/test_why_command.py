@@ -10,6 +10,7 @@ from flow.cli.what_if import part_of
 from recordings import McapSource
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
+from stages import Fuse, Rectify, VisualOdometry
 from stages.data import Cell
 from tests.conftest import SMALL, roverflow
 
@@ -74,6 +75,16 @@ def test_the_pixels_of_a_cell_have_the_disparities_of_the_result(traverse, fast_
     assert sum(found.sources.values()) == found.pixels.size
 
 
+def test_only_stages_before_the_map_run_and_the_log_is_not_surveyed_again(traverse, fast_result, stamp, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("not needed for the map of one frame")
+
+    for stage, method in ((Rectify, "survey"), (VisualOdometry, "start"), (Fuse, "start")):
+        monkeypatch.setattr(stage, method, refuse)
+    (x, y), *_ = places(fast_result, stamp, Cell.HAZARD, 1)
+    assert why(fast_result, AT, cell=(x, y), log=traverse).recorded == Cell.HAZARD
+
+
 def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, stamp, tmp_path, capsys):
     (x, y), *_ = places(fast_result, stamp, Cell.HAZARD, 1)
     out, log = tmp_path / "why.png", ("--log", traverse)
@@ -97,7 +108,7 @@ def test_what_cannot_be_explained_is_refused(traverse, fast_result, capsys):
     assert "is outside the map, which has x " in refusal("--cell", "99,1", "--log", traverse)
     assert "is outside the image of 320x240" in refusal("--pixel", "999,1", "--log", traverse)
     other = refusal("--cell", "1,1", "--log", traverse, "--map", "nix")
-    assert "no navigation map 'nix', only navigation_map, regional_navigation_map" in other
+    assert "the pipeline has no navigation map 'nix', only navigation_map, regional_navigation_map" in other
 
 
 def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, capsys):

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from flow.cli.replay import one_thread_per_call
-from flow.cli.what_if import part_of
+from flow.cli.what_if import hastened, part_of
 from flow.config.loader import load
 from flow.contracts import FrameRecord
 from flow.errors import UsageError
@@ -147,12 +147,18 @@ def why(
     >>> why(Path("out.mcap"), 12.0, cell=(3.4, -0.6)).reason  # doctest: +SKIP
     <CellReason.STEP: 3>
     """
-    items, graph = instant(result, at, log)
-    node = next((node for node in graph.nodes if node.name == stream and isinstance(node.actor, Binarise)), None)
-    if node is None or not isinstance(items.get(stream), NavigationMap):
-        known = [node.name for node in graph.nodes if isinstance(node.actor, Binarise) and node.name in items]
-        raise UsageError(f"the frame has no navigation map '{stream}', only {', '.join(known) or 'none'}")
-    navigation, terrain = items[stream], items[node.inputs["elevation"]]
+    from stages.kernel_loading import loading_kernels
+
+    with loading_kernels():
+        graph, given = graph_of(result, log)
+        rules = {node.name: node for node in graph.nodes if isinstance(node.actor, Binarise)}
+        if stream not in rules:
+            raise UsageError(f"the pipeline has no navigation map '{stream}', only {', '.join(rules) or 'none'}")
+        items = instant(graph.upstream_of([stream]), given, at)
+    if stream not in items:
+        raise UsageError(f"the frame has no navigation map '{stream}'; run the log again to see what it lacks")
+    node, navigation = rules[stream], items[stream]
+    terrain = items[node.inputs["elevation"]]
     cloud = _last(items, PointCloud, navigation.frame_id)
     if cloud is None:
         raise UsageError(f"the frame has no points in frame '{navigation.frame_id}', so nothing leads to the pixels")
@@ -203,29 +209,23 @@ def _pixels(disparity: Disparity | None, pixels: Array) -> dict[str, Any]:
     return found | {"sources": {PixelOrigin(code).name: number for code, number in counts.items()}}
 
 
-def instant(result: Path, at: float, log: Path | None = None) -> tuple[Mapping[str, Any], Graph]:
-    """Every stream of the frame of a result nearest to `at`, run again, and the graph.
-
-    Raises
-    ------
-    UsageError
-        If the input log is not there, or no frame goes through.
-    """
-    from stages.kernel_loading import loading_kernels
-
-    graph, given = graph_of(result, log)
-    with graph.source.open(given) as opened:
-        part = part_of(opened, at, frames=1, before=0)
+def instant(graph: Graph, log: Path, at: float) -> Mapping[str, Any]:
+    """Every stream of a graph at the frame of a log nearest to `at`. Raises UsageError if no frame goes through."""
     kept = _Keep()
-    with loading_kernels(), graph.source.open(given, start=part.start, end=part.end) as opened, one_thread_per_call():
-        run(replace(graph, sinks=(("keep", kept),)), opened, {"keep": Path("memory")})
+    with graph.source.open(log) as opened, one_thread_per_call():
+        part = part_of(opened, at, frames=1, before=0)
+        opened.narrow(part.start, part.end)
+        run(replace(hastened(graph), sinks=(("keep", kept),)), opened, {"keep": Path("memory")})
     if not kept.records:
         raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.start:.3f} says why")
-    return kept.records[0].items, graph
+    return kept.records[0].items
 
 
 def graph_of(result: Path, log: Path | None = None) -> tuple[Graph, Path]:
-    """The pipeline of a result log as it ran, without its sinks, and its input. Raises UsageError."""
+    """The pipeline of a result log as it ran, with what its survey fixed and without sinks, and its input.
+
+    Raises UsageError.
+    """
     from recordings.scoring.result_log import about_run, pipeline_of
 
     about = about_run(result)
@@ -237,7 +237,8 @@ def graph_of(result: Path, log: Path | None = None) -> tuple[Graph, Path]:
     with TemporaryDirectory(prefix="roverflow-why-") as folder:
         file = Path(folder) / f"{pipeline_of(result)}.yaml"
         file.write_text(about["pipeline"], encoding="utf-8")
-        return load(str(file), about["overrides"].splitlines(), with_sinks=False), given
+        changes = [*about["overrides"].splitlines(), *about.get("fixed", "").splitlines()]
+        return load(str(file), changes, with_sinks=False), given
 
 
 @dataclass

@@ -140,4 +140,3 @@ def _heights(fields: Mapping[str, Array], level: Transform, centre: tuple[float,
     points = level(np.column_stack([fields[axis] for axis in "xyz"]).astype(np.float64))
     inside = np.all(np.abs(points[:, :2] - centre) <= resolution / 2, axis=1)
     return np.asarray(points[inside, 2])
-

@@ -127,6 +127,14 @@ class Graph:
         made = {node.name for node in self.nodes}
         return {stream for node in self.nodes for stream in node.inputs.values()} - made
 
+    def upstream_of(self, streams: Iterable[str]) -> Graph:
+        """The graph of some streams and all that they depend on."""
+        needed = set(streams)
+        for node in reversed(self.nodes):  # every node comes after its inputs
+            if node.name in needed:
+                needed.update(node.inputs.values())
+        return replace(self, nodes=tuple(node for node in self.nodes if node.name in needed))
+
     def without(self, missing: Mapping[str, str]) -> Graph:
         """The graph without the optional nodes that need a stream in `missing` (stream -> why it is missing).
 

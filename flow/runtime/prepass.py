@@ -43,14 +43,15 @@ def prepass(graph: Graph, excerpts: Excerpts) -> Prepass:
     returns the stage to run and its finding, or None. Raises PipelineError where a survey depends on a stage with
     state: that stage would have to see every frame.
     """
-    if not any(_surveys(node) for node in graph.nodes):
+    surveying = [node.name for node in graph.nodes if _surveys(node)]
+    if not surveying:
         return Prepass(graph)
-    upstream = _upstream(graph.nodes)
-    needed = [node for node in graph.nodes if node.name in upstream]
+    upstream = graph.upstream_of(surveying)
+    needed = upstream.nodes
     for node in needed:
         if node.stateful:
             raise node.place.error(f"'{node.name}' has state, so no stage that depends on it can survey the log")
-    samples = _samples(replace(graph, nodes=tuple(needed)), excerpts)
+    samples = _samples(upstream, excerpts)
     nodes = {node.name: node for node in graph.nodes}
     findings, fixed, cpu_seconds = dict[str, Finding](), dict[str, Any](), 0.0
     for node in needed:
@@ -89,15 +90,6 @@ def _changed(before: Any, after: Any) -> dict[str, Any]:
 
 def _surveys(node: Node) -> bool:
     return bool(getattr(node.actor, "surveys", False))
-
-
-def _upstream(nodes: Sequence[Node]) -> set[str]:
-    """The surveying nodes and all that they depend on."""
-    needed = {node.name for node in nodes if _surveys(node)}
-    for node in reversed(nodes):  # every node comes after its inputs
-        if node.name in needed:
-            needed.update(node.inputs.values())
-    return needed
 
 
 def _samples(graph: Graph, excerpts: Excerpts) -> list[Sample]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import sys
 import time
@@ -146,7 +147,9 @@ def run(
     engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, max_frames=workers + 1, on_frame=on_frame)
     try:
         surveys = "\n".join(f"{name}: {finding.sentence}" for name, finding in prepared.findings.items())
-        if not stop.finishing() and sinks.open(graph.frame_streams, {**(about or {}), "surveys": surveys}):
+        fixed = "\n".join(f"{name}={json.dumps(value)}" for name, value in prepared.fixed.items())
+        facts = {**(about or {}), "surveys": surveys, "fixed": fixed}
+        if not stop.finishing() and sinks.open(graph.frame_streams, facts):
             started = time.perf_counter() - wall
             at_end = _feed(assembler, _read(log.events(streams), stop), engine, stop)
     finally:

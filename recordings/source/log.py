@@ -95,6 +95,10 @@ class McapLog:
         times = self.file.times(self.channels("left"))
         return int(np.sum((times >= (part.low or 0)) & (times < (part.high or 1 << 62))))
 
+    def narrow(self, start: float, end: float) -> None:
+        """Read only this part from now on, s after the first message."""
+        self.start, self.end = start, end
+
     def events(self, streams: Collection[str] = STREAMS) -> Iterator[tuple[int, str, Any]]:
         """(Log time in ns, stream, item) for each message of some streams; a lost item is an exception."""
         part = self._range()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -68,23 +69,25 @@ def _turned(
     rule: Binarise, name: str, value: float, place: tuple[ElevationMap, int, int], verdict: int, up: bool
 ) -> tuple[float, Cell] | None:
     """The factor nearest to 1 by which a parameter turns a verdict, and the new verdict; None if none does."""
-    low = 1.0
-    for factor in FACTORS if up else (1 / factor for factor in FACTORS):
-        other = _verdict(rule, name, value * factor, *place)
-        if other is None:
-            return None
-        if other != verdict:
-            high, turned = factor, other
-            while abs(high / low - 1) > PRECISION:
-                middle = math.sqrt(low * high)
-                between = _verdict(rule, name, value * middle, *place)
-                if between is None or between == verdict:
-                    low = middle
-                else:
-                    high, turned = middle, between
-            return high, Cell(turned)
-        low = factor
-    return None
+    factors = [1.0, *(FACTORS if up else (1 / factor for factor in FACTORS))]
+
+    def at(factor: float) -> int | None:
+        return _verdict(rule, name, value * factor, *place)
+
+    # Every test of the rule has one side of its limit, so a verdict that has turned does not turn back.
+    first = bisect_left(factors, True, lo=1, key=lambda factor: at(factor) != verdict)
+    turned = at(factors[first]) if first < len(factors) else None
+    if turned is None:
+        return None
+    low, high = factors[first - 1], factors[first]
+    while abs(high / low - 1) > PRECISION:
+        middle = math.sqrt(low * high)
+        between = at(middle)
+        if between is None or between == verdict:
+            low = middle
+        else:
+            high, turned = middle, between
+    return high, Cell(turned)
 
 
 def _around(terrain: ElevationMap, row: int, col: int) -> tuple[ElevationMap, int, int]:
