@@ -4,6 +4,7 @@ import re
 from functools import wraps
 
 import pytest
+import rerun as rr
 
 import stages
 from tests.conftest import FRAMES, SMALL, roverflow
@@ -47,6 +48,12 @@ def test_several_values_of_a_parameter_make_a_table_of_errors(traverse, tmp_path
     errors = {row[0]: float(row[row.index("%") + 3]) for row in rows}  # bad-1
     assert errors.keys() == {"A", "B", "C"}
     assert errors["B"] > 1.5 * errors["C"]
+    charts = {chunk.entity_path: chunk for chunk in rr.chunk.RrdReader(str(tmp_path / "try.rrd")).stream()}
+    heights, places = (
+        charts["/sweep/2/variants"].to_record_batch().column(f"BarChart:{part}").to_pylist()[0][0]["buffer"]
+        for part in ("values", "abscissa")
+    )
+    assert (places, heights) == ([16, 64], [errors["B"], errors["C"]])
 
 
 def test_frames_before_the_instant_give_the_stages_with_memory_their_state(traverse, tmp_path, capsys):

@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
+from contextlib import suppress
+from decimal import Decimal
+from typing import TYPE_CHECKING
 
 from flow.runtime.frame_selection import Every
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    At = float | str | np.datetime64 | np.timedelta64
 
 DESKS = ("overview", "matching", "terrain", "runtime", "tilt")  # of `recordings.sinks.blueprint`, loaded only when used
 _MAX_WORKERS = 1024
 _MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
+_UNIX_SECONDS = 1e9  # no log is so long; from here on seconds since 1970
+AT = "seconds after the first message, a time as the viewer shows it, or cursor: that of the open viewer"
+CURSOR = "cursor"  # the instant of a viewer that is open
 
 
 def count(text: str, low: int = 1) -> int:
@@ -47,6 +59,38 @@ def seconds(text: str) -> float:
             f"must be seconds after the log's first message, at most {_MAX_SECONDS:g}, not '{text}'"
         )
     return value
+
+
+def instant(text: str) -> At:
+    """Seconds after a log's first message, or a time as the viewer shows it: UTC, time of day, seconds or ns of Unix.
+
+    Examples
+    --------
+    >>> instant("12.3")
+    12.3
+    >>> instant("2023-11-15 22:13:20.513 000 000Z") == instant("1700086400.513")
+    np.True_
+    """
+    import numpy as np
+
+    if text == CURSOR:
+        return CURSOR
+    found = re.fullmatch(r"(?:(\d{4}-\d\d-\d\d)[ T])?(\d\d?):(\d\d):(\d\d)(?:\.([\d ]+))?Z?", text.strip())
+    if found:
+        date, hours, minutes, whole, fraction = found.groups()
+        ns = int((fraction or "0").replace(" ", "")[:9].ljust(9, "0"))
+        of_day = np.timedelta64(((60 * int(hours) + int(minutes)) * 60 + int(whole)) * 1_000_000_000 + ns, "ns")
+        with suppress(ValueError):  # no such date
+            return of_day if date is None else np.datetime64(date, "ns") + of_day
+    elif re.fullmatch(r"\d{18,19}(?: ?ns)?", text.strip()):
+        return np.datetime64(int(text.strip().removesuffix("ns")), "ns")
+    with suppress(argparse.ArgumentTypeError):
+        value = seconds(text)
+        return value if value < _UNIX_SECONDS else np.datetime64(round(Decimal(text) * 1_000_000_000), "ns")
+    raise argparse.ArgumentTypeError(
+        f"must be seconds after the log's first message, a time as the viewer shows it in UTC, such as 2023-11-15 "
+        f"22:13:20.5 or 22:13:20.5, or {CURSOR}, not '{text}'"
+    )
 
 
 def every(text: str) -> Every:

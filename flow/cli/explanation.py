@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from flow.cli.replay import one_thread_per_call
-from flow.cli.what_if import hastened, part_of
+from flow.cli.what_if import Instant, hastened, part_of
 from flow.config.loader import load
 from flow.contracts import FrameRecord
 from flow.errors import UsageError
@@ -107,7 +107,7 @@ class Explanation(CellExplanation):
 
 def why(
     result: Path,
-    at: float,
+    at: Instant,
     *,
     cell: tuple[float, float] | None = None,
     pixel: tuple[int, int] | None = None,
@@ -120,8 +120,8 @@ def why(
     ----------
     result : Path
         The result log of a run.
-    at : float
-        Instant, seconds after the first message of the input log.
+    at : float, numpy.datetime64 or numpy.timedelta64
+        Seconds after the first message of the input log, or a stamp, or the time of the day, UTC, of one.
     cell : (float, float), optional
         x and y in the map's frame, m.
     pixel : (int, int), optional
@@ -209,7 +209,7 @@ def _pixels(disparity: Disparity | None, pixels: Array) -> dict[str, Any]:
     return found | {"sources": {PixelOrigin(code).name: number for code, number in counts.items()}}
 
 
-def instant(graph: Graph, log: Path, at: float) -> Mapping[str, Any]:
+def instant(graph: Graph, log: Path, at: Instant) -> Mapping[str, Any]:
     """Every stream of a graph at the frame of a log nearest to `at`. Raises UsageError if no frame goes through."""
     kept = _Keep()
     with graph.source.open(log) as opened, one_thread_per_call():

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flow.cli.explanation import CellExplanation, centre_of, graph_of, index_of, verdict_at
+from flow.cli.what_if import Instant, ns_of
 from flow.errors import UsageError
 from recordings.containers.opening import open_recording
 from recordings.mcap.file import iter_decoded
@@ -49,7 +50,7 @@ class RegionalExplanation(CellExplanation):
 
 def why_regional(
     result: Path,
-    at: float,
+    at: Instant,
     cell: tuple[float, float],
     *,
     log: Path | None = None,
@@ -61,8 +62,8 @@ def why_regional(
     ----------
     result : Path
         The result log of a run.
-    at : float
-        Instant, seconds after the first message of the input log.
+    at : float, numpy.datetime64 or numpy.timedelta64
+        Seconds after the first message of the input log, or a stamp, or the time of the day, UTC, of one.
     cell : (float, float)
         x and y in the map's frame, m.
     log : Path, optional
@@ -86,7 +87,7 @@ def why_regional(
         raise UsageError(f"the pipeline of {result} has no navigation map '{stream}'")
     rule: Any = node.actor
     with open_recording(given) as recording:
-        stamp = recording.start + round(at * 1e9)
+        stamp = ns_of(at, recording.start)
     navigation, terrain = _maps(result, stamp, stream, node.inputs["elevation"])
     place = index_of(navigation, *cell)
     if place is None:

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from flow.cli.report import say
 from flow.errors import UsageError
 
-PORT, WEB_PORT = 9876, 9090  # the first ones tried, on loopback
+PORT, WEB_PORT = 9877, 9090  # the first ones tried, on loopback; the viewer itself listens on 9876
 
 
 @contextmanager

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flow.cli.replay import one_thread_per_call, product_version
 from flow.config.loader import load
@@ -16,11 +18,14 @@ from flow.errors import UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import fitted, run
 from flow.runtime.variants import Variants, VariantSink, merged, sink_of
+from recordings.containers.container import RawMessage
 
 if TYPE_CHECKING:
     from recordings.source.log import McapLog
 
 MAX_VARIANTS = 26  # one letter each
+MARGIN = 1_000_000_000  # ns before the first and after the last image of a log
+Instant = float | np.datetime64 | np.timedelta64
 
 
 @dataclass(frozen=True)
@@ -55,19 +60,70 @@ def changes_of(given: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return {"A": (), **{chr(ord("B") + number): changes for number, changes in enumerate(variants)}}
 
 
-def part_of(log: McapLog, at: float, frames: int, before: int) -> Part:
-    """The left images nearest to `at` (s after the log's first message), and those before them; raises UsageError."""
+def swept_setting(changes: Mapping[str, Sequence[str]]) -> tuple[str, list[float]] | None:
+    """The name, with its unit, and the numbers of the setting that variants differ in; None for other values.
+
+    Examples
+    --------
+    >>> swept_setting(changes_of(["points.camera_height=1 m", "points.camera_height=1.2 m"]))
+    ('points.camera_height (m)', [1.0, 1.2])
+    """
+    last = [own[-1].partition("=") for label, own in changes.items() if label != "A"]
+    found = [re.fullmatch(r"\s*([-+.\deE]+?)\s*([a-zA-Z%].*)?", value) for _, _, value in last]
+    units = {match[2] or "" for match in found if match}
+    if len(last) < 2 or None in found or len(units) > 1:
+        return None
+    unit, name = units.pop(), last[0][0].strip()
+    return f"{name} ({unit})" if unit else name, [float(match[1]) for match in found if match]
+
+
+def part_of(log: McapLog, at: Instant, frames: int, before: int) -> Part:
+    """The left images nearest to an instant, and those before them; raises UsageError.
+
+    at: s after the log's first message; or a stamp; or the time of the day, UTC, of one.
+    """
     times = log.file.times(log.channels("left")) if "left" in log.topics else np.zeros(0, np.int64)
     if not times.size:
         raise UsageError(f"{log.path} has no left images")
     first, last = ((int(time) - log.begin) / 1e9 for time in (times[0], times[-1]))
-    if not first - 1 <= at <= last + 1:
-        raise UsageError(f"--at {at:g} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s")
-    chosen = int(np.argmin(np.abs(times - log.begin - round(at * 1e9))))
+    chosen = _nearest(log, times, at)
+    if chosen is None:
+        shown = f"{at:g}" if isinstance(at, float | int) else f"{np.datetime64(ns_of(at, log.begin), 'ns')}Z"
+        raise UsageError(f"--at {shown} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s")
     low, high = max(0, chosen - before), min(times.size, chosen + frames) - 1
     edges = np.concatenate([times[:1] - 1_000_000_000, (times[1:] + times[:-1]) // 2, times[-1:] + 1_000_000_000])
     start, end = (max(0, int(edges[place]) - log.begin) / 1e9 for place in (low, high + 1))
     return Part(start, end, (int(times[chosen]) - log.begin) / 1e9, chosen - low)
+
+
+def ns_of(at: Instant, begin: int) -> int:
+    """An instant in ns, in a log that begins at `begin`, ns."""
+    if isinstance(at, np.timedelta64):  # of the first day on which the log has it
+        start = np.datetime64(begin - MARGIN, "ns")
+        at = start.astype("datetime64[D]") + at
+        at += np.timedelta64(0 if at >= start else 1, "D")
+    if isinstance(at, np.datetime64):
+        return int(at.astype("datetime64[ns]").astype(np.int64))
+    return begin + round(at * 1e9)
+
+
+def _nearest(log: McapLog, times: NDArray[np.int64], at: Instant) -> int | None:
+    """The place of the left image nearest to an instant; None outside the log. times: log times, ns."""
+    channels, when = log.channels("left"), ns_of(at, log.begin)
+
+    def stamps(first: int, last: int) -> dict[int, int]:
+        raws = (raw for raw in log.file.messages(channels, first, last + 1) if isinstance(raw, RawMessage))
+        return {raw.log_time: log.stamp_of(raw) or raw.log_time for raw in raws}
+
+    absolute = not isinstance(at, float | int)
+    delay = sum(time - stamp for time, stamp in stamps(times[0], times[0]).items()) if absolute else 0
+    if not times[0] - MARGIN <= when + delay <= times[-1] + MARGIN:
+        return None
+    chosen = int(np.argmin(np.abs(times - when - delay)))
+    if absolute:
+        near = stamps(times[max(0, chosen - 2)], times[min(chosen + 2, times.size - 1)])
+        chosen = int(np.searchsorted(times, min(near, key=lambda time: abs(near[time] - when), default=times[chosen])))
+    return chosen
 
 
 def hastened(graph: Graph) -> Graph:
@@ -78,9 +134,12 @@ def hastened(graph: Graph) -> Graph:
 
 
 def run_variants(
-    logs: Sequence[Path], pipeline: str, changes: Mapping[str, Sequence[str]], part: Part, folder: Path, workers: int
-) -> tuple[dict[str, Path], Variants]:
-    """Run all variants over a part of a log; returns their result logs in `folder`, and the graphs.
+    logs: Sequence[Path], pipeline: str, changes: Mapping[str, Sequence[str]], place: tuple[Instant, int, int],
+    folder: Path, workers: int,
+) -> tuple[dict[str, Path], Variants, Part]:  # fmt: skip
+    """Run all variants over a part of a log; returns their result logs in `folder`, the graphs and the part.
+
+    place: instant, frames from there on, and frames before it, as for `part_of`.
 
     Raises
     ------
@@ -90,7 +149,9 @@ def run_variants(
     from stages.kernel_loading import loading_kernels
 
     graphs = {label: hastened(load(pipeline, overrides)) for label, overrides in changes.items()}
-    with loading_kernels(), graphs["A"].source.open(logs, start=part.start, end=part.end) as log, one_thread_per_call():
+    with loading_kernels(), graphs["A"].source.open(logs) as log, one_thread_per_call():
+        part = part_of(log, *place)
+        log.narrow(part.start, part.end)
         graphs = {label: fitted(graph, log) for label, graph in graphs.items()}
         variants = merged(graphs)
         about = {
@@ -105,7 +166,7 @@ def run_variants(
         raise UsageError(
             f"no frame went through at {part.start:.3f} s; roverflow run --start {part.start:.3f} says why"
         )
-    return paths, variants
+    return paths, variants, part
 
 
 def summary_lines(variants: Variants, part: Part, frames: int) -> list[str]:

@@ -14,7 +14,9 @@ import rerun.blueprint as rrb
 from recordings.atomic_write import written
 from recordings.comparison.diff import MessageDifference
 from recordings.comparison.pages import pages
+from recordings.comparison.sweep import Sweep
 from recordings.ros2.cdr import full_name
+from recordings.sinks.blueprint import CLOCK, FRAME
 
 MAX_FRAMES = 50  # stamps that are drawn
 _SIDES = {"a": "A", "b": "B", "difference": "B less A"}  # entity -> name of its view
@@ -51,7 +53,7 @@ class DiffRecording:
         if found is not None:
             self.pictures.append((prefix + change.topic, change.stamp, tuple(map(_png, found))))
 
-    def write(self, path: Path, name: str, tables: str = "") -> None:
+    def write(self, path: Path, name: str, tables: str = "", sweep: Sweep | None = None) -> None:
         """Write the recording. tables: Markdown that is shown beside the pictures. Raises UnwritableError."""
         with written(path) as temporary:
             stream = rr.RecordingStream("roverflow_diff")
@@ -59,26 +61,34 @@ class DiffRecording:
             stream.set_sinks(rr.FileSink(str(temporary)))
             stream.send_recording_name(name)
             stream.log("tables", rr.TextDocument(tables, media_type=rr.MediaType.MARKDOWN), static=True)
+            if sweep is not None:
+                sweep.log(stream)
             for topic, stamp, pictures in self.pictures:
-                stream.set_time("time", timestamp=np.datetime64(stamp, "ns"))
-                stream.set_time("frame", sequence=self.stamps.index(stamp))
+                stream.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
+                stream.set_time(FRAME, sequence=self.stamps.index(stamp))
                 for side, picture in zip(_SIDES, pictures, strict=True):
                     stream.log(f"{topic}/{side}", rr.EncodedImage(contents=picture, media_type="image/png"))
-            stream.send_blueprint(self._blueprint())
+            stream.send_blueprint(self._blueprint([] if sweep is None else [sweep.views()]))
             stream.flush()
             stream.disconnect()
 
-    def _blueprint(self) -> rrb.Blueprint:
+    def _blueprint(self, plots: list[rrb.Container]) -> rrb.Blueprint:
         topics = dict.fromkeys(topic for topic, _, _ in self.pictures)
-        tabs = [
-            rrb.Horizontal(
-                *(rrb.Spatial2DView(origin=f"{topic}/{side}", name=title) for side, title in _SIDES.items()), name=topic
-            )
-            for topic in topics
+        tabs: list[rrb.Container] = [
+            *plots,
+            *(
+                rrb.Horizontal(
+                    *(rrb.Spatial2DView(origin=f"{topic}/{side}", name=title) for side, title in _SIDES.items()),
+                    name=topic,
+                )
+                for topic in topics
+            ),
         ]
         table = rrb.TextDocumentView(origin="tables", name="what differs")
         return rrb.Blueprint(
-            rrb.Vertical(rrb.Tabs(*tabs), table, row_shares=[3, 1]) if tabs else table, collapse_panels=True
+            rrb.Vertical(rrb.Tabs(*tabs), table, row_shares=[3, 1]) if tabs else table,
+            rrb.TimePanel(state="collapsed", timeline=CLOCK),
+            collapse_panels=True,
         )
 
 

@@ -42,6 +42,7 @@ from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for
 
 HEAD_BYTES = 64  # of a message; they contain the stamp of its header
+Edges = tuple[int | None, int | None]  # log times, ns, from which and before which messages are read
 
 
 class _Queued(NamedTuple):
@@ -348,7 +349,7 @@ class McapFile:
 
 
 def iter_decoded(
-    path: Path, topics: Iterable[str] | None = None, lost: Counter[str] | None = None
+    path: Path, topics: Iterable[str] | None = None, lost: Counter[str] | None = None, part: Edges = (None, None)
 ) -> Iterator[tuple[str, int, Any]]:
     """Read a log's ROS 2 CDR messages in log-time order.
 
@@ -360,6 +361,8 @@ def iter_decoded(
         The topics to read; by default all in CDR.
     lost : Counter, optional
         Counts the reasons why messages were lost.
+    part : Edges
+        The part of the log to read; by default all.
 
     Yields
     ------
@@ -384,7 +387,7 @@ def iter_decoded(
             schema = channel.schema
             if schema and channel.message_encoding == "cdr" and (wanted is None or channel.topic in wanted):
                 decoders[number] = decoder_for(schema.name, schema.encoding, schema.text)
-        for item in log.messages(set(decoders)):
+        for item in log.messages(set(decoders), *part):
             if isinstance(item, LostMessage):
                 lose(item.reason)
                 continue

@@ -11,14 +11,14 @@ import json
 import math
 from collections import Counter
 from dataclasses import asdict, dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings.containers.time_range import TimeRange
+from recordings.containers.time_range import MAX_LATENESS_NS, TimeRange
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
@@ -95,7 +95,7 @@ class Score:
         return json.dumps(_without_nan(asdict(self)), indent=2, allow_nan=False)
 
 
-def score(result: Path, truth: Path) -> Score:
+def score(result: Path, truth: Path, whole: bool = True) -> Score:
     """Score a result log.
 
     Parameters
@@ -104,6 +104,8 @@ def score(result: Path, truth: Path) -> Score:
         The log that a run wrote.
     truth
         The log with the truth topics (/truth/...), usually the run's input.
+    whole
+        Whether to read all of the truth, to count the frames beyond the part that was run.
 
     Raises
     ------
@@ -119,7 +121,9 @@ def score(result: Path, truth: Path) -> Score:
     """
     tally = _Tally(Path(result), Path(truth))
     results = iter_decoded(Path(result), [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)])
-    truths = iter_decoded(Path(truth), [*TRUTHS, "/tf_static"], tally.lost[str(truth)])
+    lost, near = tally.lost[str(truth)], TimeRange() if whole else tally.part.widened(MAX_LATENESS_NS)
+    mounts = iter_decoded(Path(truth), ["/tf_static"], lost) if near.edges else ()
+    truths = chain(mounts, iter_decoded(Path(truth), [*TRUTHS, "/tf_static"], lost, (near.low, near.high)))
     for stamp, frame in frames(results, tally.noted(truths)):
         if stamp in tally.outside and not frame.keys() & {*RESULTS}:
             tally.found.beyond += 1

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
-from flow.cli.arguments import count, count_or_none, seconds, workers
+from flow.cli.arguments import AT, count, count_or_none, instant, workers
+from flow.cli.debugging.viewer_cursor import without_cursor
 from flow.cli.outputs import add_log, check_outputs
 from flow.cli.report import say
 from flow.errors import COMPLETE
 from recordings.containers.finding import find_files
+
+if TYPE_CHECKING:
+    from recordings.comparison.diff import Diff
+    from recordings.comparison.sweep import Sweep
 
 HELP = "run one instant of a log with and without a change of the pipeline, and compare"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     add_log(sub)
-    sub.add_argument("--at", type=seconds, required=True, metavar="T", help="instant, seconds after the first message")
+    sub.add_argument("--at", type=instant, required=True, metavar="T", help=AT)
     sub.add_argument("--frames", type=count, default=1, metavar="N", help="frames from that instant on (1)")
     before = "frames before it, for the stages with memory: regional map, pose, tilt check (0)"
     sub.add_argument("--before", type=count_or_none, default=0, metavar="N", help=before)
@@ -34,29 +41,30 @@ def run(options: argparse.Namespace) -> int:
     find_files(options.log)
     out = options.out or options.log[0].with_name(f"{options.log[0].stem}-try.rrd")
     check_outputs({"difference": out}, options.log)
-    from flow.cli.what_if import changes_of, part_of, run_variants, summary_lines
-    from flow.config.loader import load
+    from flow.cli.what_if import changes_of, run_variants, summary_lines, swept_setting
     from recordings.comparison.diff import diff
     from recordings.comparison.recording import DiffRecording
     from recordings.comparison.text import comparison, markdown
 
     changes = changes_of(options.set)
-    with load(options.pipeline).source.open(options.log) as log:
-        part = part_of(log, options.at, options.frames, options.before)
+    place = (without_cursor(options.at), options.frames, options.before)
     with TemporaryDirectory(prefix="roverflow-try-") as folder:
-        paths, variants = run_variants(options.log, options.pipeline, changes, part, Path(folder), options.workers)
+        paths, variants, part = run_variants(
+            options.log, options.pipeline, changes, place, Path(folder), options.workers
+        )
         say("\n".join(summary_lines(variants, part, options.frames)))
-        recording, tables = DiffRecording(), list[str]()
+        recording, tables, differences = DiffRecording(), list[str](), dict[str, "Diff"]()
         for label, path in paths.items():
             if label != "A":
-                found = diff(paths["A"], path, recording.of(label))
+                differences[label] = found = diff(paths["A"], path, recording.of(label))
                 say(f"\n{label}: {', '.join(changes[label])}\n{comparison(found)}")
                 tables += [f"## {label}: {', '.join(changes[label])}", markdown(found)]
         errors = _errors(paths, options.log[0])
         if errors:
             say("\n" + "\n".join("  ".join(f"{cell:>12}" for cell in row) for row in errors))
-            tables += ["## Errors", *_markdown_rows(errors)]
-        recording.write(out, f"{options.log[0].name} at {options.at:g} s", "\n\n".join(tables))
+            tables = ["## Errors", *_markdown_rows(errors), *tables]
+        title = f"{options.log[0].name} at {part.at:g} s"
+        recording.write(out, title, "\n\n".join(tables), _sweep(swept_setting(changes), errors, differences))
     say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
     return COMPLETE
 
@@ -70,10 +78,29 @@ def _errors(paths: dict[str, Path], truth: Path) -> list[list[str]]:
     rows = [["", *SCORES[1:]]]
     for label, path in paths.items():
         try:
-            rows.append([*brief_row(label, brief_figures(score(path, truth)))])
+            rows.append([*brief_row(label, brief_figures(score(path, truth, whole=False)))])
         except LogError:  # the log has no truth
             return []
     return rows
+
+
+def _sweep(
+    setting: tuple[str, list[float]] | None, errors: Sequence[Sequence[str]], differences: Mapping[str, Diff]
+) -> Sweep | None:
+    """The errors, and the numbers of changed pixels and cells, over the values of a setting; None without numbers."""
+    from recordings.comparison.sweep import Sweep, changed
+
+    if setting is None:
+        return None
+    head, *rows = errors or [[]]
+    figures = {
+        name + (" (%)" if "%" in column[0] else ""): [float(cell.removesuffix(" %")) for cell in column]
+        for name, *column in list(zip(head, *rows, strict=True))[1:]
+    }
+    counts = {label: changed(found) for label, found in differences.items()}
+    for topic in dict.fromkeys(topic for each in counts.values() for topic in each):
+        figures[f"{topic}, changed"] = [0.0, *(each.get(topic, 0.0) for each in counts.values())]
+    return Sweep(*setting, figures) if figures else None
 
 
 def _markdown_rows(rows: list[list[str]]) -> list[str]:

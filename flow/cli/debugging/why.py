@@ -7,7 +7,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flow.cli.arguments import pair, seconds
+from flow.cli.arguments import AT, instant, pair
+from flow.cli.debugging.viewer_cursor import without_cursor
 from flow.cli.outputs import check_outputs
 from flow.cli.report import say
 from flow.errors import COMPLETE, UsageError
@@ -22,7 +23,7 @@ MAX_TURNS = 5  # changes of parameters that are listed
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("result", type=Path, metavar="OUT.mcap", help="result log of a run")
-    sub.add_argument("--at", type=seconds, required=True, metavar="T", help="instant, seconds after the first message")
+    sub.add_argument("--at", type=instant, required=True, metavar="T", help=AT)
     place = sub.add_mutually_exclusive_group(required=True)
     place.add_argument("--cell", type=pair, metavar="X,Y", help="place in the map's frame, m")
     place.add_argument("--pixel", type=pair, metavar="U,V", help="column and row in the left rectified image")
@@ -40,6 +41,7 @@ def run(options: argparse.Namespace) -> int:
     from flow.cli.explanation import why
     from recordings.comparison.marked_pixels import write_marked
 
+    options.at = without_cursor(options.at)
     if _is_regional(options.result, options.map):
         return _regional(options)
     pixel = None if options.pixel is None else (round(options.pixel[0]), round(options.pixel[1]))

@@ -1,0 +1,89 @@
+"""`--at`: seconds, times as the viewer shows them, and the cursor of an open viewer."""
+
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from flow.cli.arguments import instant
+from flow.cli.debugging.viewer_cursor import without_cursor
+from flow.cli.what_if import part_of
+from flow.errors import UsageError
+from recordings import McapSource
+from tests.conftest import SMALL, roverflow
+
+
+@pytest.fixture(scope="module")
+def stamps(traverse):
+    with McapSource().open(traverse) as log:
+        return [item.stamp for _, stream, item in log.events(("left",)) if stream == "left"]
+
+
+@pytest.mark.parametrize(
+    "shown",
+    [
+        lambda stamp: str(np.datetime64(stamp, "ns")).replace("T", " "),
+        lambda stamp: f"{np.datetime64(stamp, 'ns').astype('datetime64[us]')}Z",
+        lambda stamp: str(np.datetime64(stamp, "ns"))[11:23],
+        lambda stamp: f"{stamp / 1e9:.3f}",
+        lambda stamp: f"{stamp} ns",
+    ],
+)
+def test_a_time_as_the_viewer_shows_it_is_that_of_the_frame(traverse, stamps, shown):
+    with McapSource().open(traverse) as log:
+        for stamp in stamps:
+            part = part_of(log, instant(shown(stamp)), 1, 0)
+            with McapSource().open(traverse, start=part.start, end=part.end) as cut:
+                assert [item.stamp for _, stream, item in cut.events(("left",)) if stream == "left"] == [stamp]
+
+
+def test_other_times_are_refused(traverse, tmp_path, capsys):
+    for text in ("yesterday", "2023-13-45 00:00:00", "12:03", "-1"):
+        with pytest.raises(SystemExit):
+            roverflow("try", traverse, f"--at={text}", *SMALL)
+        assert "must be seconds after the log's first message, a time as the viewer shows it" in capsys.readouterr().err
+    out = ("-o", tmp_path / "try.rrd")
+    assert roverflow("try", traverse, "--at", "2024-01-01 00:00:00", *SMALL, *out) == 2
+    assert "--at 2024-01-01T00:00:00.000000000Z is outside the images of the log" in capsys.readouterr().err
+
+
+def free_port():
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+def test_without_a_viewer_there_is_no_cursor():
+    with pytest.raises(UsageError, match=r"no viewer answers on port [0-9]+ of this machine; open the recording"):
+        without_cursor("cursor", free_port())
+
+
+@pytest.mark.slow
+def test_the_cursor_of_an_open_viewer_is_the_instant(result, stamps):
+    from rerun.experimental import ViewerClient
+
+    port = free_port()
+    words = ["--headless", "--bind", "127.0.0.1", "--port", str(port), str(result.with_suffix(".rrd"))]
+    viewer = subprocess.Popen([sys.executable, "-m", "rerun", *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    try:
+        for _ in range(120):
+            time.sleep(0.5)
+            if viewer.poll() is not None:
+                pytest.skip("the viewer has no graphics driver here")
+            try:
+                client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+                if client.get_state().active_recording and not client.get_state().loading:
+                    break
+            except (OSError, RuntimeError):
+                continue
+        client.set_time("log clock", timestamp=np.datetime64(stamps[2], "ns"), play_state="paused")
+        assert without_cursor("cursor", port) == np.datetime64(stamps[2], "ns")
+        client.set_time("frame", sequence=1, play_state="paused")
+        with pytest.raises(UsageError, match="choose 'log clock' in its time panel"):
+            without_cursor("cursor", port)
+    finally:
+        viewer.kill()
+        viewer.wait()
