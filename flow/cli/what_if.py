@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from recordings.source.log import McapLog
 
 MAX_VARIANTS = 26  # one letter each
+DAY = 86_400_000_000_000  # ns
 MARGIN = 1_000_000_000  # ns before the first and after the last image of a log
 Instant = float | np.datetime64 | np.timedelta64
 
@@ -98,13 +99,13 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int) -> Part:
 
 def ns_of(at: Instant, begin: int) -> int:
     """An instant in ns, in a log that begins at `begin`, ns."""
+    if isinstance(at, float | int):
+        return begin + round(at * 1e9)
+    value = int(at.astype(f"{at.dtype.kind}8[ns]").astype(np.int64))
     if isinstance(at, np.timedelta64):  # of the first day on which the log has it
-        start = np.datetime64(begin - MARGIN, "ns")
-        at = start.astype("datetime64[D]") + at
-        at += np.timedelta64(0 if at >= start else 1, "D")
-    if isinstance(at, np.datetime64):
-        return int(at.astype("datetime64[ns]").astype(np.int64))
-    return begin + round(at * 1e9)
+        start = begin - MARGIN
+        value = start + (value - start) % DAY
+    return value
 
 
 def _nearest(log: McapLog, times: NDArray[np.int64], at: Instant) -> int | None:
