@@ -47,6 +47,7 @@ def replay(
 
     graph = pipelines.load(pipeline, overrides)
     logs = (log,) if isinstance(log, Path) else tuple(log)
+    _refuse_results(graph, logs)
     inputs = tuple(map(str, logs)) if with_inputs else ()
     given = {"live_port": live_port, "profile": profile, "desk": desk, "inputs": inputs}
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
@@ -79,6 +80,18 @@ def replay(
                 settings: dict[str, Any] = {"workers": workers, "every": every}
                 summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame or advance)
     return as_json(summary | {"overrides": list(overrides)})
+
+
+def _refuse_results(graph: Graph, logs: Sequence[Path]) -> None:
+    """Refuse a log of the product's own source that is already a result, which may contain its inputs."""
+    from recordings import McapSource
+    from recordings.containers.finding import find_files
+    from recordings.errors import LogError
+    from recordings.scoring.result_log import about_run
+
+    for file in find_files(logs).files if isinstance(graph.source, McapSource) else ():
+        if about := about_run(file):
+            raise LogError(f"{file} contains results; run the log that they were made from, {about.get('log', '')}")
 
 
 def _with(sink: Any, given: Mapping[str, Any]) -> Any:

@@ -292,20 +292,22 @@ class Recording:
         return parts
 
     def _steps(self) -> list[ClockStep]:
-        """The steps of the recorder's clock over all files; their places are counted through the files."""
+        """The steps of the recorder's clock over all files; their places are counted through the files.
+
+        They are judged by channel: two channels of a topic, such as results beside inputs, are stored independently.
+        """
         timelines = [file.timeline for file in self.files]
         stamps = _StampReader(self.files, [0, *np.cumsum([len(timeline) for timeline in timelines]).tolist()])
-        topics = {topic: number for number, topic in enumerate(sorted({c.topic for c in self.channels.values()}))}
-        if len(self.files) == 1 and len(topics) == len(self.channels):
+        if len(self.files) == 1:
             return clock_steps(timelines[0], self._stamped, stamps)
         channels = list[NDArray[np.int32]]()
-        for file, timeline in zip(self.files, timelines, strict=True):
-            topic_of = np.full(np.max(timeline.channels, initial=0) + 1, len(topics), np.int32)
-            for number, channel in file.channels.items():
-                topic_of[number : number + 1] = topics[channel.topic]
-            channels.append(topic_of[timeline.channels])
+        for numbers, timeline in zip(self._numbers, timelines, strict=True):
+            merged_of = np.full(np.max(timeline.channels, initial=0) + 1, -1, np.int32)  # -1: of no known channel
+            for own, number in numbers.merged.items():
+                merged_of[own : own + 1] = number
+            channels.append(merged_of[timeline.channels])
         merged = Timeline(np.concatenate(channels), np.concatenate([timeline.log_times for timeline in timelines]))
-        return clock_steps(merged, {topics[self.channels[number].topic] for number in self._stamped}, stamps)
+        return clock_steps(merged, self._stamped, stamps)
 
 
 @dataclass(frozen=True)

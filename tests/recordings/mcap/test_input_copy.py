@@ -45,3 +45,17 @@ def test_chunks_with_small_messages_contain_no_images(both):
 def test_score_and_export_read_its_results(both, traverse, tmp_path):
     assert roverflow("score", both, "--truth", traverse) == 0
     assert roverflow("export", both, tmp_path / "maps") == 0
+
+
+def test_a_result_with_its_inputs_is_sound_and_explains_itself(both, capsys):
+    assert roverflow("info", both) == 0
+    assert "damaged" not in capsys.readouterr().out
+    assert roverflow("why", both, "--at", "1", "--cell", "2.5,0", "--log", both) == 0
+    assert "limits:" in capsys.readouterr().out
+
+
+def test_a_run_refuses_a_result_with_its_inputs(both, tmp_path, capsys):
+    assert roverflow("run", both, "-o", tmp_path / "again.mcap") == 2
+    assert capsys.readouterr().err.endswith(
+        f"{both} contains results; run the log that they were made from, traverse.mcap\n"
+    )
