@@ -7,18 +7,20 @@ calls a cell free only if it is known well enough.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, find_objects
 
 from flow.contracts import StageError
 from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, Rover
 from stages.stage import Stage, parameter
 
 LAYERS = ("ground", "step", "slope", "steepness", "roughness", "support")  # of TerrainFeatures
-UNKNOWN = (CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNMATCHED, CellReason.UNSURE)
+STATE_OF = np.full(len(CellReason), Cell.HAZARD, np.int8)  # by reason
+STATE_OF[CellReason.CLEAR] = Cell.FREE
+STATE_OF[[CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNMATCHED, CellReason.UNSURE]] = Cell.UNKNOWN
 RIM = 0.1  # m; cells this near to an obstacle are not free
 MIN_SUPPORT = 0.3  # share of the cells within a wheel's reach that are known, for a free cell
 MAX_DROP_DISTANCE = 1.0  # m through hidden cells, from where hidden ground is low to where it may begin to fall
@@ -73,6 +75,18 @@ class Binarise(Stage):
 
     def __call__(self, elevation: ElevationMap) -> NavigationMap:
         """The navigation map on the grid of `elevation`."""
+        window = _shown(elevation)
+        reason = np.full(elevation.shape, CellReason.UNOBSERVED, np.uint8)
+        within = {name: layer[window] for name, layer in elevation.layers.items()}
+        reason[window] = self._reasons(replace(elevation, layers=within))
+        cells = np.full(elevation.shape, Cell.UNKNOWN, np.int8)
+        cells[window] = STATE_OF[reason[window]]
+        return NavigationMap(
+            elevation.stamp, cells, reason, elevation.resolution, elevation.origin, elevation.frame_id
+        )
+
+    def _reasons(self, elevation: ElevationMap) -> Array:
+        """Reasons (rows, cols) of all cells."""
         height = elevation.layers["elevation"]
         observed = np.isfinite(height)
         if self.method == "absolute":
@@ -85,12 +99,7 @@ class Binarise(Stage):
         seen = np.isfinite(elevation.layers.get("unmatched", np.full_like(height, np.nan)))
         reason[~observed] = np.where(hidden, CellReason.OCCLUDED, CellReason.UNOBSERVED)[~observed]
         reason[~observed & seen] = CellReason.UNMATCHED
-        cells = np.full(reason.shape, Cell.HAZARD, np.int8)
-        cells[reason == CellReason.CLEAR] = Cell.FREE
-        cells[np.isin(reason, UNKNOWN)] = Cell.UNKNOWN
-        return NavigationMap(
-            elevation.stamp, cells, reason.astype(np.uint8), elevation.resolution, elevation.origin, elevation.frame_id
-        )
+        return np.asarray(reason)
 
     def _rover_reasons(self, elevation: ElevationMap, observed: Array) -> Array:
         """Reasons (rows, cols), valid in observed cells."""
@@ -144,6 +153,17 @@ class Binarise(Stage):
         if reach and falls.any():
             falls = binary_dilation(falls, np.ones((3, 3)), iterations=reach, mask=hidden)
         return _dilated(falls, np.ceil(self.rover.wheel / 2 / elevation.resolution - 1e-6))
+
+
+def _shown(elevation: ElevationMap) -> tuple[slice, slice]:
+    """The rows and columns of the cells that anything is known of, and of their neighbours."""
+    shown = np.isfinite(elevation.layers["elevation"])
+    for name in ("occluded", "unmatched"):
+        if name in elevation.layers:
+            shown |= np.isfinite(elevation.layers[name])
+    found = find_objects(shown.view(np.int8))
+    rows, cols = found[0] if found else (slice(0, 1), slice(0, 1))
+    return slice(max(rows.start - 1, 0), rows.stop + 1), slice(max(cols.start - 1, 0), cols.stop + 1)
 
 
 def _dilated(cells: Array, distance: float) -> Array:

@@ -34,14 +34,16 @@ _NARROW_BANDS = (0.3, 0.3, 0.3)
 _MAX_EXTRAPOLATION, _EXTRAPOLATION_ERROR = 0.5, 0.03  # m: of ground into hidden cells
 
 
+Span = tuple[slice, slice]  # rows and columns
+
+
 class _Ground(NamedTuple):
-    """The ground below the cells, (rows, cols) each unless noted."""
+    """The ground below the cells, (rows, cols) each unless noted. Planes: height and slopes, rise per cell."""
 
     height: Array  # m, of the plane between the wheels
-    wide: Array  # m, of the plane of the surroundings
-    trend: Array  # (2, rows, cols), slope of the surroundings, rise per cell
-    slope: Array  # rad, under the footprint
-    planes: Array  # (3, rows, cols), height and slopes between the wheels; NaN in cells that are not ground
+    wide: Array  # (3, rows, cols), planes of the surroundings
+    under: Array  # (3, rows, cols), planes under the footprint
+    between: Array  # (3, rows, cols), planes between the wheels; NaN in cells that are not ground
 
 
 @dataclass(frozen=True)
@@ -71,30 +73,32 @@ class TerrainFeatures(Stage):
 
     def __call__(self, elevation: ElevationMap) -> ElevationMap:
         """The map with the layers added."""
-        window = self._window(elevation)
-        within = replace(elevation, layers={name: layer[window] for name, layer in elevation.layers.items()})
+        around, inside = self._windows(elevation)
+        within = replace(elevation, layers={name: layer[around] for name, layer in elevation.layers.items()})
         layers = dict(elevation.layers)
-        for name, layer in self._features(within).items():
+        for name, layer in self._features(within, inside).items():
             layers[name] = np.full(elevation.shape, np.nan, np.float32)
-            layers[name][window] = layer
+            layers[name][around] = layer
         return replace(elevation, layers=layers)
 
-    def _window(self, elevation: ElevationMap) -> tuple[slice, slice]:
-        """The rows and columns of the observed cells, widened by the widest window."""
-        found = find_objects(np.isfinite(elevation.layers["elevation"]).astype(np.int8))
+    def _windows(self, elevation: ElevationMap) -> tuple[Span, Span]:
+        """The observed cells widened by the widest window, and where the observed cells are in that."""
+        found = find_objects(np.isfinite(elevation.layers["elevation"]).view(np.int8))
         widest = max(SURROUNDINGS, self.rover.footprint, self.rover.wheel_track)
         margin = _cells(widest / 2, elevation.resolution)
         rows, cols = found[0] if found else (slice(0, 1), slice(0, 1))
-        first_row, first_col = max(rows.start - margin, 0), max(cols.start - margin, 0)
-        return slice(first_row, rows.stop + margin), slice(first_col, cols.stop + margin)
+        row, col = max(rows.start - margin, 0), max(cols.start - margin, 0)
+        inside = slice(rows.start - row, rows.stop - row), slice(cols.start - col, cols.stop - col)
+        return (slice(row, rows.stop + margin), slice(col, cols.stop + margin)), inside
 
-    def _features(self, elevation: ElevationMap) -> dict[str, Array]:
-        """The new layers, (rows, cols)."""
+    def _features(self, elevation: ElevationMap, inside: Span) -> dict[str, Array]:
+        """The new layers, (rows, cols); inside: where the observed cells are."""
         height = elevation.layers["elevation"].astype(np.float64)
         observed = np.isfinite(height)
         height = np.where(observed, height, 0.0)
         ground = self._ground(height, observed, elevation.resolution)
-        step, support = self._step(elevation, height, observed, ground)
+        step, support = (np.full(height.shape, np.nan) for _ in range(2))
+        step[inside], support[inside] = self._step(elevation, height, observed, ground, inside)
         passable = observed & ~(step >= self.min_obstacle_height)
         wheel, footprint = (
             _cells(width / 2, elevation.resolution) for width in (self.rover.wheel, self.rover.footprint)
@@ -104,14 +108,16 @@ class TerrainFeatures(Stage):
         layers = {
             "ground": ground.height,
             "step": step,
-            "slope": np.where(observed, ground.slope, np.nan),
-            "steepness": np.where(passable, _slope(steepness, elevation.resolution), np.nan),
+            "slope": _slope(ground.under, observed, elevation.resolution),
+            "steepness": _slope(steepness, passable, elevation.resolution),
             "roughness": np.where(observed, roughness, np.nan),
-            "support": np.where(observed, support, np.nan),
+            "support": support,
         }
         if "ceiling" in elevation.layers:
-            expected = np.fmax(ground.wide, _extrapolated(ground.planes, elevation.resolution))
-            layers["drop"] = np.where(observed, np.nan, expected - elevation.layers["ceiling"])
+            hidden = ~observed & np.isfinite(elevation.layers["ceiling"])
+            expected = np.fmax(ground.wide[0][hidden], _extrapolated(ground.between, hidden, elevation.resolution))
+            layers["drop"] = np.full(height.shape, np.nan)
+            layers["drop"][hidden] = expected - elevation.layers["ceiling"][hidden]
         return layers
 
     def _ground(self, height: Array, observed: Array, resolution: float) -> _Ground:
@@ -136,40 +142,44 @@ class TerrainFeatures(Stage):
         local = window_planes(height, ground, narrow, _MAX_VARIANCE)
         under = local if footprint == narrow else window_planes(height, ground, footprint, _MAX_VARIANCE)
         level = np.where(np.isfinite(local[0]), local[0], around[0])
-        trend, planes = self._trend(around[1:3], resolution), np.where(ground, local[:3], np.nan)
-        return _Ground(level, around[0], trend, _slope(under, resolution), planes)
+        return _Ground(level, around[:3], under[:3], np.where(ground, local[:3], np.nan))
 
     def _trend(self, slopes: Array, resolution: float) -> Array:
         """The slopes (2, rows, cols), rise per cell, limited to the rover's max_slope; 0 where unknown."""
         steep = np.hypot(*slopes) / (np.tan(self.rover.max_slope) * resolution + 1e-12)
         return np.where(np.isfinite(steep), slopes / np.maximum(steep, 1.0), 0.0)
 
-    def _step(self, elevation: ElevationMap, height: Array, observed: Array, ground: _Ground) -> tuple[Array, Array]:
-        """The layers `step` and `support`."""
-        lowest, support = local_minimum(height, observed, ground.trend, _cells(self.rover.wheel, elevation.resolution))
-        top, bottom = (_finite(elevation.layers.get(extreme), height) for extreme in ("maximum", "minimum"))
+    def _step(
+        self, elevation: ElevationMap, height: Array, observed: Array, ground: _Ground, inside: Span
+    ) -> tuple[Array, Array]:
+        """The layers `step` and `support` of the window `inside`, which contains all observed cells."""
+        height, observed, level = height[inside], observed[inside], ground.height[inside]
+        trend = self._trend(ground.wide[1:, *inside], elevation.resolution)
+        lowest, support = local_minimum(height, observed, trend, _cells(self.rover.wheel, elevation.resolution))
+        extremes = (elevation.layers.get(name) for name in ("maximum", "minimum"))
+        top, bottom = (_finite(None if layer is None else layer[inside], height) for layer in extremes)
         rise = np.minimum(top - lowest, MAX_EXTREME * (height - lowest))
-        above = np.minimum(top - ground.height, MAX_EXTREME * (height - ground.height))
-        below = np.minimum(ground.height - bottom, MAX_EXTREME * (ground.height - height))
-        explained = np.abs(ground.trend).sum(axis=0)  # from one corner of a cell to the opposite one
+        above = np.minimum(top - level, MAX_EXTREME * (height - level))
+        below = np.minimum(level - bottom, MAX_EXTREME * (level - height))
+        explained = np.abs(trend).sum(axis=0)  # from one corner of a cell to the opposite one
         within = np.minimum(top - bottom - explained, MAX_EXTREME * np.minimum(height - bottom, top - height))
         step = reduce(np.fmax, [rise, above, below, within, np.zeros_like(height)])
-        off_ground = np.abs(height - ground.height) >= self.min_skirt_height
-        raised = observed & (off_ground | (step >= self.min_obstacle_height))
-        return np.where(observed, _as_whole_obstacles(step, raised), np.nan), support
+        raised = observed & ((np.abs(height - level) >= self.min_skirt_height) | (step >= self.min_obstacle_height))
+        return np.where(observed, _as_whole_obstacles(step, raised), np.nan), np.where(observed, support, np.nan)
 
 
-def _extrapolated(planes: Array, resolution: float) -> Array:
-    """Least height of the nearest ground plane extrapolated to each cell, NaN far from ground; planes: (3, rows, cols)
-    of height, m, and rise per cell along columns and rows."""
+def _extrapolated(planes: Array, where: Array, resolution: float) -> Array:
+    """Least height of the nearest ground plane extrapolated to the cells `where`, (n,), NaN far from ground; planes:
+    (3, rows, cols) of height, m, and rise per cell along columns and rows."""
     known = np.isfinite(planes[0])
+    rows, cols = np.nonzero(where)
     if not known.any():
-        return np.full(known.shape, np.nan)
-    distance, (row, col) = distance_transform_edt(~known, return_indices=True)
-    rows, cols = np.indices(known.shape)
+        return np.full(len(rows), np.nan)
+    distance, nearest = distance_transform_edt(~known, return_indices=True)
+    row, col = nearest[:, rows, cols]
     height, along, across = planes[:, row, col]
     extrapolated = height + along * (cols - col) + across * (rows - row) - _EXTRAPOLATION_ERROR
-    return np.where(distance * resolution <= _MAX_EXTRAPOLATION, extrapolated, np.nan)
+    return np.where(distance[rows, cols] * resolution <= _MAX_EXTRAPOLATION, extrapolated, np.nan)
 
 
 def _as_whole_obstacles(step: Array, raised: Array) -> Array:
@@ -180,9 +190,11 @@ def _as_whole_obstacles(step: Array, raised: Array) -> Array:
     return np.where(raised, highest[obstacle], step)
 
 
-def _slope(plane: Array, resolution: float) -> Array:
-    """Slope, rad, of planes (4, rows, cols) of `window_planes`."""
-    return np.asarray(np.arctan(np.hypot(plane[1], plane[2]) / resolution))
+def _slope(planes: Array, where: Array, resolution: float) -> Array:
+    """Slope (rows, cols), rad, of planes of `window_planes` in the cells `where`; NaN in the others."""
+    slope = np.full(where.shape, np.nan)
+    slope[where] = np.arctan(np.hypot(planes[1][where], planes[2][where]) / resolution)
+    return slope
 
 
 def _finite(layer: Array | None, height: Array) -> Array:

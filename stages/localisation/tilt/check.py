@@ -187,8 +187,8 @@ def _ground_normal(cloud: PointCloud) -> Array:
 
     A plane fitted to the measured points with Tukey's weights, so that rocks do not tilt it.
     """
-    cloud = cloud.only(cloud.measured)
-    some = cloud.points[:: -(-len(cloud.points) // MAX_GROUND_POINTS) or 1].astype(np.float64)
+    measured = np.flatnonzero(cloud.measured)
+    some = cloud.points[measured[:: -(-len(measured) // MAX_GROUND_POINTS) or 1]].astype(np.float64)
     if cloud.sensor is not None:
         some = cloud.sensor.inverse()(some)
     some = some[np.isfinite(some).all(axis=1) & (some[:, 2] > MIN_GROUND_DEPTH) & (some[:, 2] < MAX_GROUND_DEPTH)]
