@@ -11,6 +11,7 @@ import numpy as np
 
 from recordings.export.mosaic import RIM_WIDTH
 from stages.data import LEVEL_FRAME, Array, Cell, CellReason, ElevationMap, NavigationMap
+from stages.data.arrays import Span, spanned
 
 Grid = tuple[str, tuple[float, float], float, tuple[int, ...]]  # frame, origin, resolution and shape
 COUNTS = {"count", "frames", "contradictions"}  # layers that are 0, not NaN, where nothing is known
@@ -52,14 +53,9 @@ def _rim(grid: Grid) -> int:
     return 0 if frame_id == LEVEL_FRAME else math.ceil(RIM_WIDTH / resolution)
 
 
-def _window(known: Array, rim: int) -> tuple[slice, slice]:
+def _window(known: Array, rim: int) -> Span:
     """Rows and columns of the known cells and a rim around them; all if none is known."""
-    places = [np.flatnonzero(known.any(axis)) for axis in (1, 0)]
-    rows, cols = (
-        slice(max(0, int(at[0]) - rim), min(extent, int(at[-1]) + 1 + rim)) if len(at) else slice(0, extent)
-        for at, extent in zip(places, known.shape, strict=True)
-    )
-    return rows, cols
+    return spanned(known, rim) if known.any() else (slice(0, known.shape[0]), slice(0, known.shape[1]))
 
 
 def _part(item: ElevationMap | NavigationMap, rows: slice, cols: slice) -> ElevationMap | NavigationMap:

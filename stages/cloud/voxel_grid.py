@@ -43,7 +43,8 @@ class VoxelGrid(Stage):
         check_level(self, cloud)
         x, y = cloud.points[:, 0], cloud.points[:, 1]
         inside = cloud.measured & np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.max_range**2)
-        near = cloud.only(inside)
-        index, count, colors = voxel_means(near.points, near.colors, self.resolution)
+        near = np.flatnonzero(inside)
+        points, colors = cloud.points.take(near, axis=0), cloud.colors.take(near, axis=0)
+        index, count, colors = voxel_means(points, colors, self.resolution)
         kept = count >= self.min_points
         return VoxelMap(cloud.stamp, index[kept], colors[kept], count[kept], self.resolution, LEVEL_FRAME)

@@ -15,6 +15,9 @@ from numpy.typing import DTypeLike, NDArray
 from flow.contracts import StageError
 
 Array = NDArray[Any]
+Span = tuple[slice, slice]  # rows and columns
+
+_UNIT, _MAX_SKEW = np.eye(3), 1e-6 + 1e-5 * np.eye(3)  # what a rotation times its transpose may differ from the unit
 
 
 def publish(owner: object, name: str, shape: tuple[int | None, ...], dtype: DTypeLike) -> None:
@@ -72,5 +75,21 @@ def read_only(array: Array) -> Array:
 
 def check_rotation(rotation: Array, where: str) -> None:
     """Raise ValueError unless a (3, 3) matrix is orthonormal and right-handed."""
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+    if not np.all(np.abs(rotation @ rotation.T - _UNIT) <= _MAX_SKEW) or np.linalg.det(rotation) < 0:
         raise StageError(f"{where} is not a rotation matrix")
+
+
+def spanned(cells: Array, margin: int = 0) -> Span:
+    """The rows and columns of the True cells of a mask, and `margin` more on each side; of the first cell if none is.
+
+    The end of a span may lie beyond the mask.
+
+    Examples
+    --------
+    >>> spanned(np.array([[False, False], [False, True]]))
+    (slice(1, 2, None), slice(1, 2, None))
+    """
+    places = [np.flatnonzero(cells.any(axis)) for axis in (1, 0)]
+    ends = [(int(at[0]), int(at[-1])) if len(at) else (0, 0) for at in places]
+    rows, cols = (slice(max(first - margin, 0), last + 1 + margin) for first, last in ends)
+    return rows, cols

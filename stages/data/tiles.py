@@ -10,10 +10,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stages.data.arrays import Array
+from stages.data.arrays import Array, Span
 
 TILE_SIDE = 32  # cells: 1.6 m at 0.05 m a cell, so a track 20 m wide wastes a twelfth at its borders
-Span = tuple[slice, slice]
 
 
 @dataclass(eq=False)
@@ -32,7 +31,7 @@ class Tiles:
         block = np.zeros((rows, cols), self.dtype)
         for index, inside, part in _parts(row, col, rows, cols):
             if index in self.tiles:
-                block[part] = self.tiles[index][inside]
+                _raw(block)[part] = _raw(self.tiles[index])[inside]
         return block
 
     def write(self, row: int, col: int, block: Array, changed: Array) -> None:
@@ -40,9 +39,29 @@ class Tiles:
         for index, inside, part in _parts(row, col, *block.shape):
             if changed[part].any():
                 old = self.tiles.get(index)
-                tile = np.zeros((TILE_SIDE, TILE_SIDE), self.dtype) if old is None else old.copy()
-                np.copyto(tile[inside], block[part], where=changed[part])
+                tile = np.zeros((TILE_SIDE, TILE_SIDE), self.dtype) if old is None else copied(old)
+                np.copyto(_raw(tile)[inside], _raw(block)[part], where=changed[part])
                 self.tiles[index] = tile
+
+
+def taken(cells: Array, where: Array) -> Array:
+    """A copy of the cells of a mask, (n,): `cells[where]`, many times faster where a cell has fields."""
+    return np.asarray(cells.reshape(-1).take(np.flatnonzero(where)))
+
+
+def put(cells: Array, where: Array, values: Array) -> None:
+    """Set the cells of a mask to values (n,): `cells[where] = values`, many times faster where a cell has fields."""
+    np.put(cells, np.flatnonzero(where), values)
+
+
+def copied(cells: Array) -> Array:
+    """A copy of contiguous cells."""
+    return _raw(cells).copy().view(cells.dtype)
+
+
+def _raw(cells: Array) -> Array:
+    """The cells as bytes, which numpy copies as a whole and not field by field."""
+    return cells.view(np.dtype((np.void, cells.dtype.itemsize)))
 
 
 def _parts(row: int, col: int, rows: int, cols: int) -> Iterator[tuple[tuple[int, int], Span, Span]]:

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.ndimage import binary_dilation, find_objects
+from scipy.ndimage import binary_dilation
 
 from flow.contracts import StageError
 from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, Rover
+from stages.data.arrays import Span, spanned
 from stages.stage import Stage, parameter
 
 LAYERS = ("ground", "step", "slope", "steepness", "roughness", "support")  # of TerrainFeatures
@@ -155,15 +156,13 @@ class Binarise(Stage):
         return _dilated(falls, np.ceil(self.rover.wheel / 2 / elevation.resolution - 1e-6))
 
 
-def _shown(elevation: ElevationMap) -> tuple[slice, slice]:
+def _shown(elevation: ElevationMap) -> Span:
     """The rows and columns of the cells that anything is known of, and of their neighbours."""
     shown = np.isfinite(elevation.layers["elevation"])
     for name in ("occluded", "unmatched"):
         if name in elevation.layers:
             shown |= np.isfinite(elevation.layers[name])
-    found = find_objects(shown.view(np.int8))
-    rows, cols = found[0] if found else (slice(0, 1), slice(0, 1))
-    return slice(max(rows.start - 1, 0), rows.stop + 1), slice(max(cols.start - 1, 0), cols.stop + 1)
+    return spanned(shown, 1)
 
 
 def _dilated(cells: Array, distance: float) -> Array:

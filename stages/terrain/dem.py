@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_erosion, find_objects
+from scipy.ndimage import binary_erosion
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Transform
+from stages.data.arrays import spanned
 from stages.stage import Stage, check_cells, check_level, parameter
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
 from stages.terrain.kernels.grid import FIGURES, Grid, cell_percentile, cell_statistics, extent
@@ -115,8 +116,9 @@ class Voxelise(Stage):
         """The part of the grid that contains the points, their splats and the lines of sight over empty cells."""
         bounds = [extent(cloud.points, whole).tolist()]
         if ceiling is not None:
-            seen = find_objects(np.isfinite(ceiling).astype(np.int8))
-            bounds += [[each.start for each in seen[0]] + [each.stop for each in seen[0]]] if seen else []
+            seen = np.isfinite(ceiling)
+            rows, cols = spanned(seen)
+            bounds += [[rows.start, cols.start, rows.stop, cols.stop]] if seen.any() else []
         margin = 2 + int(2 * self.max_splat / self.resolution)
         first = np.maximum(np.min(bounds, axis=0)[:2] - margin, 0)
         stop = np.maximum(np.minimum(np.max(bounds, axis=0)[2:] + margin, whole.shape), first + 1)

@@ -12,9 +12,10 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, find_objects, label
+from scipy.ndimage import distance_transform_edt, label
 
 from stages.data import Array, ElevationMap, Rover
+from stages.data.arrays import Span, spanned
 from stages.stage import Stage, parameter
 from stages.terrain.kernels.local_minimum import local_minimum
 from stages.terrain.kernels.plane_window import window_planes
@@ -32,9 +33,6 @@ _WIDE_BANDS = ((0.4, 0.8), (0.25, 0.6), (0.18, 0.6), (0.18, 0.6), (0.18, 0.6))
 # The same for the plane between the wheels. Each round recovers more of a crest that bends away from the wide plane.
 _NARROW_BANDS = (0.3, 0.3, 0.3)
 _MAX_EXTRAPOLATION, _EXTRAPOLATION_ERROR = 0.5, 0.03  # m: of ground into hidden cells
-
-
-Span = tuple[slice, slice]  # rows and columns
 
 
 class _Ground(NamedTuple):
@@ -83,13 +81,12 @@ class TerrainFeatures(Stage):
 
     def _windows(self, elevation: ElevationMap) -> tuple[Span, Span]:
         """The observed cells widened by the widest window, and where the observed cells are in that."""
-        found = find_objects(np.isfinite(elevation.layers["elevation"]).view(np.int8))
+        observed = np.isfinite(elevation.layers["elevation"])
         widest = max(SURROUNDINGS, self.rover.footprint, self.rover.wheel_track)
         margin = _cells(widest / 2, elevation.resolution)
-        rows, cols = found[0] if found else (slice(0, 1), slice(0, 1))
-        row, col = max(rows.start - margin, 0), max(cols.start - margin, 0)
-        inside = slice(rows.start - row, rows.stop - row), slice(cols.start - col, cols.stop - col)
-        return (slice(row, rows.stop + margin), slice(col, cols.stop + margin)), inside
+        (rows, cols), around = spanned(observed), spanned(observed, margin)
+        row, col = (each.start for each in around)
+        return around, (slice(rows.start - row, rows.stop - row), slice(cols.start - col, cols.stop - col))
 
     def _features(self, elevation: ElevationMap, inside: Span) -> dict[str, Array]:
         """The new layers, (rows, cols); inside: where the observed cells are."""

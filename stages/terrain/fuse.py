@@ -13,6 +13,7 @@ import numpy as np
 
 from flow.contracts import Finding, Severity, StageError, counted
 from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Pose, Region
+from stages.data.tiles import put, taken
 from stages.stage import Stage, check_cells, parameter
 from stages.terrain.fused_map import FusedMap, Observation, merged, variance_of, with_ceiling
 from stages.terrain.height_alignment import fit_plane, plane_height
@@ -89,10 +90,10 @@ class Fuse(Stage):
         known, observed = frame.known, self._observation(frame)
         cells, plane = self._aligned(frame, observed, pose, up, cloud.tilt_sigma or self.tilt_sigma, state)
         state.up_sum += up
-        cells[known] = merged(cells[known], observed.with_plane(plane), state.age(cloud.stamp))
+        put(cells, known, merged(taken(cells, known), observed.with_plane(plane), state.age(cloud.stamp)))
         hidden = ~known & np.isfinite(frame.ceiling) & (cells["frames"] == 0)
         ceiling = frame.ceiling[hidden] + plane_height(plane, *frame.offsets(hidden))
-        cells[hidden] = with_ceiling(cells[hidden], ceiling)
+        put(cells, hidden, with_ceiling(taken(cells, hidden), ceiling))
         state.cells.write(frame.row, frame.col, cells, known | hidden)
         state.last, state.has_ceiling = cloud.stamp, "ceiling" in frame.terrain.layers
         changed = frame.row, frame.col, frame.row + cells.shape[0], frame.col + cells.shape[1]
@@ -144,7 +145,7 @@ class Fuse(Stage):
         if state.levelling is not None:
             levelling = state.levelling.moved(pose, stated).tilted(up, tilt_sigma)
             expected = levelling.plane(up)
-            plane, covariance, overlaps = self._fitted(cells[frame.known], observed, expected)
+            plane, covariance, overlaps = self._fitted(taken(cells, frame.known), observed, expected)
             if self._jumped(plane, expected, state):
                 state.reset(frame.terrain.frame_id, frame.terrain.stamp)
                 state.resets += 1
@@ -167,7 +168,7 @@ class Fuse(Stage):
         cells, observed: (n,), the known cells of the frame; expected: the plane where they do not overlap.
         """
         both = cells["frames"] > 0
-        cells, observed = cells[both], observed.only(both)
+        cells, observed = taken(cells, both), observed.only(both)
         off = cells["height"].astype(np.float64) - observed.elevation
         variance = variance_of(cells) + observed.variance
         x, y = observed.x, observed.y

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.data import Array
-from stages.data.tiles import Tiles
+from stages.data.tiles import Tiles, copied, put, taken
 from stages.terrain.height_alignment import plane_height
 from stages.terrain.map_levelling import MapLevelling
 
@@ -81,10 +81,10 @@ def variance_of(cells: Array) -> Array:
 
 def merged(cells: Array, frame: Observation, now: int) -> Array:
     """The cells (n,) with a frame's observation at `now`, ms since the epoch."""
-    cells, known = cells.copy(), cells["frames"] > 0
+    cells, known = copied(cells), cells["frames"] > 0
     off = np.abs(frame.elevation - cells["height"])
     variance = np.full(len(cells), np.inf)
-    variance[known] = variance_of(cells[known])
+    variance[known] = variance_of(taken(cells, known))
     contradicted = known & (off > MAX_CONTRADICTION * np.sqrt(variance + frame.variance))
     replaced = contradicted & (frame.variance <= 2 * variance)  # the cell has lost half its weight
     unsettled = contradicted & ~replaced
@@ -94,9 +94,9 @@ def merged(cells: Array, frame: Observation, now: int) -> Array:
     cells["doubt"][unsettled] = off[unsettled]
     now = min(now, np.iinfo(CELL["first"]).max)
     new = ~known | replaced
-    cells[new] = _fresh(cells[new], now)
+    put(cells, new, _fresh(taken(cells, new), now))
     added = ~unsettled
-    cells[added] = _averaged(cells[added], frame.only(added), now)
+    put(cells, added, _averaged(taken(cells, added), frame.only(added), now))
     return cells
 
 
@@ -109,7 +109,7 @@ def _fresh(cells: Array, now: int) -> Array:
 
 def _averaged(cells: Array, frame: Observation, now: int) -> Array:
     """The cells (n,) with one more frame, weighted by inverse variance."""
-    after, sigma = cells.copy(), np.sqrt(frame.variance)
+    after, sigma = copied(cells), np.sqrt(frame.variance)
     weight = 1 / ((1 - SHARED_SHARE) * frame.variance + 1e-12)
     after["weight"] = total = cells["weight"] + weight
     share = weight / total
@@ -130,7 +130,7 @@ def _saturated_sum(numbers: Array, more: Array | int) -> Array:
 
 def with_ceiling(cells: Array, ceiling: Array) -> Array:
     """Cells (n,) seen by no frame, with the lower of their ceiling and a frame's, (n,) m."""
-    cells = cells.copy()
+    cells = copied(cells)
     cells["height"] = np.where(cells["weight"] == HIDDEN, np.minimum(cells["height"], ceiling), ceiling)
     cells["weight"] = HIDDEN
     return cells
@@ -139,7 +139,7 @@ def with_ceiling(cells: Array, ceiling: Array) -> Array:
 def layers_of(cells: Array, has_ceiling: bool) -> dict[str, Array]:
     """The layers of an elevation map, float32, from cells (rows, cols)."""
     known = cells["frames"] > 0
-    seen = cells[known]
+    seen = taken(cells, known)
     doubt = seen["doubt"].astype(np.float64)
     layers = {
         "elevation": _scattered(known, seen["height"]),

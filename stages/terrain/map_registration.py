@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import find_objects
 from scipy.spatial.transform import Rotation
 
 from flow.contracts import StageError
 from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
+from stages.data.arrays import Span, spanned
 from stages.terrain.dem import Voxelise
 
 # Between z of the pose's frame and up. Odometry without an inclinometer may differ by the slope of the ground.
@@ -109,14 +109,12 @@ def frame_grid(cloud: PointCloud, level: Transform, resolution: float, max_range
     return FrameGrid(level, replace(terrain, layers=layers, origin=origin, frame_id=level.parent), row, col)
 
 
-def _seen(terrain: ElevationMap) -> tuple[slice, slice]:
+def _seen(terrain: ElevationMap) -> Span:
     """Rows and columns of the cells with a height or a ceiling and of their neighbours."""
     seen = np.isfinite(terrain.layers["elevation"])
     if "ceiling" in terrain.layers:
         seen |= np.isfinite(terrain.layers["ceiling"])
-    found = find_objects(seen.astype(np.int8))
-    rows, cols = found[0] if found else (slice(0, 1), slice(0, 1))
-    return slice(max(rows.start - 1, 0), rows.stop + 1), slice(max(cols.start - 1, 0), cols.stop + 1)
+    return spanned(seen, 1)
 
 
 def with_plane(level: Transform, plane: Array) -> Transform:

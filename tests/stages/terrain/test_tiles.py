@@ -4,7 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.data.tiles import TILE_SIDE, Tiles
+from stages.data.tiles import TILE_SIDE, Tiles, copied, put, taken
+from stages.terrain.fused_map import CELL
 
 DTYPE = np.dtype([("value", "f4"), ("mark", "u1")])
 places = st.integers(-3 * TILE_SIDE, 2 * TILE_SIDE)
@@ -41,3 +42,16 @@ def test_unchanged_tiles_take_no_memory():
     changed[0, [0, -1]] = True
     tiles.write(0, 0, np.ones(changed.shape, DTYPE), changed)
     assert len(tiles.tiles) == 2
+
+
+def test_cells_with_fields_are_taken_put_and_copied_as_by_a_mask():
+    random = np.random.default_rng(3)
+    cells = random.integers(0, 256, (9, 7, CELL.itemsize), np.uint8).view(CELL)[..., 0]
+    where, other = random.random(cells.shape) < 0.4, random.permutation(cells.ravel()).reshape(cells.shape)
+    assert taken(cells, where).tobytes() == cells[where].tobytes()
+    expected, found = cells.copy(), copied(cells)
+    assert found.tobytes() == cells.tobytes()
+    expected[where] = other[where]
+    put(found, where, taken(other, where))
+    assert found.tobytes() == expected.tobytes()
+    assert found.tobytes() != cells.tobytes()
