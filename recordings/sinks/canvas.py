@@ -18,6 +18,7 @@ import rerun as rr
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import LEDGER, Panel, ViewSpec
 from recordings.sinks.colormaps import Legend, Rgb
+from recordings.sinks.png import png
 from stages.data import Array, StereoCamera
 
 TEXT_RGB: Rgb = (225, 228, 235)
@@ -101,9 +102,7 @@ class Canvas:
 
     def log_exact(self, path: str, pixels: Array, view: ViewSpec) -> None:
         """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as PNG."""
-        stored = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-        _, png = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        self.log(path, rr.EncodedImage(contents=png, media_type="image/png"), view)
+        self.log(path, rr.EncodedImage(contents=png(pixels), media_type="image/png"), view)
 
     def log_image(self, path: str, pixels: Array, view: ViewSpec) -> None:
         """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as JPEG."""
@@ -114,8 +113,9 @@ class Canvas:
     def log_values(self, values: Array, limits: tuple[float, float], view: ViewSpec) -> None:
         """Values (H, W) in colours over a range; hover reads them. The palette's darkest end is left to unknown."""
         low, high = limits
-        colors, ends = rr.components.Colormap.Turbo, (low - 0.1 * (high - low), high)
-        self.log(view.path, rr.DepthImage(values, meter=1.0, colormap=colors, depth_range=ends), view)
+        ends = (low - 0.1 * (high - low), high)
+        layout = _value_layout(values.shape, values.dtype)
+        self.log(view.path, rr.DepthImage.from_fields(buffer=values.tobytes(), depth_range=ends, **layout), view)
 
     def log_labels(self, view: ViewSpec, codes: Array, legend: Legend, beside: bool = False) -> None:
         """A label image (H, W); its names are above or beside it and appear on hover."""
@@ -173,6 +173,13 @@ class Canvas:
             else:
                 self.recording.log(path, rr.Clear(recursive=False))
         self._before, self._now = self._now, {}
+
+
+@lru_cache(maxsize=256)
+def _value_layout(shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
+    """What images of values have in common, as Arrow arrays: to make these takes longer than to log an image."""
+    same = rr.DepthImage(np.zeros(shape, dtype), meter=1.0, colormap=rr.components.Colormap.Turbo)
+    return {name: getattr(same, name).as_arrow_array() for name in ("format", "meter", "colormap")}
 
 
 @lru_cache(maxsize=256)

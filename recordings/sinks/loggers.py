@@ -16,7 +16,7 @@ from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
 from recordings.sinks.canvas import Canvas
 from recordings.sinks.colormaps import Rgb
-from recordings.sinks.png16 import png16
+from recordings.sinks.png import png
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -90,19 +90,23 @@ def log_stereo(canvas: Canvas, stream: str, frame: StereoFrame) -> None:
 
 @logger_for(Disparity)
 def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
-    """The disparities (hover reads them in px), the origin of each pixel, and the superpixels' edges."""
-    counts = cv2.calcHist([disparity.source], [0], None, [256], [0, 256]).ravel()
-    shares = {kind: 100.0 * counts[kind] / disparity.source.size for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
+    """The disparities (hover reads them in px), the origin of each pixel, and the superpixels' edges.
+
+    Shares are those of the pixels that are drawn.
+    """
+    width = canvas.width(stream)
+    source = np.ascontiguousarray(colormaps.every_nth(disparity.source, width))
+    counts = cv2.calcHist([source], [0], None, [256], [0, 256]).ravel()
+    shares = {kind: 100.0 * counts[kind] / source.size for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
     parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in shares.items() if share)
-    share = 100.0 * counts[known(ALL_CODES)].sum() / disparity.source.size
+    share = 100.0 * counts[known(ALL_CODES)].sum() / source.size
     caption = f"{stream} {', '.join([f'{share:.0f} % known', *parts])}"
     if not canvas.pictures:
         return caption
-    width = canvas.width(stream)
     _log_pixels(canvas, stream, disparity.pixels, width)
     if not {*np.flatnonzero(counts).tolist()} <= {PixelOrigin.UNKNOWN, PixelOrigin.MEASURED}:
         view = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
-        canvas.log_labels(view, colormaps.every_nth(disparity.source, width), colormaps.SOURCE_LEGEND, beside=True)
+        canvas.log_labels(view, source, colormaps.SOURCE_LEGEND, beside=True)
     if stream in canvas.full_size:
         _log_errors(canvas, stream, disparity)
     if disparity.segments is not None:
@@ -139,7 +143,7 @@ def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int) -> N
     steps: Array = cv2.multiply(thinned, DISPARITY_STEPS, dtype=cv2.CV_16U)  # type: ignore[call-overload]
     limit = canvas.limit(stream, colormaps.disparity_limit(pixels))
     image = rr.EncodedDepthImage(
-        png16(steps), media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
+        png(steps), media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
         depth_range=(0.0, limit * DISPARITY_STEPS),
     )  # fmt: skip
     view = ViewSpec(Panel.DISPARITY, stream, "pixels", stream)

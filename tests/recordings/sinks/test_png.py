@@ -1,4 +1,4 @@
-"""PNG of 16 bits, read back by OpenCV and by Pillow."""
+"""PNG, read back by OpenCV and by Pillow."""
 
 import io
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from recordings.sinks.png16 import png16
+from recordings.sinks.png import png
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (9, 1), (2, 2), (61, 83), (480, 640)])
@@ -16,7 +16,7 @@ def test_other_readers_find_every_value(shape, content):
     noise = np.random.default_rng(1).integers(0, 1 << 16, shape, np.uint16)
     slope = np.arange(shape[0] * shape[1], dtype=np.uint32).reshape(shape) // 3
     pixels = {"zero": np.zeros(shape, np.uint16), "noise": noise, "slope": slope.astype(np.uint16)}[content]
-    blob = png16(pixels)
+    blob = png(pixels)
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(blob, np.uint8), cv2.IMREAD_UNCHANGED), pixels)
     with Image.open(io.BytesIO(blob)) as image:
         image.verify()  # checksums of all parts
@@ -26,4 +26,10 @@ def test_other_readers_find_every_value(shape, content):
 @pytest.mark.parametrize("lie", [lambda pixels: pixels[::2, ::-1], np.transpose, lambda pixels: pixels.astype(">u2")])
 def test_pixels_may_lie_in_memory_in_any_way(lie):
     pixels = lie(np.random.default_rng(2).integers(0, 1 << 16, (30, 40), np.uint16))
-    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(png16(pixels), np.uint8), cv2.IMREAD_UNCHANGED), pixels)
+    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(png(pixels), np.uint8), cv2.IMREAD_UNCHANGED), pixels)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (7, 1, 3), (33, 41, 3), (33, 41)])
+def test_eight_bits_are_rgb_or_gray(shape):
+    pixels = np.random.default_rng(3).integers(0, 256, shape, np.uint8)
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png(pixels)))), pixels)
