@@ -25,7 +25,13 @@ FRAME = "frame"  # the timeline that counts frames
 LEDGER, FRAMES, SUMMARY, SECONDS, QUEUES = "ledger", "frames", "summary", "seconds", "queues"
 LAYOUT = "layout"  # the text from which other desks are made
 MAX_LEGEND_LINES = 4  # the legend of more lines would hide the plot
-SHOWN_LAYERS = ("step", "slope", "roughness", "variance")  # side by side on the desk `terrain`; the others are tabs
+SHOWN_LAYERS = (
+    "step",
+    "slope",
+    "steepness",
+    "roughness",
+    "variance",
+)  # side by side on the desk `terrain`; the others are tabs
 
 Specs = tuple["ViewSpec", ...]
 _Part = rrb.View | rrb.Container
@@ -130,7 +136,7 @@ def _terrain(drawn: Specs, slowest: Sequence[str]) -> _Part:
         *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.RELIEF, Panel.MAP, Panel.REASON)), *shown,
         _tabs(view for view in layers if view not in shown),
     ]  # fmt: skip
-    return _row((_grid(flat, 4), 5.0), (_space(drawn), 3.0)) or _ledger(drawn)
+    return _row((_grid(flat, 3), 5.0), (_space(drawn), 3.0)) or _ledger(drawn)
 
 
 def _runtime(drawn: Specs, slowest: Sequence[str]) -> _Part:

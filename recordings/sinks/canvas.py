@@ -23,8 +23,8 @@ from stages.data import Array, StereoCamera
 
 TEXT_RGB: Rgb = (225, 228, 235)
 CURVE_RGB: tuple[Rgb, ...] = ((255, 210, 60), (95, 175, 255), (245, 120, 95), (125, 215, 140), (205, 145, 245))
-LEGEND_COLUMNS = 4
-LEGEND_ROW = 0.14  # height of a row of a legend, share of the picture's height
+LEGEND_COLUMNS = (4, 3)  # of a single row, and of several, which have the longer names
+LEGEND_ROW = (0.14, 0.2)  # height of a single row of a legend, and of several, share of the picture's height
 
 
 @dataclass(eq=False)
@@ -138,18 +138,21 @@ class Canvas:
     def log_legend(
         self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, Rgb]], beside: bool = False
     ) -> None:
-        """Named dots above a picture of (H, W), in rows of at most four; or beside it, in two columns."""
+        """Named dots above a picture of (H, W), in a row of at most four or rows of three; or in two columns beside."""
         height, width = shape
         content = shape, *entries
         names, colors = zip(*content[1:], strict=True)
-        rows = -(-len(names) // (2 if beside else LEGEND_COLUMNS))
+        rows = -(-len(names) // (2 if beside else LEGEND_COLUMNS[len(names) > LEGEND_COLUMNS[0]]))
         columns = -(-len(names) // rows)
         places = [divmod(number, columns) for number in range(len(names))]
         if beside:
             dots = [((1.1 + 0.7 * column) * width, (row + 0.5) * height / rows) for row, column in places]
             pins = [(x + 0.33 * width, y - 0.45 * height / rows) for x, y in dots]  # a label is centred below its pin
         else:
-            dots = [((column + 0.5) * width / columns, (row - rows) * LEGEND_ROW * height) for row, column in places]
+            dots = [
+                ((column + 0.5) * width / columns, (row - rows) * LEGEND_ROW[rows > 1] * height)
+                for row, column in places
+            ]
             pins = dots
         dot, pin = rr.Radius.ui_points(5.0), rr.Radius.ui_points(0.5)
         self.keep(path, content, lambda: rr.Points2D(dots, colors=colors, radii=dot, draw_order=30.0))

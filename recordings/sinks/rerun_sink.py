@@ -38,7 +38,7 @@ from recordings.sinks.blueprint import (
     Panel,
     ViewSpec,
 )  # fmt: skip
-from recordings.sinks.canvas import Canvas
+from recordings.sinks.canvas import CURVE_RGB, Canvas
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import NUMBERS, plain_type
@@ -215,7 +215,11 @@ class RerunSink:
         if self.without:
             pictures["not drawn"] = ", ".join(self.without)
         self._recording.log(SUMMARY, _document(verdict, self._about, facts, pictures), static=True)
-        self._recording.log(LAYOUT, rr.TextDocument(self._layout().as_json()), static=True)
+        layout = self._layout()
+        for stage, color in zip(layout.slowest, CURVE_RGB, strict=False):
+            path = ViewSpec(Panel.STAGE, SECONDS, rr.escape_entity_path_part(stage), stage).path
+            self._recording.log(path, rr.SeriesLines(colors=[color]), static=True)
+        self._recording.log(LAYOUT, rr.TextDocument(layout.as_json()), static=True)
         self._views = -1  # the slowest stages are known now
         self._send_blueprint()
 
