@@ -1,14 +1,16 @@
 """Disparities summed over blocks of pixels, and planes fitted to windows of these blocks.
 
 Sums count from the block's centre and mean disparity, so that they are exact in single precision. A plane is fitted
-again to the residuals from an earlier one, with the weight of each block falling with its distance from that one.
+again to the residuals from an earlier one, with the weight of each block falling with its distance from that one. The
+trick: windows of neighbouring blocks are summed side by side in one array, at constant distances, so the compiler knows
+that nothing overlaps and vectorises.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import fast_kernel, fast_part, kernel
+from stages.compiled.jit import fast_part, kernel, part
 from stages.compiled.parallel import Fork, by_bands
 from stages.data import Array
 from stages.matching.kernels.texture import BLOCK
@@ -20,29 +22,33 @@ SLOPE_WEIGHT = 10.0  # px^2 of matches that keep a plane's slope as it was
 MAX_VARIANCE = 1e6  # px^2, of a plane without texture
 NOISE_CORRELATION = 0.25  # of matched noise; what exceeds it is texture that both images show
 
-BLOCKS = np.dtype([(name, np.float32) for name in (
-    "n", "x", "y", "xx", "xy", "yy", "xd", "yd", "dd",  # matches, sums over them from the block's centre and mean
-    "mean", "variance",  # of their disparities; expected of one disparity
-    "lr", "ll", "rr",  # products of gradients in units of information, 1/px^2
-)])  # fmt: skip
-PLANES = np.dtype([(name, np.float32) for name in (
-    "a", "b", "c",  # d = a x + b y + c, x and y from the block's centre
-    "n", "residual", "variance",  # weight of the matches, their variance about the plane, and the expected one
-    "bound", "correlation",  # variance of the plane by the images' gradients; correlation of these
-)])  # fmt: skip
+# Layers of an array of blocks: matches, and sums over them from the block's centre and their mean disparity
+N, X, Y, XX, XY, YY, XD, YD, DD = range(9)
+MEAN, VARIANCE = 9, 10  # mean of the disparities; expected variance of one of them
+LR, LL, RR = 11, 12, 13  # products of gradients in units of information, 1/px^2
+BLOCK_LAYERS = 14
+# Layers of an array of planes: d = a x + b y + c, x and y from the block's centre
+A, B, C = range(3)
+WEIGHT, RESIDUAL, EXPECTED = 3, 4, 5  # of the matches: their weight, variance about the plane, and the expected one
+BOUND, CORRELATION = 6, 7  # variance of the plane by the images' gradients; correlation of these
+PLANE_LAYERS = 8
+LANES = 16  # windows that are summed side by side
+START, SUMS = BLOCK_LAYERS, BLOCK_LAYERS + 3  # in the work array, after a block: its plane; sums over the window:
+S_N, S_X, S_Y, S_XX, S_XY, S_YY, S_R, S_XR, S_YR, S_RR, S_VARIANCE, S_LR, S_LL, S_RIGHT = range(SUMS, SUMS + 14)
+WORK_LAYERS = SUMS + 14
 
 
 def block_sums(
     pixels: Array, guessed: Array, guide: Array, slopes: tuple[Array, Array], scale: Array, levels: int, both: Fork
 ) -> Array:
-    """Sums over blocks of 4 x 4 px, (rows, cols) BLOCKS without variances.
+    """Sums over blocks of 4 x 4 px, (BLOCK_LAYERS, rows, cols) float32, without variances.
 
     Blocks beyond the image are empty: `levels` sizes of blocks, each twice the one before, are all whole. pixels:
     (H, W) float32, px, NaN = none; guessed: (H, W) bool, pixels to leave out; guide: (H, W) uint8; slopes:
     `texture.gradient` of both images; scale: `texture.information_scale`.
     """
     rows, cols = (-(-extent // (BLOCK << levels - 1)) << levels - 1 for extent in pixels.shape)
-    blocks = np.zeros((rows, cols), BLOCKS)
+    blocks = np.zeros((BLOCK_LAYERS, rows, cols), np.float32)
     given = pixels, guessed, guide, *slopes, scale
     used = -(-pixels.shape[0] // BLOCK)
     by_bands(both, used, lambda first, end: _gather(*given, first, end, blocks))
@@ -76,116 +82,141 @@ def _gather(pixels, guessed, guide, left, right, scale, first, end, blocks):
                         rr += other * other * factor
             if count == 0:
                 continue
-            block, mean = blocks[j, i], total / count
-            block.n, block.mean, block.lr, block.ll, block.rr = count, mean, lr, ll, rr
+            mean = total / count
+            sx, sy, sxx, sxy, syy, sxd, syd, sdd = F32(0), F32(0), F32(0), F32(0), F32(0), F32(0), F32(0), F32(0)
             for y in rows:
                 for x in columns:
                     if pixels[y, x] == pixels[y, x] and not guessed[y, x]:
                         u, v = F32(x - i * BLOCK) - F32(0.5 * (BLOCK - 1)), F32(y - j * BLOCK) - F32(0.5 * (BLOCK - 1))
                         e = pixels[y, x] - mean
-                        block.x += u
-                        block.y += v
-                        block.xx += u * u
-                        block.xy += u * v
-                        block.yy += v * v
-                        block.xd += u * e
-                        block.yd += v * e
-                        block.dd += e * e
+                        sx += u
+                        sy += v
+                        sxx += u * u
+                        sxy += u * v
+                        syy += v * v
+                        sxd += u * e
+                        syd += v * e
+                        sdd += e * e
+            block = blocks[:, j, i]
+            block[N], block[X], block[Y], block[XX], block[XY], block[YY] = count, sx, sy, sxx, sxy, syy
+            block[XD], block[YD], block[DD], block[MEAN] = sxd, syd, sdd, mean
+            block[LR], block[LL], block[RR] = lr, ll, rr
 
 
 def fit_windows(blocks: Array, start: Array | None, radius: int, size: int, both: Fork) -> Array:
-    """The planes, (rows, cols) PLANES, of windows of 2 * radius + 1 blocks around each block of `size` px.
+    """The planes, (PLANE_LAYERS, rows, cols) float32, of windows of 2 * radius + 1 blocks around each block.
 
-    start: planes that the windows' blocks have to be near; None: those of 3 x 3 blocks, whichever these are.
+    size: of a block, px; start: planes that the windows' blocks have to be near; None: those of 3 x 3 blocks, whichever
+    these are.
     """
     if start is None:
-        level = np.zeros(blocks.shape, PLANES)
-        level["c"] = blocks["mean"]
+        level = np.zeros((3, *blocks.shape[1:]), np.float32)
+        level[C] = blocks[MEAN]
         start = _fitted(blocks, level, 1, size, False, both)
     return _fitted(blocks, start, radius, size, True, both)
 
 
 def _fitted(blocks: Array, start: Array, radius: int, size: int, gated: bool, both: Fork) -> Array:
-    planes = np.zeros(blocks.shape, PLANES)
-    by_bands(both, len(blocks), lambda first, end: _fit(blocks, start, radius, F32(size), gated, first, end, planes))
+    planes = np.zeros((PLANE_LAYERS, *blocks.shape[1:]), np.float32)
+    given = blocks, start, radius, F32(size), gated
+    by_bands(both, blocks.shape[1], lambda first, end: _fit(*given, first, end, planes))
     return planes
 
 
-@fast_part
-def _deviation(block, across, down, offset, a, b):
-    """Sums of the residuals of a block's matches from a plane: alone, times x, times y, squared.
-
-    offset: of the block's mean from the plane at its centre.
-    """
-    r = offset * block.n - a * block.x - b * block.y
-    xr = block.xd + offset * block.x - a * block.xx - b * block.xy
-    yr = block.yd + offset * block.y - a * block.xy - b * block.yy
-    rr = block.dd + offset * (r - a * block.x - b * block.y) - a * block.xd - b * block.yd
-    rr -= a * (block.xd - a * block.xx - b * block.xy) + b * (block.yd - a * block.xy - b * block.yy)
-    return r, xr + across * r, yr + down * r, rr
-
-
-@fast_kernel
+@kernel
 def _fit(blocks, start, radius, size, gated, first, end, planes):
-    height, width = blocks.shape
+    _, height, width = blocks.shape
+    work = np.zeros(WORK_LAYERS * LANES, np.float32)
     for j in range(first, end):
-        for i in range(width):
-            a, b, c = start[j, i].a, start[j, i].b, start[j, i].c
-            n, x, y, xx, xy, yy = F32(0), F32(0), F32(0), F32(0), F32(0), F32(0)
-            r, xr, yr, rr, variance = F32(0), F32(0), F32(0), F32(0), F32(0)
-            lr, left, right = F32(0), F32(0), F32(0)
+        for i in range(0, width, LANES):
+            work[SUMS * LANES :] = 0
+            for layer in range(3):
+                _copy(start[layer, j], i, work, START + layer)
             for down in range(max(-radius, -j), min(radius, height - 1 - j) + 1):
-                for across in range(max(-radius, -i), min(radius, width - 1 - i) + 1):
-                    block = blocks[j + down, i + across]
-                    if block.n == 0:
-                        continue
-                    u, v = F32(across) * size, F32(down) * size
-                    offset = block.mean - c - a * u - b * v
-                    own_r, own_xr, own_yr, own_rr = _deviation(block, u, v, offset, a, b)
-                    weight = F32(1)
-                    if gated:
-                        limit = F32(MAX_DEVIATION**2) + F32(BLOCK_VARIANCES) * block.variance
-                        weight -= own_rr / (block.n * limit)
-                        if weight <= 0:
-                            continue
-                        weight *= weight
-                    n += weight * block.n
-                    x += weight * (block.x + u * block.n)
-                    y += weight * (block.y + v * block.n)
-                    xx += weight * (block.xx + F32(2) * u * block.x + u * u * block.n)
-                    xy += weight * (block.xy + u * block.y + v * block.x + u * v * block.n)
-                    yy += weight * (block.yy + F32(2) * v * block.y + v * v * block.n)
-                    r += weight * own_r
-                    xr += weight * own_xr
-                    yr += weight * own_yr
-                    rr += weight * own_rr
-                    variance += weight * block.n * block.variance
-                    lr += weight * block.lr
-                    left += weight * block.ll
-                    right += weight * block.rr
-            plane = planes[j, i]
-            plane.a, plane.b, plane.c, plane.n = a, b, c, n
-            plane.bound = F32(MAX_VARIANCE)
-            if n < F32(1):
-                plane.n = F32(0)
-                continue
-            mx, my, mr = x / n, y / n, r / n
-            cxx, cxy, cyy = xx - mx * x + F32(SLOPE_WEIGHT), xy - mx * y, yy - my * y + F32(SLOPE_WEIGHT)
-            cxr, cyr, crr = xr - mx * r, yr - my * r, rr - mr * r
-            determinant = cxx * cyy - cxy * cxy
-            da, db = (cxr * cyy - cyr * cxy) / determinant, (cyr * cxx - cxr * cxy) / determinant
-            plane.a, plane.b, plane.c = a + da, b + db, c + mr - da * mx - db * my
-            plane.residual = max((crr - da * cxr - db * cyr) / n, F32(0))
-            plane.variance = variance / n
-            both = np.sqrt(left * right)
-            plane.correlation = lr / max(both, F32(1e-9))
-            plane.bound = F32(1) / max(lr - F32(NOISE_CORRELATION) * both, F32(1e-9))
+                for across in range(-radius, radius + 1):
+                    for layer in range(BLOCK_LAYERS):
+                        _copy(blocks[layer, j + down], i + across, work, layer)
+                    _add(work, F32(across) * size, F32(down) * size, gated)
+            for lane in range(min(LANES, width - i)):
+                _solve(work, lane, planes[:, j, i + lane])
+
+
+@part
+def _copy(row, start, work, layer):
+    """Copy LANES values of a row into a layer of the work array; beyond the row they are 0."""
+    first, end = max(-start, 0), min(LANES, row.size - start)
+    if first > 0 or end < LANES:
+        work[layer * LANES : (layer + 1) * LANES] = 0
+    source, target = row[start + first :], work[layer * LANES + first :]
+    for lane in range(end - first):
+        target[lane] = source[lane]
+
+
+@fast_part
+def _add(work, u, v, gated):
+    """Add one block of each of `LANES` windows, (u, v) px from its middle, to the window's sums."""
+    for i in range(LANES):
+        n, x, y = work[N * LANES + i], work[X * LANES + i], work[Y * LANES + i]
+        xx, xy, yy = work[XX * LANES + i], work[XY * LANES + i], work[YY * LANES + i]
+        xd, yd, expected = work[XD * LANES + i], work[YD * LANES + i], work[VARIANCE * LANES + i]
+        a, b = work[(START + A) * LANES + i], work[(START + B) * LANES + i]
+        # Residuals of the block's matches from the plane: their sum, times x, times y, squared
+        offset = work[MEAN * LANES + i] - work[(START + C) * LANES + i] - a * u - b * v
+        r = offset * n - a * x - b * y
+        xr, yr = xd + offset * x - a * xx - b * xy, yd + offset * y - a * xy - b * yy
+        rr = work[DD * LANES + i] + offset * (r - a * x - b * y) - a * xd - b * yd
+        rr -= a * (xd - a * xx - b * xy) + b * (yd - a * xy - b * yy)
+        weight = F32(1)
+        if gated:
+            limit = F32(MAX_DEVIATION**2) + F32(BLOCK_VARIANCES) * expected
+            weight = max(F32(1) - rr / (max(n, F32(1)) * limit), F32(0))
+            weight *= weight
+        work[S_N * LANES + i] += weight * n
+        work[S_X * LANES + i] += weight * (x + u * n)
+        work[S_Y * LANES + i] += weight * (y + v * n)
+        work[S_XX * LANES + i] += weight * (xx + F32(2) * u * x + u * u * n)
+        work[S_XY * LANES + i] += weight * (xy + u * y + v * x + u * v * n)
+        work[S_YY * LANES + i] += weight * (yy + F32(2) * v * y + v * v * n)
+        work[S_R * LANES + i] += weight * r
+        work[S_XR * LANES + i] += weight * (xr + u * r)
+        work[S_YR * LANES + i] += weight * (yr + v * r)
+        work[S_RR * LANES + i] += weight * rr
+        work[S_VARIANCE * LANES + i] += weight * n * expected
+        work[S_LR * LANES + i] += weight * work[LR * LANES + i]
+        work[S_LL * LANES + i] += weight * work[LL * LANES + i]
+        work[S_RIGHT * LANES + i] += weight * work[RR * LANES + i]
+
+
+@fast_part
+def _solve(work, lane, plane):
+    """The plane of the window in a lane, by least squares over its matches, as a change of the one it starts from."""
+    a, b, c = work[(START + A) * LANES + lane], work[(START + B) * LANES + lane], work[(START + C) * LANES + lane]
+    n, variance = work[S_N * LANES + lane], work[S_VARIANCE * LANES + lane]
+    x, y, r = work[S_X * LANES + lane], work[S_Y * LANES + lane], work[S_R * LANES + lane]
+    plane[A], plane[B], plane[C], plane[BOUND] = a, b, c, F32(MAX_VARIANCE)
+    if n < F32(1):
+        return
+    mx, my, mr = x / n, y / n, r / n
+    cxx = work[S_XX * LANES + lane] - mx * x + F32(SLOPE_WEIGHT)
+    cyy = work[S_YY * LANES + lane] - my * y + F32(SLOPE_WEIGHT)
+    cxy = work[S_XY * LANES + lane] - mx * y
+    cxr, cyr = work[S_XR * LANES + lane] - mx * r, work[S_YR * LANES + lane] - my * r
+    crr = work[S_RR * LANES + lane] - mr * r
+    determinant = cxx * cyy - cxy * cxy
+    da, db = (cxr * cyy - cyr * cxy) / determinant, (cyr * cxx - cxr * cxy) / determinant
+    plane[A], plane[B], plane[C] = a + da, b + db, c + mr - da * mx - db * my
+    plane[WEIGHT], plane[RESIDUAL] = n, max((crr - da * cxr - db * cyr) / n, F32(0))
+    plane[EXPECTED] = variance / n
+    both = np.sqrt(work[S_LL * LANES + lane] * work[S_RIGHT * LANES + lane])
+    matched = work[S_LR * LANES + lane]
+    plane[CORRELATION] = matched / max(both, F32(1e-9))
+    plane[BOUND] = F32(1) / max(matched - F32(NOISE_CORRELATION) * both, F32(1e-9))
 
 
 def coarser(blocks: Array, planes: Array, size: int) -> tuple[Array, Array]:
     """Blocks of twice the `size`, px, and planes to start from, about their centres."""
-    rows, cols = blocks.shape
-    whole, start = np.zeros((rows // 2, cols // 2), BLOCKS), np.zeros((rows // 2, cols // 2), PLANES)
+    _, rows, cols = blocks.shape
+    whole, start = (np.zeros((layers, rows // 2, cols // 2), np.float32) for layers in (BLOCK_LAYERS, 3))
     _coarsen(blocks, planes, F32(size), whole, start)
     return whole, start
 
@@ -193,42 +224,41 @@ def coarser(blocks: Array, planes: Array, size: int) -> tuple[Array, Array]:
 @kernel
 def _coarsen(blocks, planes, size, whole, start):
     """Blocks of twice the `size`, px, and the means of their planes, into `whole` and `start`."""
-    for j in range(whole.shape[0]):
-        for i in range(whole.shape[1]):
+    for j in range(whole.shape[1]):
+        for i in range(whole.shape[2]):
             total, n, weight, variance = F32(0), F32(0), F32(0), F32(0)
             for k in range(4):
-                part = blocks[2 * j + k // 2, 2 * i + k % 2]
-                total, n = total + part.n * part.mean, n + part.n
-                variance += F32(0.25) * part.variance
-                weight += planes[2 * j + k // 2, 2 * i + k % 2].n
-            block, plane = whole[j, i], start[j, i]
-            block.n, block.mean, block.variance = n, total / max(n, F32(1)), variance
+                part = blocks[:, 2 * j + k // 2, 2 * i + k % 2]
+                total, n = total + part[N] * part[MEAN], n + part[N]
+                variance += F32(0.25) * part[VARIANCE]
+                weight += planes[WEIGHT, 2 * j + k // 2, 2 * i + k % 2]
+            block, plane = whole[:, j, i], start[:, j, i]
+            block[N], block[MEAN], block[VARIANCE] = n, total / max(n, F32(1)), variance
             for k in range(4):
-                part, own = blocks[2 * j + k // 2, 2 * i + k % 2], planes[2 * j + k // 2, 2 * i + k % 2]
+                part, own = blocks[:, 2 * j + k // 2, 2 * i + k % 2], planes[:, 2 * j + k // 2, 2 * i + k % 2]
                 u, v = size * (F32(k % 2) - F32(0.5)), size * (F32(k // 2) - F32(0.5))
-                e = part.mean - block.mean
-                x, y = part.x + u * part.n, part.y + v * part.n
-                block.x += x
-                block.y += y
-                block.xx += part.xx + u * (part.x + x)
-                block.xy += part.xy + u * part.y + v * x
-                block.yy += part.yy + v * (part.y + y)
-                block.xd += part.xd + e * x
-                block.yd += part.yd + e * y
-                block.dd += part.dd + e * e * part.n
-                block.lr += part.lr
-                block.ll += part.ll
-                block.rr += part.rr
-                share = own.n / max(weight, F32(1e-6))
-                plane.a += share * own.a
-                plane.b += share * own.b
-                plane.c += share * (own.c - own.a * u - own.b * v)
+                e = part[MEAN] - block[MEAN]
+                x, y = part[X] + u * part[N], part[Y] + v * part[N]
+                block[X] += x
+                block[Y] += y
+                block[XX] += part[XX] + u * (part[X] + x)
+                block[XY] += part[XY] + u * part[Y] + v * x
+                block[YY] += part[YY] + v * (part[Y] + y)
+                block[XD] += part[XD] + e * x
+                block[YD] += part[YD] + e * y
+                block[DD] += part[DD] + e * e * part[N]
+                for layer in (LR, LL, RR):
+                    block[layer] += part[layer]
+                share = own[WEIGHT] / max(weight, F32(1e-6))
+                plane[A] += share * own[A]
+                plane[B] += share * own[B]
+                plane[C] += share * (own[C] - own[A] * u - own[B] * v)
 
 
 def block_sums_reference(
     pixels: Array, guessed: Array, guide: Array, slopes: tuple[Array, Array], scale: Array, size: int
-) -> dict[str, Array]:
-    """`block_sums` for blocks of `size` px in plain numpy and float64: the fields of BLOCKS without variance."""
+) -> Array:
+    """`block_sums` for blocks of `size` px in plain numpy and float64: (BLOCK_LAYERS, rows, cols)."""
     height, width = pixels.shape
     rows, cols = -(-height // size), -(-width // size)
     at = np.arange(width) - np.where(guessed, np.nan, pixels).astype(np.float64)
@@ -236,7 +266,7 @@ def block_sums_reference(
     left, right = (image.astype(np.float64) for image in slopes)
     partner = np.stack([np.interp(place, np.arange(width), row) for place, row in zip(at, right, strict=True)])
     one, other = (np.where(inside, image * np.sqrt(scale[guide]), 0) for image in (left, partner))
-    sums = {name: np.zeros((rows, cols)) for name in BLOCKS.names or () if name != "variance"}
+    sums = np.zeros((BLOCK_LAYERS, rows, cols))
     for j, i in np.ndindex(rows, cols):
         block = np.s_[j * size : (j + 1) * size, i * size : (i + 1) * size]
         y, x = np.nonzero(np.isfinite(pixels[block]) & ~guessed[block])
@@ -244,13 +274,10 @@ def block_sums_reference(
         if not d.size:
             continue
         u, v, e = x - (size - 1) / 2, y - (size - 1) / 2, d - d.mean()
-        terms = {
-            "n": np.ones_like(d), "x": u, "y": v, "xx": u * u, "xy": u * v, "yy": v * v, "xd": u * e, "yd": v * e,
-            "dd": e * e, "lr": (one * other)[block], "ll": (one * one)[block], "rr": (other * other)[block],
-        }  # fmt: skip
-        for name, values in terms.items():
-            sums[name][j, i] = values.sum()
-        sums["mean"][j, i] = d.mean()
+        terms = np.ones_like(d), u, v, u * u, u * v, v * v, u * e, v * e, e * e
+        sums[: len(terms), j, i] = np.sum(terms, axis=1)
+        sums[LR:, j, i] = [image[block].sum() for image in (one * other, one * one, other * other)]
+        sums[MEAN, j, i] = d.mean()
     return sums
 
 

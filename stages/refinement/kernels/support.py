@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 from stages.matching.kernels.texture import (
@@ -25,7 +25,25 @@ from stages.matching.kernels.texture import (
     stereo_noise,
     summed,
 )
-from stages.refinement.kernels.blocks import block_sums, coarser, fit_windows
+from stages.refinement.kernels.blocks import (
+    BOUND,
+    CORRELATION,
+    EXPECTED,
+    LANES,
+    LL,
+    LR,
+    RESIDUAL,
+    RR,
+    VARIANCE,
+    WEIGHT,
+    A,
+    B,
+    C,
+    N,
+    block_sums,
+    coarser,
+    fit_windows,
+)
 
 F32 = np.float32
 LEVELS = 3  # sizes of blocks: 4, 8 and 16 px
@@ -35,6 +53,11 @@ EXCESS, SYSTEMATIC = 1.9, 0.04  # of the errors over the bound; px, of what no a
 BEND_REACH, MAX_BEND = 3, 0.45  # px; where the surface bends, an error is about as large as the bend
 PIXEL_SIGMAS, PIXEL_DEVIATION = 10.0, 0.1  # a match farther off the plane than both together is of another surface
 MIN_BACKING = 4  # matches in the block of a guessed pixel that is supported
+MIDDLE = 0.5 * (BLOCK - 1)  # of a block, from its first pixel
+# Layers of the work array, of LANES pixels each: four times those of a plane, then inputs and three results of the pixels
+BASE, SLOPE, SHARE, SCATTER, UNCERTAIN, ALIKE, PLANES = range(7)
+DISPARITY, OWN, NEAR, RESULT = range(4 * PLANES, 4 * PLANES + 4)
+WORK_LAYERS = RESULT + 3
 
 
 class Support(NamedTuple):
@@ -62,8 +85,8 @@ def supported(pixels: Array, guessed: Array, left: Array, right: Array, noise: A
     texture = information(left, slopes[0], noise, threads)
     variance, first_row = match_variance(texture), sky_end(texture, left, noise)
     blocks = block_sums(pixels, guessed, left, slopes, information_scale(noise), LEVELS, both)
-    blocks["variance"][: variance.shape[0], : variance.shape[1]] = variance
-    alike, smallest = _correlated(blocks), blocks
+    blocks[VARIANCE, : variance.shape[0], : variance.shape[1]] = variance
+    alike, matches = _correlated(blocks), blocks[N]
     planes, size = [fit_windows(blocks, None, RADIUS, BLOCK, both)], BLOCK
     for _ in range(1, LEVELS):
         blocks, start = coarser(blocks, planes[-1], size)
@@ -71,7 +94,7 @@ def supported(pixels: Array, guessed: Array, left: Array, right: Array, noise: A
         planes.append(fit_windows(blocks, start, RADIUS, size, both))
     shrunk, spread = _shrunk(planes)
     result = Support(*(np.empty(pixels.shape, np.float32) for _ in Support._fields))
-    given = pixels, guessed, smallest, shrunk, variance, spread, alike, first_row
+    given = pixels, guessed, matches, shrunk, variance, spread, alike, first_row
     by_bands(both, len(pixels), lambda first, end: _blend(*given, first, end, *result))
     by_bands(both, len(pixels), lambda first, end: _add_bend(result.pixels, first, end, result.sigma))
     return result
@@ -79,97 +102,126 @@ def supported(pixels: Array, guessed: Array, left: Array, right: Array, noise: A
 
 def _correlated(blocks: Array) -> Array:
     """Correlation of the images' gradients over each 3 x 3 blocks, (rows, cols) float32."""
-    lr, ll, rr = (summed(np.ascontiguousarray(blocks[name])) for name in ("lr", "ll", "rr"))
+    lr, ll, rr = (summed(blocks[layer]) for layer in (LR, LL, RR))
     return np.asarray(lr / np.sqrt(np.maximum(ll * rr, F32(1e-9))))
 
 
 def _shrunk(planes: list[Array]) -> tuple[Array, Array]:
     """The planes of the smallest blocks, moved to those of larger ones as far as noise explains the difference.
 
-    Returns the planes, (rows, cols) PLANES, whose `residual` is that of the smallest windows, and the variance of the
-    planes, (rows, cols) float32, px^2.
+    Returns the planes, (PLANE_LAYERS, rows, cols), whose RESIDUAL is that of the smallest windows, and the variance of
+    the planes, (rows, cols) float32, px^2.
     """
     result, size = planes[-1].copy(), BLOCK << len(planes) - 1
     spread = _plane_variance(result)
     for fine in reversed(planes[:-1]):
         size //= 2
-        rows, cols = np.ogrid[: fine.shape[0], : fine.shape[1]]
-        coarse = result.repeat(2, axis=0).repeat(2, axis=1)
-        c = coarse["c"] + (coarse["a"] * (cols % 2 - F32(0.5)) + coarse["b"] * (rows % 2 - F32(0.5))) * F32(size)
+        rows, cols = ((np.arange(extent) % 2).astype(np.float32) - F32(0.5) for extent in fine.shape[1:])
+        coarse = result.repeat(2, axis=1).repeat(2, axis=2)
+        coarse[C] += (coarse[A] * cols + coarse[B] * rows[:, np.newaxis]) * F32(size)
         noise = _averaged(fine)
-        relief = np.maximum(coarse["residual"] - fine["residual"] - noise / 2, 0)
-        apart = np.maximum(np.abs(c - fine["c"]) - 2 * np.sqrt(noise), 0)
+        relief = np.maximum(coarse[RESIDUAL] - fine[RESIDUAL] - noise / 2, 0)
+        apart = np.maximum(np.abs(coarse[C] - fine[C]) - 2 * np.sqrt(noise), 0)
         weight = noise / np.maximum(noise + relief + apart**2, F32(1e-12))  # 0 without matches
         result = fine.copy()
-        for name, value in (("a", coarse["a"]), ("b", coarse["b"]), ("c", c), ("correlation", coarse["correlation"])):
-            result[name] += weight * (value - fine[name])
+        for layer in (A, B, C, CORRELATION):
+            result[layer] += weight * (coarse[layer] - fine[layer])
         spread = spread.repeat(2, axis=0).repeat(2, axis=1)
         spread = (1 - weight) ** 2 * _plane_variance(fine) + weight**2 * spread
-    return result, spread.astype(np.float32)
+    return result, spread
 
 
 def _averaged(planes: Array) -> Array:
     """Variance of the planes by the noise of their matches, px^2."""
-    return np.asarray(planes["variance"] * np.minimum(F32(CORRELATED) / np.maximum(planes["n"], 1), 1))
+    return np.asarray(planes[EXPECTED] * np.minimum(F32(CORRELATED) / np.maximum(planes[WEIGHT], 1), 1))
 
 
 def _plane_variance(planes: Array) -> Array:
-    return np.asarray(np.minimum(np.maximum(_averaged(planes), planes["bound"]), planes["variance"]))
+    return np.asarray(np.minimum(np.maximum(_averaged(planes), planes[BOUND]), planes[EXPECTED]))
 
 
 @kernel
 def _blend(
-    pixels, guessed, blocks, planes, variance, spread, correlated, first_row, first, end, moved, sigma, correlation
+    pixels, guessed, matches, planes, variance, spread, correlated, first_row, first, end, moved, sigma, correlation
 ):
-    """Each pixel moves towards the planes of the four blocks around it, as far as it lies on them."""
-    rows, cols = planes.shape
-    middle = F32(0.5 * (BLOCK - 1))
-    share_down, base, slope, residual, uncertain, alike = np.empty((6, 4), np.float32)
+    """Each pixel moves towards the planes of the four blocks around it, as far as it lies on them.
+
+    Handled together are every fourth of 4 * LANES pixels: each of them lies alike between the middles of four blocks.
+    """
+    height, width = pixels.shape
+    work = np.zeros(WORK_LAYERS * LANES, np.float32)
     for y in range(first, end):
-        top = (y - BLOCK // 2) // BLOCK
-        lower = (F32(y) - middle) / F32(BLOCK) - F32(top)
-        for left in range(-1, (pixels.shape[1] - 1 - BLOCK // 2) // BLOCK + 1):
-            start = left * BLOCK + BLOCK // 2
+        j, top = y // BLOCK, (y - BLOCK // 2) // BLOCK
+        lower = (F32(y) - F32(MIDDLE)) / F32(BLOCK) - F32(top)
+        for left in range(-1, (width - 1 - BLOCK // 2) // BLOCK + 1, LANES):
             for k in range(4):
-                j, i = top + k // 2, left + k % 2
-                share_down[k] = F32(0)
-                if 0 <= j < rows and 0 <= i < cols and planes[j, i].n > 0:
-                    plane = planes[j, i]
-                    across, down = F32(start - i * BLOCK) - middle, F32(y - j * BLOCK) - middle
-                    base[k], slope[k] = plane.c + plane.a * across + plane.b * down, plane.a
-                    share_down[k] = lower if k >= 2 else F32(1) - lower
-                    residual[k], uncertain[k], alike[k] = plane.residual, spread[j, i], plane.correlation
-            for x in range(max(start, 0), min(start + BLOCK, pixels.shape[1])):
-                d, j, i = pixels[y, x], y // BLOCK, x // BLOCK
-                moved[y, x], sigma[y, x], correlation[y, x] = d, F32(np.inf), F32(0)
-                if d != d:
-                    continue
-                own = variance[j, i]
-                reach = F32(1) / (F32(PIXEL_SIGMAS) * np.sqrt(own) + F32(PIXEL_DEVIATION))
-                farther = (F32(x) - middle) / F32(BLOCK) - F32(left)
-                weights, value, scatter, random, common = F32(0), F32(0), F32(0), F32(0), F32(0)
-                for k in range(4):
-                    if share_down[k] > 0:
-                        off = base[k] + slope[k] * F32(x - start) - d
-                        near = max(F32(1) - (off * reach) ** 2, F32(0))
-                        weight = share_down[k] * (farther if k % 2 else F32(1) - farther) * near * near
-                        weights += weight
-                        value += weight * off
-                        scatter += weight * residual[k]
-                        random += weight * uncertain[k]
-                        common += weight * alike[k]
-                share = F32(0)
-                if weights > 0:
-                    relief = max(scatter / weights - own, F32(0))
-                    share = own / (own + relief) * min(F32(2) * weights, F32(1))
-                    moved[y, x] = d + share * value / weights
-                    random, common = share * share * random / weights, share * common / weights
-                if y >= first_row[x] and (not guessed[y, x] or blocks[j, i].n >= MIN_BACKING):
-                    random += (F32(1) - share) ** 2 * own
-                    sigma[y, x] = np.sqrt(F32(EXCESS**2) * random + F32(SYSTEMATIC**2))
-                    near_correlation = correlated[j, i]
-                    mean = (F32(1) - share) * near_correlation + common
-                    correlation[y, x] = min(mean, F32(2) * near_correlation)
+                above, share = top + k // 2, lower if k >= 2 else F32(1) - lower
+                if 0 <= above < planes.shape[1]:
+                    down = F32(y - above * BLOCK) - F32(MIDDLE)
+                    _take_planes(planes[:, above], spread[above], left + k % 2, down, share, work, PLANES * k)
+                else:
+                    work[(PLANES * k + SHARE) * LANES : (PLANES * k + SHARE + 1) * LANES] = 0
+            for phase in range(BLOCK):
+                start = left * BLOCK + BLOCK // 2 + phase
+                lanes = range(1 if start < 0 else 0, min(LANES, (width - start + BLOCK - 1) // BLOCK))
+                for lane in lanes:
+                    x = start + BLOCK * lane
+                    work[DISPARITY * LANES + lane], work[OWN * LANES + lane] = pixels[y, x], variance[j, x // BLOCK]
+                    work[NEAR * LANES + lane] = correlated[j, x // BLOCK]
+                _mix(work, F32(phase) + F32(0.5))
+                for lane in lanes:
+                    x = start + BLOCK * lane
+                    d, moved_to = pixels[y, x], work[RESULT * LANES + lane]
+                    moved[y, x], sigma[y, x], correlation[y, x] = d, F32(np.inf), F32(0)
+                    if d == d:
+                        moved[y, x] = moved_to
+                        if y >= first_row[x] and (not guessed[y, x] or matches[j, x // BLOCK] >= MIN_BACKING):
+                            sigma[y, x] = work[(RESULT + 1) * LANES + lane]
+                            correlation[y, x] = work[(RESULT + 2) * LANES + lane]
+
+
+@part
+def _take_planes(planes, spread, start, down, share, work, layer):
+    """Copy what `_mix` needs of LANES planes in a row; those beyond its ends, and without matches, have no share."""
+    first, end = max(-start, 0), min(LANES, spread.size - start)
+    work[layer * LANES : (layer + PLANES) * LANES] = 0
+    target, at = work[layer * LANES :], start + first
+    a, b, c, weight = planes[A, at:], planes[B, at:], planes[C, at:], planes[WEIGHT, at:]
+    residual, alike, uncertain = planes[RESIDUAL, at:], planes[CORRELATION, at:], spread[at:]
+    for lane in range(end - first):
+        i = first + lane
+        target[BASE * LANES + i], target[SLOPE * LANES + i] = c[lane] + b[lane] * down, a[lane]
+        target[SHARE * LANES + i] = share if weight[lane] > 0 else F32(0)
+        target[SCATTER * LANES + i], target[UNCERTAIN * LANES + i] = residual[lane], uncertain[lane]
+        target[ALIKE * LANES + i] = alike[lane]
+
+
+@part
+def _mix(work, across):
+    """The disparity, sigma and correlation of LANES pixels, `across` px right of the middles of the left planes."""
+    for i in range(LANES):
+        d, own = work[DISPARITY * LANES + i], work[OWN * LANES + i]
+        scale = F32(1) / (F32(PIXEL_SIGMAS) * np.sqrt(own) + F32(PIXEL_DEVIATION))
+        weights, value, scatter, random, common = F32(0), F32(0), F32(0), F32(0), F32(0)
+        for k in range(4):
+            plane = PLANES * k * LANES + i
+            aside = across - F32(BLOCK * (k % 2))
+            off = work[plane + BASE * LANES] + work[plane + SLOPE * LANES] * aside - d
+            near = max(F32(1) - (off * scale) ** 2, F32(0))
+            weight = work[plane + SHARE * LANES] * (F32(1) - abs(aside) / F32(BLOCK)) * near * near
+            weights += weight
+            value += weight * off
+            scatter += weight * work[plane + SCATTER * LANES]
+            random += weight * work[plane + UNCERTAIN * LANES]
+            common += weight * work[plane + ALIKE * LANES]
+        mean = F32(1) / max(weights, F32(1e-12))
+        relief = max(scatter * mean - own, F32(0))
+        share = own / (own + relief) * min(F32(2) * weights, F32(1))  # 0 without a plane
+        random = share * share * random * mean + (F32(1) - share) * (F32(1) - share) * own
+        alone = work[NEAR * LANES + i]
+        work[RESULT * LANES + i] = d + share * value * mean
+        work[(RESULT + 1) * LANES + i] = np.sqrt(F32(EXCESS**2) * random + F32(SYSTEMATIC**2))
+        work[(RESULT + 2) * LANES + i] = min((F32(1) - share) * alone + share * common * mean, F32(2) * alone)
 
 
 @kernel
@@ -201,25 +253,26 @@ def add_bend_reference(pixels: Array, sigma: Array) -> Array:
 
 
 def blend_reference(
-    pixels: Array, guessed: Array, blocks: Array, planes: Array, variance: Array, spread: Array, correlated: Array,
+    pixels: Array, guessed: Array, matches: Array, planes: Array, variance: Array, spread: Array, correlated: Array,
     first_row: Array,
 ) -> Support:  # fmt: skip
     """The last step of `supported`, in plain numpy and float64, pixel by pixel."""
     result = Support(pixels.astype(np.float64), np.full(pixels.shape, np.inf), np.zeros(pixels.shape))
     for y, x in np.argwhere(np.isfinite(pixels)):
         d, own, sums = float(pixels[y, x]), float(variance[y // BLOCK, x // BLOCK]), np.zeros(5)
-        for j, i in np.ndindex(planes.shape):
+        for j, i in np.ndindex(planes.shape[1:]):
             across, down = (place - number * BLOCK - (BLOCK - 1) / 2 for place, number in ((x, i), (y, j)))
-            if max(abs(across), abs(down)) < BLOCK and planes[j, i]["n"] > 0:
-                off = planes[j, i]["c"] + planes[j, i]["a"] * across + planes[j, i]["b"] * down - d
+            if max(abs(across), abs(down)) < BLOCK and planes[WEIGHT, j, i] > 0:
+                plane = planes[:, j, i]
+                off = plane[C] + plane[A] * across + plane[B] * down - d
                 near = max(1 - (off / (PIXEL_SIGMAS * np.sqrt(own) + PIXEL_DEVIATION)) ** 2, 0) ** 2
-                terms = 1, off, planes[j, i]["residual"], spread[j, i], planes[j, i]["correlation"]
+                terms = 1, off, plane[RESIDUAL], spread[j, i], plane[CORRELATION]
                 sums += (1 - abs(across) / BLOCK) * (1 - abs(down) / BLOCK) * near * np.array(terms, np.float64)
         mean, share = sums / max(sums[0], 1e-12), 0.0
         if sums[0] > 0:
             share = own / (own + max(mean[2] - own, 0)) * min(2 * sums[0], 1)
         result.pixels[y, x] = d + share * mean[1]
-        if y >= first_row[x] and (not guessed[y, x] or blocks["n"][y // BLOCK, x // BLOCK] >= MIN_BACKING):
+        if y >= first_row[x] and (not guessed[y, x] or matches[y // BLOCK, x // BLOCK] >= MIN_BACKING):
             random, near_correlation = share**2 * mean[3] + (1 - share) ** 2 * own, correlated[y // BLOCK, x // BLOCK]
             result.sigma[y, x] = np.sqrt(EXCESS**2 * random + SYSTEMATIC**2)
             result.correlation[y, x] = min(share * mean[4] + (1 - share) * near_correlation, 2 * near_correlation)

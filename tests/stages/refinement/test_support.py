@@ -10,8 +10,15 @@ from stages.compiled.parallel import shared_by
 from stages.matching.image_noise import noise_levels
 from stages.matching.kernels.texture import gradient, information_scale
 from stages.refinement.kernels.blocks import (
-    BLOCKS,
-    PLANES,
+    BLOCK_LAYERS,
+    MEAN,
+    PLANE_LAYERS,
+    RESIDUAL,
+    VARIANCE,
+    WEIGHT,
+    A,
+    B,
+    C,
     block_sums,
     block_sums_reference,
     coarser,
@@ -39,14 +46,14 @@ def test_sums_of_both_sizes_equal_the_reference(height, width, seed, threads):
     pixels, guessed, (left, right), noise = case(height, width, seed)
     slopes, scale = (gradient(left), gradient(right)), information_scale(noise)
     small = block_sums(pixels, guessed, left, slopes, scale, 3, shared_by(threads))
-    large, _ = coarser(small, np.zeros(small.shape, PLANES), 4)
+    large, _ = coarser(small, np.zeros((PLANE_LAYERS, *small.shape[1:]), np.float32), 4)
     for blocks, size in ((small, 4), (large, 8)):
         expected = block_sums_reference(pixels, guessed, left, slopes, scale, size)
-        rows, cols = expected["n"].shape
-        for name, values in expected.items():
-            tolerance = 1e-3 * max(1.0, float(np.abs(values).max()))
-            assert np.allclose(blocks[name][:rows, :cols], values, atol=tolerance), name
-            assert not blocks[name][rows:].any()
+        _, rows, cols = expected.shape
+        for layer in range(BLOCK_LAYERS):
+            tolerance = 1e-3 * max(1.0, float(np.abs(expected[layer]).max()))
+            assert np.allclose(blocks[layer, :rows, :cols], expected[layer], atol=tolerance), layer
+            assert not blocks[layer, rows:].any()
 
 
 @settings(max_examples=15, deadline=None)
@@ -55,20 +62,20 @@ def test_planes_equal_least_squares_over_the_matches_of_the_window(seed):
     pixels, guessed, (left, right), noise = case(32, 48, seed)
     slopes = gradient(left), gradient(right)
     blocks = block_sums(pixels, guessed, left, slopes, information_scale(noise), 3, ALONE)
-    blocks["variance"] = np.random.default_rng(seed).uniform(0.01, 0.3, blocks.shape)
-    start = np.zeros(blocks.shape, PLANES)
-    start["a"], start["b"], start["c"] = 0.04, 0.12, blocks["mean"] + 0.1
+    blocks[VARIANCE] = np.random.default_rng(seed).uniform(0.01, 0.3, blocks.shape[1:])
+    start = np.zeros((3, *blocks.shape[1:]), np.float32)
+    start[A], start[B], start[C] = 0.04, 0.12, blocks[MEAN] + 0.1
     found = fit_windows(blocks, start, 2, 4, ALONE)
     y, x = np.nonzero(np.isfinite(pixels) & ~guessed)
     for j, i in ((0, 0), (3, 5), (7, 11)):
         within = (abs(y // 4 - j) <= 2) & (abs(x // 4 - i) <= 2)
         across, down = x[within] - 4 * i - 1.5, y[within] - 4 * j - 1.5
-        numbers = (y // 4 * blocks.shape[1] + x // 4)[within]
+        numbers = (y // 4 * blocks.shape[2] + x // 4)[within]
         points = np.stack([across, down, pixels[y, x][within], numbers], axis=1).astype(np.float64)
-        first = np.array([start[j, i][name] for name in "abc"], np.float64)
-        plane, residual = fit_window_reference(points, first, blocks["variance"].ravel().astype(np.float64))
-        assert np.allclose([found[j, i][name] for name in "abc"], plane, atol=2e-3)
-        assert found[j, i]["residual"] == pytest.approx(residual, rel=0.02, abs=1e-3)
+        first = start[:, j, i].astype(np.float64)
+        plane, residual = fit_window_reference(points, first, blocks[VARIANCE].ravel().astype(np.float64))
+        assert np.allclose(found[:3, j, i], plane, atol=2e-3)
+        assert found[RESIDUAL, j, i] == pytest.approx(residual, rel=0.02, abs=1e-3)
 
 
 @settings(max_examples=15, deadline=None)
@@ -77,14 +84,12 @@ def test_the_last_step_equals_the_reference(height, width, seed):
     rng = np.random.default_rng(seed)
     pixels, guessed, _, _ = case(height, width, seed)
     shape = 4, 8  # blocks
-    blocks, planes = np.zeros(shape, BLOCKS), np.zeros(shape, PLANES)
-    for name in ("n", "a", "b", "c", "residual", "correlation"):
-        planes[name] = rng.uniform(0, 0.3, shape)
-    planes["c"] += 10
-    planes["n"][rng.random(shape) < 0.2] = 0
-    blocks["n"] = rng.integers(0, 17, shape)
+    planes = rng.uniform(0, 0.3, (PLANE_LAYERS, *shape)).astype(np.float32)
+    planes[C] += 10
+    planes[WEIGHT, rng.random(shape) < 0.2] = 0
+    matches = rng.integers(0, 17, shape).astype(np.float32)
     variance, spread, near = (rng.uniform(0.01, 0.5, shape).astype(np.float32) for _ in range(3))
-    given = pixels, guessed, blocks, planes, variance, spread, near, rng.integers(0, height + 1, width)
+    given = pixels, guessed, matches, planes, variance, spread, near, rng.integers(0, height + 1, width)
     result = [np.empty(pixels.shape, np.float32) for _ in range(3)]
     _blend(*given, 0, height, *result)
     for layer, expected in zip(result, blend_reference(*given), strict=True):
