@@ -25,6 +25,7 @@ _workspaces = Workspaces()
 LIGHTNESS_SCALE = F32(100 / 255)  # from 8 bits to L in 0..100
 NO_CENTRE = F32(1e30)
 ITERATIONS = 2  # of the centres, before the last assignment
+TILE = 64  # pixels of a row whose nearest centres are found together
 MIN_HALVED_CELL = 8  # px; with smaller grid cells the centres move at full resolution
 
 
@@ -109,34 +110,50 @@ def _labels(colour: Array, centres: Array, grid: tuple[int, int], weight: float,
 def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, labels):
     """Find the nearest of nine centres for the pixels of grid rows first_row to end_row."""
     height, width, channels = colour.shape
-    # Separate arrays, not rows of one: so the compiler knows that they do not overlap.
-    first, second, third = np.zeros(width, np.float32), np.zeros(width, np.float32), np.zeros(width, np.float32)
-    least, nearest, col = np.empty(width, np.float32), np.empty(width, np.int32), np.empty(width, np.int32)
+    work, col = np.zeros((4 + 9 * 5) * TILE, np.float32), np.empty(width, np.int32)
     for k in range(cols):
         col[k * width // cols : (k + 1) * width // cols] = k
-    candidates = np.empty((9, 5, width), np.float32)
+    centre_rows = np.empty((9, 5, width), np.float32)
     for row in range(first_row, end_row):
         for place in range(9):
-            _expand_row(centres, rows, cols, row + place // 3 - 1, place % 3 - 1, position_weight, candidates[place])
-        for y in range(row * height // rows, (row + 1) * height // rows):
-            for x in range(width):
-                first[x] = F32(colour[y, x, 0]) * LIGHTNESS_SCALE
-            if channels == 3:
-                for x in range(width):
-                    second[x] = colour[y, x, 1]
-                    third[x] = colour[y, x, 2]
-            least[:] = NO_CENTRE
+            _expand_row(centres, rows, cols, row + place // 3 - 1, place % 3 - 1, position_weight, centre_rows[place])
+        for start in range(0, width, TILE):
+            size = min(TILE, width - start)
             for place in range(9):
-                beside = np.int32((place // 3 - 1) * cols + place % 3 - 1)
-                for x in range(width):
-                    da, db = first[x] - candidates[place, 0, x], second[x] - candidates[place, 1, x]
-                    dc, dy = third[x] - candidates[place, 2, x], F32(y) - candidates[place, 3, x]
-                    d = da * da + db * db + dc * dc + dy * dy * position_weight + candidates[place, 4, x]
-                    closer = d < least[x]
-                    least[x] = d if closer else least[x]
-                    nearest[x] = beside if closer else nearest[x]
-            for x in range(width):
-                labels[y, x] = nearest[x] + row * cols + col[x]
+                for i in range(5):
+                    at = (4 + 5 * place + i) * TILE
+                    work[at : at + size] = centre_rows[place, i, start : start + size]
+            for y in range(row * height // rows, (row + 1) * height // rows):
+                pixels = colour[y, start : start + size]
+                for x in range(size):
+                    work[x] = F32(pixels[x, 0]) * LIGHTNESS_SCALE
+                if channels == 3:
+                    for x in range(size):
+                        work[TILE + x], work[2 * TILE + x] = pixels[x, 1], pixels[x, 2]
+                _find_nearest(work, F32(y), position_weight)
+                for x in range(size):
+                    nearest = np.int32(work[3 * TILE + x])
+                    labels[y, start + x] = (row + nearest // 3 - 1) * cols + col[start + x] + nearest % 3 - 1
+
+
+@fast_part
+def _find_nearest(work, y, position_weight):
+    """Write which of nine centres is nearest to each of TILE pixels of row y, 0 to 8, behind their three colours.
+
+    Five layers of each centre follow. All are in one array at constant distances: so the compiler knows that they do
+    not overlap and vectorises.
+    """
+    for x in range(TILE):
+        first, second, third = work[x], work[TILE + x], work[2 * TILE + x]
+        least, nearest = NO_CENTRE, F32(0)
+        for place in range(9):
+            at = (4 + 5 * place) * TILE + x
+            da, db, dc = first - work[at], second - work[at + TILE], third - work[at + 2 * TILE]
+            dy = y - work[at + 3 * TILE]
+            d = da * da + db * db + dc * dc + dy * dy * position_weight + work[at + 4 * TILE]
+            nearest = F32(place) if d < least else nearest
+            least = d if d < least else least
+        work[3 * TILE + x] = nearest
 
 
 @kernel
