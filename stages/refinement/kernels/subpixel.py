@@ -94,8 +94,8 @@ def _add(own, disparity, error, gradient, sums):
     All sums are in one array at constant distances: so the compiler knows that they do not overlap and vectorises.
     """
     for j in range(LANES):
-        inside = abs(disparity[j] - own[j]) <= MAX_WINDOW_STEP
-        g, e = gradient[j] if inside else F32(0), error[j] if inside else F32(0)
+        g, e, inside = gradient[j], error[j], abs(disparity[j] - own[j]) <= MAX_WINDOW_STEP
+        g, e = g if inside else F32(0), e if inside else F32(0)
         sums[j] += F32(1) if inside else F32(0)
         sums[LANES + j] += g
         sums[2 * LANES + j] += e
