@@ -54,7 +54,7 @@ BEND_REACH, MAX_BEND = 3, 0.45  # px; where the surface bends, an error is about
 PIXEL_SIGMAS, PIXEL_DEVIATION = 10.0, 0.1  # a match farther off the plane than both together is of another surface
 MIN_BACKING = 4  # matches in the block of a guessed pixel that is supported
 MIDDLE = 0.5 * (BLOCK - 1)  # of a block, from its first pixel
-# Layers of the work array, of LANES pixels each: four times those of a plane, then inputs and three results of the pixels
+# Layers of the work array, LANES pixels each: those of four planes, then inputs and three results of the pixels
 BASE, SLOPE, SHARE, SCATTER, UNCERTAIN, ALIKE, PLANES = range(7)
 DISPARITY, OWN, NEAR, RESULT = range(4 * PLANES, 4 * PLANES + 4)
 WORK_LAYERS = RESULT + 3
@@ -148,7 +148,7 @@ def _blend(
 
     Handled together are every fourth of 4 * LANES pixels: each of them lies alike between the middles of four blocks.
     """
-    height, width = pixels.shape
+    width = pixels.shape[1]
     work = np.zeros(WORK_LAYERS * LANES, np.float32)
     for y in range(first, end):
         j, top = y // BLOCK, (y - BLOCK // 2) // BLOCK
