@@ -312,7 +312,10 @@ class Recording:
 
 @dataclass(frozen=True)
 class _StampReader:
-    """Reads the header stamp of the message at a place. firsts: the place of the first message of each file."""
+    """Reads the header stamp of the message at a place; 0 if a damaged index gives it another log time.
+
+    firsts: the place of the first message of each file.
+    """
 
     files: Sequence[Container]
     firsts: Sequence[int]
@@ -322,6 +325,6 @@ class _StampReader:
         file, own = self.files[number], place - self.firsts[number]
         channel = int(file.timeline.channels[own])
         for item in file.messages({channel}, places=range(own, own + 1)):
-            if isinstance(item, RawMessage):
+            if isinstance(item, RawMessage) and item.log_time == file.timeline.log_times[own]:
                 return peek_stamp(item.data, file.channels[channel].message_encoding)
         return 0

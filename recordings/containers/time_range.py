@@ -35,9 +35,9 @@ class TimeRange:
         when = stamp if stamp and abs(stamp - log_time) < MAX_LATENESS_NS else log_time
         return (self.low is None or when >= self.low) and (self.high is None or when < self.high)
 
-    def widened(self, by: int) -> TimeRange:
-        """The range with `by` ns more at both ends."""
-        low = None if self.low is None else max(self.low - by, 0)
+    def widened(self, by: int, before: int | None = None) -> TimeRange:
+        """The range with `by` ns more at both ends, or `before` ns more at its beginning."""
+        low = None if self.low is None else max(self.low - (by if before is None else before), 0)
         return TimeRange(low, None if self.high is None else self.high + by)
 
 

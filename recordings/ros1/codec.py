@@ -13,7 +13,8 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 
 from recordings.errors import LogError
-from recordings.ros2.cdr import SharedTypestore, full_name, store_of
+from recordings.ros2.cdr import full_name, store_of
+from recordings.ros2.typestore import SharedTypestore
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _NO_FIELDS = "structure_needs_at_least_one_member"  # the only field of a type without fields, as rosbags has it

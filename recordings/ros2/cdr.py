@@ -12,16 +12,15 @@ from collections.abc import Callable
 from functools import lru_cache
 from importlib import import_module
 from textwrap import shorten
-from threading import RLock
 from typing import Any
 
 import zstandard
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_idl, get_types_from_msg
-from rosbags.typesys.store import Typestore
 
 from recordings.errors import LogError
 from recordings.mcap.chunk import MAX_CHUNK_BYTES, max_unpacked
+from recordings.ros2.typestore import REGISTERING, SharedTypestore
 
 GRID_MAP = """\
 std_msgs/Header header
@@ -46,27 +45,16 @@ _MAX_REASON = 100  # characters of a parser's message, which may contain the who
 _SEPARATOR = re.compile(r"^={20,}\s*$", re.MULTILINE)
 _MAX_LINES = 1000  # of a definition
 _MAX_ELEMENTS = 1000  # of an array of a fixed size, unless they are numbers
-_registering = RLock()  # rosbags builds classes and codecs in module-wide state
-
-
-class SharedTypestore(Typestore):
-    """A type store for several threads: codecs are built on first use, one at a time."""
-
-    def get_msgdef(self, typename: str) -> Any:
-        if typename not in self.cache:
-            with _registering:
-                return super().get_msgdef(typename)
-        return self.cache[typename]
 
 
 def _typestore(name: str) -> SharedTypestore:
-    with _registering:
+    with REGISTERING:
         return SharedTypestore(import_module(f"rosbags.typesys.stores.{name}"))
 
 
 def _known_types() -> SharedTypestore:
     store = _typestore("ros2_jazzy")
-    with _registering:
+    with REGISTERING:
         definitions = get_types_from_msg(GRID_MAP_INFO, "grid_map_msgs/msg/GridMapInfo")
         store.register({**definitions, **get_types_from_msg(GRID_MAP, "grid_map_msgs/msg/GridMap")})
     return store
@@ -109,7 +97,6 @@ def store_of(schema_name: str, schema_encoding: str, text: bytes) -> SharedTypes
     try:
         # Definitions may contain a byte order mark, Windows line ends, and comments that are not UTF-8.
         store = _store_of(name, schema_encoding, text.decode("utf-8-sig", "replace").replace("\r\n", "\n"))
-        store.get_msgdef(name)
     except Exception as error:  # a parser of foreign text may fail in any way
         why = shorten(f"{type(error).__name__}: {error}", _MAX_REASON, placeholder=" ...")
         raise LogError(f"schema '{schema_name}' cannot be parsed ({why})") from error
@@ -131,7 +118,7 @@ def plain(data: bytes | memoryview, size: int = MAX_CHUNK_BYTES) -> bytes | memo
 def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
     """A store of the types in the schema, completed by the standard types that it leaves out."""
     store = _typestore("empty")
-    with _registering:
+    with REGISTERING:
         # Lines of '=' separate a schema's definitions. The time to parse one grows with its square.
         parts = _SEPARATOR.split(text)
         if max(map(_lines_of, parts)) > _MAX_LINES:
@@ -146,8 +133,11 @@ def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
         else:
             store.register(get_types_from_msg(text, name))
         known = _typestore("ros1_noetic") if encoding == "ros1msg" else TYPES
-        _complete(store, known, name, [], set())
+        parts_of = set[str]()
+        _complete(store, known, name, [], parts_of)
         _check_arrays(store)
+        for part in sorted(parts_of):  # what cannot be built is refused now
+            getattr(store.get_msgdef(part), "deserialize_ros1" if encoding == "ros1msg" else "deserialize_cdr_le")
     return store
 
 

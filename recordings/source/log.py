@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from functools import partial
 from heapq import merge
+from itertools import islice
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.contracts import Finding
+from recordings.containers.clock import MAX_JITTER_NS
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
@@ -107,12 +109,21 @@ class McapLog:
     def excerpts(self, count: int, streams: Collection[str]) -> Iterator[Iterator[tuple[int, str, Any]]]:
         """The events of a few frames at `count` places of the whole log, independent of the range that is read."""
         times = self.file.times(self.channels("left")).tolist() if "left" in self.topics else []
+        ahead = self._stamps_ahead() if set(streams) <= {*CAMERAS} else INTERPOLATION_LEAD_NS
         for first in sorted({int((part + 0.5) * len(times) / count) for part in range(count)}) if times else ():
             last = min(first + EXCERPT_FRAMES, len(times)) - 1
             # Stamps precede log times, so begin after the previous image.
             low = times[first - 1] + 1 if first else self.file.start
             part = TimeRange(low, times[last] + MAX_LATENESS_NS)
-            yield self._between(part, FramesInRange(part, ()), streams)
+            yield self._between(part, FramesInRange(part, ()), streams, ahead)
+
+    def _stamps_ahead(self) -> int:
+        """By how much, ns, stamps of images may be later than their log times: so much earlier they are looked for."""
+        raws = [
+            raw for side in CAMERAS if side in self.topics for raw in islice(self.file.messages(self.channels(side)), 1)
+        ]
+        ahead = (self.stamp_of(raw) - raw.log_time for raw in raws if isinstance(raw, RawMessage))
+        return min(max(*ahead, 0, 0) + MAX_JITTER_NS, MAX_LATENESS_NS)
 
     def _lefts_around(self, part: TimeRange) -> Iterator[tuple[int, int]]:
         """Stamp and log time, ns, of the left images around the edges of a part."""
@@ -122,9 +133,9 @@ class McapLog:
                     yield self.stamp_of(raw), raw.log_time
 
     def _between(
-        self, part: TimeRange, frames: FramesInRange, streams: Collection[str]
+        self, part: TimeRange, frames: FramesInRange, streams: Collection[str], ahead: int = MAX_LATENESS_NS
     ) -> Iterator[tuple[int, str, Any]]:
-        events = self._read(part, frames, streams)
+        events = self._read(part, frames, streams, ahead)
         tilt = self.resolution.tilt
         if "inclinometer" not in streams or "inclinometer" not in self.topics or tilt is None or not tilt.estimates:
             return events
@@ -146,9 +157,11 @@ class McapLog:
             if isinstance(raw, RawMessage):
                 yield raw.log_time, readers[raw.channel](raw)
 
-    def _read(self, part: TimeRange, frames: FramesInRange, streams: Collection[str]) -> Iterator[tuple[int, str, Any]]:
-        """The events without estimates."""
-        wide, near = part.widened(MAX_LATENESS_NS), part.widened(INTERPOLATION_LEAD_NS)
+    def _read(
+        self, part: TimeRange, frames: FramesInRange, streams: Collection[str], ahead: int
+    ) -> Iterator[tuple[int, str, Any]]:
+        """The events without estimates. ahead: how much earlier, ns, than the part an image of it may be logged."""
+        wide, near = part.widened(MAX_LATENESS_NS, ahead), part.widened(INTERPOLATION_LEAD_NS)
         log_start = max(wide.low or 0, self.file.start)
         for stream, problem in self.resolution.problems:
             if stream in (*streams, "log"):
