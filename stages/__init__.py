@@ -45,7 +45,7 @@ from stages.refinement.refine import Refine
 from stages.terrain.binarise import Binarise
 from stages.terrain.dem import Voxelise
 from stages.terrain.features import TerrainFeatures
-from stages.terrain.fuse import Fuse
+from stages.terrain.fuse import Fuse, FuseRegion
 from stages.terrain.map_region import MapRegion
 
 __all__ = [
@@ -61,6 +61,7 @@ __all__ = [
     "Disparity",
     "ElevationMap",
     "Fuse",
+    "FuseRegion",
     "Halve",
     "ImageNoise",
     "LeftRightCheck",

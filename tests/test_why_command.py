@@ -10,7 +10,7 @@ from flow.cli.what_if import part_of
 from recordings import McapSource
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
-from stages import Fuse, Rectify, VisualOdometry
+from stages import FuseRegion, Rectify, VisualOdometry
 from stages.data import Cell
 from tests.conftest import SMALL, roverflow
 
@@ -79,7 +79,7 @@ def test_only_stages_before_the_map_run_and_the_log_is_not_surveyed_again(traver
     def refuse(*_, **__):
         raise AssertionError("not needed for the map of one frame")
 
-    for stage, method in ((Rectify, "survey"), (VisualOdometry, "start"), (Fuse, "start")):
+    for stage, method in ((Rectify, "survey"), (VisualOdometry, "start"), (FuseRegion, "start")):
         monkeypatch.setattr(stage, method, refuse)
     (x, y), *_ = places(fast_result, stamp, Cell.HAZARD, 1)
     assert why(fast_result, AT, cell=(x, y), log=traverse).recorded == Cell.HAZARD

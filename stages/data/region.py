@@ -1,4 +1,4 @@
-"""The fused cells of a run: what `Fuse` makes of each frame, and `MapRegion` turns into maps."""
+"""The fused cells of a run: what `FuseRegion` makes of each frame, and `MapRegion` turns into maps."""
 
 from __future__ import annotations
 

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from flow.contracts import Finding, Severity, StageError, counted
-from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Pose, Region
+from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Region
 from stages.data.tiles import put, taken
 from stages.stage import Stage, check_cells, parameter
 from stages.terrain.fused_map import FusedMap, Observation, merged, variance_of, with_ceiling
 from stages.terrain.height_alignment import fit_plane, plane_height
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
 from stages.terrain.map_levelling import MapLevelling, StatedErrors
+from stages.terrain.map_region import map_around
 from stages.terrain.map_registration import FrameGrid, frame_grid, register, with_plane
 
 MIN_OVERLAP_CELLS = 100  # of a frame and the map, for their heights to show a jump
@@ -29,22 +30,8 @@ MAX_GRADIENT = 3.0  # rise per run of a cell in the variance of misplaced frames
 
 
 @dataclass(frozen=True)
-class Fuse(Stage):
-    """Merges levelled clouds into the cells of a region, which `MapRegion` turns into maps.
-
-    The region starts again if the pose's frame changes. docs/terrain.md describes its alignment and variance.
-
-    Examples
-    --------
-    >>> from stages import Tilt, Level
-    >>> cloud = PointCloud(0, np.float32([[0, 1, 3]]), np.zeros((1, 3), np.uint8), np.float32([0.01]), np.int32([0]),
-    ...                    "camera")
-    >>> level = Level()(cloud, Tilt(0, [0.0, -1.0, 0.0], "camera"))
-    >>> fuse, pose = Fuse(), Pose(0, [5, 0, 1], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
-    >>> region = fuse(level, pose, state=fuse.start())
-    >>> region.frame_id, region.level.translation.tolist()
-    ('odom', [5.0, 0.0, 0.0])
-    """
+class _Fusion(Stage):
+    """What `Fuse` and `FuseRegion` share: parameters, state and the work."""
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
     max_range: float = parameter(
@@ -77,11 +64,8 @@ class Fuse(Stage):
         """An empty map, the state of one run."""
         return FusedMap()
 
-    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> Region:
-        """The region in the pose's frame, with a cloud in frame `level` merged in.
-
-        `mount` may be left out if the pose is the camera's.
-        """
+    def _fused(self, cloud: PointCloud, pose: Pose, mount: Mount | None, state: FusedMap) -> Region:
+        """The region in the pose's frame, with a cloud in frame `level` merged in."""
         self._check(cloud, state)
         level, up = register(cloud, pose, mount)
         frame = frame_grid(cloud, level, self.resolution, self.max_range)
@@ -123,7 +107,9 @@ class Fuse(Stage):
                 f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; put stages.Level before it"
             )
         if cloud.stamp <= state.last:
-            raise StageError(f"Fuse: the cloud of {cloud.stamp} ns is not later than the last one, {state.last} ns")
+            raise StageError(
+                f"Fuse: the cloud of {cloud.stamp} ns is not later than the last one, {state.last} ns"
+            )
 
     def _observation(self, frame: FrameGrid) -> Observation:
         """The known cells of a frame; the errors of its position are added to their variance."""
@@ -199,3 +185,58 @@ class Fuse(Stage):
                 "unlike the frames before; its pose or its tilt has jumped, and it is left out of the regional map"
             )
         return True
+
+
+@dataclass(frozen=True)
+class FuseRegion(_Fusion):
+    """Merges levelled clouds into the cells of a region, which `MapRegion` turns into maps.
+
+    The region starts again if the pose's frame changes. `mount` may be left out if the pose is the camera's.
+    docs/terrain.md describes the alignment and the variance.
+
+    Examples
+    --------
+    >>> from stages import Tilt, Level
+    >>> cloud = PointCloud(0, np.float32([[0, 1, 3]]), np.zeros((1, 3), np.uint8), np.float32([0.01]), np.int32([0]),
+    ...                    "camera")
+    >>> level = Level()(cloud, Tilt(0, [0.0, -1.0, 0.0], "camera"))
+    >>> fuse, pose = FuseRegion(), Pose(0, [5, 0, 1], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
+    >>> region = fuse(level, pose, state=fuse.start())
+    >>> region.frame_id, region.level.translation.tolist()
+    ('odom', [5.0, 0.0, 0.0])
+    """
+
+    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> Region:
+        """The region in the pose's frame, with a cloud in frame `level` merged in."""
+        return self._fused(cloud, pose, mount, state)
+
+
+@dataclass(frozen=True)
+class Fuse(_Fusion):
+    """Merges levelled clouds into a regional map, and returns the map around the rover with each of them.
+
+    It does at once what `FuseRegion` and `MapRegion` do one after the other, for a map of every frame.
+
+    Examples
+    --------
+    >>> from stages import Tilt, Level
+    >>> cloud = PointCloud(0, np.float32([[0, 1, 3]]), np.zeros((1, 3), np.uint8), np.float32([0.01]), np.int32([0]),
+    ...                    "camera")
+    >>> level = Level()(cloud, Tilt(0, [0.0, -1.0, 0.0], "camera"))
+    >>> fuse, pose = Fuse(), Pose(0, [5, 0, 1], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
+    >>> terrain = fuse(level, pose, state=fuse.start())
+    >>> row, col = np.argwhere(np.isfinite(terrain.layers["elevation"]))[0]
+    >>> round(terrain.origin[0] + 0.05 * (float(col) + 0.5), 3), round(float(terrain.layers["elevation"][row, col]), 3)
+    (8.025, 0.0)
+    """
+
+    window: float = parameter(20.0, "width of the map", unit="m", low=0.5, high=200.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_cells("Fuse.window", self.window, self.resolution)
+
+    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> ElevationMap:
+        """The map around the rover, in the pose's frame, with a cloud in frame `level` merged in."""
+        region = self._fused(cloud, pose, mount, state)
+        return map_around(region, self.window, region.changed)

@@ -30,7 +30,7 @@ _MS = 1_000_000
 
 @dataclass(eq=False)
 class FusedMap:
-    """The regional map so far, the state of `Fuse`."""
+    """The regional map so far, the state of `Fuse` and `FuseRegion`."""
 
     frame_id: str | None = None  # "" is a valid name
     epoch: int = 0  # ns, stamp of the first frame

@@ -43,11 +43,11 @@ class MapRegion(Stage):
 
     Examples
     --------
-    >>> from stages import Fuse, Level, PointCloud, Pose, Tilt
+    >>> from stages import FuseRegion, Level, PointCloud, Pose, Tilt
     >>> cloud = PointCloud(0, np.float32([[0, 1, 3]]), np.zeros((1, 3), np.uint8), np.float32([0.01]), np.int32([0]),
     ...                    "camera")
     >>> level = Level()(cloud, Tilt(0, [0.0, -1.0, 0.0], "camera"))
-    >>> fuse, maps, pose = Fuse(), MapRegion(), Pose(0, [5, 0, 1], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
+    >>> fuse, maps, pose = FuseRegion(), MapRegion(), Pose(0, [5, 0, 1], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
     >>> terrain = maps(fuse(level, pose, state=fuse.start()), state=maps.start())
     >>> row, col = np.argwhere(np.isfinite(terrain.layers["elevation"]))[0]
     >>> round(terrain.origin[0] + 0.05 * (float(col) + 0.5), 3), round(float(terrain.layers["elevation"][row, col]), 3)
@@ -70,7 +70,7 @@ class MapRegion(Stage):
         held, changed = state.held, state.changed
         if held is not None and changed is not None and _way(held, region) > MAX_GAP:
             state.mapped, state.held, state.changed = held, region, region.changed
-            return self._map(held, changed)
+            return map_around(held, self.window, changed)
         state.held, state.changed = region, _around(changed, region.changed)
         if state.mapped is None or _way(state.mapped, region) >= self.step:
             return self.flush(state)
@@ -82,19 +82,20 @@ class MapRegion(Stage):
         if held is None or changed is None:
             return None
         state.mapped, state.held, state.changed = held, None, None
-        return self._map(held, changed)
+        return map_around(held, self.window, changed)
 
-    def _map(self, region: Region, changed: Bounds) -> ElevationMap:
-        """The map around the rover and around what has changed."""
-        step, half = region.resolution, math.ceil(self.window / 2 / region.resolution - 1e-9)
-        margin = math.ceil(MARGIN / step - 1e-9)
-        col, row = (math.floor(position / step) - half for position in region.level.translation[:2])
-        first_row, first_col, end_row, end_col = changed
-        wide = first_row - margin, first_col - margin, end_row + margin, end_col + margin
-        row, col, end_row, end_col = _around((row, col, row + 2 * half, col + 2 * half), wide)
-        layers = layers_of(region.cells.read(row, col, end_row - row, end_col - col), region.has_ceiling)
-        origin = (col * step, row * step)
-        return ElevationMap(region.stamp, layers, step, origin, region.frame_id, region.level, region.epoch)
+
+def map_around(region: Region, window: float, changed: Bounds) -> ElevationMap:
+    """The map of `window`, m, around the rover, and around what has changed."""
+    step, half = region.resolution, math.ceil(window / 2 / region.resolution - 1e-9)
+    margin = math.ceil(MARGIN / step - 1e-9)
+    col, row = (math.floor(position / step) - half for position in region.level.translation[:2])
+    first_row, first_col, end_row, end_col = changed
+    wide = first_row - margin, first_col - margin, end_row + margin, end_col + margin
+    row, col, end_row, end_col = _around((row, col, row + 2 * half, col + 2 * half), wide)
+    layers = layers_of(region.cells.read(row, col, end_row - row, end_col - col), region.has_ceiling)
+    origin = (col * step, row * step)
+    return ElevationMap(region.stamp, layers, step, origin, region.frame_id, region.level, region.epoch)
 
 
 def _way(one: Region, other: Region) -> float:

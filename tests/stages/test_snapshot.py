@@ -16,6 +16,7 @@ from stages import (
     CheckTilt,
     Disparity,
     Fuse,
+    FuseRegion,
     Level,
     MapRegion,
     Mount,
@@ -36,7 +37,7 @@ FRAMES = 6
 def inputs():
     """Stage -> what each of some frames gives it."""
     simulation, drive = Simulation(frames=FRAMES, width=320, height=240, relief_cells=512, seed=5), Drive(2, 6.0)
-    given, fuse = {VisualOdometry: [], Fuse: [], MapRegion: []}, Running(Fuse())
+    given, fuse = {VisualOdometry: [], FuseRegion: [], MapRegion: []}, Running(FuseRegion())
     left = simulation.mounts[0]
     for index in range(FRAMES):
         truth, stamp = simulation.frame(index), simulation.stamp(index)
@@ -45,12 +46,13 @@ def inputs():
         given[VisualOdometry].append((frame, disparity))
         base, mount = simulation.base_at(stamp), Mount(stamp, left.rotation.T, left)
         cloud = Level()(Reproject()(frame, disparity), Tilt(stamp, base.rotation[2]), mount)
-        given[Fuse].append((cloud, simulation.odometry[5 + 5 * index], mount))
-        given[MapRegion].append((fuse(*given[Fuse][-1]),))
+        given[FuseRegion].append((cloud, simulation.odometry[5 + 5 * index], mount))
+        given[MapRegion].append((fuse(*given[FuseRegion][-1]),))
     moved = motions(drive.cameras(), drive.stamps())
     tilts = [Tilt(motion.stamp, up) for motion, up in zip(moved, drive.ups(), strict=True)]
     upright = [(motion, tilt, Mount(0, drive.mount)) for motion, tilt in zip(moved, tilts, strict=True)]
     nothing = Disparity(0, *(np.zeros((8, 8), kind) for kind in (np.float32, np.uint8, np.float32)))
+    given[Fuse] = given[FuseRegion]
     return given | {PoseFilter: upright, CheckTilt: upright, CheckMatches: [(nothing,)] * FRAMES}
 
 
@@ -67,7 +69,7 @@ def same(one, other):
     return one == other or (one != one and other != other)
 
 
-@pytest.mark.parametrize("kind", [VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse, MapRegion])
+@pytest.mark.parametrize("kind", [VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse, FuseRegion, MapRegion])
 def test_a_run_in_two_parts_is_the_whole_run(inputs, kind):
     frames, stage = inputs[kind], MapRegion(step=5.0) if kind is MapRegion else kind()
     half, whole, first, fresh = len(frames) // 2 + 1, stage.start(), stage.start(), stage.start()
@@ -85,7 +87,7 @@ def test_a_run_in_two_parts_is_the_whole_run(inputs, kind):
 
 def test_every_stage_with_state_is_tried_above():
     with_state = {kind for name in stages.__all__ if has_state(kind := getattr(stages, name))}
-    assert with_state == {VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse, MapRegion}
+    assert with_state == {VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse, FuseRegion, MapRegion}
 
 
 def test_a_snapshot_of_another_stage_is_refused():

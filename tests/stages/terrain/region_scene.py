@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages import ElevationMap, Fuse, MapRegion, Mount, PointCloud, Pose, Region, Transform
+from stages import ElevationMap, FuseRegion, MapRegion, Mount, PointCloud, Pose, Region, Transform
 from tests.stages.running import Running
 
 SECOND = 1_000_000_000
@@ -17,12 +17,12 @@ MOUNT = Mount(START, np.eye(3), Transform("base_link", "camera", LOOKING, np.arr
 
 
 class Fusing(Running):
-    """`Fuse` as the engine calls it, with the map of every frame; region: of the last frame."""
+    """`FuseRegion` as the engine calls it, with the map of every frame; region: of the last frame."""
 
     region: Region
 
     def __init__(self, window: float = 20.0, **parameters: float) -> None:
-        super().__init__(Fuse(**parameters))
+        super().__init__(FuseRegion(**parameters))
         self._maps = Running(MapRegion(window=window))
 
     def __call__(self, *inputs: object, **named: object) -> ElevationMap:

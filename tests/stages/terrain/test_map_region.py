@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stages import ElevationMap, Fuse, MapRegion, Region, Transform
+from stages import ElevationMap, Fuse, FuseRegion, MapRegion, Region, Transform
 from stages.data import Tiles
 from stages.terrain.fused_map import CELL
 from stages.terrain.map_region import MAX_GAP
@@ -74,7 +74,7 @@ def test_a_map_precedes_a_jump_that_the_next_one_would_not_span():
 
 @pytest.mark.parametrize(("step", "ways"), [(0.0, [1.5] * 5), (1.0, [0.4] * 6), (2.0, [0.3, 0.3, 6.0, 0.3, 24.0, 1.0])])
 def test_the_maps_laid_over_each_other_are_the_whole_region(step, ways):
-    fuse, maps, whole = Running(Fuse()), MapRegion(step=step, window=5.0), {}
+    fuse, maps, whole = Running(FuseRegion()), MapRegion(step=step, window=5.0), {}
     state, found = maps.start(), []
     for frame, x in enumerate(np.cumsum(ways)):
         cloud, pose = drive(frame, at=(float(x) - 9, 0.3 * frame, 0.2 * frame))
@@ -92,9 +92,19 @@ def test_the_maps_laid_over_each_other_are_the_whole_region(step, ways):
 
 
 def test_a_later_frame_does_not_change_a_region():
-    fuse = Running(Fuse())
+    fuse = Running(FuseRegion())
     early = fuse(*drive(0), MOUNT)
     before = early.cells.read(-300, -300, 600, 600)
     fuse(*drive(1), MOUNT)
     assert early.cells.read(-300, -300, 600, 600).tobytes() == before.tobytes()
     assert fuse.state.cells.read(-300, -300, 600, 600).tobytes() != before.tobytes()
+
+
+def test_fuse_returns_the_maps_of_both_stages():
+    at_once, fuse, maps = Running(Fuse(window=5.0)), Running(FuseRegion()), Running(MapRegion(window=5.0))
+    for frame in range(3):
+        given = *drive(frame), MOUNT
+        found, wanted = at_once(*given), maps(fuse(*given))
+        assert (found.origin, found.shape, found.epoch) == (wanted.origin, wanted.shape, wanted.epoch)
+        for name, layer in wanted.layers.items():
+            np.testing.assert_array_equal(found.layers[name], layer)
