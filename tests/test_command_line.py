@@ -81,7 +81,7 @@ def test_the_summary_contains_frame_counts_losses_and_seconds_per_stage(result):
     summary = json.loads(result.with_suffix(".json").read_text())
     assert (summary["verdict"], summary["frames_in"], summary["frames_out"]) == ("COMPLETE", FRAMES, FRAMES)
     assert summary["drops"] == {}
-    assert summary["surveys"]["rectified"]["sentence"].endswith("not corrected, too little")
+    assert summary["surveys"]["rectified"]["sentence"].endswith("): too small to correct")
     assert summary["seconds"]["disparity/full"] > 0
     assert set(summary["seconds"]) >= {"rectified", "disparity", "points", "elevation_map", "navigation_map"}
 
@@ -133,7 +133,7 @@ def test_a_row_offset_is_measured_once_for_the_log_reported_and_corrected(traver
     (survey,) = json.loads((tmp_path / "whole.json").read_text())["surveys"].values()
     finding = survey["sentence"]
     assert f"rectified: {finding}" in capsys.readouterr().out
-    assert float(re.search(r"rows are offset by (\S+) px at the centre", finding)[1]) == pytest.approx(-2, abs=0.1)
+    assert float(re.search(r"differ by (\S+) px at the centre", finding)[1]) == pytest.approx(-2, abs=0.1)
     assert "; corrected, as row_offset=[" in finding
     assert roverflow("run", log, *SMALL, "--no-rrd", "-o", part, "--start", "1.5") == 0
     images = [{m for m in raw_messages(path) if m[0] == "/nav/disparity"} for path in (whole, part)]

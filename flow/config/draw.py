@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from html import escape
 from typing import Any
 
+from flow.contracts import counted
 from flow.runtime.graph import Graph
 from flow.units import as_written
 
@@ -44,9 +45,9 @@ def _boxes(graph: Graph, expand: bool) -> list[_Box]:
             made = tuple(inner.name for inner in folded[root])
             used = dict.fromkeys(stream for inner in folded[root] for stream in inner.inputs.values())
             inputs = tuple(stream for stream in used if stream not in made)
-            use = graph.templates[root]
+            use, remark = graph.templates[root], f", {counted(len(made), 'stream')}: --expand"
             settings = tuple(f"{key}={value}" for key, value in use.parameters.items())
-            boxes.append(_Box(root, use.template, made, inputs, settings, f", {len(made)} streams: --expand"))
+            boxes.append(_Box(root, use.template, made, inputs, settings, remark))
         elif root not in graph.templates or expand:
             inputs, remark = tuple(dict.fromkeys(node.inputs.values())), " (optional)" if node.optional else ""
             boxes.append(_Box(node.name, node.use, (node.name,), inputs, tuple(_settings(node.actor)), remark))

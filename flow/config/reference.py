@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import Field, dataclass, fields, is_dataclass
+from enum import IntEnum
 from importlib import import_module
 from typing import Any
 
@@ -48,7 +49,8 @@ class ParameterReference:
 class NodeReference:
     """A class that a pipeline can use, or a type of its streams.
 
-    role: "stage", "aligner", "source", "sink" or "data type"; inputs: port -> type; of a data type, field -> content.
+    role: "stage", "aligner", "source", "sink", "data type" or "codes"; inputs: port -> type; of a data type, field ->
+    content; of codes, name -> number.
     """
 
     use: str
@@ -84,10 +86,11 @@ def stage_reference(name: str | None = None) -> list[NodeReference]:
 
 
 def data_types() -> list[NodeReference]:
-    """The types of streams that document their fields."""
+    """The types of streams and of their fields, those that document their own fields and those of codes."""
     module = import_module("stages.data")
     kinds = [getattr(module, name) for name in module.__all__]
-    nodes = [_reference(kind.__name__, kind, "data type") for kind in kinds if isinstance(kind, type)]
+    classes = [kind for kind in kinds if isinstance(kind, type)]
+    nodes = [_reference(kind.__name__, kind, "codes" if issubclass(kind, IntEnum) else "data type") for kind in classes]
     return [node for node in nodes if node.inputs]
 
 
@@ -115,12 +118,22 @@ def _role(kind: type) -> str:
 def _reference(use: str, kind: type, role: str = "") -> NodeReference:
     doc, role = inspect.cleandoc(kind.__doc__ or ""), role or _role(kind) or "data type"
     summary = doc.partition("\n\n")[0].replace("\n", " ")
-    if role == "data type":
-        return NodeReference(use, "data type", summary, _documented_fields(doc), (), "", ())
+    if role in ("data type", "codes"):
+        return NodeReference(use, role, summary, _contents(kind, doc), (), "", ())
     ports, optional = ports_of(kind) if role in ("stage", "aligner") else ({}, set())
     inputs = {port: "any stream" if role == "aligner" else type_name(hint) for port, hint in ports.items()}
     output = type_name(hints_of(kind.__call__).get("return")) if role == "stage" else ""
     return NodeReference(use, role, summary, inputs, tuple(sorted(optional)), output, tuple(_parameters(kind)))
+
+
+def _contents(kind: type, doc: str) -> dict[str, str]:
+    """Field -> content, from the section Parameters of a numpydoc docstring or from the parameters; name -> code."""
+    if issubclass(kind, IntEnum):
+        return {code.name: str(code.value) for code in kind}
+    return _documented_fields(doc) or {
+        item.name: f"{item.meaning}{f', {item.unit}' * bool(item.unit)}"
+        for item in (_parameters(kind) if is_dataclass(kind) and _is_documented(kind) else ())
+    }
 
 
 def _documented_fields(doc: str) -> dict[str, str]:

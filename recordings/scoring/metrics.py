@@ -1,5 +1,7 @@
 """Error metrics over arrays: heights, angles, aligned grids. Pure functions, no files.
 
+Disparity: stereo_metrics.py; maps: terrain_metrics.py; poses: pose_metrics.py.
+
 Metrics of many frames are kept as sums: a log of any length takes the memory of one frame, and every cell, not every
 frame, counts the same. NaN is unknown and has no error. The share of an empty set is NaN.
 """

@@ -91,7 +91,7 @@ class McapSink:
         False, "also write depth, left image, coloured terrain and codes as colours, which viewers draw without plugins"
     )
     compression: str = parameter(
-        "lz4", "of the log; zstd takes a fifth less room than lz4 and twice the time", choices=tuple(COMPRESSIONS)
+        "lz4", "of the log; zstd takes a third less room than lz4 and twice the time", choices=tuple(COMPRESSIONS)
     )
 
     profile: str = parameter(

@@ -62,7 +62,15 @@ class Disparity:
 
 @dataclass(frozen=True)
 class MatchHealth:
-    """The matched shares of all pixels of a frame (`all`) and of the nearest ground in view (`near`)."""
+    """The matched shares of a frame.
+
+    Parameters
+    ----------
+    stamp : int
+        Of the frame.
+    all, near : float
+        Of all pixels, and of the nearest ground in view.
+    """
 
     stamp: int
     all: float

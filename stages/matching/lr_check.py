@@ -1,7 +1,7 @@
 """Left-right check between two disparity images, one of each camera's view (Hirschmüller, 2008, section 2.4).
 
-The matcher's own check uses the same sums twice, and their paths follow the edges of the left image. A second matching
-follows the edges of the right image, so it reveals surfaces that only one camera sees.
+`Match` has its own check, in kernels/selection.py: it uses the same sums twice, and their paths follow the edges of the
+left image. A second matching follows the edges of the right image, so it reveals surfaces that only one camera sees.
 """
 
 from __future__ import annotations

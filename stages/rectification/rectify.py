@@ -132,11 +132,11 @@ class Rectify(Stage):
             return replace(self, row_offset=0.0), Finding(swapped, Severity.FAULT, about="cameras")
         terms = tuple(round(term, 4) for term in offset.terms)
         found = (
-            f"left and right rows are offset by {terms[0]:+.2f} px at the centre, by up to {offset.largest:.2f} px, "
-            f"+- {offset.error:.2f} ({offset.features} features of {counted(len(plain), 'frame')})"
+            f"rows of left and right differ by {terms[0]:+.2f} px at the centre, at most {offset.largest:.2f} px "
+            f"(sigma {offset.error:.2f}, {offset.features} features of {counted(len(plain), 'frame')})"
         )
         if not offset.clear:
-            return replace(self, row_offset=0.0), Finding(f"{found}: not corrected, too little")
+            return replace(self, row_offset=0.0), Finding(f"{found}: too small to correct")
         severity = Severity.NOTE
         if offset.largest > UNUSUAL_ROW_OFFSET:
             severity = Severity.WARNING

@@ -71,10 +71,12 @@ def _stages() -> str:
             if node.use.startswith(module):
                 parts += _section(node)
     parts.append(
-        "## Data types\n\nTypes of streams. Arrays are read-only; `NaN` is unknown; `stamp` is in nanoseconds.\n"
+        "## Data types\n\nTypes of streams and of their fields. Arrays are read-only; `NaN` is unknown; `stamp` is in "
+        "nanoseconds. [results.md](results.md#codes) explains the codes.\n"
     )
     for node in data_types():
-        parts.append(f"### {node.use}\n\n{_escaped(node.summary)}\n\n| field | content |\n|---|---|")
+        head = "| name | code |" if node.role == "codes" else "| field | content |"
+        parts.append(f"### {node.use}\n\n{_escaped(node.summary)}\n\n{head}\n|---|---|")
         parts.append("\n".join(_row(f"`{field}`", text) for field, text in node.inputs.items()) + "\n")
     return "\n".join(parts)
 
@@ -135,7 +137,7 @@ def _option(action: argparse.Action) -> str:
     choices = ", ".join(map(str, action.choices)) if action.choices else ""
     value = action.metavar if isinstance(action.metavar, str) else action.dest.upper()
     shown = f"`{value}`" if not names else names if action.nargs == 0 else f"{names} `{value}`"
-    return _row(shown, "; ".join(text for text in (action.help, choices) if text))
+    return _row(shown, "; ".join(text for text in ((action.help or "").replace("%%", "%"), choices) if text))
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--profile",
         choices=("ros2", "foxglove"),
-        help="messages of the result log (ros2); score and export read only those",
+        help="messages of the result log (ros2); score, export, diff and report read only ros2",
     )
     sub.add_argument(
         "--with-inputs", action="store_true", help="copy the messages of the log into the result log, byte for byte"

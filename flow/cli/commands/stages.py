@@ -47,8 +47,8 @@ def details(node: NodeReference) -> str:
     optional = dict.fromkeys(node.optional_inputs, " (optional)")
     ports = [f"  {port}: {kind}{optional.get(port, '')}" for port, kind in node.inputs.items()]
     lines = [f"{node.use} ({node.role}): {node.summary}"]
-    if node.role == "data type":
-        return "\n".join([*lines, "fields:", *ports])
+    if node.role in ("data type", "codes"):
+        return "\n".join([*lines, *(["fields:"] if node.role == "data type" else []), *ports])
     lines += ["inputs:", *ports] if ports else []
     lines += [f"output: {node.output}"] if node.output else []
     lines += ["parameters:"] if node.parameters else ["no parameters"]

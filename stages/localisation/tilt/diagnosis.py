@@ -173,14 +173,14 @@ def _passed(tried: _Hypotheses) -> Diagnosis:
         )
         return Diagnosis(OFF_GROUND, sentence, False)
     undecided = any(cause.score(variance) - sound.score(variance) < MIN_GAIN for cause in tried.axes)
-    unseen = ["exchanged or flipped axes"] if undecided else []
+    unseen = ["axes are exchanged or flipped"] if undecided else []
     if tried.mount.error * np.sqrt(variance) > MAX_UNSEEN:
-        unseen.append("a wrong mount")
+        unseen.append("the mount is wrong")
     if tried.offset is None or tried.offset.error * np.sqrt(variance) > MAX_UNSEEN:
-        unseen.append("a time offset")
+        unseen.append("the tilt's stamps are early or late")
     if unseen:
         which = " or ".join([", ".join(unseen[:-1]), unseen[-1]] if len(unseen) > 1 else unseen)
-        return Diagnosis("", f"Not enough motion in {n} frames to rule out {which}.", False)
+        return Diagnosis("", f"The rover moved too little in {n} frames to decide whether {which}.", False)
     return Diagnosis("", f"Tilt and camera agree to {degrees(tried.residual(sound))} ({n} frames).", True)
 
 

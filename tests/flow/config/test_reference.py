@@ -49,6 +49,13 @@ def test_ranges_and_defaults_are_written_as_in_a_pipeline_file(stage, name, valu
     assert (item.range, item.default) == (values, default)
 
 
+def test_data_types_list_their_fields_and_codes_their_names():
+    (reason,), (rover,), (health,) = map(stage_reference, ("CellReason", "Rover", "MatchHealth"))
+    assert reason.inputs["UNMATCHED"] == "10"
+    assert rover.inputs["max_step"] == "highest step that is not a hazard, m"
+    assert list(health.inputs) == ["stamp", "all, near"]
+
+
 def test_an_unknown_name_is_answered_with_the_nearest():
     with pytest.raises(UsageError, match=r"called 'Mach'; did you mean 'Match'\?"):
         stage_reference("Mach")

@@ -125,7 +125,8 @@ def still(drive: Drive, frames: int) -> Evidence:
 def test_without_motion_the_diagnosis_is_not_clear():
     found = diagnose(still(Drive(1), 50))
     assert (found.fault, found.clear) == ("", False)
-    assert found.sentence.startswith("Not enough motion in 50 frames to rule out exchanged or flipped axes")
+    little = "The rover moved too little in 50 frames to decide whether axes are exchanged or flipped"
+    assert found.sentence.startswith(little)
     assert not diagnose(Drive(1).evidence(4)).clear
 
 
