@@ -26,7 +26,8 @@ class ResultFrame:
     stamp : int
         Nanoseconds.
     items : dict
-        Stream -> `Disparity`, `ElevationMap`, `NavigationMap` or `Pose`; of a cloud its fields, name -> (N,) array.
+        Stream -> `Disparity`, `ElevationMap`, `NavigationMap`, `Pose`, number or text; of a cloud its fields, name ->
+        (N,) array.
     """
 
     stamp: int
@@ -71,8 +72,10 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
         for topic, schema in sorted(schemas.items())
         if topic.startswith("/nav/") and schema in (*_JOINED, *_READERS) and not topic.endswith("/reason")
     }
-    if missing := sorted(set(streams) - known.keys()):
-        raise LogError(f"{path} has no stream '{missing[0]}', only {', '.join(known)}")
+    for name in sorted(set(streams) - known.keys()):
+        if other := schemas.get(f"/nav/{name}"):
+            raise LogError(f"{path}: stream '{name}' is {other}, which read_result does not read; it reads {_READABLE}")
+        raise LogError(f"{path} has no stream '{name}', only {', '.join(known)}")
     chosen = {known[name] for name in streams or known}
     parts = {f"{topic}/{part}" for topic in chosen for part, _ in _JOINED.values()} & schemas.keys()
     for stamp, group in groupby(iter_decoded(path, sorted(chosen | parts)), key=lambda item: item[1]):
@@ -100,6 +103,10 @@ def _disparity(message: Any, origins: Any) -> Disparity:
     return Disparity(ros2.stamp_of(message.header), pixels, source, unstated)
 
 
+def _data(message: Any) -> Any:
+    return message.data
+
+
 # Schema -> the part of the topic that belongs to its messages, and what reads both
 _JOINED: dict[str, tuple[str, Callable[[Any, Any], Any]]] = {
     "stereo_msgs/msg/DisparityImage": ("source", _disparity),
@@ -109,4 +116,6 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "grid_map_msgs/msg/GridMap": ros2.read_grid_map,
     "nav_msgs/msg/Odometry": lambda message: ros2.pose_of(message, 0, "base_link"),
     "sensor_msgs/msg/PointCloud2": ros2.read_point_cloud,
+    **dict.fromkeys(("std_msgs/msg/Float64", "std_msgs/msg/Int64", "std_msgs/msg/Bool", "std_msgs/msg/String"), _data),
 }
+_READABLE = ", ".join(name.rpartition("/")[2] for name in (*_JOINED, *_READERS))

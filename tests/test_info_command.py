@@ -20,7 +20,7 @@ def test_info_describes_a_log(traverse, capsys):
     output = capsys.readouterr().out
     assert "/stereo/left/image_rect_color" in output
     assert f"{FRAMES}" in output
-    verdict, command, costs = output.splitlines()[-3:]
+    verdict, command, costs, _ = output.splitlines()[-4:]
     assert verdict == "run -p rover: can run on this log"
     assert command == f"  roverflow run {traverse}"
     assert re.match(rf"  {FRAMES} frames: about \d+ s on .*; result log about \d+ MB, recording about \d+ MB; ", costs)
@@ -90,6 +90,11 @@ def test_info_compares_the_search_range_with_the_ground_in_view(traverse, capsys
     assert 0.9 * found["ground_px"] < truth < found["range_px"]
     assert roverflow("info", traverse, "--set", "disparities=16") == 0
     assert f"--set=disparities={found['range_px']:.0f} includes it" in capsys.readouterr().out
+    assert roverflow("info", traverse) == 0
+    assert (
+        f"fewer than the 192 disparities: --set=disparities={found['range_px']:.0f} is faster"
+        in capsys.readouterr().out
+    )
 
 
 def test_info_recognises_a_result_and_its_pipeline(result, capsys):

@@ -422,3 +422,39 @@ def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
     os.link(traverse, log)
     assert roverflow("run", os.fsdecode(log), *SMALL, "--end", 0.6, "-o", tmp_path / "out.mcap") == 0
     assert not list(tmp_path.glob("*.partial"))
+
+
+@pytest.mark.parametrize(
+    ("command", "usage", "words"),
+    [
+        ("rnu a.mcap", "roverflow", "there is no command 'rnu'; did you mean 'run'?"),
+        ("import kiti a", "roverflow", "there is no kind of import 'kiti'; did you mean 'kitti'?"),
+        ("export a.mcap b --mpa x", "roverflow export", "unknown: --mpa x; did you mean '--map'?"),
+        ("run a b --dis 64", "roverflow run", "unknown: --dis 64; --set STREAM.PARAM=VALUE changes the pipeline"),
+    ],
+)
+def test_an_unknown_name_is_answered_with_the_usage_and_the_nearest(command, usage, words, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        roverflow(*command.split())
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"usage: {usage} [-h]")
+    assert f"\n{usage}: error: {words}" in printed
+
+
+def test_an_unknown_pipeline_is_answered_with_templates_too(capsys):
+    assert roverflow("pipeline", "rover_disparty") == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith(
+        "roverflow: no pipeline or template 'rover_disparty': neither a file nor one of accurate, "
+    )
+    assert printed.endswith("match_right, rover_disparity; did you mean 'rover_disparity'?\n")
+
+
+def test_a_result_log_needs_the_ending_of_a_log(traverse, tmp_path, capsys):
+    assert roverflow("run", traverse, "-o", tmp_path / "out.txt") == 2
+    assert capsys.readouterr().err.endswith("out.txt is no name of a log; end it in .mcap\n")
+
+
+def test_a_pair_of_numbers_may_begin_with_a_minus(result, traverse, tmp_path, capsys):
+    assert roverflow("why", result, "--log", traverse, "--at", 1, "--cell", "-1.2,0.4", "-o", tmp_path / "a.png") == 0
+    assert "cell (-1.175, 0.425) m" in capsys.readouterr().out

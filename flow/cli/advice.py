@@ -18,6 +18,7 @@ from flow.contracts import counted
 from flow.errors import UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import fitted
+from recordings.inventory.search_range import ROCK
 
 if TYPE_CHECKING:
     from recordings.source.log import McapLog
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 # CPU seconds of a frame: at any size, and for each megapixel of the left image (`make bench`, docs/benchmarks.md)
 _SECONDS = {"fast": (0.15, 0.26), "rover": (0.15, 0.33), "accurate": (0.15, 0.55), "paper": (0.2, 3.8)}
+AMPLE = 1.5  # times the range that is enough, from which a smaller one is recommended
 _STARTING_SECONDS = 2.0  # before the first frame
 # Megabytes of a frame: at any size, and for each megapixel of the left image
 _LOG_MB, _RECORDING_MB = (0.9, 2.0), (0.65, 0.35)
@@ -111,11 +113,15 @@ def _costs(pipeline: str, description: Mapping[str, Any]) -> str:
 
 
 def _range_advice(found: Mapping[str, float] | None, graph: Graph) -> list[str]:
-    """What to set if the ground has more disparities than the pipeline searches."""
+    """What to set if the ground has more disparities than the pipeline searches, or by far fewer."""
     searched = max((getattr(node.actor, "disparities", 0) for node in graph.nodes), default=0)
-    if found is None or not searched or found["ground_px"] < searched:
+    if found is None or not searched:
         return []
     enough = f"--set=disparities={found['range_px']:.0f}"
+    if searched >= AMPLE * found["range_px"]:
+        return [f"  the ground and rocks of {ROCK} m need fewer than the {searched} disparities: {enough} is faster"]
+    if found["ground_px"] < searched:
+        return []
     return [f"  the near ground has more disparities than the {searched} that are searched: {enough} includes it"]
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import argparse
 import errno
 import logging
+import re
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import ModuleType
-from typing import Any
+from typing import Any, NoReturn
 
 from flow.cli.commands import (
     demo,
@@ -66,8 +67,7 @@ IMPORTERS: dict[str, ModuleType] = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code. An error is one sentence on stderr."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    options = parser().parse_args(given or ["--help"])
+    options = _parsed(sys.argv[1:] if arguments is None else list(arguments))
     logging.basicConfig(level=logging.DEBUG if options.debug else logging.ERROR, format="%(message)s")
     logging.getLogger("numba").setLevel(logging.WARNING)
     try:
@@ -80,6 +80,46 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         print(f"roverflow: {_sentence(error, options.debug)}", file=sys.stderr)
         return _exit_code(error)
+
+
+def _parsed(given: Sequence[str]) -> argparse.Namespace:
+    """The options of a command line. An unknown name ends the program with the nearest valid one."""
+    top = parser()
+    for what, name, known in _named(given):
+        if not name.startswith("-") and name not in known:
+            _refuse(top, f"there is no {what} '{name}'", name, known)
+    options, unknown = top.parse_known_args(_joined(given) or ["--help"])
+    if unknown:
+        valid = [option for action in options.parser._actions for option in action.option_strings]
+        remedy = "; --set STREAM.PARAM=VALUE changes the pipeline" if "--set" in valid else ""
+        _refuse(options.parser, f"unknown: {' '.join(unknown)}{remedy}", unknown[0], valid)
+    return options
+
+
+def _refuse(parser: argparse.ArgumentParser, why: str, name: str, valid: Sequence[str]) -> NoReturn:
+    """End the program with the usage of a command and the valid name nearest to `name`."""
+    from flow.config.yaml_tree import nearest
+
+    parser.error(f"{why}{nearest(name, valid)}")
+
+
+def _named(given: Sequence[str]) -> Iterator[tuple[str, str, Sequence[str]]]:
+    """What the first words of a command line name: (what, name, valid names)."""
+    if given:
+        yield "command", given[0], [*COMMANDS, "import"]
+    if len(given) > 1 and given[0] == "import":
+        yield "kind of import", given[1], [*IMPORTERS]
+
+
+def _joined(given: Sequence[str]) -> list[str]:
+    """The words of a command line; a pair of numbers that begins with a minus is joined to its option."""
+    words = list[str]()
+    for word in given:
+        if re.match(r"-[\d.]+,", word) and words and words[-1].startswith("--"):
+            words[-1] += f"={word}"
+        else:
+            words.append(word)
+    return words
 
 
 def _interrupted(error: BaseException | None) -> bool:
@@ -132,7 +172,7 @@ def _add(commands: Any, name: str, command: ModuleType) -> None:
     sub: argparse.ArgumentParser = commands.add_parser(name, help=command.HELP, description=_titled(command.HELP))
     command.add_arguments(sub)
     sub.add_argument("--debug", action="store_true", help="print tracebacks")
-    sub.set_defaults(command=command.run)
+    sub.set_defaults(command=command.run, parser=sub)
 
 
 def _titled(help: str) -> str:

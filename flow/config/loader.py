@@ -78,14 +78,17 @@ def _text(path: Path) -> str:
         raise UsageError(f"cannot read the pipeline {path}: {error}") from error
 
 
-def pipeline_file(name: str) -> Path:
-    """The file of the pipeline `name`, which `load` accepts; a copy of it loads from any folder."""
-    if name in shipped():
-        return SHIPPED / f"{name}.yaml"
-    if Path(name).is_file():
-        return Path(name)
-    known = shipped()
-    raise UsageError(f"no pipeline '{name}': neither a file nor one of {', '.join(known)}{nearest(name, known)}")
+def pipeline_file(name: str, templates: bool = False) -> Path:
+    """The file of the pipeline `name`, which `load` accepts; a copy of it loads from any folder.
+
+    templates: whether `name` may also be a template that ships.
+    """
+    folders = [SHIPPED, SHIPPED / "parts"] if templates else [SHIPPED]
+    known = {file.stem: file for folder in folders for file in sorted(folder.glob("*.yaml"))}
+    if name not in known and not Path(name).is_file():
+        what = "pipeline or template" if templates else "pipeline"
+        raise UsageError(f"no {what} '{name}': neither a file nor one of {', '.join(known)}{nearest(name, known)}")
+    return known.get(name, Path(name))
 
 
 def shipped() -> list[str]:

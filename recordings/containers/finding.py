@@ -72,7 +72,8 @@ def _files_of(folder: Path) -> FoundFiles:
     groups = {_group(path) for path in present}
     if len(groups) > 1:
         raise LogError(
-            f"{folder} contains several recordings ({_named([path.name for path in present])}); give the files of one"
+            f"{folder} contains several recordings ({_named([path.name for path in present])}); give the files of one; "
+            "roverflow fleet runs all"
         )
     return FoundFiles(present, [])
 

@@ -16,9 +16,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the file."""
-    from flow.config.loader import SHIPPED, pipeline_file
+    from flow.config.loader import pipeline_file
 
-    part = SHIPPED / "parts" / f"{options.name}.yaml"
-    file = part if part.is_file() else pipeline_file(options.name)
-    say(file.read_text(encoding="utf-8").rstrip("\n"))
+    say(pipeline_file(options.name, templates=True).read_text(encoding="utf-8").rstrip("\n"))
     return COMPLETE

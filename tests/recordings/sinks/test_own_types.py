@@ -15,6 +15,7 @@ from flow.errors import PipelineError
 from recordings import McapSink
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
+from recordings.results import read_result
 from recordings.sinks.own_types import leaves, refusal
 from stages.data import Disparity, StereoFrame, Transform
 from tests.conftest import roverflow
@@ -168,6 +169,9 @@ def test_a_pipeline_of_own_types_runs(tmp_path, traverse):
     assert roverflow("run", traverse, "-p", file, "-o", out) == 0
     read = list(iter_decoded(out, ["/nav/sharpness", "/nav/edges"]))
     assert [topic for topic, *_ in read] == 4 * ["/nav/sharpness", "/nav/edges"]
+    assert [frame.items["sharpness"] for frame in read_result(out, ["sharpness"])] == [m.data for _, _, m in read[::2]]
+    with pytest.raises(LogError, match="stream 'edges' is sensor_msgs/msg/Image, which read_result does not read; it"):
+        next(read_result(out, ["edges"]))
     assert {"/sharpness", "/edges"} <= entities(out.with_suffix(".rrd"))
 
 
