@@ -60,10 +60,10 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = (
                 raise UsageError(f"{path} is an input of this command; choose another name for the output")
         if (resolved := os.path.realpath(path)) in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
-        if kind.endswith("log") and path.suffix.lower() != ".mcap":
-            raise UsageError(f"{path} is no name of a log; end it in .mcap")
         if path.suffix.lower() == ".mcap" and not kind.endswith("log"):
             raise UsageError(f"{path} has the name of a log; choose another for a {kind}")
         if path.exists() and not is_ours(path, kind):
             raise UsageError(f"{path} exists and is no {kind} of roverflow; choose another name or remove it")
+        if kind == "result log" and path.suffix.lower() != ".mcap":
+            raise UsageError(f"{path} is no name of a log; end it in .mcap")
         taken.append(resolved)

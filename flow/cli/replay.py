@@ -90,7 +90,7 @@ def _refuse_results(graph: Graph, logs: Sequence[Path]) -> None:
     from recordings.scoring.result_log import about_run
 
     for file in find_files(logs).files if isinstance(graph.source, McapSource) else ():
-        if about := about_run(file):
+        if file.is_file() and (about := about_run(file)):
             raise LogError(f"{file} contains results; run the log that they were made from, {about.get('log', '')}")
 
 
