@@ -40,11 +40,12 @@ _Part = rrb.View | rrb.Container
 # The places of the layout. Derived images have another size than the camera's; OWN_... are of the user's own types.
 Panel = Enum(
     "Panel",
-    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE CONFIDENCE SIGMA CLOUD VOXELS TERRAIN CAMERA "
-    "TRAJECTORY RELIEF LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE OWN_IMAGE OWN_NUMBER "
-    "OWN_TEXT OWN_BARS OWN_TENSOR",
+    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE MATCH_CONFIDENCE CONFIDENCE SIGMA DIFFERENCE "
+    "CLOUD VOXELS TERRAIN CAMERA TRAJECTORY RELIEF LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE "
+    "OWN_IMAGE OWN_NUMBER OWN_TEXT OWN_BARS OWN_TENSOR",
 )
 
+ERRORS = (Panel.CONFIDENCE, Panel.SIGMA, Panel.DIFFERENCE)  # what is known of the last disparity's
 MATCHED = "matched (%)"
 SENSOR_PLOTS = (
     (Panel.ANGLE, "tilt (degrees)"),
@@ -118,14 +119,15 @@ def _overview(drawn: Specs, slowest: Sequence[str]) -> _Part:
 
 
 def _matching(drawn: Specs, slowest: Sequence[str]) -> _Part:
-    """Both images, the disparity of each step, and what is known of its errors."""
-    disparities = _flat_views(drawn, Panel.DISPARITY)
+    """Both images and their difference, disparity and origin of each step, and what is known of its errors."""
+    disparities, sources = _flat_views(drawn, Panel.DISPARITY), _flat_views(drawn, Panel.SOURCE)
     parts = [
-        *_image_tabs(drawn), _tabs(disparities[-1:]), _tabs(disparities[-2::-1]),
-        _tabs(reversed(_flat_views(drawn, Panel.SOURCE))), _tabs(reversed(_superpixels(drawn))),
-        *_flat_views(drawn, Panel.CONFIDENCE, Panel.SIGMA), _plot(_at(drawn, Panel.MATCHES), MATCHED),
+        *_image_tabs(drawn), _tabs(_flat_views(drawn, Panel.DIFFERENCE)), _tabs(reversed(_superpixels(drawn))),
+        _tabs(disparities[-2::-1]), _tabs(disparities[-1:]), _tabs(sources[-2::-1]), _tabs(sources[-1:]),
+        *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.MATCH_CONFIDENCE, Panel.CONFIDENCE, Panel.SIGMA)),
+        _plot(_at(drawn, Panel.MATCHES), MATCHED),
     ]  # fmt: skip
-    return _grid(parts, 3) or _ledger(drawn)
+    return _grid(parts, 4) or _ledger(drawn)
 
 
 def _terrain(drawn: Specs, slowest: Sequence[str]) -> _Part:
@@ -219,7 +221,7 @@ def _images(drawn: Specs) -> _Part | None:
         _tabs(disparities[-2::-1]),
         _tabs(disparities[-1:]),
         _tabs(reversed(_superpixels(drawn))),
-        _tabs([*reversed(_flat_views(drawn, Panel.SOURCE)), *_flat_views(drawn, Panel.CONFIDENCE, Panel.SIGMA)]),
+        _tabs([*reversed(_flat_views(drawn, Panel.SOURCE)), *_flat_views(drawn, *ERRORS)]),
         _tabs(_flat_views(drawn, Panel.OWN_IMAGE)),
     ]
     return _grid(parts, 2)

@@ -24,6 +24,11 @@ from stages.data import Array, StereoCamera
 TEXT_RGB: Rgb = (225, 228, 235)
 CURVE_RGB: tuple[Rgb, ...] = ((255, 210, 60), (95, 175, 255), (245, 120, 95), (125, 215, 140), (205, 145, 245))
 LEGEND_COLUMNS = (4, 3)  # of a single row, and of several, which have the longer names
+VIEWER_COLORMAPS = {  # the viewer's own, by OpenCV's
+    cv2.COLORMAP_TURBO: rr.components.Colormap.Turbo,
+    cv2.COLORMAP_VIRIDIS: rr.components.Colormap.Viridis,
+    cv2.COLORMAP_INFERNO: rr.components.Colormap.Inferno,
+}
 LEGEND_ROW = (0.14, 0.2)  # height of a single row of a legend, and of several, share of the picture's height
 
 
@@ -43,6 +48,7 @@ class Canvas:
     pictures: bool = True  # whether this frame's images, clouds and surfaces are drawn
     full_size: frozenset[str] = frozenset()  # streams of disparities and images that are no intermediates
     sized: frozenset[str] = frozenset()  # all streams of disparities and images
+    matched: frozenset[str] = frozenset()  # the stream of the match that the last disparity is made from
     counts_bytes: bool = False
     logged_bytes: int = 0  # so far, before compression
     views: dict[tuple[Panel, str], ViewSpec] = field(default_factory=dict)
@@ -51,7 +57,7 @@ class Canvas:
     _texts: dict[str, str] = field(default_factory=dict)
     _legends: dict[str, Legend] = field(default_factory=dict)
     _present: dict[str, set[int]] = field(default_factory=dict)
-    _limits: dict[str, float] = field(default_factory=dict)
+    _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     _kept: dict[str, Hashable] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
@@ -95,10 +101,14 @@ class Canvas:
             self._texts[path] = text
             self.recording.log(f"{LEDGER}/{path}", rr.TextLog(text, level=level))
 
+    @property
+    def small_width(self) -> int:
+        """The widest picture of an intermediate, px."""
+        return max(1, self.max_width * 3 // 8)
+
     def width(self, stream: str) -> int:
-        """The widest picture of a stream of disparities or images, px: an intermediate is drawn smaller."""
-        intermediate = stream in self.sized and stream not in self.full_size
-        return max(1, self.max_width * 3 // 8) if intermediate else self.max_width
+        """The widest picture of a stream of disparities or images, px."""
+        return self.small_width if stream in self.sized - self.full_size else self.max_width
 
     def log_exact(self, path: str, pixels: Array, view: ViewSpec) -> None:
         """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as PNG."""
@@ -110,12 +120,44 @@ class Canvas:
         _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         self.log(path, rr.EncodedImage(contents=blob, media_type="image/jpeg"), view)
 
-    def log_values(self, values: Array, limits: tuple[float, float], view: ViewSpec) -> None:
-        """Values (H, W) in colours over a range; hover reads them. The palette's darkest end is left to unknown."""
+    def log_values(
+        self,
+        values: Array,
+        limits: tuple[float, float],
+        view: ViewSpec,
+        unit: str | None = None,
+        palette: int = cv2.COLORMAP_TURBO,
+    ) -> None:
+        """Values (H, W) in colours over a range; hover reads them. The palette's darkest end is left to unknown.
+
+        unit: of the scale above the picture; None: no scale.
+        """
         low, high = limits
         ends = (low - 0.1 * (high - low), high)
-        layout = _value_layout(values.shape, values.dtype)
+        layout = _value_layout(values.shape, values.dtype, palette)
         self.log(view.path, rr.DepthImage.from_fields(buffer=values.tobytes(), depth_range=ends, **layout), view)
+        if unit is not None:
+            self.log_scale(f"{view.path}/scale", values.shape, low, high, unit, palette)
+
+    def log_steps(
+        self,
+        steps: Array,
+        per_unit: float,
+        limit: float,
+        view: ViewSpec,
+        unit: str,
+        palette: int = cv2.COLORMAP_TURBO,
+    ) -> None:
+        """Numbers of steps (H, W), uint16, as PNG, in colours from 0 to `limit`; hover reads units of `per_unit` steps.
+
+        limit: in units. The viewer draws such images of 8 bits black.
+        """
+        image = rr.EncodedDepthImage(
+            png(steps), media_type="image/png", meter=per_unit, colormap=VIEWER_COLORMAPS[palette],
+            depth_range=(0.0, limit * per_unit),
+        )  # fmt: skip
+        self.log(view.path, image, view)
+        self.log_scale(f"{view.path}/scale", steps.shape, 0.0, limit, unit, palette)
 
     def log_labels(self, view: ViewSpec, codes: Array, legend: Legend, beside: bool = False) -> None:
         """A label image (H, W); its names are above or beside it and appear on hover."""
@@ -160,9 +202,10 @@ class Canvas:
         texts: dict[str, Any] = {"labels": names, "show_labels": True, "radii": pin, "draw_order": 31.0}
         self.keep(f"{path}/text", content, lambda: rr.Points2D(pins, colors=[TEXT_RGB], **texts))
 
-    def limit(self, path: str, value: float) -> float:
-        """The largest value given for `path` so far, so that a scale stays."""
-        self._limits[path] = max(value, self._limits.get(path, value))
+    def limits(self, path: str, low: float, high: float) -> tuple[float, float]:
+        """The lowest and the highest value given for `path` so far, so that a scale stays."""
+        lowest, highest = self._limits.get(path, (low, high))
+        self._limits[path] = min(low, lowest), max(high, highest)
         return self._limits[path]
 
     def clear_missing(self) -> None:
@@ -179,9 +222,9 @@ class Canvas:
 
 
 @lru_cache(maxsize=256)
-def _value_layout(shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
+def _value_layout(shape: tuple[int, ...], dtype: np.dtype[Any], palette: int) -> dict[str, Any]:
     """What images of values have in common, as Arrow arrays: to make these takes longer than to log an image."""
-    same = rr.DepthImage(np.zeros(shape, dtype), meter=1.0, colormap=rr.components.Colormap.Turbo)
+    same = rr.DepthImage(np.zeros(shape, dtype), meter=1.0, colormap=VIEWER_COLORMAPS[palette])
     return {name: getattr(same, name).as_arrow_array() for name in ("format", "meter", "colormap")}
 
 

@@ -120,6 +120,31 @@ def shrunk(image: Array, max_width: int) -> Array:
     return mean
 
 
+def gray_difference(left: Array, right: Array, disparity: Array, max_width: int) -> Array:
+    """|left(x) - right(x - d)| of the pixels that `every_nth` takes, float32, in gray levels of 8 bits; NaN = unknown.
+
+    The right image has the gain and offset with which its pixels have the mean and deviation of the left image's.
+    """
+    height, width = disparity.shape
+    x, y = (
+        every_nth(np.broadcast_to(numbers, disparity.shape), max_width)
+        for numbers in (np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None])
+    )
+    partner = x - every_nth(disparity, max_width)
+    seen = (partner >= 0) & (partner <= width - 1)
+    ours = cv2.remap(left, x, y, cv2.INTER_NEAREST)
+    theirs = cv2.remap(right, np.where(seen, partner, np.float32(0)), y, cv2.INTER_LINEAR)
+    ours, theirs = top_eight_bits(ours, theirs)
+    if ours.ndim == 3:
+        ours, theirs = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (ours, theirs))
+    (mean, deviation), (their_mean, their_deviation) = (
+        np.ravel(cv2.meanStdDev(image, mask=seen.astype(np.uint8))).tolist() for image in (ours, theirs)
+    )
+    gain = deviation / their_deviation if their_deviation else 1.0
+    fitted = cv2.addWeighted(ours, 1.0, theirs, -gain, gain * their_mean - mean, dtype=cv2.CV_32F)
+    return np.where(seen, np.abs(fitted), np.float32(np.nan))
+
+
 def every_nth_cell(terrain: ElevationMap, max_cells: int) -> ElevationMap:
     """The terrain at every n-th row and column, with about `max_cells` known elevations at most."""
     elevation = terrain.layers["elevation"]

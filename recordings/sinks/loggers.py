@@ -16,7 +16,6 @@ from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
 from recordings.sinks.canvas import Canvas
 from recordings.sinks.colormaps import Rgb
-from recordings.sinks.png import png
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -39,8 +38,13 @@ from stages.data import (
 
 DISPARITY_STEPS = 4  # disparities are drawn to 1/4 px; the result log has them as they are
 ALL_CODES = np.arange(256, dtype=np.uint8)
-# Layer -> the upper end of its scale, twice the rover's usual limit, and its unit
-LAYER_SCALES = {"step": (0.4, "m"), "slope": (0.7, "rad"), "steepness": (0.7, "rad"), "roughness": (0.12, "m")}
+# Layer -> the upper end of its scale, twice the usual limit, and its unit
+LAYER_SCALES = {
+    "step": (0.4, "m"), "slope": (0.7, "rad"), "steepness": (0.7, "rad"), "roughness": (0.12, "m"),
+    "variance": (0.009, "m²"),
+}  # fmt: skip
+DIFFERENCE_STEPS = 0.25  # the difference of the images is drawn to 4 gray levels
+MAX_DIFFERENCE = 32  # gray levels, the upper end of the scale of the images' difference
 MAX_SIGMA = 0.5  # px, the upper end of the scale of the disparities' standard deviation
 MAX_CELLS = 4000  # known ones, of a surface and of the layers of a map; a relief has all
 MIN_DEPTH = 0.2  # m in front of the camera, of what is drawn over its image
@@ -108,7 +112,11 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
         view = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
         canvas.log_labels(view, source, colormaps.SOURCE_LEGEND, beside=True)
     if stream in canvas.full_size:
-        _log_errors(canvas, stream, disparity)
+        _log_confidence(canvas, ViewSpec(Panel.CONFIDENCE, stream, "confidence", f"{stream}: confidence"), disparity)
+        _log_sigma(canvas, stream, disparity)
+    elif stream in canvas.matched and disparity.segments is None:
+        title = f"{stream}: confidence of the match"
+        _log_confidence(canvas, ViewSpec(Panel.MATCH_CONFIDENCE, stream, "confidence", title), disparity)
     if disparity.segments is not None:
         # They lie over the left image. Edges of fewer pixels are denser, so they are fainter.
         segments, step = disparity.segments, colormaps.stride(disparity.segments.shape[1], canvas.max_width)
@@ -121,19 +129,23 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     return caption
 
 
-def _log_errors(canvas: Canvas, stream: str, disparity: Disparity) -> None:
-    """What the disparities state of their errors: confidence and standard deviation of every n-th pixel."""
-    width = canvas.max_width * 3 // 8
-    unknown = np.isnan(colormaps.every_nth(disparity.pixels, width))
-    view = ViewSpec(Panel.CONFIDENCE, stream, "confidence", f"{stream}: confidence")
-    confidence = np.where(unknown, np.float32(0), 100 * colormaps.every_nth(disparity.confidence, width))
-    canvas.log_values(np.rint(confidence).astype(np.uint8), (0.0, 100.0), view)
-    canvas.log_scale(f"{view.path}/scale", unknown.shape, 0.0, 100.0, "%", cv2.COLORMAP_TURBO)
+def _log_confidence(canvas: Canvas, view: ViewSpec, disparity: Disparity) -> None:
+    """The confidence of every n-th pixel, in percent; 0 is unknown."""
+    pixels, confidence = (
+        colormaps.every_nth(layer, canvas.small_width) for layer in (disparity.pixels, disparity.confidence)
+    )
+    percent = np.where(np.isnan(pixels), np.float32(0), 100 * confidence)
+    canvas.log_values(np.rint(percent).astype(np.uint8), (0.0, 100.0), view, "%")
+
+
+def _log_sigma(canvas: Canvas, stream: str, disparity: Disparity) -> None:
+    """The standard deviation of every n-th disparity."""
     if disparity.sigma is not None:
-        view = ViewSpec(Panel.SIGMA, stream, "sigma", f"{stream}: sigma")
-        sigma = np.where(unknown, np.float32(np.nan), colormaps.every_nth(disparity.sigma, width))
-        canvas.log_values(sigma.astype(np.float16), (0.0, MAX_SIGMA), view)
-        canvas.log_scale(f"{view.path}/scale", unknown.shape, 0.0, MAX_SIGMA, "px", cv2.COLORMAP_TURBO)
+        pixels, sigma = (
+            colormaps.every_nth(layer, canvas.small_width) for layer in (disparity.pixels, disparity.sigma)
+        )
+        values = np.where(np.isnan(pixels), np.float32(np.nan), sigma).astype(np.float16)
+        canvas.log_values(values, (0.0, MAX_SIGMA), ViewSpec(Panel.SIGMA, stream, "sigma", f"{stream}: sigma"), "px")
 
 
 def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int) -> None:
@@ -141,14 +153,8 @@ def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int) -> N
     # Rounded; NaN and negative values become 0.
     thinned = np.ascontiguousarray(colormaps.every_nth(pixels, max_width))
     steps: Array = cv2.multiply(thinned, DISPARITY_STEPS, dtype=cv2.CV_16U)  # type: ignore[call-overload]
-    limit = canvas.limit(stream, colormaps.disparity_limit(pixels))
-    image = rr.EncodedDepthImage(
-        png(steps), media_type="image/png", meter=DISPARITY_STEPS, colormap=rr.components.Colormap.Turbo,
-        depth_range=(0.0, limit * DISPARITY_STEPS),
-    )  # fmt: skip
-    view = ViewSpec(Panel.DISPARITY, stream, "pixels", stream)
-    canvas.log(view.path, image, view)
-    canvas.log_scale(f"{view.path}/scale", steps.shape, 0.0, limit, "px", cv2.COLORMAP_TURBO)
+    _, limit = canvas.limits(stream, 0.0, colormaps.disparity_limit(pixels))
+    canvas.log_steps(steps, DISPARITY_STEPS, limit, ViewSpec(Panel.DISPARITY, stream, "pixels", stream), "px")
 
 
 @logger_for(PointCloud)
@@ -231,7 +237,7 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     """
     terrain = colormaps.terrain_ahead(terrain)
     elevation, suffix = terrain.layers["elevation"], _frame_suffix(terrain.frame_id)
-    low, high = colormaps.elevation_limits(elevation)
+    low, high = canvas.limits(stream, *colormaps.elevation_limits(elevation))
     rgb = colormaps.elevation_colors(terrain, (low, high))
     relief = ViewSpec(Panel.RELIEF, stream, "relief", f"relief{suffix}")
     canvas.log_exact(relief.path, colormaps.birds_eye(rgb), relief)
@@ -243,11 +249,14 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     coarse = colormaps.every_nth_cell(terrain, MAX_CELLS)
     for name, layer in coarse.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
         view = ViewSpec(Panel.LAYER, stream, f"layers/{rr.escape_entity_path_part(name)}", f"{name}{suffix}")
-        end, unit = LAYER_SCALES.get(name, (0.0, ""))
-        limits = (0.0, end) if unit else colormaps.value_limits(layer)
-        canvas.log_values(colormaps.birds_eye(layer.astype(np.float16)), limits, view)
-        if unit:
-            canvas.log_scale(f"{view.path}/scale", coarse.shape[::-1], *limits, unit, cv2.COLORMAP_TURBO)
+        values = colormaps.birds_eye(layer.astype(np.float16))
+        if name == "elevation":
+            canvas.log_values(values, (low, high), view, "m", cv2.COLORMAP_VIRIDIS)
+        elif name in LAYER_SCALES:
+            end, unit = LAYER_SCALES[name]
+            canvas.log_values(values, (0.0, end), view, unit)
+        else:
+            canvas.log_values(values, colormaps.value_limits(layer), view)
     vertices, triangles = colormaps.surface(coarse)
     if len(triangles):
         colors = colormaps.elevation_colors(coarse, (low, high))[np.isfinite(coarse.layers["elevation"])]
@@ -269,6 +278,17 @@ def log_navigation(canvas: Canvas, stream: str, navigation: NavigationMap) -> st
     canvas.log_labels(reason, colormaps.birds_eye(navigation.reason), colormaps.REASON_LEGEND)
     free, hazard = (int(np.count_nonzero(cells == state)) for state in (Cell.FREE, Cell.HAZARD))
     return f"{stream} {free} free, {hazard} hazard"
+
+
+@logger_for(Disparity, StereoFrame)
+def log_difference(canvas: Canvas, stream: str, disparity: Disparity, frame: StereoFrame) -> None:
+    """The difference of the images at the last disparity; hover reads it. It is large where the match is wrong."""
+    if stream not in canvas.full_size or disparity.pixels.shape != frame.left.shape[:2] or not canvas.pictures:
+        return
+    difference = colormaps.gray_difference(frame.left, frame.right, disparity.pixels, canvas.small_width)
+    steps = np.rint(DIFFERENCE_STEPS * np.minimum(np.nan_to_num(difference), MAX_DIFFERENCE)).astype(np.uint16)
+    view = ViewSpec(Panel.DIFFERENCE, stream, "difference", "difference: wrong match, occlusion, glint")
+    canvas.log_steps(steps, DIFFERENCE_STEPS, MAX_DIFFERENCE, view, "gray levels", cv2.COLORMAP_INFERNO)
 
 
 @logger_for(StereoFrame, PointCloud)

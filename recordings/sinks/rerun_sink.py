@@ -118,13 +118,15 @@ class RerunSink:
             self._partial.unlink(missing_ok=True)
             raise
         sized = [name for name, kind in streams.items() if _is(kind, Disparity) or _is(kind, StereoFrame)]
-        self._last_disparity = [name for name in sized if _is(streams[name], Disparity)][-1:]
+        disparities = [name for name in sized if _is(streams[name], Disparity)]
+        self._last_disparity = disparities[-1:]
         self._canvas = Canvas(
             self._recording,
             self.jpeg_quality,
             self.max_points,
             self.max_width,
             sized=frozenset(sized),
+            matched=frozenset(disparities[-2:-1]),
             counts_bytes=self.max_megabytes > 0,
         )
         self._interval, self._rest = self.every, 1e6 * self.max_megabytes

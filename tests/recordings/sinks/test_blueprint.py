@@ -65,6 +65,14 @@ def test_a_desk_shows_only_what_a_recording_has(desk, rrd):
     assert all(any(entity.startswith(path) for entity in logged) for path in shown)
 
 
+def test_the_desk_of_matching_shows_the_images_and_what_is_known_of_errors(rrd):
+    shown = {path for view in views(container(list(read_layout(rrd).views), "matching")) for path in view_paths(view)}
+    assert shown >= {
+        "/rectified/left", "/rectified/right", "/disparity/difference", "/matched/confidence", "/disparity/confidence",
+        "/disparity/source",
+    }  # fmt: skip
+
+
 def view_paths(view: Any) -> list[str]:
     """The entities that a view shows."""
     if view.contents == "$origin/**" or not isinstance(view.contents, list):

@@ -32,6 +32,45 @@ def test_disparities_are_stored_to_a_quarter_px_unknown_as_0(rrd):
     assert (stored[~known] == 0).all()
 
 
+@pytest.mark.parametrize("color", [False, True])
+@pytest.mark.parametrize("deep", [False, True])
+def test_the_difference_shows_wrong_disparities_and_no_exposure(deep, color, tmp_path):
+    items = scene()
+    wide = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH + 8), np.uint8), (5, 5), 0)
+    wide = cv2.normalize(wide, None, 20, 220, cv2.NORM_MINMAX)  # type: ignore[call-overload]
+    images = [wide[:, :WIDTH], cv2.convertScaleAbs(wide[:, 8:], alpha=0.8, beta=15)]  # the right one has less contrast
+    if color:
+        images = [cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) for image in images]
+    if deep:
+        images = [image.astype(np.uint16) << 4 for image in images]
+    pixels = np.full((HEIGHT, WIDTH), 8, np.float32)
+    pixels[20:30, 30:40] = 13  # wrong
+    pixels[:4] = np.nan
+    items["rectified"] = StereoFrame(START, *images, items["rectified"].camera)
+    items["disparity"] = replace(items["disparity"], pixels=pixels)
+    path = record_of(tmp_path / "run.rrd", [Record(START, items)])
+    blob = rows(path, "/disparity/difference", "EncodedDepthImage:blob")[0][2][0]
+    levels = decoded(blob, cv2.IMREAD_UNCHANGED) * 4
+    right = np.ones_like(pixels, bool)
+    right[20:30, 30:40] = False
+    assert (levels[right] <= 8).mean() > 0.98
+    assert levels[~right].mean() > 16
+    assert levels.max() == 32
+    assert not levels[:4].any()
+    assert not levels[:, :8].any()  # out of view
+
+
+def test_the_confidence_of_the_match_is_drawn_beside_that_of_the_result(tmp_path):
+    items = scene()
+    for stream, share in (("matched", 0.4), ("disparity", 0.9)):
+        confidence = np.full_like(items[stream].confidence, share)
+        items[stream] = replace(items[stream], confidence=confidence)
+    path = record_of(tmp_path / "run.rrd", [Record(START, items)])
+    for stream, percent in (("matched", 40), ("disparity", 90)):
+        shown = np.frombuffer(bytes(rows(path, f"/{stream}/confidence", "DepthImage:buffer")[0][2][0]), np.uint8)
+        assert set(shown) == {0, percent}  # 0 is unknown
+
+
 def test_superpixel_edges_lie_between_different_labels(rrd):
     edges = decoded(rows(rrd, "/disparity/superpixels", "EncodedImage:blob")[0][2][0], cv2.IMREAD_GRAYSCALE)
     assert edges.shape == (HEIGHT, WIDTH)

@@ -21,6 +21,24 @@ def test_a_map_that_a_later_map_contains_is_not_drawn_twice(tmp_path):
     assert not any(entity.startswith("/cells") for entity in drawn)
 
 
+def test_layers_with_a_limit_and_heights_have_scales_that_stay(tmp_path):
+    def frame(number, rise):
+        terrain = scene()["elevation_map"]
+        elevation = terrain.layers["elevation"] + np.float32(rise)
+        layers = {"elevation": elevation, "variance": np.abs(elevation) / 100, "step": np.abs(elevation)}
+        return Record(START + number, {"elevation_map": replace(terrain, layers=layers)})
+
+    path = record_of(tmp_path / "run.rrd", [frame(0, 0), frame(1, 1), frame(2, 0)])
+    scales = {
+        name: [texts for *_, texts in rows(path, f"/elevation_map/{name}/scale/text", "Points2D:labels")]
+        for name in ("relief", "layers/elevation", "layers/variance", "layers/step")
+    }
+    assert scales["layers/variance"] == [["0 m²", "0.0045 m²", "0.009 m²"]]
+    assert scales["layers/step"] == [["0 m", "0.2 m", "0.4 m"]]
+    heights = [["-0.1 m", "0 m", "0.1 m"], ["-0.1 m", "0.5 m", "1.1 m"]]  # it grows once
+    assert scales["relief"] == scales["layers/elevation"] == heights
+
+
 def test_voxels_are_boxes_at_the_centres_of_their_cubes(tmp_path):
     voxels = VoxelMap(
         START, np.array([[0, 0, 0], [20, -3, 2]], np.int32), np.array([[1, 2, 3], [4, 5, 6]], np.uint8),
