@@ -8,11 +8,21 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recordings.ros2.to_msg import camera_info, compressed_image, float_cloud, image
-from stages.data import Array, CameraModel, Disparity, ElevationMap, StereoCamera, StereoFrame
+from recordings.ros2.to_msg import camera_info, compressed_image, float_cloud, image, transform_message
+from stages.data import (
+    Array,
+    CameraModel,
+    Disparity,
+    ElevationMap,
+    NavigationMap,
+    StereoCamera,
+    StereoFrame,
+    Transform,
+)  # fmt: skip
 
 MAX_WIDTH = 640  # px of depth and left image
 JPEG_QUALITY = 85
+CAMERA_HEIGHT = 10.0  # m above the map's frame, of the camera that sees a map from above
 
 Messages = dict[str, Any]  # topic below that of the stream -> message
 
@@ -57,6 +67,24 @@ def code_image(stamp: int, frame_id: str, codes: Array, colors: Mapping[int, tup
         table[code & 0xFF] = rgb[::-1]
     _, blob = cv2.imencode(".png", table[codes.astype(np.uint8)], [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return compressed_image(stamp, frame_id, blob.reshape(-1), "png")
+
+
+def camera_above(navigation: NavigationMap, frame_id: str) -> tuple[Any, Any]:
+    """CameraInfo and TFMessage of a camera whose image is the map at height 0, as `birds_eye` draws it.
+
+    It is above the centre of the map and looks down; its frame is `frame_id`.
+    """
+    rows, cols = navigation.cells.shape
+    left, right = navigation.origin[1] + rows * navigation.resolution, navigation.origin[1]
+    near, far = navigation.origin[0], navigation.origin[0] + cols * navigation.resolution
+    focal = CAMERA_HEIGHT / navigation.resolution
+    k = np.array([[focal, 0.0, (rows - 1) / 2], [0.0, focal, (cols - 1) / 2], [0.0, 0.0, 1.0]])
+    model = CameraModel(rows, cols, k, np.zeros(5), np.eye(3), np.column_stack([k, np.zeros(3)]))
+    down = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    place = np.array([(near + far) / 2, (left + right) / 2, CAMERA_HEIGHT])
+    pose = Transform(navigation.frame_id, frame_id, down, place)
+    stamp = navigation.stamp
+    return camera_info(stamp, frame_id, model), transform_message([(pose, stamp)])
 
 
 def terrain_points(terrain: ElevationMap, colors: Array) -> Any:

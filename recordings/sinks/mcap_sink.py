@@ -147,15 +147,15 @@ class McapSink:
         writer, stamp = self._writer, record.stamp
         kept = {name: record.items[name] for name in self._written if name in record.items}
         self._write_items(kept, stamp)
-        if self.viewers:
-            for topic, message in viewer_messages(record.items, kept):
-                writer.write(topic, message, stamp)
         transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
         if transforms:
             writer.write("/tf", transform_message(transforms.values()), stamp)
             if self.viewers and not self._rooted:
                 self._rooted = True
                 writer.write("/tf_static", transform_message([(rerun_root(list(transforms)), stamp)]), stamp)
+        if self.viewers:
+            for topic, message in viewer_messages(record.items, kept):
+                writer.write(topic, message, stamp)
         health = [_health(name, item) for name, item in record.items.items() if isinstance(item, TiltHealth)]
         maps = [(name, record.items.get(name)) for name in self._written]
         epochs = [

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from recordings.ros2.viewer_msgs import code_image, depth_messages, left_messages, terrain_points
+from recordings.ros2.viewer_msgs import camera_above, code_image, depth_messages, left_messages, terrain_points
 from recordings.sinks.colormaps import (
     REASON_LEGEND,
     SOURCE_LEGEND,
@@ -38,8 +38,11 @@ def viewer_messages(items: Mapping[str, Any], written: Mapping[str, Any]) -> Ite
                 yield f"{topic}/points", terrain_points(item, elevation_colors(item))
             case NavigationMap():
                 colors = {code: rgb for code, (_, rgb) in REASON_LEGEND.items()}
-                picture = code_image(item.stamp, item.frame_id, birds_eye(item.reason), colors)
-                yield f"{topic}/reason/color/compressed", picture
+                above = f"{stream}/above"  # rerun draws a picture in 3D only in the frame of a camera
+                yield f"{topic}/reason/color/compressed", code_image(item.stamp, above, birds_eye(item.reason), colors)
+                info, placed = camera_above(item, above)
+                yield f"{topic}/reason/camera_info", info
+                yield "/tf", placed
     frames = [(stream, item) for stream, item in items.items() if isinstance(item, StereoFrame)]
     if frames:
         width = max(item.camera.width for _, item in frames)

@@ -7,9 +7,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
+from scipy.spatial.transform import Rotation
 
 from recordings.mcap.file import iter_decoded
-from recordings.ros2.from_msg import read_disparity, read_point_cloud
+from recordings.ros2.from_msg import read_disparity, read_occupancy_grid, read_point_cloud
+from recordings.sinks.colormaps import REASON_LEGEND, legend_colors
+from stages.data import CellReason
 from tests.conftest import SMALL, roverflow
 
 
@@ -18,10 +21,13 @@ def messages(traverse, tmp_path_factory):
     """Topic -> its first message, by mcap-ros2-support."""
     out = tmp_path_factory.mktemp("viewers") / "out.mcap"
     assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--set", "McapSink.viewers=true") == 0
-    found = {}
+    found, cameras = {}, {}  # cameras: frame -> its first transform
     with out.open("rb") as file:
         for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
             found.setdefault(channel.topic, message)
+            for placed in message.transforms[:1] if channel.topic == "/tf" else ():
+                cameras.setdefault(placed.child_frame_id, [placed])
+    found["cameras"] = cameras
     found["own"] = {topic: message for topic, _, message in reversed(list(iter_decoded(out)))}
     return found
 
@@ -62,3 +68,24 @@ def test_the_tree_of_frames_hangs_from_the_frame_in_which_rerun_draws_a_log(mess
     parents = {item.header.frame_id for item in messages["/tf"].transforms}
     children = {item.child_frame_id for item in messages["/tf"].transforms}
     assert (root.header.frame_id, root.child_frame_id) == ("tf#/", *(parents - children))
+
+
+@pytest.mark.parametrize("name", ["navigation_map", "regional_navigation_map"])
+def test_the_camera_of_the_reasons_sees_each_cell_at_its_pixel(messages, name):
+    own, info = messages["own"][f"/nav/{name}"].info, messages[f"/nav/{name}/reason/camera_info"]
+    compressed = messages[f"/nav/{name}/reason/color/compressed"]
+    picture = cv2.imdecode(np.frombuffer(compressed.data, np.uint8), cv2.IMREAD_COLOR)
+    assert (info.height, info.width) == picture.shape[:2]
+    (pose,) = messages["cameras"][f"{name}/above"]
+    assert compressed.header.frame_id == info.header.frame_id == pose.child_frame_id
+    assert pose.header.frame_id == messages[f"/nav/{name}"].header.frame_id
+    q, t = pose.transform.rotation, pose.transform.translation
+    down = Rotation.from_quat([q.x, q.y, q.z, q.w])
+    reason = read_occupancy_grid(messages["own"][f"/nav/{name}"], messages["own"][f"/nav/{name}/reason"]).reason
+    row, col = np.argwhere(np.isin(reason, [CellReason.CLEAR, CellReason.STEP, CellReason.BESIDE])).T
+    x, y = (own.origin.position.x + (col + 0.5) * own.resolution, own.origin.position.y + (row + 0.5) * own.resolution)
+    cells = down.inv().apply(np.column_stack([x - t.x, y - t.y, np.full_like(x, -t.z)]))
+    u, v, depth = np.reshape(info.k, (3, 3)) @ cells.T
+    seen = picture[np.rint(v / depth).astype(int), np.rint(u / depth).astype(int), ::-1]
+    np.testing.assert_array_equal(seen, legend_colors(reason[row, col], REASON_LEGEND))
+    assert len(np.unique(seen, axis=0)) > 1
