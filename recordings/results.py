@@ -13,7 +13,7 @@ import numpy as np
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
-from recordings.scoring.result_log import about_run, check_profile
+from recordings.scoring.result_log import check_profile, facts_of
 from stages.data import Disparity
 
 
@@ -61,10 +61,7 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
     ...     print(frame.stamp, (frame.items["navigation_map"].cells == 100).sum())
     """
     path = Path(path)
-    about = about_run(path)
-    if not about:
-        raise LogError(f"{path} is not a result log; give a log that roverflow run wrote")
-    check_profile(path, about)
+    check_profile(path, facts_of(path, "a log that roverflow run wrote"))
     with McapFile(path) as log:
         schemas = {channel.topic: getattr(channel.schema, "name", "") for channel in log.channels.values()}
     known = {

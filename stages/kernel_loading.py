@@ -39,6 +39,11 @@ def imported_kernels() -> list[Any]:
     return list({id(value): value for value in values if isinstance(value, Dispatcher)}.values())
 
 
+def compiled_now() -> bool:
+    """Whether this process has compiled a kernel because none was kept."""
+    return any(kernel.stats.cache_misses for kernel in imported_kernels())
+
+
 def load(kernel: Any) -> int:
     """Load what numba keeps of a kernel for this processor and its present source; returns the number of versions."""
     cache = kernel._cache

@@ -1,6 +1,7 @@
 """`roverflow diff`: two results side by side."""
 
 import json
+import re
 
 import pytest
 
@@ -63,6 +64,16 @@ def test_a_difference_is_also_a_message_that_only_one_result_has(plain, variant_
     assert "/nav/elevation_map: 0 of 0 messages differ, " in capsys.readouterr().out
 
 
-def test_a_log_without_results_is_refused(traverse, plain, capsys):
+def test_copied_inputs_are_counted_and_not_compared(traverse, plain, tmp_path, capsys):
+    out = tmp_path / "out.mcap"
+    assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
+    capsys.readouterr()
+    assert roverflow("diff", out, plain) == 0
+    assert re.search(r"^equal: all .*\n\d+ topics of the input copied in A only$", capsys.readouterr().out, re.M)
+
+
+def test_a_log_without_results_is_refused(traverse, plain, tmp_path, capsys):
     assert roverflow("diff", plain, traverse) == 2
     assert "is not a result log; give two logs that roverflow run wrote" in capsys.readouterr().err
+    assert roverflow("diff", plain, tmp_path / "missing.mcap") == 2
+    assert "missing.mcap: No such file or directory" in capsys.readouterr().err

@@ -65,7 +65,7 @@ def test_two_results_stand_beside_each_other(traverse, result, tmp_path):
     )
     assert roverflow("report", result, other) == 0
     page = Page(result.with_suffix(".html").read_text())
-    assert "the results part at /nav/navigation_map" in " ".join(page.words)
+    assert "the results first differ at /nav/navigation_map" in " ".join(page.words)
     assert len([name for name, _ in page.images if name == "/nav/navigation_map of the worst frame"]) == 2
 
 
@@ -80,3 +80,5 @@ def test_losses_are_listed_and_a_foreign_file_is_kept(traverse, tmp_path, capsys
     assert "exists and is no report of roverflow" in capsys.readouterr().err
     assert roverflow("report", traverse) == 2
     assert "is not a result log" in capsys.readouterr().err
+    assert roverflow("report", tmp_path / "missing.mcap") == 2
+    assert "missing.mcap: No such file or directory" in capsys.readouterr().err

@@ -1,5 +1,9 @@
 """`roverflow why`: what made a cell of a navigation map."""
 
+import re
+import shutil
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -8,11 +12,12 @@ from flow.cli.explanation import why
 from flow.cli.regional_explanation import why_regional
 from flow.cli.what_if import part_of
 from recordings import McapSource
+from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from stages import FuseRegion, Rectify, VisualOdometry
 from stages.data import Cell
-from tests.conftest import SMALL, roverflow
+from tests.conftest import SMALL, rewrite, roverflow
 
 AT = 1.0
 
@@ -92,8 +97,10 @@ def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, s
     for _ in range(2):  # the second picture replaces the first
         assert roverflow("why", fast_result, "--at", AT, f"--cell={x},{y}", *log, "-o", out) == 0
     output = capsys.readouterr().out
-    assert f"cell ({x:.3f}, {y:.3f}) m at {stamp} ns: hazard, reason " in output
-    assert "\n  step " in output
+    assert f"cell ({x:.3f}, {y:.3f}) m at {moment(stamp)}: hazard, reason " in output
+    assert re.search(r"\n  step .*; limit 0.17 m = rover.max_step 0.2 - height_margin 0.03\n", output)
+    assert "\n  drop                     none (only hidden cells have one)\n" in output
+    assert re.search(r"\n(free|unknown) with navigation_map\.[a-z_.]+ = ", output)
     assert "\npixels: " in output
     picture = cv2.imread(str(out)).astype(int)
     assert ((picture[..., 2] > 200) & (picture[..., 1] < 80) & (picture[..., 0] > 150)).sum() > 20
@@ -111,6 +118,31 @@ def test_what_cannot_be_explained_is_refused(traverse, fast_result, capsys):
     assert "the pipeline has no navigation map 'nix', only navigation_map, regional_navigation_map" in other
 
 
+def test_a_cell_without_height_has_no_limits(traverse, fast_result, stamp, capsys):
+    grid = read_occupancy_grid(messages(fast_result, "/nav/navigation_map")[stamp])
+    x, y = (start + 0.5 * grid.resolution for start in grid.origin)
+    assert roverflow("why", fast_result, "--at", AT, f"--cell={x},{y}", "--log", traverse) == 0
+    assert "unknown, reason unobserved\nno height, so no limit applies\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("regional", [(), ("--map", "regional_navigation_map")])
+def test_a_log_of_other_stamps_is_not_taken_for_the_input(traverse, fast_result, tmp_path, capsys, regional):
+    def later(topic, index, data):
+        return data[:4] + struct.pack("<i", struct.unpack("<i", data[4:8])[0] + 3600) + data[8:]
+
+    images = ("/stereo/left/image_rect_color", "/stereo/right/image_rect_color")
+    other = rewrite(traverse, tmp_path / "b.mcap", lambda *one: later(*one) if one[0] in images else one[2])
+    words = ("--at", AT, "--cell", "3,0", *regional)
+    assert roverflow("why", fast_result, *words, "--log", other) == 2
+    said = capsys.readouterr().err
+    assert f"b.mcap is not the input of {fast_result}: its frames have other stamps; give traverse.mcap\n" in said
+    result = shutil.copy(fast_result, tmp_path / "out.mcap")
+    other.rename(tmp_path / "traverse.mcap")
+    assert roverflow("why", result, *words) == 2
+    said = capsys.readouterr().err
+    assert "other stamps (taken for the input because the result names traverse.mcap; give --log)" in said
+
+
 def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, capsys):
     grids = messages(fast_result, "/nav/regional_navigation_map")
     end, grid = max(grids), read_occupancy_grid(grids[max(grids)])
@@ -121,11 +153,12 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, cap
     late = ("--at", 60, f"--cell={x},{y}", "--map", "regional_navigation_map", "--log", traverse)
     assert roverflow("why", fast_result, *late) == 0
     said = capsys.readouterr().out
-    assert f"cell ({x:.3f}, {y:.3f}) m in 'odom', map of {end} ns: free, reason clear" in said
+    assert f"cell ({x:.3f}, {y:.3f}) m in 'odom', map of {moment(end)}: free, reason clear" in said
     found = why_regional(fast_result, 60, (x, y), log=traverse)
     assert found.layers["frames"] == len(found.frames) == 4
     assert all(abs(frame.height - found.layers["elevation"]) < 0.05 for frame in found.frames)
     assert said.count(" points, height ") == 4
+    assert "frames with points in the cell (of the clouds that the log keeps, thinned to 2 cm): 4\n" in said
     assert len(why_regional(fast_result, 0, (x, y), log=traverse).frames) == 1
     assert roverflow("why", fast_result, *late[:2], "--pixel", "9,9", *late[3:]) == 2
     assert "is a regional map: give --cell" in capsys.readouterr().err

@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from flow.cli.replay import one_thread_per_call
-from flow.cli.what_if import Instant, hastened, part_of
+from flow.cli.what_if import Instant, hastened, is_other, part_of
 from flow.config.loader import load
 from flow.contracts import FrameRecord
-from flow.errors import UsageError
+from flow.errors import RoverflowError, UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import run
 from stages import Binarise
@@ -36,7 +37,10 @@ from stages.data import (
     StereoFrame,
     Tilt,
 )
-from stages.terrain.verdict_limits import Turn, limits_at, turns_at
+from stages.terrain.verdict_limits import Limit, Turn, limits_at, turns_at
+
+if TYPE_CHECKING:
+    from recordings.source.log import McapLog
 
 REACH_PX = 10.0  # from a pixel to the nearest one that has a point
 
@@ -47,6 +51,8 @@ class CellExplanation:
 
     Attributes
     ----------
+    stream : str
+        The navigation map.
     stamp : int
         Of the map, ns.
     x, y : float
@@ -58,18 +64,19 @@ class CellExplanation:
     layers : dict
         Layer of the elevation map -> its value in the cell; NaN is unknown.
     limits : dict
-        Quantity -> (value, limit, unit): the rule compares value with limit.
+        Quantity -> `Limit`: the rule compares its value with its limit.
     turns : list of Turn
         The smallest change of each parameter that would turn the verdict.
     """
 
+    stream: str
     stamp: int
     x: float
     y: float
     verdict: Cell
     reason: CellReason
     layers: Mapping[str, float]
-    limits: Mapping[str, tuple[float, float, str]]
+    limits: Mapping[str, Limit]
     turns: list[Turn]
 
 
@@ -139,7 +146,8 @@ def why(
     Raises
     ------
     UsageError
-        If the input log is not there, the pipeline has no such map, or the cell or pixel is outside of it.
+        If the input log is not there or is another one, the pipeline has no such map, or the cell or pixel is outside
+        of it.
 
     Examples
     --------
@@ -150,11 +158,13 @@ def why(
     from stages.kernel_loading import loading_kernels
 
     with loading_kernels():
-        graph, given = graph_of(result, log)
+        graph = graph_of(result)
         rules = {node.name: node for node in graph.nodes if isinstance(node.actor, Binarise)}
         if stream not in rules:
             raise UsageError(f"the pipeline has no navigation map '{stream}', only {', '.join(rules) or 'none'}")
-        items = instant(graph.upstream_of([stream]), given, at)
+        graph = graph.upstream_of([stream])
+        with input_of(graph, result, log) as opened:
+            items = instant(graph, opened, at)
     if stream not in items:
         raise UsageError(f"the frame has no navigation map '{stream}'; run the log again to see what it lacks")
     node, navigation = rules[stream], items[stream]
@@ -171,6 +181,7 @@ def why(
     frame, origin = _last(items, StereoFrame), np.zeros(3) if cloud.sensor is None else cloud.sensor.translation
     return Explanation(
         **verdict_at(node.actor, navigation, terrain, place),
+        stream=stream,
         recorded=_recorded(result, stream, navigation.stamp, x, y),
         distance=float(np.median(np.linalg.norm(cloud.points[inside] - origin, axis=1))) if inside.any() else math.nan,
         tilt=_last(items, Tilt),
@@ -209,36 +220,53 @@ def _pixels(disparity: Disparity | None, pixels: Array) -> dict[str, Any]:
     return found | {"sources": {PixelOrigin(code).name: number for code, number in counts.items()}}
 
 
-def instant(graph: Graph, log: Path, at: Instant) -> Mapping[str, Any]:
+def instant(graph: Graph, log: McapLog, at: Instant) -> Mapping[str, Any]:
     """Every stream of a graph at the frame of a log nearest to `at`. Raises UsageError if no frame goes through."""
     kept = _Keep()
-    with graph.source.open(log) as opened, one_thread_per_call():
-        part = part_of(opened, at, frames=1, before=0)
-        opened.narrow(part.start, part.end)
-        run(replace(hastened(graph), sinks=(("keep", kept),)), opened, {"keep": Path("memory")})
+    with one_thread_per_call():
+        part = part_of(log, at, frames=1, before=0)
+        log.narrow(part.start, part.end)
+        run(replace(hastened(graph), sinks=(("keep", kept),)), log, {"keep": Path("memory")})
     if not kept.records:
         raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.start:.3f} says why")
     return kept.records[0].items
 
 
-def graph_of(result: Path, log: Path | None = None) -> tuple[Graph, Path]:
-    """The pipeline of a result log as it ran, with what its survey fixed and without sinks, and its input.
+def graph_of(result: Path, *, with_sinks: bool = False) -> Graph:
+    """The pipeline of a result log as it ran, with what its survey fixed. Raises LogError."""
+    from recordings.scoring.result_log import facts_of, pipeline_of
 
-    Raises UsageError.
-    """
-    from recordings.scoring.result_log import about_run, pipeline_of
-
-    about = about_run(result)
-    if not about:
-        raise UsageError(f"{result} is not a result log; give the log that roverflow run wrote")
-    given = log or result.with_name(about["log"])
-    if not given.exists():
-        raise UsageError(f"the input of {result}, {about['log']}, is not beside it; give it with --log")
+    about = facts_of(result, "the log that roverflow run wrote")
     with TemporaryDirectory(prefix="roverflow-why-") as folder:
         file = Path(folder) / f"{pipeline_of(result)}.yaml"
         file.write_text(about["pipeline"], encoding="utf-8")
         changes = [*about["overrides"].splitlines(), *about.get("fixed", "").splitlines()]
-        return load(str(file), changes, with_sinks=False), given
+        return load(str(file), changes, with_sinks=with_sinks)
+
+
+@contextmanager
+def input_of(graph: Graph, result: Path, log: Path | None = None) -> Iterator[McapLog]:
+    """The opened input of a result log: `log`, or the one that the result names, beside it.
+
+    Raises UsageError if it is not there, cannot be read, or has none of the result's frames.
+    """
+    from recordings.errors import LogError
+    from recordings.scoring.result_log import about_run, stamps_of
+
+    named = about_run(result)["log"]
+    given = log or result.with_name(named)
+    if not given.exists():
+        raise UsageError(f"the input of {result}, {named}, is not beside it; give it with --log")
+    with ExitStack() as stack:
+        try:
+            opened = stack.enter_context(graph.source.open(given))
+            if is_other(opened, stamps_of(result)):
+                remedy = "" if log is None else f"; give {named}"
+                raise UsageError(f"{given} is not the input of {result}: its frames have other stamps{remedy}")
+        except (LogError, RoverflowError) as error:
+            taken = f" (taken for the input because the result names {named}; give --log)" if log is None else ""
+            raise UsageError(f"{error}{taken}") from error
+        yield opened
 
 
 @dataclass

@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flow.cli.explanation import CellExplanation, centre_of, graph_of, index_of, verdict_at
+from flow.cli.explanation import CellExplanation, centre_of, graph_of, index_of, input_of, verdict_at
 from flow.cli.what_if import Instant, ns_of
 from flow.errors import UsageError
-from recordings.containers.opening import open_recording
 from recordings.mcap.file import iter_decoded
 from recordings.results import read_result
 from recordings.ros2.from_msg import read_point_cloud, transform_of
@@ -41,11 +40,14 @@ class RegionalExplanation(CellExplanation):
     frame_id : str
         The map's frame.
     frames : list of Contribution
-        The frames with points in the cell, up to the map's stamp; the points are the thinned ones of the log.
+        The frames with points in the cell, up to the map's stamp; the points are those that the log keeps.
+    spacing : float
+        To which the log's points are thinned, m; 0: they are not.
     """
 
     frame_id: str
     frames: list[Contribution]
+    spacing: float
 
 
 def why_regional(
@@ -79,23 +81,25 @@ def why_regional(
     Raises
     ------
     UsageError
-        If the input log is not there, the result has no such map, or the cell is outside of it.
+        If the input log is not there or is another one, the result has no such map, or the cell is outside of it.
     """
-    graph, given = graph_of(result, log)
+    graph = graph_of(result, with_sinks=True)
     node = next((node for node in graph.nodes if node.name == stream and isinstance(node.actor, Binarise)), None)
     if node is None:
         raise UsageError(f"the pipeline of {result} has no navigation map '{stream}'")
     rule: Any = node.actor
-    with open_recording(given) as recording:
-        stamp = ns_of(at, recording.start)
+    with input_of(graph, result, log) as opened:
+        stamp = ns_of(at, opened.begin)
     navigation, terrain = _maps(result, stamp, stream, node.inputs["elevation"])
     place = index_of(navigation, *cell)
     if place is None:
         raise UsageError(f"({cell[0]:g}, {cell[1]:g}) is outside the regional map in '{navigation.frame_id}'")
     return RegionalExplanation(
         **verdict_at(rule, navigation, terrain, place),
+        stream=stream,
         frame_id=navigation.frame_id,
         frames=_contributions(result, navigation, centre_of(navigation, place)),
+        spacing=next((getattr(sink, "point_spacing", 0.0) for _, sink in graph.sinks if sink.suffix == ".mcap"), 0.0),
     )
 
 

@@ -56,7 +56,9 @@ def headline(summary: dict[str, Any]) -> str:
 
 def report(summary: dict[str, Any]) -> None:
     """Print the summary of a run."""
-    say(headline(summary))
+    from stages.kernel_loading import compiled_now
+
+    say(headline(summary) + (" (with compiling kernels)" if compiled_now() else ""))
     if summary["frames_left_out"]:
         say(f"  {counted(summary['frames_left_out'], 'frame')} left out by --every {summary['every']}")
     found = [summary["surveys"], summary["findings"]]

@@ -9,8 +9,10 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from flow.cli.report import say
 from flow.errors import UsageError
@@ -19,10 +21,11 @@ PORT, WEB_PORT = 9877, 9090  # the first ones tried, on loopback; the viewer its
 
 
 @contextmanager
-def watched(view: bool, serve: bool) -> Iterator[int]:
+def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
     """Start what watches a run; yields the port of loopback for the sink, 0 for none.
 
-    view: open the viewer, which stays open after the run; serve: serve a page to browsers, which ends with the run.
+    view: open the viewer, which stays open after the run; serve: serve a page to browsers, which ends with the run;
+    recording: the file that a viewer can open afterwards.
     """
     if not (view or serve):
         yield 0
@@ -35,15 +38,23 @@ def watched(view: bool, serve: bool) -> Iterator[int]:
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         start_new_session=True,  # Ctrl-C is for the run
     )  # fmt: skip
+
+    def report_failure() -> None:
+        if process.wait() > 0:
+            say(f"No viewer (no display?). The run goes on; afterwards: rerun {recording}")
+
+    reporter = threading.Thread(target=report_failure, name="viewer", daemon=True)
     if serve:
         say(f"watch the run at http://127.0.0.1:{web}/?url={address} while it lasts")
+    else:
+        reporter.start()
     try:
         yield port
     finally:
         if serve:
             process.terminate()
-        elif process.poll():
-            say("the viewer could not be opened, or was closed; rerun opens the recording")
+        elif process.poll() is not None:
+            reporter.join()
 
 
 def _free(first: int) -> int:

@@ -97,6 +97,16 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int) -> Part:
     return Part(start, end, (int(times[chosen]) - log.begin) / 1e9, chosen - low)
 
 
+def is_other(log: McapLog, stamps: NDArray[np.int64]) -> bool:
+    """Whether a log has left images, but none of those of a run, whose sorted stamps, ns, are given."""
+    times = log.file.times(log.channels("left")) if "left" in log.topics else np.zeros(0, np.int64)
+    if not (times.size and stamps.size):
+        return False
+    tried = stamps[[0, stamps.size // 2, -1]].astype("datetime64[ns]")
+    places = [place for stamp in tried if (place := _nearest(log, times, stamp)) is not None]
+    return not any(np.isin(list(_stamps(log, times, place).values()), stamps).any() for place in places)
+
+
 def ns_of(at: Instant, begin: int) -> int:
     """An instant in ns, in a log that begins at `begin`, ns."""
     if isinstance(at, float | int):
@@ -110,21 +120,22 @@ def ns_of(at: Instant, begin: int) -> int:
 
 def _nearest(log: McapLog, times: NDArray[np.int64], at: Instant) -> int | None:
     """The place of the left image nearest to an instant; None outside the log. times: log times, ns."""
-    channels, when = log.channels("left"), ns_of(at, log.begin)
-
-    def stamps(first: int, last: int) -> dict[int, int]:
-        raws = (raw for raw in log.file.messages(channels, first, last + 1) if isinstance(raw, RawMessage))
-        return {raw.log_time: log.stamp_of(raw) or raw.log_time for raw in raws}
-
-    absolute = not isinstance(at, float | int)
-    delay = sum(time - stamp for time, stamp in stamps(times[0], times[0]).items()) if absolute else 0
+    when, absolute = ns_of(at, log.begin), not isinstance(at, float | int)
+    delay = sum(time - stamp for time, stamp in _stamps(log, times, 0, 0).items()) if absolute else 0
     if not times[0] - MARGIN <= when + delay <= times[-1] + MARGIN:
         return None
     chosen = int(np.argmin(np.abs(times - when - delay)))
     if absolute:
-        near = stamps(times[max(0, chosen - 2)], times[min(chosen + 2, times.size - 1)])
+        near = _stamps(log, times, chosen)
         chosen = int(np.searchsorted(times, min(near, key=lambda time: abs(near[time] - when), default=times[chosen])))
     return chosen
+
+
+def _stamps(log: McapLog, times: NDArray[np.int64], place: int, reach: int = 2) -> dict[int, int]:
+    """Log time -> stamp, ns, of the left image at a place and of those within `reach` of it."""
+    first, last = times[max(0, place - reach)], times[min(place + reach, times.size - 1)]
+    raws = (raw for raw in log.file.messages(log.channels("left"), first, last + 1) if isinstance(raw, RawMessage))
+    return {raw.log_time: log.stamp_of(raw) or raw.log_time for raw in raws}
 
 
 def hastened(graph: Graph) -> Graph:
@@ -173,10 +184,12 @@ def run_variants(
 def summary_lines(variants: Variants, part: Part, frames: int) -> list[str]:
     """What ran, for a terminal."""
     again = [name for label, own in variants.own.items() if label != "A" for name in own]
+    once = len(variants.graph.stages) - len(again)
+    change = counted(len(variants.own) - 1, "change") if len(variants.own) > 2 else "change"
     before = f", after {counted(part.before, 'frame')} before it" if part.before else ""
-    total = counted(len(variants.graph.stages), "stage")
+    ran = f"{counted(once, 'stage')} run once, {len(again)} again with the {change}"
     return [
-        f"{counted(frames, 'frame')} from {part.at:.3f} s on{before}: {total}, {len(again)} of them for changes",
+        f"{counted(frames, 'frame')} from {part.at:.3f} s on{before}: {ran}",
         f"the change touches {', '.join(dict.fromkeys(again)) or 'no stage'}",
     ]
 

@@ -16,7 +16,7 @@ from recordings.containers.container import LostMessage
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 from recordings.ros2.cdr import decoder_for
-from recordings.scoring.result_log import about_run, check_profile
+from recordings.scoring.result_log import check_profile, facts_of
 
 _LATE = ("/tf", "/nav/diagnostics")  # they follow from the streams, so they are never the first to differ
 
@@ -78,6 +78,8 @@ class Diff:
         Topic -> `TopicDiff`, in the order of the pipeline.
     begin : int
         Log time of the first message of the first result, ns.
+    copied : dict
+        "A" and "B" -> topics of the input that only this result has a copy of; copies are not compared.
     facts : dict
         Fact of the run -> its values in both results, where these differ. The pipelines are a unified diff.
     """
@@ -85,6 +87,7 @@ class Diff:
     first: tuple[str, int] | None = None
     topics: dict[str, TopicDiff] = field(default_factory=dict)
     begin: int = 0
+    copied: dict[str, list[str]] = field(default_factory=dict)
     facts: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     @property
@@ -119,19 +122,18 @@ def diff(one: Path, other: Path, on_change: Callable[[MessageDifference], None] 
     >>> diff(Path("a.mcap"), Path("b.mcap")).first  # doctest: +SKIP
     ('/nav/elevation_map', 1700086400013000000)
     """
-    about = {path: about_run(path) for path in (one, other)}
+    about = {path: facts_of(path, "two logs that roverflow run wrote") for path in (one, other)}
     for path, facts in about.items():
-        if not facts:
-            raise LogError(f"{path} is not a result log; give two logs that roverflow run wrote")
         check_profile(path, facts)
     found = Diff(facts=_facts(about[one], about[other]))
     with McapFile(one) as first, McapFile(other) as second:
         found.begin = first.start
-        rank = _rank_of(
-            about[one]["pipeline"], {channel.topic for log in (first, second) for channel in log.channels.values()}
-        )
+        readers = _Reader(first), _Reader(second)
+        copies = [reader.copied for reader in readers]
+        found.copied = {"A": sorted(copies[0] - copies[1]), "B": sorted(copies[1] - copies[0])}
+        rank = _rank_of(about[one]["pipeline"], {topic for reader in readers for topic in reader.topics})
         topics = {topic: TopicDiff() for topic in sorted(rank, key=lambda topic: rank[topic])}
-        for change in _changes(_Reader(first), _Reader(second), topics):
+        for change in _changes(*readers, topics):
             topics[change.topic].add(change)
             on_change(change)
             found.first = found.first or (change.topic, change.stamp)
@@ -140,16 +142,22 @@ def diff(one: Path, other: Path, on_change: Callable[[MessageDifference], None] 
 
 
 class _Reader:
-    """Reads a log by groups of one stamp."""
+    """Reads the results of a log by groups of one stamp.
+
+    topics: of the results; copied: of the inputs that `run --with-inputs` copied, in the channels after the results'.
+    """
 
     def __init__(self, log: McapFile) -> None:
         self.log = log
+        last = max((number for number, channel in log.channels.items() if channel.topic.startswith("/nav/")), default=0)
+        self._own = {number for number in log.channels if number <= last}
+        self.topics = {log.channels[number].topic for number in self._own}
+        self.copied = {channel.topic for number, channel in log.channels.items() if number > last}
         self._decoders: dict[int, Callable[[bytes | memoryview], Any]] = {}
 
     def groups(self) -> Iterator[tuple[int, dict[str, tuple[int, bytes]]]]:
         """(Stamp, topic -> number of its channel and bytes)."""
-        numbers = set(self.log.channels)
-        for stamp, group in groupby(self.log.messages(numbers), key=lambda raw: raw.log_time):
+        for stamp, group in groupby(self.log.messages(self._own), key=lambda raw: raw.log_time):
             messages = dict[str, tuple[int, bytes]]()
             for raw in group:
                 if isinstance(raw, LostMessage):

@@ -85,7 +85,7 @@ def _maps(one: Any, other: Any) -> Measures:
     layers = side_by_side(read_layers(one), read_layers(other), grids)
     heights = layers.pop("elevation", None)
     found = {} if heights is None else _changes(*heights, "cells", "cm", 100.0)
-    return found | {f"cells of {name}": float(np.sum(_differ(*pair))) for name, pair in layers.items()}
+    return found | {f"cells of layer {name}": float(np.sum(_differ(*pair))) for name, pair in layers.items()}
 
 
 def _grid_of(message: Any) -> _Grid:
@@ -116,7 +116,8 @@ def _poses(one: Any, other: Any) -> Measures:
     places = [np.array([pose.position.x, pose.position.y, pose.position.z]) for pose in (first, second)]
     turns = [np.array([q.x, q.y, q.z, q.w]) for q in (first.orientation, second.orientation)]
     angle = 2.0 * angle_between(turns[0], turns[1] * np.sign(turns[0] @ turns[1] or 1.0))
-    return {"position mm": 1e3 * float(np.linalg.norm(places[1] - places[0])), "angle deg": float(np.degrees(angle))}
+    distance = float(np.linalg.norm(places[1] - places[0]))
+    return {"largest position mm": 1e3 * distance, "largest angle deg": float(np.degrees(angle))}
 
 
 def _points(one: Any, other: Any) -> Measures:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from flow.contracts import counted
 from recordings.comparison.diff import Diff, TopicDiff
 
-_MAX_MEASURES = 6  # of a topic, in a line
+_LAYER = "cells of layer "
 
 
 def format_diff(found: Diff) -> str:
@@ -13,17 +15,28 @@ def format_diff(found: Diff) -> str:
     return "\n".join([*(f"{name}: {_shown(*values)}" for name, values in found.facts.items()), comparison(found)])
 
 
+def moment(stamp: int) -> str:
+    """A stamp as the viewer's time of day, UTC, and in ns; `--at` takes both.
+
+    Examples
+    --------
+    >>> moment(1700086400513000000)
+    '22:13:20.513 (1700086400513000000 ns)'
+    """
+    return f"{str(np.datetime64(stamp // 1_000_000, 'ms'))[11:]} ({stamp} ns)"
+
+
 def comparison(found: Diff) -> str:
     """The topics that differ, for a terminal."""
     if found.first is None:
         messages = sum(topic.messages for topic in found.topics.values())
-        return f"equal: all {counted(messages, 'message')} of {counted(len(found.topics), 'topic')}"
+        equal = f"equal: all {counted(messages, 'message')} of {counted(len(found.topics), 'topic')}"
+        return "\n".join([equal, *_copies(found)])
     topic, stamp = found.first
-    seconds = (stamp - found.begin) / 1e9
-    lines = [f"the results part at {topic}, {seconds:.3f} s after the first result ({stamp} ns)"]
+    lines = [f"the results first differ at {topic}, {moment(stamp)}"]
     lines += [f"  {name}: {_line(item)}" for name, item in found.topics.items() if item.first is not None]
     same = [name for name, item in found.topics.items() if item.first is None]
-    return "\n".join([*lines, *([f"equal: {', '.join(same)}"] if same else [])])
+    return "\n".join([*lines, *([f"equal: {', '.join(same)}"] if same else []), *_copies(found)])
 
 
 def markdown(found: Diff) -> str:
@@ -39,12 +52,27 @@ def markdown(found: Diff) -> str:
 
 
 def _line(item: TopicDiff) -> str:
-    parts = [f"{item.differing} of {item.messages} messages differ"]
-    parts += [f"{number} only in {name}" for name, number in (("A", item.only_one), ("B", item.only_other)) if number]
-    worst = list(item.worst.items())
-    shown = [f"{value:.0f} {name}" if value >= 100 else f"{value:.3g} {name}" for name, value in worst[:_MAX_MEASURES]]
-    more = [f"and {len(worst) - _MAX_MEASURES} more"] if len(worst) > _MAX_MEASURES else []
-    return "; ".join([", ".join(parts), *([f"at most {', '.join([*shown, *more])}"] if shown else [])])
+    alone = [f"{number} only in {name}" for name, number in (("A", item.only_one), ("B", item.only_other)) if number]
+    parts = [", ".join([f"{item.differing} of {item.messages} messages differ", *alone])]
+    layers = [name for name in item.worst if name.startswith(_LAYER)]
+    sizes = [name for name in item.worst if name.startswith(("median ", "largest "))]
+    counts = [name for name in item.worst if name not in (*layers[1:], *sizes)]
+    number = {name: f"{value:.0f}" if value >= 100 else f"{value:.2g}" for name, value in item.worst.items()}
+    first, *rest = [f"{number[name]} {name}" for name in counts] or [""]
+    largest = [f"{what} {number[name]} {unit}" for name in sizes for what, _, unit in [name.rpartition(" ")]]
+    parts += [", ".join([f"up to {first} a message", *rest])] if first else []
+    parts += [", ".join(largest)] if largest else []
+    parts += [f"{counted(len(layers) - 1, 'more layer differs', 'more layers differ')}"] if layers[1:] else []
+    return "; ".join(parts)
+
+
+def _copies(found: Diff) -> list[str]:
+    """The copied inputs that only one result has."""
+    return [
+        f"{counted(len(topics), 'topic')} of the input copied in {name} only"
+        for name, topics in found.copied.items()
+        if topics
+    ]
 
 
 def _shown(one: str, other: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 from flow.contracts import counted
 from recordings.atomic_write import written
 from recordings.comparison.diff import diff
-from recordings.comparison.text import format_diff
+from recordings.comparison.text import format_diff, moment
 from recordings.export.png_pages import disparity_page, elevation_page, navigation_page
 from recordings.reporting.figures import line_plot, picture, track_plot
 from recordings.reporting.run_facts import REGIONAL, RunFacts, read_facts
@@ -124,8 +124,7 @@ def _frame(facts: RunFacts, name: str) -> str:
         "/nav/navigation_map": lambda message: navigation_page(read_occupancy_grid(message)),
     }
     pictures = [picture(draw[topic](message), f"{topic} of the {name}") for topic, message in messages.items()]
-    seconds = (stamp - facts.stamps[0]) / 1e9
-    return f"<p>{seconds:.3f} s after the first frame ({stamp} ns)</p><div class=pictures>{''.join(pictures)}</div>"
+    return f"<p>at {moment(stamp)}</p><div class=pictures>{''.join(pictures)}</div>"
 
 
 def _losses(facts: RunFacts) -> str:

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from mcap.reader import make_reader
 
-from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
-from recordings.scoring.result_log import about_run, check_profile
+from recordings.scoring.result_log import check_profile, facts_of
 from stages.data import Cell
 
 TOPICS = (
@@ -50,9 +49,7 @@ def read_facts(path: Path) -> RunFacts:
     LogError
         If the file is no result log, or cannot be read.
     """
-    about = about_run(path)
-    if not about:
-        raise LogError(f"{path} is not a result log; give a log that roverflow run wrote")
+    about = facts_of(path, "a log that roverflow run wrote")
     check_profile(path, about)
     facts = RunFacts(path, about, _counts(path))
     for topic, stamp, message in iter_decoded(path, TOPICS):

@@ -8,11 +8,14 @@ from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
+from numpy.typing import NDArray
 
+from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 
@@ -26,6 +29,15 @@ def about_run(result: Path) -> dict[str, str]:
         if isinstance(record, Metadata) and record.name == "roverflow":
             return dict(record.metadata)
     return {}
+
+
+def facts_of(result: Path, remedy: str) -> dict[str, str]:
+    """The facts of the run that wrote a result log; raises LogError for another log, with what to give instead."""
+    about = about_run(result)
+    if not about:
+        open_recording(result).close()  # a file that cannot be read is refused for that
+        raise LogError(f"{result} is not a result log; give {remedy}")
+    return about
 
 
 def check_profile(path: Path, about: Mapping[str, str]) -> None:
@@ -52,13 +64,17 @@ def part_run(result: Path, log: Path) -> tuple[float | None, float | None]:
     return start, end
 
 
+def stamps_of(result: Path) -> NDArray[np.int64]:
+    """The sorted stamps, ns, of the diagnostics in a result log, which each frame and each loss have."""
+    with McapFile(result) as log:
+        return log.times(log.channels_of(["/nav/diagnostics"]))
+
+
 def stamps_run(result: Path) -> set[int] | None:
     """The stamps of the frames that a run of selected frames (`run --every`) took; None for a run of all frames."""
     if not about_run(result).get("every"):
         return None
-    with McapFile(result) as log:  # every frame has diagnostics, at its stamp as the log time
-        channels = log.channels_of(["/nav/diagnostics"])
-        return set(log.times(channels).tolist())
+    return set(stamps_of(result).tolist())
 
 
 def without_results(path: Path, wanted: Sequence[str], instead: Sequence[str] = (), remedy: str = "") -> LogError:

@@ -100,6 +100,10 @@ class Layout:
 def read_layout(recording: Path) -> Layout:
     """The layout that a recording of `RerunSink` keeps. Raises LogError."""
     try:
+        recording.open("rb").close()
+    except OSError as error:
+        raise LogError(f"cannot read {recording}: {error.strerror or error}") from error
+    try:
         for chunk in rr.chunk.RrdReader(str(recording)).stream():
             if chunk.entity_path == f"/{LAYOUT}":
                 (text,) = chunk.to_record_batch().column("TextDocument:text").to_pylist()[-1]

@@ -6,7 +6,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from stages.data import Cell, ElevationMap
 from stages.terrain.binarise import Binarise
@@ -15,6 +15,15 @@ FACTORS = tuple(1.1**step for step in range(1, 25))  # by which a parameter is c
 PRECISION = 0.01  # of a parameter that would turn the verdict
 NEIGHBOURHOOD = 2.0  # m around a cell that its verdict may depend on
 _LIMITS = ("max_step", "ground_clearance", "max_slope")  # of the rover
+
+
+class Limit(NamedTuple):
+    """What the rule compares: a value, NaN if unknown, and its limit. made_of: the parameters of a computed limit."""
+
+    value: float
+    limit: float
+    unit: str
+    made_of: str = ""
 
 
 @dataclass(frozen=True)
@@ -28,27 +37,29 @@ class Turn:
     verdict: Cell
 
 
-def limits_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> dict[str, tuple[float, float, str]]:
-    """What the rule compares in a cell: quantity -> (value, limit, unit); NaN is unknown."""
+def limits_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> dict[str, Limit]:
+    """What the rule compares in a cell, by quantity."""
     layers = {name: float(layer[row, col]) for name, layer in terrain.layers.items()}
     if rule.method == "absolute" or "step" not in layers:
-        return {"elevation": (layers["elevation"], rule.rover.max_step, "m")}
+        return {"elevation": Limit(layers["elevation"], rule.rover.max_step, "m")}
     found = {
-        "step": (layers["step"], rule.rover.max_step - rule.height_margin, "m"),
-        "height above the ground": (
-            layers["elevation"] - layers["ground"],
-            rule.rover.ground_clearance - rule.height_margin,
-            "m",
-        ),
-        "slope": (math.degrees(layers["slope"]), math.degrees(rule.rover.max_slope), "deg"),
-        "steepness": (math.degrees(layers["steepness"]), math.degrees(rule.rover.max_slope), "deg"),
-        "roughness": (layers["roughness"], rule.max_roughness, "m"),
+        "step": _height(rule, layers["step"], "max_step"),
+        "height above the ground": _height(rule, layers["elevation"] - layers["ground"], "ground_clearance"),
+        "slope": Limit(math.degrees(layers["slope"]), math.degrees(rule.rover.max_slope), "deg"),
+        "steepness": Limit(math.degrees(layers["steepness"]), math.degrees(rule.rover.max_slope), "deg"),
+        "roughness": Limit(layers["roughness"], rule.max_roughness, "m"),
     }
     if "variance" in layers:
-        found["sigma of the height"] = (math.sqrt(layers["variance"]), rule.max_sigma, "m")
+        found["sigma of the height"] = Limit(math.sqrt(layers["variance"]), rule.max_sigma, "m")
     if "drop" in layers:
-        found["drop"] = (layers["drop"], rule.min_drop, "m")
+        found["drop"] = Limit(layers["drop"], rule.min_drop, "m")
     return found
+
+
+def _height(rule: Binarise, value: float, name: str) -> Limit:
+    """A height against a limit of the rover, less the margin."""
+    limit, margin = getattr(rule.rover, name), rule.height_margin
+    return Limit(value, limit - margin, "m", f"rover.{name} {limit:g} - height_margin {margin:g}")
 
 
 def turns_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> list[Turn]:
@@ -61,7 +72,7 @@ def turns_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> list[
         known = [change for change in changes if change is not None]
         if known:
             factor, turned = min(known, key=lambda change: abs(math.log(change[0])))
-            found.append((abs(math.log(factor)), Turn(name, value, value * factor, unit, turned)))
+            found.append((abs(math.log(factor)), Turn(name, value, _like(value, value * factor), unit, turned)))
     return [turn for _, turn in sorted(found, key=lambda item: item[0])]
 
 
@@ -72,7 +83,7 @@ def _turned(
     factors = [1.0, *(FACTORS if up else (1 / factor for factor in FACTORS))]
 
     def at(factor: float) -> int | None:
-        return _verdict(rule, name, value * factor, *place)
+        return _verdict(rule, name, _like(value, value * factor), *place)
 
     # Every test of the rule has one side of its limit, so a verdict that has turned does not turn back.
     first = bisect_left(factors, True, lo=1, key=lambda factor: at(factor) != verdict)
@@ -110,9 +121,14 @@ def _numbers(rule: Binarise) -> Iterator[tuple[str, float, str]]:
             yield known.name, value, known.metadata.get("unit", "")
 
 
+def _like(now: float, value: float) -> float:
+    """A value of a parameter, a whole number if the parameter is one."""
+    return round(value) if isinstance(now, int) else value
+
+
 def _verdict(rule: Binarise, name: str, value: float, part: ElevationMap, row: int, col: int) -> int | None:
     """The verdict with another value of a parameter; None where the rule does not allow the value."""
-    change: dict[str, Any] = {name.removeprefix("rover."): round(value) if name == "min_points" else value}
+    change: dict[str, Any] = {name.removeprefix("rover."): value}
     try:
         changed = replace(rule, **({"rover": replace(rule.rover, **change)} if name.startswith("rover.") else change))
     except ValueError:

@@ -53,19 +53,22 @@ def run(options: argparse.Namespace) -> int:
             options.log, options.pipeline, changes, place, Path(folder), options.workers
         )
         say("\n".join(summary_lines(variants, part, options.frames)))
-        recording, tables, differences = DiffRecording(), list[str](), dict[str, "Diff"]()
+        say(f"\nA: {options.pipeline} as it is")
+        recording, tables, differences = DiffRecording(), [f"A: {options.pipeline} as it is"], dict[str, "Diff"]()
         for label, path in paths.items():
             if label != "A":
                 differences[label] = found = diff(paths["A"], path, recording.of(label))
                 say(f"\n{label}: {', '.join(changes[label])}\n{comparison(found)}")
                 tables += [f"## {label}: {', '.join(changes[label])}", markdown(found)]
+        title, setting = f"{options.log[0].name} at {part.at:g} s", swept_setting(changes)
+        recording.write(out, title, "\n\n".join(tables), _sweep(setting, [], differences))
+        say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
         errors = _errors(paths, options.log[0])
         if errors:
             say("\n" + "\n".join("  ".join(f"{cell:>12}" for cell in row) for row in errors))
             tables = ["## Errors", *_markdown_rows(errors), *tables]
-        title = f"{options.log[0].name} at {part.at:g} s"
-        recording.write(out, title, "\n\n".join(tables), _sweep(swept_setting(changes), errors, differences))
-    say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
+            recording.write(out, title, "\n\n".join(tables), _sweep(setting, errors, differences))
+            say(f"\nadded the errors to {out}")
     return COMPLETE
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from flow.cli.arguments import DESKS
 from flow.cli.outputs import check_outputs
 from flow.cli.report import say
-from flow.errors import COMPLETE
+from flow.errors import COMPLETE, UsageError
 from recordings.atomic_write import written
 
 HELP = "write layouts of a recording, one for each kind of question"
@@ -22,8 +22,12 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write a file for each desk."""
+    from recordings.scoring.result_log import about_run
     from recordings.sinks.blueprint import read_layout
 
+    if about_run(options.recording):
+        recording = options.recording.with_suffix(".rrd").name
+        raise UsageError(f"{options.recording} is a result log; give its recording, {recording}")
     folder = options.out or options.recording.parent
     paths = {name: folder / f"{options.recording.stem}-{name}.rbl" for name in options.desk or DESKS}
     for path in paths.values():

@@ -16,6 +16,7 @@ from flow.errors import COMPLETE, UsageError
 if TYPE_CHECKING:
     from flow.cli.explanation import Explanation
     from flow.cli.regional_explanation import RegionalExplanation
+    from stages.terrain.verdict_limits import Limit, Turn
 
 HELP = "explain a cell of a navigation map: its pixels, its limits, and what would turn its verdict"
 MAX_TURNS = 5  # changes of parameters that are listed
@@ -66,25 +67,32 @@ def _is_regional(result: Path, stream: str) -> bool:
 def _regional(options: argparse.Namespace) -> int:
     """Print the explanation of a cell of a regional map."""
     from flow.cli.regional_explanation import why_regional
+    from recordings.comparison.text import moment
 
     if options.cell is None or options.out is not None:
         raise UsageError(f"'{options.map}' is a regional map: give --cell in its frame; it has no picture of pixels")
     found = why_regional(options.result, options.at, options.cell, log=options.log, stream=options.map)
     verdict, reason = found.verdict.name.lower(), found.reason.name.lower()
     place = f"({found.x:.3f}, {found.y:.3f}) m in '{found.frame_id}'"
-    lines = [f"cell {place}, map of {found.stamp} ns: {verdict}, reason {reason}", *_cell_lines(found)]
+    lines = [f"cell {place}, map of {moment(found.stamp)}: {verdict}, reason {reason}", *_cell_lines(found)]
     conflicts = found.layers.get("contradictions", 0.0)
     more = f"; {conflicts:.0f} contradicted the height" if conflicts > 0 else ""
-    lines.append(f"frames with points in the cell: {len(found.frames)}{more}")
-    lines += [f"  {frame.stamp} ns  {frame.points:4} points, height {frame.height:.3f} m" for frame in found.frames]
+    thinned = f", thinned to {100 * found.spacing:g} cm" if found.spacing else ""
+    kept = f"of the clouds that the log keeps{thinned}"
+    lines.append(f"frames with points in the cell ({kept}): {len(found.frames)}{more}")
+    lines += [
+        f"  {moment(frame.stamp)}  {frame.points:4} points, height {frame.height:.3f} m" for frame in found.frames
+    ]
     say("\n".join(lines))
     return COMPLETE
 
 
 def lines_of(found: Explanation) -> list[str]:
     """The explanation for a terminal."""
+    from recordings.comparison.text import moment
+
     verdict, reason = found.verdict.name.lower(), found.reason.name.lower()
-    lines = [f"cell ({found.x:.3f}, {found.y:.3f}) m at {found.stamp} ns: {verdict}, reason {reason}"]
+    lines = [f"cell ({found.x:.3f}, {found.y:.3f}) m at {moment(found.stamp)}: {verdict}, reason {reason}"]
     if found.recorded is not None and found.recorded != found.verdict:
         lines.append(f"the result has {found.recorded.name.lower()} here: from earlier frames, or by another version")
     return [*lines, *_cell_lines(found), *_pixel_lines(found), *_tilt_lines(found)]
@@ -97,13 +105,12 @@ def _cell_lines(found: Explanation | RegionalExplanation) -> list[str]:
         sigma = f" +- {math.sqrt(layers['variance']):.3f} m" if layers.get("variance", -1.0) >= 0 else ""
         points = f", {layers['count']:.0f} points" if "count" in layers else ""
         lines.append(f"height: {layers['elevation']:.3f} m{sigma}{points}")
-    lines.append("limits:")
-    lines += [f"  {name:<24} {_against(*values)}" for name, values in found.limits.items()]
-    turns = [
-        f"{turn.verdict.name.lower()} with {turn.parameter} = {_shown(turn.needed, turn.unit)} "
-        f"instead of {_shown(turn.now, turn.unit)}"
-        for turn in found.turns[:MAX_TURNS]
-    ]
+    if all(math.isnan(limit.value) for limit in found.limits.values()):
+        lines.append("no height, so no limit applies")
+    else:
+        lines.append("limits:")
+        lines += [f"  {name:<24} {_against(name, limit)}" for name, limit in found.limits.items()]
+    turns = [f"{turn.verdict.name.lower()} with {_change(found.stream, turn)}" for turn in found.turns[:MAX_TURNS]]
     return [*lines, *(turns or ["no single parameter of the hazard rule turns the verdict"])]
 
 
@@ -131,14 +138,27 @@ def _tilt_lines(found: Explanation) -> list[str]:
     return [f"tilt: up is {lean:.2f} deg off the z axis of '{found.tilt.frame_id}'{sigma}"]
 
 
-def _against(value: float, limit: float, unit: str) -> str:
+def _against(name: str, found: Limit) -> str:
+    value, limit, unit, made_of = found
+    more = f"; limit {_shown(limit, unit)} = {made_of}" if made_of else ""
     if math.isnan(value):
-        return f"unknown (limit {_shown(limit, unit)})"
+        return "none (only hidden cells have one)" if name == "drop" else f"unknown (limit {_shown(limit, unit)})"
     side = "exceeds" if value > limit else "within"
-    return f"{_shown(value, unit):>10} {side} {_shown(limit, unit)} by {_shown(abs(value - limit), unit)}"
+    return f"{_shown(value, unit):>10} {side} {_shown(limit, unit)} by {_shown(abs(value - limit), unit)}{more}"
+
+
+def _change(stream: str, turn: Turn) -> str:
+    """A change as --set takes it; its number is rounded away from the present one, so that it still turns."""
+    (needed, unit), (now, _) = _in_words(turn.needed, turn.unit), _in_words(turn.now, turn.unit)
+    step = 10.0 ** (math.floor(math.log10(needed)) - 2)
+    needed = (math.ceil if needed > now else math.floor)(needed / step) * step
+    return f"{stream}.{turn.parameter} = {_shown(needed, unit)} instead of {_shown(now, unit)}"
 
 
 def _shown(value: float, unit: str) -> str:
-    if unit == "rad":
-        value, unit = math.degrees(value), "deg"
+    value, unit = _in_words(value, unit)
     return f"{value:.3g} {unit}".strip()
+
+
+def _in_words(value: float, unit: str) -> tuple[float, str]:
+    return (math.degrees(value), "deg") if unit == "rad" else (value, unit)
