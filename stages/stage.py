@@ -20,11 +20,12 @@ MAX_CELLS = 4000  # cells, of a map
 class Stage:
     """Base of the stages: a frozen dataclass whose fields are its parameters and whose `__call__` is the work.
 
-    The docstring of a subclass gets a section Parameters, made from the fields, for `help()`.
+    The docstring of a subclass gets a section Parameters, made from all fields, for `help()`.
     """
 
     def __init_subclass__(cls) -> None:
-        rows = [f"{name}\n    {known.metadata['help']}" for name, known in vars(cls).items() if _is_parameter(known)]
+        known = {**getattr(cls, "__dataclass_fields__", {}), **vars(cls)}  # inherited ones first
+        rows = [f"{name}\n    {item.metadata['help']}" for name, item in known.items() if _is_parameter(item)]
         if cls.__doc__ and rows and "Parameters\n---" not in cls.__doc__:
             sections = re.split(r"\n\n(?=\w+\n---)", inspect.cleandoc(cls.__doc__))
             cls.__doc__ = "\n\n".join([sections[0], "\n".join(["Parameters", "----------", *rows]), *sections[1:]])
