@@ -19,7 +19,7 @@ from stages.terrain.fused_map import FusedMap, Observation, merged, variance_of,
 from stages.terrain.height_alignment import fit_plane, plane_height
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
 from stages.terrain.map_levelling import MapLevelling, StatedErrors
-from stages.terrain.map_region import map_around
+from stages.terrain.map_region import MARGIN, map_around
 from stages.terrain.map_registration import FrameGrid, frame_grid, register, with_plane
 
 MIN_OVERLAP_CELLS = 100  # of a frame and the map, for their heights to show a jump
@@ -193,17 +193,6 @@ class FuseRegion(_Fusion):
 
     The region starts again if the pose's frame changes. `mount` may be left out if the pose is the camera's.
     docs/terrain.md describes the alignment and the variance.
-
-    Examples
-    --------
-    >>> from stages import Tilt, Level
-    >>> cloud = PointCloud(0, np.float32([[0, 1, 3]]), np.zeros((1, 3), np.uint8), np.float32([0.01]), np.int32([0]),
-    ...                    "camera")
-    >>> level = Level()(cloud, Tilt(0, [0.0, -1.0, 0.0], "camera"))
-    >>> fuse, pose = FuseRegion(), Pose(0, [5, 0, 1], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
-    >>> region = fuse(level, pose, state=fuse.start())
-    >>> region.frame_id, region.level.translation.tolist()
-    ('odom', [5.0, 0.0, 0.0])
     """
 
     def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> Region:
@@ -230,11 +219,17 @@ class Fuse(_Fusion):
     (8.025, 0.0)
     """
 
-    window: float = parameter(20.0, "width of the map", unit="m", low=0.5, high=200.0)
+    window: float = parameter(20.0, "width of the map returned with each frame", unit="m", low=0.5, high=400.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_cells("Fuse.window", self.window, self.resolution)
+        min_window = 2 * (self.max_range + MARGIN)
+        if self.window < min_window:
+            raise ValueError(
+                f"Fuse.window must be at least {min_window:g} m, not {self.window:g} m: it contains all that a frame "
+                f"changes (max_range, {self.max_range:g} m) and {MARGIN:g} m around it"
+            )
 
     def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> ElevationMap:
         """The map around the rover, in the pose's frame, with a cloud in frame `level` merged in."""

@@ -41,7 +41,7 @@ sys.exit(program())
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
-    """Pairs of noise, too large to share a chunk, and the log of an import without interruption."""
+    """A folder with pairs of images and the log of an uninterrupted import. Noise fills a chunk with each image."""
     home, random = tmp_path_factory.mktemp("source"), np.random.default_rng(5)
     (home / "pairs").mkdir()
     for number in range(PAIRS):

@@ -10,14 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages import Binarise, Cell, PixelOrigin, TerrainFeatures
+from stages import Binarise, Cell, Fuse, PixelOrigin, TerrainFeatures
+from stages.data.tiles import Tiles
 from stages.terrain.fused_map import SHARED_SHARE
 from stages.terrain.map_registration import frame_grid, register
-from tests.stages.terrain.region_scene import MOUNT, SECOND, START, Fusing, cell, centres, drive, flat, part, rolling
+from tests.stages.running import Running
+from tests.stages.terrain.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
 
 
 def test_frames_at_any_heading_make_one_map_of_the_ground():
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame in range(12):
         cloud, pose = drive(frame)
         terrain = fuse(cloud, pose, MOUNT)
@@ -33,7 +35,7 @@ def test_a_rock_seen_from_two_headings_keeps_its_place():
     def with_rock(x, y):
         return np.where(np.hypot(x - 1.0, y - 2.0) < 0.3, 0.25, 0.0)
 
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame, at in enumerate([(-3.0, 2.0, 0.0), (1.0, -2.0, np.pi / 2), (4.0, 5.0, np.radians(-135))]):
         cloud, pose = drive(frame, with_rock, at=at)
         terrain = fuse(cloud, pose, MOUNT)
@@ -54,7 +56,7 @@ def test_cells_hidden_from_all_frames_differ_from_cells_out_of_view(monkeypatch)
     heights = iter((-0.2, -0.1))
     use_whole_frames(monkeypatch)
     monkeypatch.setattr("stages.terrain.fuse.frame_grid", hiding)
-    fuse = Fusing()
+    fuse = Running(Fuse())
     fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
     terrain = fuse(*drive(1, flat, at=(0.0, 0.0, 1.2)), MOUNT)
     assert [cell(terrain, *place, "occluded") for place in ((1.02, 0.02), (2.52, 0.02), (1.02, 2.22))] == [1, 0, 0]
@@ -71,7 +73,7 @@ def use_whole_frames(monkeypatch):
 
 def test_a_mean_over_frames_is_weighted_by_inverse_variance(monkeypatch):
     use_whole_frames(monkeypatch)
-    fuse = Fusing(tilt_sigma=0.0, height_sigma=0.0, position_sigma=0.0)
+    fuse = Running(Fuse(tilt_sigma=0.0, height_sigma=0.0, position_sigma=0.0))
     clouds = [
         drive(0, flat, at=(0.0, 0.0, 0.0)),
         drive(1, lambda x, y: flat(x, y) + 0.01, sigma=0.04, at=(0.0, 0.0, 0.0)),
@@ -94,7 +96,7 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance(monkeypatch):
 def test_position_errors_add_to_the_variance_of_steep_cells():
     variance, steep = {}, 0.2
     for position in (0.0, 0.05):
-        terrain = Fusing(position_sigma=position)(*drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0)), MOUNT)
+        terrain = Running(Fuse(position_sigma=position))(*drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0)), MOUNT)
         variance[position] = terrain.layers["variance"]
     known = np.isfinite(variance[0.0])
     added = float(np.mean((variance[0.05] - variance[0.0])[known]))
@@ -102,7 +104,7 @@ def test_position_errors_add_to_the_variance_of_steep_cells():
 
 
 def test_many_frames_do_not_reduce_the_variance_they_share():
-    fuse = Fusing(alignment_sigma=0.01, position_sigma=0.0)
+    fuse = Running(Fuse(alignment_sigma=0.01, position_sigma=0.0))
     for frame in range(40):
         cloud, pose = drive(frame, at=(0.0, 0.0, 0.3))
         terrain = fuse(cloud, pose, MOUNT)
@@ -114,7 +116,7 @@ def test_many_frames_do_not_reduce_the_variance_they_share():
 
 
 def test_cells_count_their_frames_and_keep_their_first_and_last_time():
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame in range(6):
         cloud, pose = drive(frame, at=(1.0 * frame, 0.0, 0.0))
         terrain = fuse(cloud, pose, MOUNT)
@@ -126,7 +128,7 @@ def test_cells_count_their_frames_and_keep_their_first_and_last_time():
 
 @pytest.mark.parametrize("gap", [0.0, 5.0, 12.0])
 def test_a_drifting_height_aligns_after_a_gap_and_makes_no_step(gap):
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame in range(90):
         along = 0.25 * frame + (gap if frame >= 60 else 0.0)
         cloud, pose = drive(frame, flat, at=(along, 0.0, 0.0), noise=0.005)
@@ -138,7 +140,7 @@ def test_a_drifting_height_aligns_after_a_gap_and_makes_no_step(gap):
 
 
 def test_a_clock_that_jumps_by_years_keeps_the_map():
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame in range(2):
         fuse(*drive(frame, flat, at=(0.0, 0.0, 0.0)), MOUNT)
     cloud, pose = drive(2, flat, at=(0.0, 0.0, 0.0))
@@ -150,7 +152,7 @@ def test_a_clock_that_jumps_by_years_keeps_the_map():
 def test_a_pose_in_a_frame_without_a_name_makes_the_same_map():
     maps = {}
     for name in ("odom", ""):
-        fuse = Fusing()
+        fuse = Running(Fuse())
         for frame in range(3):
             cloud, pose = drive(frame)
             maps[name] = fuse(cloud, replace(pose, frame_id=name), MOUNT)
@@ -164,7 +166,7 @@ def with_box(x, y):
 
 
 def test_newer_frames_clear_an_obstacle_that_is_gone():
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame in range(10):
         cloud, pose = drive(frame, with_box if frame < 5 else flat, at=(0.05 * frame, 0.0, 0.0))
         terrain = fuse(cloud, pose, MOUNT)
@@ -178,7 +180,7 @@ def test_newer_frames_clear_an_obstacle_that_is_gone():
 
 
 def test_one_uncertain_frame_does_not_overturn_many():
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame in range(6):
         cloud, pose = drive(frame, with_box, at=(0.05 * frame, 0.0, 0.0))
         fuse(cloud, pose, MOUNT)
@@ -188,10 +190,26 @@ def test_one_uncertain_frame_does_not_overturn_many():
     assert cell(terrain, 4.02, 0.02, "last") == 5.0
 
 
+def test_the_windows_laid_over_each_other_are_the_whole_map():
+    fuse, whole = Running(Fuse(max_range=7.0, window=17.0)), {}
+    for frame in range(12):
+        cloud, pose = drive(frame, at=(1.5 * frame - 9, 0.3 * frame, 0.2))
+        terrain = fuse(cloud, pose, MOUNT)
+        row, col = (round(place / 0.05) for place in terrain.origin[::-1])
+        for name, layer in terrain.layers.items():
+            whole.setdefault(name, Tiles(np.dtype("f4"))).write(
+                row, col, np.nan_to_num(layer), np.ones(layer.shape, bool)
+            )
+    cells = fuse.state.cells.read(-400, -400, 900, 900)
+    assert (cells["frames"] > 0).sum() > 50_000
+    np.testing.assert_array_equal(whole["elevation"].read(-400, -400, 900, 900), cells["height"])
+    np.testing.assert_array_equal(whole["frames"].read(-400, -400, 900, 900), cells["frames"])
+
+
 def test_equal_frames_give_equal_bits():
     maps = []
     for _ in range(2):
-        fuse = Fusing()
+        fuse = Running(Fuse())
         for frame in range(3):
             cloud, pose = drive(frame, noise=0.01)
             terrain = fuse(cloud, pose, MOUNT)
@@ -200,7 +218,7 @@ def test_equal_frames_give_equal_bits():
 
 
 def test_an_obstacle_that_appears_is_never_mapped_as_sure_flat_ground():
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame in range(16):
         ground, sigma = (with_box, 0.05) if frame >= 10 else (flat, 0.01)
         cloud, pose = drive(frame, ground, at=(0.0, 0.0, 0.0), sigma=sigma)
@@ -213,14 +231,14 @@ def test_an_obstacle_that_appears_is_never_mapped_as_sure_flat_ground():
 
 
 def test_an_empty_cloud_changes_nothing():
-    fuse = Fusing()
+    fuse = Running(Fuse())
     cloud, pose = drive(0)
     assert np.isnan(fuse(part(cloud, np.s_[:0]), pose, MOUNT).layers["elevation"]).all()
     assert np.isfinite(fuse(*drive(1), MOUNT).layers["elevation"]).any()
 
 
 def test_points_without_a_sigma_do_not_enter_the_map():
-    fuse, (cloud, pose) = Fusing(), drive(0)
+    fuse, (cloud, pose) = Running(Fuse()), drive(0)
     unsure = cloud.sigma.copy()
     left = cloud.points[:, 1] > 0
     unsure[left] = np.nan
@@ -235,21 +253,26 @@ def test_filled_points_do_not_enter_the_map():
     cloud, pose = drive(0)
     filled = cloud.points[:, 1] > 0
     partly_filled = replace(cloud, source=np.where(filled, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8))
-    terrain, expected = Fusing()(partly_filled, pose, MOUNT), Fusing()(part(cloud, ~filled), pose, MOUNT)
+    terrain, expected = Running(Fuse())(partly_filled, pose, MOUNT), Running(Fuse())(part(cloud, ~filled), pose, MOUNT)
     assert np.isfinite(terrain.layers["elevation"]).any()
     for name, layer in expected.layers.items():
         np.testing.assert_array_equal(terrain.layers[name], layer)
 
 
+def test_a_window_smaller_than_a_frame_is_refused():
+    with pytest.raises(ValueError, match=r"Fuse\.window must be at least 19 m, not 15 m"):
+        Fuse(max_range=8.0, window=15.0)
+
+
 TRACK = """
 import sys
 import numpy as np
-from stages import PointCloud, Pose, Transform
-from tests.stages.terrain.region_scene import Fusing
+from stages import Fuse, PointCloud, Pose, Transform
+from tests.stages.running import Running
 def peak():
     with open("/proc/self/status") as status:
         return next(int(line.split()[1]) / 1024 for line in status if line.startswith("VmHWM"))
-before, fuse, step = peak(), Fusing(max_range=11.0, window=25.0), 8.0
+before, fuse, step = peak(), Running(Fuse(max_range=11.0, window=25.0)), 8.0
 x, y = (axis.ravel() + 0.025 for axis in np.meshgrid(np.arange(-4, 4, 0.05), np.arange(-10, 10, 0.05)))
 points = np.column_stack([x, y, 0.1 * np.sin(x)]).astype(np.float32)
 n = len(points)

@@ -101,7 +101,7 @@ def test_a_later_frame_does_not_change_a_region():
 
 
 def test_fuse_returns_the_maps_of_both_stages():
-    at_once, fuse, maps = Running(Fuse(window=5.0)), Running(FuseRegion()), Running(MapRegion(window=5.0))
+    at_once, fuse, maps = Running(Fuse()), Running(FuseRegion()), Running(MapRegion())
     for frame in range(3):
         given = *drive(frame), MOUNT
         found, wanted = at_once(*given), maps(fuse(*given))

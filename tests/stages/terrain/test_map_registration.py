@@ -9,9 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flow.contracts import Severity
-from stages import Pose, Transform
+from stages import Fuse, Pose, Transform
 from stages.terrain.map_registration import register
-from tests.stages.terrain.region_scene import MOUNT, START, Fusing, centres, drive, flat, part, rolling
+from tests.stages.running import Running
+from tests.stages.terrain.region_scene import MOUNT, START, centres, drive, flat, part, rolling
 
 
 def heights(cloud, placed):
@@ -23,7 +24,7 @@ def heights(cloud, placed):
 
 
 def test_frames_with_tilt_errors_join_without_a_seam():
-    rng, fuse, seams, before = np.random.default_rng(3), Fusing(), [], None
+    rng, fuse, seams, before = np.random.default_rng(3), Running(Fuse()), [], None
     for frame in range(12):
         cloud, pose = drive(frame, tilt=tuple(rng.normal(0, np.radians(0.4), 2)), noise=0.01)
         now = [heights(cloud, placed) for placed in (register(cloud, pose, MOUNT)[0], fuse(cloud, pose, MOUNT).level)]
@@ -39,7 +40,7 @@ def test_frames_with_tilt_errors_join_without_a_seam():
 
 def leans_of_the_map(covariance):
     """Lean of the map that each frame is placed in, over the error of the first tilt; and the last map."""
-    fuse, lean, found = Fusing(), np.radians(0.6), []
+    fuse, lean, found = Running(Fuse()), np.radians(0.6), []
     for frame in range(61):
         cloud, pose = drive(frame, flat, tilt=(0.0 if frame else lean, 0.0), at=(0.25 * frame, 0.0, 0.0))
         terrain = fuse(part(cloud, np.s_[::10]), replace(pose, covariance=covariance), MOUNT)
@@ -64,7 +65,7 @@ def test_the_tilt_error_of_a_frame_does_not_tilt_the_map_of_a_precise_pose(covar
 
 
 def test_a_map_of_noisy_tilts_and_exact_poses_is_level_and_at_the_true_height():
-    tilts, fuse = np.radians(0.2) * np.random.default_rng(3).normal(size=(50, 2)), Fusing()
+    tilts, fuse = np.radians(0.2) * np.random.default_rng(3).normal(size=(50, 2)), Running(Fuse())
     for frame, tilt in enumerate(tilts):
         cloud, pose = drive(frame, tilt=tuple(tilt), at=(0.3 * frame, 0.0, 0.0))
         terrain = fuse(replace(part(cloud, np.s_[::20]), tilt_sigma=np.radians(0.2)), pose, MOUNT)
@@ -84,8 +85,8 @@ def test_a_pose_of_the_camera_gives_the_map_of_a_pose_of_the_rover():
     camera = base.after(MOUNT.base_from_camera)
     turn = Rotation.from_matrix(camera.rotation).as_quat()
     seen = [
-        Fusing()(cloud, pose, MOUNT),
-        Fusing()(cloud, Pose(pose.stamp, camera.translation, turn, "odom", "camera")),
+        Running(Fuse())(cloud, pose, MOUNT),
+        Running(Fuse())(cloud, Pose(pose.stamp, camera.translation, turn, "odom", "camera")),
     ]
     np.testing.assert_allclose(seen[0].level.translation, seen[1].level.translation, atol=1e-9)
     np.testing.assert_allclose(seen[0].layers["elevation"], seen[1].layers["elevation"], atol=1e-5)
@@ -117,7 +118,7 @@ def upside_down(pose):
     ],
 )  # fmt: skip
 def test_a_frame_that_cannot_be_registered_does_not_change_the_map(change, message):
-    fuse = Fusing()
+    fuse = Running(Fuse())
     fuse(*drive(0), MOUNT)
     before = fuse.state.cells.read(-300, -300, 600, 600)
     with pytest.raises(ValueError, match=message):
@@ -127,7 +128,7 @@ def test_a_frame_that_cannot_be_registered_does_not_change_the_map(change, messa
 
 @pytest.mark.parametrize(("degrees", "warned"), [(0, False), (3, False), (12, True)])
 def test_a_pose_in_a_frame_that_leans_is_a_warning(degrees, warned):
-    fuse, lean = Fusing(), Rotation.from_euler("x", degrees, degrees=True)
+    fuse, lean = Running(Fuse()), Rotation.from_euler("x", degrees, degrees=True)
     for frame in range(4):
         cloud, pose = drive(frame)
         quaternion = (lean * Rotation.from_quat(pose.quaternion)).as_quat()
@@ -140,7 +141,7 @@ def test_a_pose_in_a_frame_that_leans_is_a_warning(degrees, warned):
 
 
 def test_a_refused_frame_does_not_count_as_leaning():
-    fuse, lean = Fusing(), Rotation.from_euler("x", 29, degrees=True)
+    fuse, lean = Running(Fuse()), Rotation.from_euler("x", 29, degrees=True)
     for frame in range(3):
         fuse(*drive(frame), MOUNT)
     for frame in (3, 4):
@@ -153,7 +154,7 @@ def test_a_refused_frame_does_not_count_as_leaning():
 
 @pytest.mark.parametrize("jump", [np.array([0, 0, up]) for up in (0.6, -0.4, 30.0, -1e3, 1e6)])
 def test_a_pose_that_jumps_is_refused_and_the_third_time_resets_the_map(jump):
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame in range(5):
         terrain = fuse(*drive(frame), MOUNT)
     for frame in (5, 6):
@@ -186,7 +187,7 @@ def leaning(frame, degrees, up=0.0):
     ({"tilt_sigma": 0.05}, (0, 3, -4, 5, -3, 4)), ({"height_sigma": 0.002}, (0.0, 0.4, -0.3, 0.5, -0.4, 0.3)),
 ])  # fmt: skip
 def test_a_change_within_the_stated_height_and_tilt_errors_is_no_jump(sigmas, degrees):
-    fuse = Fusing(**sigmas)
+    fuse = Running(Fuse(**sigmas))
     for frame, angle in enumerate(degrees):
         terrain = fuse(*leaning(frame, angle), MOUNT)
     assert terrain.layers["frames"].max() == len(degrees)
@@ -194,7 +195,7 @@ def test_a_change_within_the_stated_height_and_tilt_errors_is_no_jump(sigmas, de
 
 
 def test_a_tilt_that_jumps_is_refused_with_its_degrees():
-    fuse = Fusing()
+    fuse = Running(Fuse())
     for frame in range(3):
         fuse(*drive(frame), MOUNT)
     with pytest.raises(ValueError, match=r"and [3-6]\.\d degrees off the map"):
@@ -202,7 +203,7 @@ def test_a_tilt_that_jumps_is_refused_with_its_degrees():
 
 
 def test_a_pose_in_another_frame_resets_the_map():
-    fuse, fresh = Fusing(), Fusing()
+    fuse, fresh = Running(Fuse()), Running(Fuse())
     fuse(*drive(0), MOUNT)
     cloud, pose = drive(1)
     lost = replace(pose, frame_id="visual_odom/2")

@@ -31,7 +31,8 @@ from stages.data import (
 from stages.terrain.binarise import Binarise
 from stages.terrain.dem import Voxelise
 from stages.terrain.features import TerrainFeatures
-from tests.stages.terrain.region_scene import Fusing
+from stages.terrain.fuse import Fuse
+from tests.stages.running import Running
 from tests.stages.terrain.terrain_scene import (
     HEIGHT,
     ROCKS,
@@ -144,7 +145,7 @@ def test_the_edge_of_a_drop_is_not_free_in_the_regional_map() -> None:
     exact = profile_disparity(lambda x: np.where(x < 4.5, 0.0, -3.0))
     cloud = Level(camera_height=HEIGHT)(Clean()(Reproject()(blank_frame(), as_disparity(exact))), Tilt(7, UP, "camera"))
     pose = Pose(7, [100.0, 50.0, 3.0], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
-    elevation = TerrainFeatures()(Fusing()(cloud, pose))
+    elevation = TerrainFeatures()(Running(Fuse())(cloud, pose))
     ahead = elevation.origin[0] - 100 + (np.arange(elevation.shape[1]) + 0.5) * elevation.resolution
     lane = elevation.shape[0] // 2 + np.arange(-15, 15)
     cells, blind = (Binarise(**limits)(elevation).cells[lane] for limits in ({}, BLIND))
