@@ -16,6 +16,7 @@ import numpy as np
 
 from flow.contracts import StageError
 from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
+from stages.matching.denoise import denoised
 from stages.matching.image_noise import noise_levels
 from stages.matching.intensity import eight_bit, gray
 from stages.matching.kernels.prior_cost import MAX_GAIN, prior_costs
@@ -23,7 +24,7 @@ from stages.matching.kernels.row_ranges import Range, lanes_for, row_ranges, who
 from stages.matching.kernels.semiglobal import Matches, match
 from stages.matching.kernels.sgm_local import SearchWindows, windows_around
 from stages.matching.kernels.sgm_params import SgmParams
-from stages.matching.kernels.texture import gradient, information, match_variance, stereo_noise
+from stages.matching.kernels.texture import gradient, information, match_variance, noise_ratio
 from stages.stage import Stage, check_rectified, parameter
 
 F32 = np.float32
@@ -104,6 +105,9 @@ class Match(Stage):
     weak_texture_gain: float = parameter(
         4.0, "factor of `prior_weight` where noise leaves a match uncertain by 1 px", low=1, high=MAX_GAIN
     )
+    denoise: bool = parameter(
+        False, "remove noise beyond 1.25 gray levels, as the image and the prior show it, from the images to match"
+    )  # fmt: skip
     search_radius: int = parameter(
         0, "distance from the prior that is searched at least; pixels without a prior are not searched; 0: the whole"
         " range everywhere",
@@ -146,7 +150,10 @@ class Match(Stage):
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
         search = self._search_range(frame.camera)
         area = self._search_area(prior, search, len(left))
-        guide = None if prior is None else self._prior_costs(prior, search, area, left, right)
+        guide = None
+        if prior is not None:
+            gain, left, right = self._noise_measures(prior, left, right)
+            guide = self._prior_costs(prior, search, area, gain)
         excluded = None if prior is None else self._excluded(prior, search, area)
         found = match(left, right, self._params(search), guide, area, excluded, self.threads, self.max_memory << 20)
         if prior is not None and self.out_of_range == "prior" and not self.search_radius:
@@ -199,20 +206,32 @@ class Match(Stage):
             return row_ranges(prior.pixels, self.band_height, search.start, len(search), self.threads)
         return whole_range(rows, len(search))
 
+    def _noise_measures(self, prior: Disparity, left: Array, right: Array) -> tuple[Array | None, Array, Array]:
+        """What noise asks for: the factor of `prior_weight` in each block of pixels, or None, and the images to match.
+
+        Noise is what the left image shows as such and what the two images do not share at the prior's disparities.
+        """
+        weighted = self.prior_weight > 0 and self.weak_texture_gain > 1
+        if not weighted and not self.denoise:
+            return None, left, right
+        slopes, noise = (gradient(left), gradient(right)), noise_levels(left)
+        ratio = noise_ratio(prior.pixels, left, slopes, noise, self.threads)
+        gain = None
+        if weighted:
+            seen = information(left, slopes[0], noise * F32(math.sqrt(max(ratio, 1))), self.threads)
+            gain = 1 + F32(self.weak_texture_gain - 1) * np.minimum(match_variance(seen), 1)
+        if self.denoise:
+            left, right = denoised((left, right), noise * F32(math.sqrt(min(ratio, 1))))
+        return gain, left, right
+
     def _prior_costs(
-        self, prior: Disparity, search: range, area: SearchArea, image: Array, other: Array
+        self, prior: Disparity, search: range, area: SearchArea, gain: Array | None
     ) -> tuple[Array, Array]:
         if isinstance(area, SearchWindows):
             first, lanes = area.first, area.width.lanes
         else:
             firsts = [np.full((each.end - each.top, 1), search.start + each.first, np.int32) for each in area]
             first, lanes = np.concatenate(firsts), lanes_for(len(search))
-        gain = None
-        if self.prior_weight and self.weak_texture_gain > 1:
-            slopes = gradient(image), gradient(other)
-            noise = stereo_noise(prior.pixels, image, slopes, noise_levels(image), self.threads)
-            variance = match_variance(information(image, slopes[0], noise, self.threads))
-            gain = 1 + F32(self.weak_texture_gain - 1) * np.minimum(variance, 1)
         return prior_costs(prior.pixels, first, lanes, self.prior_weight, MAX_PRIOR_DISTANCE, self.threads, gain)
 
     def _excluded(self, prior: Disparity, search: range, area: SearchArea) -> Array:

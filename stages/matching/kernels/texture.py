@@ -44,9 +44,18 @@ def information_scale(noise: Array) -> Array:
 def stereo_noise(pixels: Array, image: Array, slopes: tuple[Array, Array], noise: Array, threads: int = 1) -> Array:
     """The noise (256,) that both images together show: at least the one given, of the left image alone.
 
-    Compression removes the noise of smooth blocks, but not the differences of two images of the same ground. pixels:
-    (H, W) float32, px, NaN = none, disparities; image: left, (H, W) uint8; slopes: the images' `gradient`; noise:
-    (256,) float32, standard deviation at each gray level.
+    Compression removes the noise of smooth blocks, but not the differences of two images of the same ground.
+    Parameters are those of `noise_ratio`.
+    """
+    return np.asarray(noise * F32(np.sqrt(max(noise_ratio(pixels, image, slopes, noise, threads), 1.0))))
+
+
+def noise_ratio(pixels: Array, image: Array, slopes: tuple[Array, Array], noise: Array, threads: int = 1) -> float:
+    """What the two images do not share at the disparities, over the noise of the left image: a ratio of variances.
+
+    Above 1 where compression has removed the noise of smooth blocks; below 1 where fine texture looks like noise. 1
+    where too few pixels have a disparity. pixels: (H, W) float32, px, NaN = none, disparities; image: left, (H, W)
+    uint8; slopes: the images' `gradient`; noise: (256,) float32, standard deviation at each gray level.
     """
     rows, cols = (extent // PATCH for extent in image.shape)
     sums = np.zeros((2, rows, cols), np.float32)
@@ -56,9 +65,8 @@ def stereo_noise(pixels: Array, image: Array, slopes: tuple[Array, Array], noise
     ))  # fmt: skip
     total, count = sums[:, sums[1] >= PATCH**2 / 4]
     if not count.size:
-        return noise
-    factor = float(np.quantile(total / count, DIFFERENT_SHARE)) / (NOISE_GAIN / GRADIENT_GAIN**2)
-    return np.asarray(noise * F32(np.sqrt(max(factor, 1.0))))
+        return 1.0
+    return float(np.quantile(total / count, DIFFERENT_SHARE)) / (NOISE_GAIN / GRADIENT_GAIN**2)
 
 
 @kernel
