@@ -64,6 +64,17 @@ def test_a_difference_is_also_a_message_that_only_one_result_has(plain, variant_
     assert "/nav/elevation_map: 0 of 0 messages differ, " in capsys.readouterr().out
 
 
+def test_results_of_other_logs_show_the_digests_of_the_logs(traverse, plain, tmp_path, capsys):
+    log, out = tmp_path / traverse.name, tmp_path / "out.mcap"
+    log.write_bytes(traverse.read_bytes() + b"\0")  # a byte that is reported as not read
+    assert roverflow("run", log, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 3
+    capsys.readouterr()
+    roverflow("diff", plain, out, "--json")
+    facts = json.loads(capsys.readouterr().out)["facts"]
+    assert list(facts) == ["log_digest"]
+    assert facts["log_digest"][0] != facts["log_digest"][1]
+
+
 def test_copied_inputs_are_counted_and_not_compared(traverse, plain, tmp_path, capsys):
     out = tmp_path / "out.mcap"
     assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0

@@ -43,11 +43,12 @@ def replay(
     from flow.config import loader as pipelines
     from flow.runtime.interrupts import Stop, interrupts
     from flow.runtime.run import run
+    from recordings.containers.digest import log_digest
     from stages.kernel_loading import loading_kernels
 
     graph = pipelines.load(pipeline, overrides)
     logs = (log,) if isinstance(log, Path) else tuple(log)
-    _refuse_results(graph, logs)
+    files = _files(graph, logs)
     inputs = tuple(map(str, logs)) if with_inputs else ()
     given = {"live_port": live_port, "profile": profile, "desk": desk, "inputs": inputs}
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
@@ -58,7 +59,8 @@ def replay(
             "roverflow": product_version(),
             "pipeline": graph.text,
             "overrides": "\n".join(overrides),
-            "log": ", ".join(path.name for path in ([log] if isinstance(log, Path) else log)),
+            "log": ", ".join(path.name for path in logs),
+            "log_digest": log_digest(files) if files else "",
             "start": "" if start is None else repr(float(start)),
             "end": "" if end is None else repr(float(end)),
             "every": "" if every is None else str(every),
@@ -82,16 +84,21 @@ def replay(
     return as_json(summary | {"overrides": list(overrides)})
 
 
-def _refuse_results(graph: Graph, logs: Sequence[Path]) -> None:
-    """Refuse a log of the product's own source that is already a result, which may contain its inputs."""
+def _files(graph: Graph, logs: Sequence[Path]) -> Sequence[Path]:
+    """The files that the product's own source reads, none for another source.
+
+    Raises LogError for a file that is already a result, which may contain its inputs.
+    """
     from recordings import McapSource
     from recordings.containers.finding import find_files
     from recordings.errors import LogError
     from recordings.scoring.result_log import about_run
 
-    for file in find_files(logs).files if isinstance(graph.source, McapSource) else ():
-        if file.is_file() and (about := about_run(file)):
+    files = [file for file in find_files(logs).files if file.is_file()] if isinstance(graph.source, McapSource) else []
+    for file in files:
+        if about := about_run(file):
             raise LogError(f"{file} contains results; run the log that they were made from, {about.get('log', '')}")
+    return files
 
 
 def _with(sink: Any, given: Mapping[str, Any]) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,10 +11,9 @@ from typing import Any
 
 from flow.cli.fleet.catalogue import ENDED
 from flow.errors import UsageError
+from recordings.containers.digest import log_digest
 from recordings.containers.finding import RESULT_ENDING, SUFFIXES, find_files
 from recordings.errors import LogError
-
-SAMPLE_BYTES = 1 << 20  # at the beginning and at the end of a file, for its digest
 
 
 @dataclass(frozen=True)
@@ -109,16 +107,9 @@ def _in_folder(path: Path, folder: Path) -> Iterable[Path]:
 def _job(log: Path, root: Path) -> Job:
     files = find_files(log).files
     name = log.relative_to(root)
-    digest = hashlib.blake2b(digest_size=16)
-    for file in files:
-        try:
-            size = file.stat().st_size
-            with file.open("rb") as stream:
-                digest.update(f"{file.name} {size} ".encode("utf-8", "surrogateescape"))
-                digest.update(stream.read(SAMPLE_BYTES))
-                stream.seek(max(0, size - SAMPLE_BYTES))
-                digest.update(stream.read(SAMPLE_BYTES))
-        except OSError as error:
-            raise UsageError(f"cannot read {file}: {error.strerror or error}") from error
-    size = sum(file.stat().st_size for file in files)
-    return Job((name if log.is_dir() else name.with_suffix("")).as_posix(), log, size, digest.hexdigest())
+    try:
+        digest = log_digest(files)
+        size = sum(file.stat().st_size for file in files)
+    except OSError as error:
+        raise UsageError(f"cannot read {error.filename}: {error.strerror or error}") from error
+    return Job((name if log.is_dir() else name.with_suffix("")).as_posix(), log, size, digest)
