@@ -30,6 +30,7 @@ VIEWER_COLORMAPS = {  # the viewer's own, by OpenCV's
     cv2.COLORMAP_INFERNO: rr.components.Colormap.Inferno,
 }
 LEGEND_ROW = (0.14, 0.2)  # height of a single row of a legend, and of several, share of the picture's height
+HEADROOM = 0.35  # above the first row of a legend, share of the height of a row
 
 
 @dataclass(eq=False)
@@ -191,11 +192,11 @@ class Canvas:
             dots = [((1.1 + 0.7 * column) * width, (row + 0.5) * height / rows) for row, column in places]
             pins = [(x + 0.33 * width, y - 0.45 * height / rows) for x, y in dots]  # a label is centred below its pin
         else:
-            dots = [
-                ((column + 0.5) * width / columns, (row - rows) * LEGEND_ROW[rows > 1] * height)
-                for row, column in places
-            ]
+            row_height = LEGEND_ROW[rows > 1] * height
+            dots = [((column + 0.5) * width / columns, (row - rows) * row_height) for row, column in places]
             pins = dots
+            # The view ends at the uppermost point, so an invisible one keeps the first row's dots whole.
+            dots, colors = [*dots, (width / 2, -(rows + HEADROOM) * row_height)], [*colors, (0, 0, 0, 0)]
         dot, pin = rr.Radius.ui_points(5.0), rr.Radius.ui_points(0.5)
         self.keep(path, content, lambda: rr.Points2D(dots, colors=colors, radii=dot, draw_order=30.0))
         # A label takes the colour of its dot, which may be as dark as the background, so labels have dots of their own.
