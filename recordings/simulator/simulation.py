@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -210,7 +210,7 @@ class Simulation:
         cover = texture.Cover(
             self.sand, self.dust, self.bedrock, self.sand_contrast, self.gravel_contrast, self.ripples
         )  # fmt: skip
-        return texture.make_texture(self._rng(1), self.sun, cover, self._rng(6))
+        return _texture(self.seed, tuple(self.sun.tolist()), cover)
 
     @cached_property
     def mounts(self) -> tuple[Transform, Transform, Transform]:
@@ -343,3 +343,9 @@ class Simulation:
 
     def _rng(self, *stream: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, *stream])
+
+
+@lru_cache(maxsize=1)  # variants of a simulation mostly have its texture, which takes seconds to make
+def _texture(seed: int, sun: tuple[float, float, float], cover: texture.Cover) -> texture.Texture:
+    gravel, others = (np.random.default_rng([seed, stream]) for stream in (1, 6))
+    return texture.make_texture(gravel, np.array(sun), cover, others)
