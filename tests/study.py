@@ -7,7 +7,7 @@ command line.
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -28,8 +28,7 @@ PLAIN: dict[str, Any] = {
     "edge_radius": 0, "min_confidence": 0, "subpixel_radius": 0, "support": False,
 }  # fmt: skip
 LAST: dict[str, Any] = {"bilateral_radius": 0, "edge_radius": 0, "support": False}
-SEEDS = (1, 2, 3)
-ABUNDANCES = (0.05, 0.15, 0.10)
+ABUNDANCES = {1: 0.05, 2: 0.15, 3: 0.10}  # of rocks, by seed
 PLANE, STEP, CONTRASTS = 25, 8, (0, 2, 4, 8)  # px, side and spacing of planes; gray levels from which classes begin
 EDGE_STEP, EDGE_REACH = 2.0, 3  # px of disparity that make an edge of depth, px from it that count as near
 SOURCE_COLOURS = np.full((len(PixelOrigin), 3), 40, np.uint8)
@@ -51,18 +50,16 @@ class Case(NamedTuple):
 Chain = Callable[[dict[str, Any], Case], Disparity]
 
 
-def simulated(width: int = 640, height: int = 480) -> list[Case]:
+def simulated(width: int = 640, height: int = 480, seeds: Iterable[int] = ABUNDANCES) -> Iterator[Case]:
     """Frames of simulated traverses, of the ground within the search range."""
-    cases = []
-    for seed, abundance in zip(SEEDS, ABUNDANCES, strict=True):
-        simulation = Simulation(frames=4, width=width, height=height, seed=seed, abundance=abundance)
+    for seed in seeds:
+        simulation = Simulation(frames=4, width=width, height=height, seed=seed, abundance=ABUNDANCES[seed])
         camera, found = simulation.camera, simulation.frame(1)
         truth = (camera.fx * camera.baseline / found.depth).astype(np.float32)
         disparities = 192 * width // 1280
         truth[(truth <= 0) | (truth > disparities - 2)] = np.nan
         frame = StereoFrame(seed, *found.images, camera)
-        cases.append(Case(f"seed {seed}", frame, truth, found.seen, disparities, frame))
-    return cases
+        yield Case(f"seed {seed}", frame, truth, found.seen, disparities, frame)
 
 
 def real(folder: Path) -> Iterator[Case]:
@@ -360,7 +357,7 @@ def main(folder: Path) -> None:
             }
             print_scatter(name, frame, ways)
             pictures(folder, name, frame, ways["accurate"])
-    cases = simulated()
+    cases = list(simulated())
     print_table("simulated frames", measure(cases), None)
     print_fills(cases)
     print_skies(cases)

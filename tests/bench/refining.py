@@ -77,6 +77,7 @@ def _needed(pipeline: str, given: frozenset[str]) -> tuple[Any, ...]:
     return tuple(reversed(needed))
 
 
+@functools.cache
 def stage(pipeline: str, name: str) -> Any:
     """The stage that makes a stream of a pipeline."""
     return next(node.actor for node in load(pipeline).nodes if node.name == name)

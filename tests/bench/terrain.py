@@ -77,15 +77,21 @@ def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
     samples, noise = deque[Token](), TiltNoise()
     for sample in range(max(number - WINDOW, 0), number + TILT_SAMPLES + 1):
         at = simulation.begin + round(sample / simulation.tilt_rate * 1e9)
-        random = np.random.default_rng([simulation.seed, 4, sample])
-        base, mount = simulation.base_at(at), simulation.mounts[2]
-        reading = traverse.inclinometer_reading(base, mount, simulation.tilt_noise, random)
-        up = Rotation.from_quat(reading).as_matrix()[2]
-        samples.append(Token(at, noise(Tilt(at, up / np.linalg.norm(up)))))
+        samples.append(Token(at, noise(Tilt(at, measured_up(simulation, sample, at)))))
     aligner = next(node.actor for node in nodes(pipeline) if node.name == "tilt")
     tilt = aligner.choose("tilt", "inclinometer", stamp, samples, " by the log's end")
     assert isinstance(tilt, Tilt), tilt
     return tilt
+
+
+@cache
+def measured_up(simulation: Simulation, sample: int, at: int) -> Array:
+    """A sample of the inclinometer, (3,)."""
+    random = np.random.default_rng([simulation.seed, 4, sample])
+    base, mount = simulation.base_at(at), simulation.mounts[2]
+    reading = traverse.inclinometer_reading(base, mount, simulation.tilt_noise, random)
+    up = Rotation.from_quat(reading).as_matrix()[2]
+    return np.asarray(up / np.linalg.norm(up))
 
 
 def tilt_errors(pipeline: str, simulation: Simulation) -> Array:
