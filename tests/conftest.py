@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from flow.cli.main import main
 from recordings.ros2.cdr import TYPES
 
-settings.register_profile("untimed", deadline=None)  # the first example may compile a kernel
+settings.register_profile("untimed", deadline=None, max_examples=50)  # the first example may compile a kernel
 settings.load_profile("untimed")
 
 FRAMES = 4
@@ -36,6 +36,20 @@ def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("result") / "out.mcap"
     assert roverflow("run", traverse, *SMALL, "-o", out, "--summary", out.with_suffix(".json")) == 0
     return out
+
+
+@pytest.fixture(scope="session")
+def fast_result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The traverse, run through the fastest pipeline."""
+    out = tmp_path_factory.mktemp("fast") / "out.mcap"
+    assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
+    return out
+
+
+def slow(*cases: Any) -> list[Any]:
+    """Cases of a test that only `make check-all` runs."""
+    several = (case if isinstance(case, tuple) else (case,) for case in cases)
+    return [pytest.param(*values, marks=pytest.mark.slow) for values in several]
 
 
 def roverflow(*arguments: object) -> int:

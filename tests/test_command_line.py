@@ -27,7 +27,7 @@ from recordings.simulator import Simulation
 from recordings.simulator.traverse import level_pose
 from recordings.sinks.mcap_sink import McapSink
 from stages.data import PixelOrigin, known
-from tests.conftest import FRAMES, SMALL, rewrite, roverflow
+from tests.conftest import FRAMES, SMALL, rewrite, roverflow, slow
 
 ROOT = Path(__file__).parent.parent
 RESULTS = {
@@ -190,7 +190,7 @@ def test_the_recording_verifies_and_contains_every_intermediate(result):
         assert any(f"/{stream}" in path for path in paths), (stream, sorted(paths))
 
 
-@pytest.mark.parametrize("pipeline", ["rover", "paper"])
+@pytest.mark.parametrize("pipeline", ["rover", *slow("paper")])
 def test_results_do_not_depend_on_the_number_of_workers(traverse, tmp_path, pipeline):
     logs = []
     for workers in (1, 4):
@@ -414,7 +414,7 @@ sys.exit(program.program())
     assert (done.returncode, done.stdout) == (130, "INCOMPLETE\n")
 
 
-@pytest.mark.parametrize("closed", ["stdout", "stderr"])
+@pytest.mark.parametrize("closed", ["stdout", *slow("stderr")])
 def test_the_program_works_without_stdout_or_stderr(traverse, tmp_path, closed):
     arguments = ["run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--end", "0.8"]
     command = ["bash", "-c", f'"$@" {"" if closed == "stdout" else "2"}>&-', "bash"]

@@ -22,14 +22,9 @@ def variant_of(traverse, tmp_path_factory):
     return make
 
 
-@pytest.fixture(scope="module")
-def plain(variant_of):
-    return variant_of()
-
-
-def test_a_run_and_the_same_run_are_equal(plain, variant_of, capsys):
-    assert roverflow("diff", plain, plain) == 0
-    assert roverflow("diff", plain, variant_of()) == 0
+def test_a_run_and_the_same_run_are_equal(fast_result, variant_of, capsys):
+    assert roverflow("diff", fast_result, fast_result) == 0
+    assert roverflow("diff", fast_result, variant_of()) == 0
     assert capsys.readouterr().out.splitlines()[-1].startswith("equal: all ")
 
 
@@ -42,14 +37,14 @@ def test_a_run_and_the_same_run_are_equal(plain, variant_of, capsys):
     ],
 )
 def test_the_first_difference_is_in_the_stream_that_a_setting_touches(
-    plain, variant_of, capsys, tmp_path, change, topic, measure
+    fast_result, variant_of, capsys, tmp_path, change, topic, measure
 ):
     capsys.readouterr()
     other = variant_of(change)
     capsys.readouterr()
-    assert roverflow("diff", plain, other, "--json", "-o", tmp_path / "diff.rrd") == 3
+    assert roverflow("diff", fast_result, other, "--json", "-o", tmp_path / "diff.rrd") == 3
     found = json.loads(capsys.readouterr().out)
-    first = min(stamp for name, stamp, _ in iter_decoded(plain, [topic]))
+    first = min(stamp for name, stamp, _ in iter_decoded(fast_result, [topic]))
     assert found["first"] == [topic, first]
     assert found["topics"][topic]["worst"][measure] > 0
     assert found["facts"] == {"overrides": [SMALL[1], f"{SMALL[1]}\n{change}"]}
@@ -58,33 +53,33 @@ def test_the_first_difference_is_in_the_stream_that_a_setting_touches(
     assert (tmp_path / "diff.rrd").stat().st_size > 10_000
 
 
-def test_a_difference_is_also_a_message_that_only_one_result_has(plain, variant_of, tmp_path, capsys):
+def test_a_difference_is_also_a_message_that_only_one_result_has(fast_result, variant_of, tmp_path, capsys):
     other = variant_of("McapSink.results=[disparity]")
-    assert roverflow("diff", plain, other) == 3
+    assert roverflow("diff", fast_result, other) == 3
     assert "/nav/elevation_map: 0 of 0 messages differ, " in capsys.readouterr().out
 
 
-def test_results_of_other_logs_show_the_digests_of_the_logs(traverse, plain, tmp_path, capsys):
+def test_results_of_other_logs_show_the_digests_of_the_logs(traverse, fast_result, tmp_path, capsys):
     log, out = tmp_path / traverse.name, tmp_path / "out.mcap"
     log.write_bytes(traverse.read_bytes() + b"\0")  # a byte that is reported as not read
     assert roverflow("run", log, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 3
     capsys.readouterr()
-    roverflow("diff", plain, out, "--json")
+    roverflow("diff", fast_result, out, "--json")
     facts = json.loads(capsys.readouterr().out)["facts"]
     assert list(facts) == ["log_digest"]
     assert facts["log_digest"][0] != facts["log_digest"][1]
 
 
-def test_copied_inputs_are_counted_and_not_compared(traverse, plain, tmp_path, capsys):
+def test_copied_inputs_are_counted_and_not_compared(traverse, fast_result, tmp_path, capsys):
     out = tmp_path / "out.mcap"
     assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
     capsys.readouterr()
-    assert roverflow("diff", out, plain) == 0
+    assert roverflow("diff", out, fast_result) == 0
     assert re.search(r"^equal: all .*\n\d+ topics of the input copied in A only$", capsys.readouterr().out, re.M)
 
 
-def test_a_log_without_results_is_refused(traverse, plain, tmp_path, capsys):
-    assert roverflow("diff", plain, traverse) == 2
+def test_a_log_without_results_is_refused(traverse, fast_result, tmp_path, capsys):
+    assert roverflow("diff", fast_result, traverse) == 2
     assert "is not a result log; give two logs that roverflow run wrote" in capsys.readouterr().err
-    assert roverflow("diff", plain, tmp_path / "missing.mcap") == 2
+    assert roverflow("diff", fast_result, tmp_path / "missing.mcap") == 2
     assert "missing.mcap: No such file or directory" in capsys.readouterr().err

@@ -22,13 +22,6 @@ from tests.conftest import SMALL, rewrite, roverflow
 AT = 1.0
 
 
-@pytest.fixture(scope="module")
-def fast_result(traverse, tmp_path_factory):
-    out = tmp_path_factory.mktemp("fast") / "out.mcap"
-    assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
-    return out
-
-
 def messages(result, topic):
     return {stamp: message for _, stamp, message in iter_decoded(result, [topic])}
 

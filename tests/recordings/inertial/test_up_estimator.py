@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from recordings.inertial.blocks import InertialSample
 from recordings.inertial.up_estimator import UpEstimator
 from stages.data import Tilt
+from tests.conftest import slow
 from tests.recordings.inertial.drive import drive, estimated
 from tests.recordings.sample_log import data_folder
 
@@ -22,13 +23,15 @@ def rms(values):
     ("changes", "largest", "first"),
     [
         ({}, 0.2, 0.12),
-        ({"rest": 0}, 0.3, 0.55),
         ({"rest": 0, "gyroscope_bias": 0.05}, 0.5, 0.85),
-        ({"speed": 1.5}, 0.32, 0.12),
-        ({"vibration": 2.0}, 0.37, 0.12),
-        ({"rate": 400, "accelerometer_bias": 0.03}, 0.35, 0.45),
-        ({"gravity": 3.71}, 0.45, 0.14),
-        ({"gravity": 1.62}, 0.75, 0.18),
+        *slow(
+            ({"rest": 0}, 0.3, 0.55),
+            ({"speed": 1.5}, 0.32, 0.12),
+            ({"vibration": 2.0}, 0.37, 0.12),
+            ({"rate": 400, "accelerometer_bias": 0.03}, 0.35, 0.45),
+            ({"gravity": 3.71}, 0.45, 0.14),
+            ({"gravity": 1.62}, 0.75, 0.18),
+        ),
     ],
 )
 def test_up_is_right_at_rest_and_while_driving(changes, largest, first):

@@ -351,6 +351,7 @@ def test_odometry_without_errors_is_exact():
         np.testing.assert_allclose(pose.position, expected.translation, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_odometry_has_the_scale_error_and_heading_drift_of_its_settings():
     """Over many drives, the errors of heading and of lateral position grow with the distance as the model states."""
     long, scale, turn = 16.0, 0.02, np.radians(0.5)

@@ -9,6 +9,7 @@ from stages.matching.kernels.aggregation import aggregate_reference, aggregate_r
 from stages.matching.kernels.census import census_costs_reference, census_reference
 from stages.matching.kernels.matching_inputs import NO_PRIOR, MatchingInputs, matching_inputs
 from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
+from tests.conftest import slow
 from tests.stages.matching.test_census import params_of
 from tests.stages.matching.test_match_opencv import textured
 
@@ -21,7 +22,7 @@ def sweep(costs, inputs, params, paths, step, sums, total, final, width):
         aggregate_row(inputs, params, 0, costs[y], paths, y, step, sums, y * size, total[y], final, width)
 
 
-@pytest.mark.parametrize("lanes", [16, 96, 192])
+@pytest.mark.parametrize("lanes", [96, *slow(16, 192)])
 @pytest.mark.parametrize("paths", [4, 8])
 @pytest.mark.parametrize(("height", "columns"), [(9, 23), (30, 5)])
 @pytest.mark.parametrize("pull", [None, (0.5, 4.0), (16.0, 64.0)])  # weight and reach: the last costs more than 255

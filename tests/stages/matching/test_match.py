@@ -248,6 +248,7 @@ def test_a_wrong_prior_does_not_overrule_the_images(slope):
     assert np.nanmedian(np.abs(pixels - truth)) < 0.15
 
 
+@pytest.mark.slow
 def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
     simulation = Simulation(scene="gravel", frames=3, width=480, height=360)
     parts = []

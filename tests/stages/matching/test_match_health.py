@@ -39,10 +39,15 @@ def test_of_a_camera_that_hangs_upside_down_the_nearest_ground_is_above(up, near
     assert Running(CheckMatches())(disparity_with(matched), tilt, Mount(0, np.eye(3))).near == near
 
 
-@pytest.mark.parametrize("pipeline", ["accurate", "rover", "fast"])
-def test_only_a_search_range_that_ends_short_of_the_ground_is_a_warning(pipeline):
+@pytest.fixture(scope="module")
+def frame():
+    """A simulated frame of ground up to 46 px near."""
     simulation = Simulation(frames=1, width=320, height=240, seed=1, abundance=0.1)
-    frame = StereoFrame(1, *simulation.frame(0).images, simulation.camera)  # of ground up to 46 px near
+    return StereoFrame(1, *simulation.frame(0).images, simulation.camera)
+
+
+@pytest.mark.parametrize("pipeline", ["accurate", "rover", "fast"])
+def test_only_a_search_range_that_ends_short_of_the_ground_is_a_warning(frame, pipeline):
     for disparities, words in ((48, None), (16, None), (8, "increase `disparities`")):
         check = Running(CheckMatches())
         check(stereo_part(pipeline, frame, disparities, entry="rectified")["disparity"])

@@ -34,7 +34,7 @@ from tests.stages.matching.test_match_opencv import slanted_pair
 from tests.stages.matching.test_sgm_local import views
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     st.integers(1, 70), st.integers(1, 40), st.integers(1, 80), st.integers(-40, 40), st.integers(1, 400),
     st.integers(0, 2**32 - 1),
@@ -91,7 +91,7 @@ def test_moved_paths_keep_what_both_ranges_have(lanes, other_lanes, later):
     np.testing.assert_array_equal(moved.reshape(5, -1), wide[:, 400 + later : 400 + later + other_lanes])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     st.booleans(), st.booleans(), st.sampled_from([0, -9, -60, 7]), st.sampled_from([65, 96, 100, 130, 192]),
     st.integers(0, 2**32 - 1),

@@ -14,6 +14,7 @@ from stages.matching.kernels.row_ranges import lanes_for
 from stages.matching.kernels.selection import find_partners, find_winners, fit_row, select_reference
 from stages.matching.kernels.speckles import drop_speckles, drop_speckles_reference
 from stages.matching.kernels.texture import drop_unmatchable, drop_unmatchable_reference
+from tests.conftest import slow
 from tests.stages.matching.test_census import params_of
 
 
@@ -24,7 +25,7 @@ def select(total, beyond, guard, step, winner, votes, right, partners, first, pa
     fit_row(winner, votes, partners, first, params.disparities - 1, params, *layers)
 
 
-@pytest.mark.parametrize("disparities", [9, 64, 90, 300])
+@pytest.mark.parametrize("disparities", [64, 300, *slow(9, 90)])
 @pytest.mark.parametrize("minimum", [0, -30, 25])
 def test_a_row_is_selected_as_by_the_reference_in_either_direction(disparities, minimum):
     rng = np.random.default_rng(disparities)

@@ -14,6 +14,7 @@ from stages import Binarise, Cell, Fuse, PixelOrigin, TerrainFeatures
 from stages.data.tiles import Tiles
 from stages.terrain.fused_map import SHARED_SHARE
 from stages.terrain.map_registration import frame_grid, register
+from tests.conftest import slow
 from tests.stages.running import Running
 from tests.stages.terrain.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
 
@@ -126,7 +127,7 @@ def test_cells_count_their_frames_and_keep_their_first_and_last_time():
     assert cell(terrain, 1.0, 0.02, "frames") == 0
 
 
-@pytest.mark.parametrize("gap", [0.0, 5.0, 12.0])
+@pytest.mark.parametrize("gap", [12.0, *slow(0.0, 5.0)])
 def test_a_drifting_height_aligns_after_a_gap_and_makes_no_step(gap):
     fuse = Running(Fuse())
     for frame in range(90):
@@ -289,7 +290,7 @@ print(cells, sum(tile.nbytes for tile in tiles) / 1e6, peak() - before)
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the memory of a process as Linux does")
-@pytest.mark.parametrize("metres", [160, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("metres", [160, *slow(1000)])
 def test_a_kilometre_20_metres_wide_fits_into_500_megabytes(metres):
     done = subprocess.run([sys.executable, "-c", TRACK, str(metres)], capture_output=True, text=True, check=True)
     cells, map_size, grown = (float(value) for value in done.stdout.split())
