@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+# Where bytecode is not kept, every process compiles the sources again: a quarter of the time of the tests.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test check-all bench fuzz study pictures docs lint clean
 

@@ -15,7 +15,7 @@ import yaml
 from recordings.importers import recording
 from recordings.importers.files import read_bytes
 from recordings.mcap.resumable import ResumableWriter
-from tests.conftest import roverflow
+from tests.conftest import roverflow, slow
 
 PAIRS = 6
 ROOT = Path(__file__).parents[3]
@@ -86,7 +86,7 @@ def interrupted(source, tmp_path, monkeypatch, capsys):
     return left
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, *slow(signal.SIGINT)])
 def test_the_import_of_a_process_that_was_ended_is_continued(source, tmp_path, number, capsys, logged):
     out = tmp_path / "out.mcap"
     command = [sys.executable, "-c", CHILD, "8", str(int(number)), *map(str, importing(source, out))]

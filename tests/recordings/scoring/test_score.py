@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,13 @@ def frames():
     return [SMALL.frame(index) for index in range(SMALL.frames)]
 
 
+@cache
+def truth_of(index):
+    """The true disparity and maps of a frame."""
+    stamp, frame = SMALL.stamp(index), SMALL.frame(index)
+    return ground_truth.true_disparity(SMALL, stamp, frame), *ground_truth.truth_maps(SMALL, stamp, frame)
+
+
 @dataclass
 class Run:
     """A result log made from the truth; each field changes one property."""
@@ -65,18 +73,17 @@ class Run:
                     continue
                 stamp = SMALL.stamp(index) + self.shift.get(index, 0)
                 run = replace(self, **BLIND) if index in self.blind else self
-                for topic, message in run.messages(stamp, frame).items():
+                for topic, message in run.messages(stamp, frame, index).items():
                     if topic in self.only:
                         writer.write(topic, message, stamp)
         return path
 
-    def messages(self, stamp, frame):
-        true = ground_truth.true_disparity(SMALL, stamp, frame)
+    def messages(self, stamp, frame, index):
+        true, terrain, navigation = truth_of(index)
         disparity = Disparity(
             stamp, self.disparity(true.pixels.copy()), true.source, true.confidence,
             camera=replace(SMALL.camera, **self.lens),
         )  # fmt: skip
-        terrain, navigation = ground_truth.truth_maps(SMALL, stamp, frame)
         inside = slice(self.crop, 320 - self.crop), slice(self.crop, 320 - 2 * self.crop)
         mean = np.where(np.isnan(terrain.layers["mean"]), terrain.layers["elevation"], terrain.layers["mean"])
         layer = np.ascontiguousarray(self.elevation(mean)[inside])
