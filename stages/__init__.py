@@ -1,9 +1,10 @@
 """The method: plain callables over the data types of `stages.data`."""
 
-from stages.cloud.clean import Clean
-from stages.cloud.level import Level
-from stages.cloud.reproject import Reproject
-from stages.cloud.voxel_grid import VoxelGrid
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from stages.data import (
     CameraImage,
     CameraModel,
@@ -30,23 +31,29 @@ from stages.data import (
     VoxelMap,
     known,
 )
-from stages.localisation.pose_filter import PoseFilter
-from stages.localisation.tilt.check import CheckTilt
-from stages.localisation.visual_odometry import VisualOdometry
-from stages.matching.image_noise import MeasureNoise
-from stages.matching.lr_check import LeftRightCheck
-from stages.matching.match import Match
-from stages.matching.match_health import CheckMatches
-from stages.matching.match_opencv import MatchOpenCV
-from stages.matching.pyramid import Halve, SwapViews, Upsample
-from stages.rectification.rectify import Rectify
-from stages.refinement.paper import RefinePaper
-from stages.refinement.refine import Refine
-from stages.terrain.binarise import Binarise
-from stages.terrain.dem import Voxelise
-from stages.terrain.features import TerrainFeatures
-from stages.terrain.fuse import Fuse, FuseRegion
-from stages.terrain.map_region import MapRegion
+
+if TYPE_CHECKING:
+    from stages.cloud.clean import Clean
+    from stages.cloud.level import Level
+    from stages.cloud.reproject import Reproject
+    from stages.cloud.voxel_grid import VoxelGrid
+    from stages.localisation.pose_filter import PoseFilter
+    from stages.localisation.tilt.check import CheckTilt
+    from stages.localisation.visual_odometry import VisualOdometry
+    from stages.matching.image_noise import MeasureNoise
+    from stages.matching.lr_check import LeftRightCheck
+    from stages.matching.match import Match
+    from stages.matching.match_health import CheckMatches
+    from stages.matching.match_opencv import MatchOpenCV
+    from stages.matching.pyramid import Halve, SwapViews, Upsample
+    from stages.rectification.rectify import Rectify
+    from stages.refinement.paper import RefinePaper
+    from stages.refinement.refine import Refine
+    from stages.terrain.binarise import Binarise
+    from stages.terrain.dem import Voxelise
+    from stages.terrain.features import TerrainFeatures
+    from stages.terrain.fuse import Fuse, FuseRegion
+    from stages.terrain.map_region import MapRegion
 
 __all__ = [
     "Binarise",
@@ -98,3 +105,37 @@ __all__ = [
     "Voxelise",
     "known",
 ]
+
+_HOMES = {
+    "Binarise": "terrain.binarise",
+    "CheckMatches": "matching.match_health",
+    "CheckTilt": "localisation.tilt.check",
+    "Clean": "cloud.clean",
+    "Fuse": "terrain.fuse",
+    "FuseRegion": "terrain.fuse",
+    "Halve": "matching.pyramid",
+    "LeftRightCheck": "matching.lr_check",
+    "Level": "cloud.level",
+    "MapRegion": "terrain.map_region",
+    "Match": "matching.match",
+    "MatchOpenCV": "matching.match_opencv",
+    "MeasureNoise": "matching.image_noise",
+    "PoseFilter": "localisation.pose_filter",
+    "Rectify": "rectification.rectify",
+    "Refine": "refinement.refine",
+    "RefinePaper": "refinement.paper",
+    "Reproject": "cloud.reproject",
+    "SwapViews": "matching.pyramid",
+    "TerrainFeatures": "terrain.features",
+    "Upsample": "matching.pyramid",
+    "VisualOdometry": "localisation.visual_odometry",
+    "VoxelGrid": "cloud.voxel_grid",
+    "Voxelise": "terrain.dem",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import on first use: a pipeline should not wait for stages that it does not have."""
+    if name in _HOMES:
+        return getattr(import_module(f"stages.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'stages' has no attribute '{name}'")

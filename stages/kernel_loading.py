@@ -1,4 +1,4 @@
-"""Loads compiled kernels beside other work, because the first call of each would wait for its own."""
+"""Loads compiled kernels and slow modules beside other work, because the first use of each would wait for its own."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from typing import Any
 
 from numba.core.dispatcher import Dispatcher
 
+SLOW_MODULES = ("scipy.ndimage",)  # that stages import when they use them, late in a frame
+
 
 @contextmanager
-def loading_kernels() -> Iterator[None]:
-    """Load the machine code of earlier runs in a thread, for all kernels of imported stages."""
+def loading_kernels(*modules: str) -> Iterator[None]:
+    """Load the machine code of earlier runs in a thread, for all kernels of imported stages; then import `modules`."""
     ended = threading.Event()
 
     def work() -> None:
@@ -22,6 +25,10 @@ def loading_kernels() -> Iterator[None]:
                 return
             with suppress(Exception):  # the first call loads or compiles it, and reports what is wrong
                 load(kernel)
+        for module in (*SLOW_MODULES, *modules):
+            if not ended.is_set():
+                with suppress(Exception):  # likewise
+                    import_module(module)
 
     thread = threading.Thread(target=work, name="kernels", daemon=True)
     thread.start()
@@ -33,8 +40,8 @@ def loading_kernels() -> Iterator[None]:
 
 
 def imported_kernels() -> list[Any]:
-    """The kernels in all modules of stages that are imported, each once."""
-    modules = [module for name, module in sorted(sys.modules.items()) if name.startswith("stages.")]
+    """The kernels in all modules of stages that are imported, each once, in the order of the pipeline's stages."""
+    modules = [module for name, module in list(sys.modules.items()) if name.startswith("stages.")]
     values = [value for module in modules for value in vars(module).values()]
     return list({id(value): value for value in values if isinstance(value, Dispatcher)}.values())
 

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from flow.cli.main import main
-from recordings.ros2.cdr import TYPES
+from recordings.ros2.cdr import standard_types
 
 settings.register_profile("untimed", deadline=None, max_examples=50)  # the first example may compile a kernel
 settings.load_profile("untimed")
@@ -96,8 +96,8 @@ def edit_of(topic: str, schema: str, edit: Callable[[int, Any], object]) -> Call
     def change(name: str, index: int, data: bytes) -> bytes:
         if not name.endswith(topic):
             return data
-        message = TYPES.deserialize_cdr(data, schema)
+        message = standard_types().deserialize_cdr(data, schema)
         edit(index, message)
-        return bytes(TYPES.serialize_cdr(message, schema))
+        return bytes(standard_types().serialize_cdr(message, schema))
 
     return change

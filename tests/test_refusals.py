@@ -212,7 +212,7 @@ def test_only_a_log_replaces_a_log_or_has_its_name(traverse, tmp_path, capsys, o
 def test_an_output_that_cannot_be_opened_keeps_earlier_results(traverse, result, tmp_path, capsys, monkeypatch):
     out, rrd = tmp_path / "out.mcap", tmp_path / "out.rrd"
     out.write_bytes(result.read_bytes())
-    monkeypatch.setattr("recordings.sinks.rerun_sink.RESERVED_BYTES", 1 << 62)
+    monkeypatch.setattr("recordings.sinks.rerun_recording.RESERVED_BYTES", 1 << 62)
     assert roverflow("run", traverse, *SMALL, "-o", out, "--rrd", rrd) == 1
     assert "MB more can be written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [out]

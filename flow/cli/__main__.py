@@ -9,9 +9,11 @@ from flow.errors import INTERRUPTED
 
 def program() -> int:
     """Run `flow.cli.main.main`; returns its exit code. An interrupt at any moment is no traceback."""
+    import gc
     import os
     import signal
 
+    gc.set_threshold(20_000, 50, 50)  # imports make many objects and no garbage
     try:
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is signal.SIG_DFL:

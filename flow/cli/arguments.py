@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     At = float | str | np.datetime64 | np.timedelta64
 
-DESKS = ("overview", "matching", "terrain", "runtime", "tilt")  # of `recordings.sinks.blueprint`, loaded only when used
 _MAX_WORKERS = 1024
 _MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
 _UNIX_SECONDS = 1e9  # no log is so long; from here on seconds since 1970

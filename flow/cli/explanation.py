@@ -157,14 +157,13 @@ def why(
     """
     from stages.kernel_loading import loading_kernels
 
-    with loading_kernels():
-        graph = graph_of(result)
-        rules = {node.name: node for node in graph.nodes if isinstance(node.actor, Binarise)}
-        if stream not in rules:
-            raise UsageError(f"the pipeline has no navigation map '{stream}', only {', '.join(rules) or 'none'}")
-        graph = graph.upstream_of([stream])
-        with input_of(graph, result, log) as opened:
-            items = instant(graph, opened, at)
+    graph = graph_of(result)
+    rules = {node.name: node for node in graph.nodes if isinstance(node.actor, Binarise)}
+    if stream not in rules:
+        raise UsageError(f"the pipeline has no navigation map '{stream}', only {', '.join(rules) or 'none'}")
+    graph = graph.upstream_of([stream])
+    with loading_kernels(), input_of(graph, result, log) as opened:
+        items = instant(graph, opened, at)
     if stream not in items:
         raise UsageError(f"the frame has no navigation map '{stream}'; run the log again to see what it lacks")
     node, navigation = rules[stream], items[stream]

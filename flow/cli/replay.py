@@ -54,7 +54,8 @@ def replay(
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()
-    with loading_kernels(), graph.source.open(log, start=start, end=end) as opened, one_thread_per_call():
+    drawing = () if rrd is None else ("recordings.sinks.rerun_recording",)
+    with loading_kernels(*drawing), graph.source.open(log, start=start, end=end) as opened, one_thread_per_call():
         about = {
             "roverflow": product_version(),
             "pipeline": graph.text,

@@ -103,7 +103,7 @@ def is_other(log: McapLog, stamps: NDArray[np.int64]) -> bool:
     if not (times.size and stamps.size):
         return False
     tried = stamps[[0, stamps.size // 2, -1]].astype("datetime64[ns]")
-    places = [place for stamp in tried if (place := _nearest(log, times, stamp)) is not None]
+    places = (place for stamp in tried if (place := _nearest(log, times, stamp)) is not None)
     return not any(np.isin(list(_stamps(log, times, place).values()), stamps).any() for place in places)
 
 
@@ -161,7 +161,8 @@ def run_variants(
     from stages.kernel_loading import loading_kernels
 
     graphs = {label: hastened(load(pipeline, overrides)) for label, overrides in changes.items()}
-    with loading_kernels(), graphs["A"].source.open(logs) as log, one_thread_per_call():
+    drawing = "recordings.comparison.recording"
+    with loading_kernels(drawing), graphs["A"].source.open(logs) as log, one_thread_per_call():
         part = part_of(log, *place)
         log.narrow(part.start, part.end)
         graphs = {label: fitted(graph, log) for label, graph in graphs.items()}

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stages.data import Array
+from stages.data.rotations import nearest_rotation
 
 BLOCK_NS = 200_000_000
 REST_BLOCKS = 2  # to both sides of a block, which must be at rest as well
@@ -89,6 +89,8 @@ def integrate(samples: Sequence[InertialSample], begin: Knot, bias: Array, origi
     bias: (3,) rad/s of the gyroscope; origin: ns, the time at which a block begins. A step between two samples turns
     by the mean of their rates.
     """
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     rated = [sample for sample in samples if sample.rate is not None]
     stamps = np.array([begin.stamp, *(sample.stamp for sample in rated)])
     rates = np.array([begin.rate, *(sample.rate for sample in rated)])
@@ -112,13 +114,15 @@ def integrate(samples: Sequence[InertialSample], begin: Knot, bias: Array, origi
         rate=_sums(rates[1:], block, count) / samples_of[:, None], shaking=scatter, samples=samples_of,
         stamps=stamps[1:], rotations=rotations[1:], block=block,
     )  # fmt: skip
-    return blocks, Knot(int(stamps[-1]), rates[-1], _orthonormal(rotations[-1]))
+    return blocks, Knot(int(stamps[-1]), rates[-1], nearest_rotation(rotations[-1]))
 
 
 def _accelerations(
     samples: Sequence[InertialSample], stamps: Array, rates: Array, rotations: Array, block: Array, count: int
 ) -> tuple[Array, Array, Array, Array]:
     """Force and axes of `Blocks`; the accelerations (k, 3) and the block (k,) of each."""
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     taken = [sample for sample in samples if sample.acceleration is not None]
     accelerations = np.array([sample.acceleration for sample in taken], np.float64).reshape(-1, 3)
     times = np.array([sample.stamp for sample in taken], np.int64)
@@ -155,7 +159,3 @@ def _sums(values: Array, block: Array, count: int) -> Array:
     total = np.zeros((count, *values.shape[1:]))
     np.add.at(total, block, values)
     return total
-
-
-def _orthonormal(matrix: Array) -> Array:
-    return np.asarray(Rotation.from_matrix(matrix).as_matrix())

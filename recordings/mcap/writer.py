@@ -17,7 +17,7 @@ from flow.contracts import counted
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile
-from recordings.ros2.cdr import LAST_STAMP, TYPES
+from recordings.ros2.cdr import LAST_STAMP, standard_types
 
 MIN_OWN_CHUNK_BYTES = 64 * 1024  # of a message that gets a chunk of its own
 COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
@@ -81,9 +81,9 @@ class Ros2Writer:
         if not 0 <= stamp < LAST_STAMP:
             raise ValueError(f"{kind} for {topic}: the stamp {stamp} ns is outside ROS time; give ns since 1970")
         if kind not in self._kinds:
-            text, _ = TYPES.generate_msgdef(kind, ros_version=2)
+            text, _ = standard_types().generate_msgdef(kind, ros_version=2)
             self._kinds[kind] = MessageKind(kind, "cdr", "ros2msg", text.encode())
-        self.add(topic, self._kinds[kind], stamp, TYPES.serialize_cdr(message, kind))
+        self.add(topic, self._kinds[kind], stamp, standard_types().serialize_cdr(message, kind))
 
     def add(
         self, topic: str, kind: MessageKind, stamp: int, data: bytes | memoryview, copy_of: int | None = None

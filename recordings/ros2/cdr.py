@@ -1,15 +1,15 @@
 """ROS 2 message types and their CDR codec, without a ROS installation.
 
-`TYPES` contains the message classes we write. `decoder_for` builds a decoder from the schema in a log, so messages of
-a vendor or of an older version are read as they were written. The codec is rosbags'; a decoded image is a view of the
-message's bytes, not a copy.
+`standard_types` has the message classes we write. `decoder_for` builds a decoder from the schema in a log, so messages
+of a vendor or of an older version are read as they were written. The codec is rosbags'; a decoded image is a view of
+the message's bytes, not a copy.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache, lru_cache, partial
 from importlib import import_module
 from textwrap import shorten
 from typing import Any
@@ -52,20 +52,23 @@ def _typestore(name: str) -> SharedTypestore:
         return SharedTypestore(import_module(f"rosbags.typesys.stores.{name}"))
 
 
-def _known_types() -> SharedTypestore:
-    store = _typestore("ros2_jazzy")
+def standard_types() -> SharedTypestore:
+    """The message classes we write. They take long to import, so the first call does it."""
     with REGISTERING:
-        definitions = get_types_from_msg(GRID_MAP_INFO, "grid_map_msgs/msg/GridMapInfo")
-        store.register({**definitions, **get_types_from_msg(GRID_MAP, "grid_map_msgs/msg/GridMap")})
+        return _standard_types()
+
+
+@cache
+def _standard_types() -> SharedTypestore:
+    store = _typestore("ros2_jazzy")
+    definitions = get_types_from_msg(GRID_MAP_INFO, "grid_map_msgs/msg/GridMapInfo")
+    store.register({**definitions, **get_types_from_msg(GRID_MAP, "grid_map_msgs/msg/GridMap")})
     return store
-
-
-TYPES = _known_types()
 
 
 def make(name: str, /, **fields: Any) -> Any:
     """Make a message of the type `name`, such as "std_msgs/msg/Header", from all of its fields."""
-    cls: Any = TYPES.types[name]
+    cls: Any = standard_types().types[name]
     return cls(**fields)
 
 
@@ -85,8 +88,8 @@ def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable
     name = full_name(schema_name)
     if schema_encoding not in ("ros2msg", "ros2idl"):
         raise LogError(f"schema '{schema_name}' is in '{schema_encoding}', not a ROS 2 format (ros2msg, ros2idl)")
-    if not text.strip() and name in TYPES.types:
-        return lambda data: TYPES.deserialize_cdr(plain(data), name)
+    if not text.strip() and name in standard_types().types:
+        return lambda data: standard_types().deserialize_cdr(plain(data), name)
     store = store_of(schema_name, schema_encoding, text)
     return lambda data: store.deserialize_cdr(plain(data), name)
 
@@ -132,7 +135,7 @@ def _store_of(name: str, encoding: str, text: str) -> SharedTypestore:
                     store.register(get_types_from_idl(body))
         else:
             store.register(get_types_from_msg(text, name))
-        known = _typestore("ros1_noetic") if encoding == "ros1msg" else TYPES
+        known = partial(_typestore, "ros1_noetic") if encoding == "ros1msg" else standard_types
         parts_of = set[str]()
         _complete(store, known, name, [], parts_of)
         _check_arrays(store)
@@ -157,15 +160,17 @@ def _check_arrays(store: SharedTypestore) -> None:
                     raise ValueError(f"{name}.{field} has {size} elements")
 
 
-def _complete(store: SharedTypestore, known: SharedTypestore, name: str, above: list[str], done: set[str]) -> None:
+def _complete(
+    store: SharedTypestore, known: Callable[[], SharedTypestore], name: str, above: list[str], done: set[str]
+) -> None:
     """Add the `known` types in the fields of type `name`, recursively. above: the types that contain it."""
     if name in above:
         raise ValueError(f"{name} contains itself")
     if name in done:
         return
     if name not in store.fielddefs:
-        store.fielddefs[name] = known.fielddefs[name]
-        store.types[name] = known.types[name]
+        store.fielddefs[name] = known().fielddefs[name]
+        store.types[name] = known().types[name]
     for part in sorted(_references(store.fielddefs[name][1])):
         _complete(store, known, part, [*above, name], done)
     done.add(name)

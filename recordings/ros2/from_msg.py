@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
 from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.to_msg import FLOAT32
 from stages.data import Array, CameraModel, Cell, CellReason, ElevationMap, NavigationMap, Pose, Transform
+from stages.data.rotations import matrix_of, unit
 
 REASON_NOT_RECORDED = 255  # of a hazard in an OccupancyGrid without its `reason_map`
 MAX_DISTANCE_M = 1e9
@@ -70,7 +70,7 @@ def transform_of(message: Any) -> Transform:
     if not parent or not child:
         raise LogError(f"{name} lacks the name of a frame")
     translation = _finite(transform.translation, f"the translation of {name}")
-    return Transform(parent, child, rotation_of(transform.rotation, name).as_matrix(), translation)
+    return Transform(parent, child, matrix_of(unit_quaternion(transform.rotation, name)), translation)
 
 
 def _finite(vector: Any, what: str) -> Array:
@@ -79,11 +79,6 @@ def _finite(vector: Any, what: str) -> Array:
     if not (np.abs(values) < MAX_DISTANCE_M).all():  # or NaN
         raise LogError(f"{what} is {values.tolist()}, which is no place")
     return values
-
-
-def rotation_of(quaternion: Any, what: str) -> Rotation:
-    """The rotation of a geometry_msgs/Quaternion of length 1, within 1 %."""
-    return Rotation.from_quat(unit_quaternion(quaternion, what))
 
 
 def unit_quaternion(quaternion: Any, what: str) -> tuple[float, float, float, float]:
@@ -106,7 +101,7 @@ def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
         if transform is None:
             return None
         at = transform_of(transform)
-        quaternion = rotation_of(transform.transform.rotation, "the pose").as_quat()
+        quaternion = unit(unit_quaternion(transform.transform.rotation, "the pose"))
         return Pose(stamp_or(transform.header, log_time), at.translation, quaternion, at.parent, base_frame)
     stated = message.pose if hasattr(message.pose, "covariance") else None
     pose = message.pose.pose if stated is not None else message.pose
@@ -116,7 +111,7 @@ def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
     position = _finite(pose.position, "the position of the pose")
     child = frame_name(getattr(message, "child_frame_id", "")) or base_frame
     return Pose(
-        stamp_or(message.header, log_time), position, rotation_of(pose.orientation, "the pose").as_quat(),
+        stamp_or(message.header, log_time), position, unit(unit_quaternion(pose.orientation, "the pose")),
         frame_of(message), child, covariance,
     )  # fmt: skip
 

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.ros2.cdr import make
 from recordings.ros2.rounding import rounded_layer, to_multiples, to_relative
@@ -24,6 +23,7 @@ from stages.data import (
     Pose,
     Transform,
 )
+from stages.data.rotations import canonical, quaternion_of
 
 FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32
 
@@ -271,7 +271,7 @@ def _region(width: int, height: int) -> Any:
 
 def transform_stamped(transform: Transform, stamp: int) -> Any:
     """geometry_msgs/TransformStamped."""
-    turn = Rotation.from_matrix(transform.rotation).as_quat(canonical=True)
+    turn = canonical(quaternion_of(transform.rotation))
     return make(
         "geometry_msgs/msg/TransformStamped", header=header(stamp, transform.parent), child_frame_id=transform.child,
         transform=make(

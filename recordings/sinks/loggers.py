@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 import rerun as rr
-from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.scoring.metrics import cell_centres
@@ -35,6 +34,7 @@ from stages.data import (
     VoxelMap,
     known,
 )
+from stages.data.rotations import matrix_of
 
 DISPARITY_STEPS = 4  # disparities are drawn to 1/4 px; the result log has them as they are
 ALL_CODES = np.arange(256, dtype=np.uint8)
@@ -198,7 +198,7 @@ def log_tilt(canvas: Canvas, stream: str, tilt: Tilt) -> None:
 @logger_for(Pose)
 def log_pose(canvas: Canvas, stream: str, pose: Pose) -> None:
     """An arrow along the rover's heading; the viewer shows those of all frames so far."""
-    forward = Rotation.from_quat(pose.quaternion).apply([0.4, 0.0, 0.0])
+    forward = matrix_of(pose.quaternion) @ [0.4, 0.0, 0.0]
     arrow = rr.Arrows3D(origins=[pose.position], vectors=[forward], colors=[CAMERA_RGB])
     view = ViewSpec(Panel.TRAJECTORY, stream, "trajectory", f"{stream} ({pose.frame_id})", pose.frame_id)
     canvas.log(view.path, arrow, view)

@@ -11,12 +11,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.discovery.images import looks_rectified
 from recordings.errors import LogError
 from recordings.source.transforms import TRANSFORM_ATOL, TransformTree
 from stages.data import CameraModel, StereoCamera, Transform
+from stages.data.rotations import angle_of
 
 MAX_PARALLEL_RAD = 1e-3  # parallel cameras are turned against each other by less: 1 pixel at 1000 px
 MAX_OFFSET_SHARE = 0.01  # of the baseline; parallel cameras are displaced against each other in y and z by less
@@ -184,7 +184,7 @@ def _right_in_left(names: tuple[str, str], tree: TransformTree) -> Transform:
 
 def _is_parallel(left: CameraModel, right: CameraModel, right_in_left: Transform) -> bool:
     """Whether two cameras look in parallel from two places along x, with equal lenses."""
-    angle = Rotation.from_matrix(left.r @ right_in_left.rotation @ right.r.T).magnitude()
+    angle = angle_of(left.r @ right_in_left.rotation @ right.r.T)
     x, y, z = left.r @ right_in_left.translation
     return angle < MAX_PARALLEL_RAD and max(abs(y), abs(z)) < MAX_OFFSET_SHARE * abs(x) and not left.unlike(right)
 

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.calibration.yaml_files import read_yaml
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name
 from stages.data import Array, Transform
+from stages.data.rotations import turn_by
 
 _VECTORS = {"xyz": (0.0, 0.0, 0.0), "rpy": (0.0, 0.0, 0.0), "axis": (1.0, 0.0, 0.0)}  # as URDF has them by default
 _MAX_NUMBER = 1e6  # m or rad
@@ -40,7 +40,7 @@ class Joint:
 
     def at(self, angle: float) -> Transform:
         """parent <- child at an angle, rad."""
-        turn = Rotation.from_rotvec(angle * self.axis).as_matrix()
+        turn = turn_by(angle * self.axis)
         return self.origin.after(Transform(self.origin.child, self.origin.child, turn, np.zeros(3)))
 
 
@@ -53,6 +53,8 @@ def read_joints(path: str | Path) -> dict[str, Joint]:
 
 
 def _joint(where: str, entry: Any) -> Joint:
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     if not isinstance(entry, dict):
         raise LogError(f"{where} is no mapping of parent, child, xyz, rpy and axis")
     if unknown := sorted(map(str, entry.keys() - _VECTORS.keys() - {"parent", "child"})):

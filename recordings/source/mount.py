@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
 from recordings.source.calibration import Camera
 from recordings.source.transforms import TransformTree
 from stages.data import Array, Mount, Pose
+from stages.data.rotations import matrix_of
 
 STATIC_STAMP = 0  # ns; a mount holds for the whole log, whose frames may have stamps of another clock
 
@@ -53,7 +53,7 @@ def _camera_from_inclinometer(
     camera: Camera, inclinometer: str, tree: TransformTree, given: Sequence[float] | None
 ) -> Array:
     if given is not None:
-        return np.asarray(Rotation.from_quat(given).as_matrix())
+        return matrix_of(given)
     transform = tree.between(camera.frame_id, inclinometer)
     if transform is None:
         raise LogError(

@@ -14,7 +14,6 @@ from operator import itemgetter
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.discovery.roles import TRANSFORMS
 from recordings.errors import LogError
@@ -169,6 +168,8 @@ def _needed(
 
 def _interpolated(link: Link, samples: Sequence[tuple[int, Transform]], stamp: int) -> Transform:
     """A transform at `stamp`, between two samples; beside them only where it stands still."""
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     name = f"the transform '{link[0]}' <- '{link[1]}'"
     first = min(max(bisect_right(samples, stamp, key=itemgetter(0)) - 1, 0), max(len(samples) - 2, 0))
     near = samples[first : first + 2]

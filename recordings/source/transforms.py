@@ -9,11 +9,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
 from recordings.ros2.from_msg import transform_of
 from stages.data import Array, Transform
+from stages.data.rotations import nearest_rotation
 
 # The axes of a camera (x right, y down, z forward) that looks straight ahead, in the rover's (x forward, y left, z up).
 BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -25,7 +25,7 @@ def orthonormal(matrix: Array, where: str) -> Array:
     """The rotation (3, 3) that a matrix of rounded numbers stands for. Raises LogError if it stands for none."""
     if not np.abs(matrix @ matrix.T - np.eye(3)).max() <= MAX_ROUNDING or np.linalg.det(matrix) < 0:
         raise LogError(f"{where} contains no rotation: its axes are not orthonormal; get the file again")
-    return np.asarray(Rotation.from_matrix(matrix).as_matrix())
+    return nearest_rotation(matrix)
 
 
 def rigid(parent: str, child: str, matrix: Any) -> Transform:

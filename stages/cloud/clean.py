@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from flow.contracts import StageError
 from stages.cloud.kernels.depth_order import out_of_order
@@ -101,6 +100,8 @@ class Clean(Stage):
 
     def _knn(self, cloud: PointCloud) -> Array:
         """Indices of the points kept by the mean distance to their nearest neighbours in space."""
+        from scipy.spatial import cKDTree  # takes long to import, and only this method needs it
+
         points = cloud.points.astype(np.float64)
         near = np.flatnonzero(np.einsum("ij,ij->i", points, points) <= self._crop**2)
         if len(near) <= self.knn_neighbours:

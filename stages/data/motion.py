@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from flow.contracts import StageError
 from stages.data.arrays import Array, check_rotation, publish_stamp, publish_vector
 from stages.data.covariance import translated_covariance
+from stages.data.rotations import matrix_of, product, quaternion_of, unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,15 +174,13 @@ class Pose:
     @property
     def transform(self) -> Transform:
         """The transform from `child_frame_id` to `frame_id`."""
-        rotation = Rotation.from_quat(self.quaternion).as_matrix()
-        return Transform(self.frame_id, self.child_frame_id, rotation, self.position)
+        return Transform(self.frame_id, self.child_frame_id, matrix_of(self.quaternion), self.position)
 
     def of(self, part: Transform) -> Pose:
         """The pose of `part.child`, a frame fixed to this one, `part.parent`."""
-        rotation = Rotation.from_quat(self.quaternion)
-        offset = rotation.as_matrix() @ part.translation
+        offset = matrix_of(self.quaternion) @ part.translation
         covariance = None if self.covariance is None else translated_covariance(self.covariance, offset)
-        quaternion = (rotation * Rotation.from_matrix(part.rotation)).as_quat()
+        quaternion = product(unit(self.quaternion), quaternion_of(part.rotation))
         return Pose(self.stamp, self.position + offset, quaternion, self.frame_id, part.child, covariance)
 
 

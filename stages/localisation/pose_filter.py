@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flow.contracts import Finding, Severity, StageError, counted
 from stages.cloud.level import level_transform
 from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.data.covariance import translated_covariance
+from stages.data.rotations import canonical, quaternion_of, turn_by
 from stages.localisation.pose_check import PoseCheck
 from stages.stage import Stage, parameter
 
@@ -135,7 +135,7 @@ class PoseFilter(Stage):
         up = world.rotation @ mount.camera_from_inclinometer @ tilt.up
         gain = covariance[:, 3:5] @ np.linalg.inv(covariance[3:5, 3:5] + self._variance(tilt) * np.eye(2))
         change = gain @ np.array([up[1], -up[0]])  # the rotation that brings up to z
-        turn = np.asarray(Rotation.from_rotvec(change[3:]).as_matrix())
+        turn = turn_by(change[3:])
         corrected = Transform(world.parent, world.child, turn @ world.rotation, world.translation + change[:3])
         return replace(estimate, world=corrected, covariance=covariance - gain @ covariance[3:5])
 
@@ -146,7 +146,7 @@ class PoseFilter(Stage):
         covariance = translated_covariance(estimate.covariance, rover.translation - estimate.world.translation)
         covariance = covariance + common.T @ common
         np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # at the origin zero but for rounding
-        quaternion = Rotation.from_matrix(rover.rotation).as_quat(canonical=True)
+        quaternion = canonical(quaternion_of(rover.rotation))
         return Pose(stamp, rover.translation, quaternion, _frame_of(estimate.segment), rover.child, covariance)
 
 

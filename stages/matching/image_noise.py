@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy import optimize
 
 from stages.data import Array, ImageNoise, StereoFrame
 from stages.matching.intensity import eight_bit, gray
@@ -86,6 +85,8 @@ def _line(level: Array, variance: Array, count: Array) -> tuple[float, float]:
 
     level, variance, count: (n,), of the bins; bins far above the line contain texture and are left out.
     """
+    from scipy import optimize  # takes long to import
+
     weight = np.sqrt(count / variance)
     terms = np.stack([np.ones_like(level), level], axis=1)
     while True:

@@ -145,11 +145,11 @@ def _view(pair: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
 
 def _as_bright(image: Array, model: Array) -> Array:
     """An image scaled to the mean and the contrast of another, because tracking compares brightness."""
-    mean, contrast = float(image.mean()), float(image.std())
+    (mean, contrast), (other_mean, other_contrast) = (np.ravel(cv2.meanStdDev(each)) for each in (image, model))
     if not contrast:
         return image
-    scale = float(model.std()) / contrast
-    return cv2.convertScaleAbs(image, alpha=scale, beta=float(model.mean()) - scale * mean)
+    scale = float(other_contrast / contrast)
+    return cv2.convertScaleAbs(image, alpha=scale, beta=float(other_mean) - scale * float(mean))
 
 
 def _corrected(offset: RowOffset, left: Array, right: Array, here: Array, there: Array) -> tuple[Array, ...]:
@@ -207,7 +207,7 @@ def _paired_features(left: Array, right: Array) -> tuple[Array, Array]:
     (points, codes), (partners, partner_codes) = _orb_features(left), _orb_features(right)
     if len(points) < 2 or len(partners) < 2:
         return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
-    left_places, right_places = (np.array([point.pt for point in found], np.float32) for found in (points, partners))
+    left_places, right_places = (np.asarray(cv2.KeyPoint.convert(found)) for found in (points, partners))
     chosen, matched = clear_partners(codes, partner_codes, MAX_HAMMING_BITS, MAX_DISTANCE_RATIO)
     here, there = left_places[chosen], right_places[matched]
     within = np.abs(here[:, 1] - there[:, 1]) <= MAX_OFFSET

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.ndimage import binary_dilation
 
 from flow.contracts import StageError
 from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, Rover
@@ -82,9 +81,7 @@ class Binarise(Stage):
         reason[window] = self._reasons(replace(elevation, layers=within))
         cells = np.full(elevation.shape, Cell.UNKNOWN, np.int8)
         cells[window] = STATE_OF[reason[window]]
-        return NavigationMap(
-            elevation.stamp, cells, reason, elevation.resolution, elevation.origin, elevation.frame_id
-        )
+        return NavigationMap(elevation.stamp, cells, reason, elevation.resolution, elevation.origin, elevation.frame_id)
 
     def _reasons(self, elevation: ElevationMap) -> Array:
         """Reasons (rows, cols) of all cells."""
@@ -142,7 +139,10 @@ class Binarise(Stage):
         if not cut.any():
             return cut
         near = _dilated(cut, np.ceil(self.rover.wheel / 2 / elevation.resolution - 1e-6))
-        return np.asarray(near | binary_dilation(cut, np.ones((3, 3)), iterations=-1, mask=raised))
+        count, obstacle = cv2.connectedComponents(raised.view(np.uint8), connectivity=8)
+        is_cut = np.zeros(count, bool)
+        is_cut[obstacle[cut]] = True
+        return np.asarray(near | is_cut[obstacle])
 
     def _brink(self, elevation: ElevationMap) -> Array:
         """Cells within half a wheel of hidden ground that falls away, (rows, cols) bool."""
@@ -151,8 +151,8 @@ class Binarise(Stage):
         hidden = elevation.layers["occluded"] == 1
         falls = hidden & (elevation.layers["drop"] >= self.min_drop)
         reach = int(MAX_DROP_DISTANCE / elevation.resolution + 1e-6)
-        if reach and falls.any():
-            falls = binary_dilation(falls, np.ones((3, 3)), iterations=reach, mask=hidden)
+        for _ in range(reach if falls.any() else 0):
+            falls = hidden & _dilated(falls, 1)
         return _dilated(falls, np.ceil(self.rover.wheel / 2 / elevation.resolution - 1e-6))
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_erosion
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Transform
 from stages.data.arrays import spanned
@@ -191,7 +190,9 @@ def _statistics(cloud: PointCloud, grid: Grid) -> Array:
 
 def _beside_hole(height: Array) -> Array:
     """Which cells (rows, cols) are empty or have an empty neighbour."""
-    return ~np.asarray(binary_erosion(np.isfinite(height), np.ones((3, 3))))
+    known = np.pad(np.isfinite(height), 1)
+    in_row = known[:, :-2] & known[:, 1:-1] & known[:, 2:]
+    return np.asarray(~(in_row[:-2] & in_row[1:-1] & in_row[2:]))
 
 
 def _sight_fall(sensor: Transform, height: Array, x: Array, y: Array) -> Array:

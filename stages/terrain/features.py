@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-from scipy.ndimage import distance_transform_edt, label
 
 from stages.data import Array, ElevationMap, Rover
 from stages.data.arrays import Span, spanned
@@ -172,6 +172,8 @@ def _extrapolated(planes: Array, where: Array, resolution: float) -> Array:
     rows, cols = np.nonzero(where)
     if not known.any():
         return np.full(len(rows), np.nan)
+    from scipy.ndimage import distance_transform_edt  # takes long to import
+
     distance, nearest = distance_transform_edt(~known, return_indices=True)
     row, col = nearest[:, rows, cols]
     height, along, across = planes[:, row, col]
@@ -181,9 +183,11 @@ def _extrapolated(planes: Array, where: Array, resolution: float) -> Array:
 
 def _as_whole_obstacles(step: Array, raised: Array) -> Array:
     """The steps (rows, cols), with the largest of an obstacle in all its 8-connected `raised` cells."""
-    obstacle, _ = label(raised, np.ones((3, 3)))
-    highest = np.zeros(obstacle.max() + 1)
-    np.maximum.at(highest, obstacle[raised], step[raised])
+    if not raised.any():
+        return step
+    count, obstacle = cv2.connectedComponents(raised.view(np.uint8), connectivity=8)
+    highest = np.zeros(count)
+    np.maximum.at(highest, obstacle[raised].astype(np.intp), step[raised])
     return np.where(raised, highest[obstacle], step)
 
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flow.contracts import StageError
 from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
 from stages.data.arrays import Span, spanned
+from stages.data.rotations import turn_about_z, turn_by
 from stages.terrain.dem import Voxelise
 
 # Between z of the pose's frame and up. Odometry without an inclinometer may differ by the slope of the ground.
@@ -72,7 +72,7 @@ def register(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tuple
             "tilt; check the tilt, or give a pose in a frame whose z points up"
         )
     yaw = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
-    rotation = Rotation.from_euler("z", yaw).as_matrix()
+    rotation = turn_about_z(yaw)
     origin = cloud.sensor(child.inverse().translation)  # of the pose's child frame, in level
     return Transform(pose.frame_id, LEVEL_FRAME, rotation, pose.position - rotation @ origin), turned[:, 2]
 
@@ -119,6 +119,6 @@ def _seen(terrain: ElevationMap) -> Span:
 
 def with_plane(level: Transform, plane: Array) -> Transform:
     """The transform of frame `level` with a plane (height, slopes) added: a rise and a small rotation."""
-    rotation = Rotation.from_rotvec([plane[2], -plane[1], 0.0]).as_matrix()
+    rotation = turn_by([plane[2], -plane[1], 0.0])
     translation = level.translation + np.array([0, 0, plane[0]])
     return replace(level, rotation=rotation @ level.rotation, translation=translation)

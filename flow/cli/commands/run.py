@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flow.cli.arguments import DESKS, every, seconds, workers
+from flow.cli.arguments import every, seconds, workers
 from flow.cli.outputs import add_log, add_pipeline_options, check_outputs, default_result, write_text
 from flow.cli.replay import as_json, replay
 from flow.cli.report import exit_code, headline, report, say
@@ -17,6 +17,7 @@ from flow.cli.watching import watched
 from flow.errors import SinkError, UsageError
 from recordings.containers.finding import find_files
 from recordings.errors import UnwritableError
+from recordings.sinks import DESKS
 
 HELP = "replay a log through a pipeline"
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from flow.cli.arguments import DESKS
 from flow.cli.outputs import check_outputs
 from flow.cli.report import say
 from flow.errors import COMPLETE, UsageError
 from recordings.atomic_write import written
+from recordings.sinks import DESKS
 
 HELP = "write layouts of a recording, one for each kind of question"
 

@@ -8,8 +8,6 @@ connected to the ground at its foot.
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from stages.compiled.jit import kernel
 from stages.compiled.union_find import join, root
@@ -132,6 +130,9 @@ def in_large_patches_reference(
 
 def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
     """The same as `connected_patches`: scipy's connected components of the graph of links."""
+    from scipy.sparse import coo_array  # takes long to import
+    from scipy.sparse.csgraph import connected_components
+
     present = inverse > 0
     index = np.arange(inverse.size).reshape(inverse.shape)
     links = []

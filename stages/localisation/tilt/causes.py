@@ -8,11 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations, product
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from stages.data import Array
+from stages.data.rotations import canonical, quaternion_of, turn_by
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import RotationSpline
 
 GROUND_SIGMA = float(np.deg2rad(8))  # rad, of the mean slope of the ground in view
 PARAMETER_COST = 4.0  # added to the score for each fitted number
@@ -157,6 +161,8 @@ def _right_angles() -> Array:
 
 def wrong_mount(fit: Fit) -> Cause:
     """The rotation missing from the mount, by Gauss-Newton from the best of the right angles."""
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     mount = fit.evidence.mount
     starts = [mount @ turn @ mount.T for turn in _right_angles()]
     cost = [fit.misfit_of(fit.ups @ s.T) + fit.slope_of(fit.ups @ s.T) for s in starts]
@@ -171,13 +177,13 @@ def wrong_mount(fit: Fit) -> Cause:
         columns = np.einsum("mk,kil->mil", fit.operator, turned).reshape(-1, 3)
         normal = columns.T @ columns + np.eye(3)  # a prior for directions that the motion does not determine
         change = -np.linalg.solve(normal, columns.T @ fit.residuals(ups).ravel())
-        turn = Rotation.from_rotvec(change).as_matrix() @ turn
+        turn = turn_by(change) @ turn
     ups = fit.ups @ turn.T
     error = Rotation.from_matrix(turn).as_rotvec()
     angle = float(np.linalg.norm(error))
     sigma = float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(normal))[-1]))
     along = mount.T @ error / max(angle, 1e-12)
-    x, y, z, w = Rotation.from_matrix(turn @ mount).as_quat(canonical=True)
+    x, y, z, w = canonical(quaternion_of(turn @ mount))
     fault = f"the mount of the inclinometer is wrong by {degrees(angle)}"
     remedy = (
         f"It is rotated by {degrees(angle)} about axis ({along[0]:.2f}, {along[1]:.2f}, {along[2]:.2f}). Check "
@@ -230,6 +236,8 @@ def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
 def _splines(evidence: Evidence) -> tuple[Array, dict[int, RotationSpline]]:
     """The camera's rotation over time, s, for each stretch of rising stamps without long gaps; and the stretch of each
     frame, -1 within `MAX_OFFSET` of its ends."""
+    from scipy.spatial.transform import Rotation, RotationSpline  # takes long to import
+
     seconds = (evidence.stamps - evidence.stamps[0]) / 1e9
     steps = np.diff(seconds)
     breaks = (steps <= 0) | (steps > MAX_FRAME_GAP) | (np.diff(evidence.segments) != 0)

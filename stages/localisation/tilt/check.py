@@ -10,10 +10,10 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flow.contracts import Finding, Severity
 from stages.data import Array, CameraMotion, Mount, PointCloud, Tilt, TiltHealth, Transform
+from stages.data.rotations import angle_of
 from stages.localisation.tilt.causes import Evidence
 from stages.localisation.tilt.diagnosis import INCONSISTENT, OFF_GROUND, Diagnosis, diagnose, off_level
 from stages.robust_weights import MAD_TO_SIGMA, tukey_weights
@@ -132,7 +132,7 @@ class CheckTilt(Stage):
         before = state.kept[-1] if state.kept else None
         if before is not None and before.segment == sample.segment:
             step = before.camera.inverse().after(sample.camera)
-            turn = Rotation.from_matrix(step.rotation).magnitude()
+            turn = angle_of(step.rotation)
             if np.linalg.norm(step.translation) < MIN_STEP and turn < MIN_TURN:
                 return
         state.kept.append(sample)

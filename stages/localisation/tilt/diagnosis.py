@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from stages.data.rotations import angle_of
 from stages.localisation.tilt.causes import (
     GROUND_SIGMA,
     MIN_FRAMES,
@@ -195,7 +195,7 @@ def _degrees_as_radians(evidence: Evidence) -> Diagnosis | None:
     ups, cameras = evidence.ups, evidence.cameras
     swings = np.arccos(np.clip(np.sum(ups[near] * ups[near + 1], axis=1), -1, 1))
     turned = np.swapaxes(cameras[near], 1, 2) @ cameras[near + 1]
-    turns = Rotation.from_matrix(turned).magnitude()
+    turns = np.array([angle_of(turn) for turn in turned])
     normals = evidence.ground[near]
     with_ground = np.arccos(np.clip(np.einsum("ki,kij,kj->k", normals, turned, normals), -1, 1))  # NaN: no ground
     lean = 2 * np.sin(MAX_SLOPE) * np.sin(turns / 2)

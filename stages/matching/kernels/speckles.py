@@ -10,8 +10,6 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import Fork, by_bands, in_turn
@@ -126,6 +124,9 @@ def _drop(pixels, strength, source, runs, first, last, max_size):
 
 def drop_speckles_reference(disparity: Array, evidence: Array, source: Array, step: float, max_size: int) -> None:
     """`drop_speckles` by the connected components of a graph of pixels."""
+    from scipy.sparse import coo_array  # takes long to import
+    from scipy.sparse.csgraph import connected_components
+
     index = np.arange(disparity.size).reshape(disparity.shape)
     with np.errstate(invalid="ignore"):
         beside = np.abs(np.diff(disparity, axis=1)) <= np.float32(step)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import special
 
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by
@@ -48,7 +48,7 @@ def label_origin(
         [np.interp(steps, MATCH_CONFIDENCES, values) for values in (trust.agreed, trust.alone)], np.float32
     )
     others = np.array([np.interp(0.5, MATCH_CONFIDENCES, trust.agreed), *trust[2:]], np.float32)
-    within = special.erf(SIGMA_STEPS / np.maximum(np.arange(256), 1) / np.sqrt(2)).astype(np.float32)
+    within = np.array([math.erf(SIGMA_STEPS / max(code, 1) / math.sqrt(2)) for code in range(256)], np.float32)
 
     def label(first: int, end: int) -> None:
         rows = slice(first, end)
@@ -95,6 +95,8 @@ def label_origin_reference(
     sigma: Array, max_move: float, trust: Trust,
 ) -> tuple[Array, Array]:  # fmt: skip
     """`label_origin` in plain numpy."""
+    from scipy import special  # takes long to import
+
     own = np.rint(np.clip(confidence, 0, 1) * F32(255)).astype(np.float64) / 255
     stayed = np.abs(refined - matches) <= F32(max_move) + 2 * sigma
     blur = np.rint(np.minimum(sigma * F32(SIGMA_STEPS), 255)).astype(np.float64)

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from recordings.ros2.cdr import TYPES
+from recordings.ros2.cdr import standard_types
 from tests.recordings.encodings.rewritten import ROS1, as_ros1
 
 Row = tuple[str, str, int, bytes]  # topic, type, log time, data
@@ -53,7 +53,7 @@ def _write(folder: Path, rows: list[Row], plugin: StoragePlugin, mode: Compressi
     with writer:
         for topic, kind, log_time, data in rows:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=TYPES)
+                connections[topic] = writer.add_connection(topic, kind, typestore=standard_types())
             writer.write(connections[topic], log_time, data)
 
 
@@ -69,6 +69,6 @@ def write_bag(rows: list[Row], path: Path, compression: Bag1Writer.CompressionFo
             writer.write(
                 connections[topic],
                 log_time,
-                bytes(ROS1.serialize_ros1(as_ros1(TYPES.deserialize_cdr(data, kind)), kind)),
+                bytes(ROS1.serialize_ros1(as_ros1(standard_types().deserialize_cdr(data, kind)), kind)),
             )
     return path

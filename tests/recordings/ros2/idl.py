@@ -3,7 +3,7 @@ typedefs for arrays of fixed size, and a module of constants."""
 
 from typing import Any
 
-from recordings.ros2.cdr import TYPES
+from recordings.ros2.cdr import standard_types
 
 BASE, NAME, ARRAY = 1, 2, 3  # kinds of fields in the type store; a sequence is 4
 NAMES = {"float64": "double", "float32": "float", "bool": "boolean", "byte": "octet"}
@@ -19,7 +19,7 @@ def idl_schema(kind: str) -> bytes:
 
 def _definition(kind: str) -> str:
     package, _, name = kind.split("/")
-    constants, fields = TYPES.fielddefs[kind]
+    constants, fields = standard_types().fielddefs[kind]
     lines = [
         "// generated from rosidl_adapter/resource/msg.idl.em",
         f"// with input from {package}/msg/{name}.msg\n",
@@ -42,7 +42,7 @@ def _definition(kind: str) -> str:
 
 def _references(kind: str) -> list[str]:
     found = []
-    for _, (node, detail) in TYPES.fielddefs[kind][1]:
+    for _, (node, detail) in standard_types().fielddefs[kind][1]:
         inner, name = (node, detail) if int(node) <= NAME else detail[0]
         if int(inner) == NAME and name not in found:
             found.append(name)

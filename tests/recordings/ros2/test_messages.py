@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2.cdr import TYPES, decoder_for, make
+from recordings.ros2.cdr import decoder_for, make, standard_types
 from recordings.ros2.from_msg import (
     read_disparity,
     read_grid_map,
@@ -123,7 +123,9 @@ def plain(value: Any) -> Any:
 def through_rosbags(message: Any) -> Any:
     """A message as rosbags' own store decodes it (it knows all of ours but grid_map_msgs)."""
     store, name = get_typestore(Stores.ROS2_JAZZY), message.__msgtype__
-    return (store if name in store.types else TYPES).deserialize_cdr(TYPES.serialize_cdr(message, name), name)
+    return (store if name in store.types else standard_types()).deserialize_cdr(
+        standard_types().serialize_cdr(message, name), name
+    )
 
 
 def test_another_decoder_reads_the_same_numbers(written):
@@ -313,7 +315,7 @@ def test_codecs_are_built_safely_by_many_threads():
 def test_a_schema_may_leave_out_standard_types():
     decoder = decoder_for("vendor_msgs/msg/Tilt", "ros2msg", b"std_msgs/Header header\nfloat32 pitch\n")
     header = make("std_msgs/msg/Header", stamp=make("builtin_interfaces/msg/Time", sec=1, nanosec=2), frame_id="abc")
-    raw = bytes(TYPES.serialize_cdr(header, "std_msgs/msg/Header")) + np.float32(2.5).tobytes()
+    raw = bytes(standard_types().serialize_cdr(header, "std_msgs/msg/Header")) + np.float32(2.5).tobytes()
     message = decoder(raw)
     assert (message.header.frame_id, message.pitch) == ("abc", 2.5)
 
@@ -324,7 +326,7 @@ def test_idl_schemas_of_rosidl_are_read(tmp_path):
         for schema, _, message in make_reader(log).iter_messages():
             assert schema is not None
             decoded = decoder_for(schema.name, "ros2idl", idl_schema(schema.name))(message.data)
-            assert bytes(TYPES.serialize_cdr(decoded, schema.name)) == message.data
+            assert bytes(standard_types().serialize_cdr(decoded, schema.name)) == message.data
             seen.add(schema.name.rpartition("/")[2])
     assert seen == {"Image", "CameraInfo", "Imu", "Odometry", "TFMessage"}
 

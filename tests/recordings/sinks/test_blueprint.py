@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from flow.cli.arguments import DESKS as NAMES
 from recordings.errors import LogError
+from recordings.sinks import DESKS as NAMES
 from recordings.sinks.blueprint import DESKS, Layout, Panel, ViewSpec, read_layout
 from tests.conftest import roverflow
 from tests.recordings.sinks.recorded_scene import entities

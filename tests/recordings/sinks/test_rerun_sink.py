@@ -14,7 +14,8 @@ import rerun as rr
 
 from recordings.errors import LogError
 from recordings.sinks.blueprint import CLOCK, FRAME
-from recordings.sinks.rerun_sink import PLOT_BATCH, RESERVED_BYTES, RerunSink
+from recordings.sinks.rerun_recording import PLOT_BATCH, RESERVED_BYTES
+from recordings.sinks.rerun_sink import RerunSink
 from stages.data import Disparity, Mount
 from tests.recordings.sinks.recorded_scene import (
     START,
@@ -193,7 +194,7 @@ def test_an_unwritable_path_is_named(tmp_path):
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path, monkeypatch):
     """rerun reports an unexpected full disk only in its log, so the sink checks for it."""
-    monkeypatch.setattr("recordings.sinks.rerun_sink.room_to_grow", lambda file: RESERVED_BYTES)
+    monkeypatch.setattr("recordings.sinks.rerun_recording.room_to_grow", lambda file: RESERVED_BYTES)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = opened(tmp_path / "run.rrd")
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))

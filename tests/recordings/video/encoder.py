@@ -12,7 +12,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from recordings.mcap.file import iter_decoded
-from recordings.ros2.cdr import TYPES
+from recordings.ros2.cdr import standard_types
 from recordings.ros2.image_from_msg import pixels_of
 from tests.recordings.encodings.rewritten import as_foxglove, foxglove, json_log, protobuf_log
 
@@ -70,7 +70,7 @@ def cdr_log(source: Path, out: Path, convert: Callable[[str, Any], Any]) -> Path
         writer, channels = Writer(file), dict[str, int]()
         writer.start(profile="ros2", library="")
         for topic, log_time, message in iter_decoded(source):
-            kind, types = message.__msgtype__, TYPES
+            kind, types = message.__msgtype__, standard_types()
             if kind.endswith("/Image"):
                 made, kind, types = convert(topic, message), VIDEO, store
                 data = np.frombuffer(made.data, np.uint8)

@@ -1,0 +1,332 @@
+"""A rerun recording of every intermediate of a run, laid out by `recordings.sinks.blueprint`.
+
+The loggers draw the items; the recording sets the timelines and writes the ledger and the file. rerun only warns of its
+errors by default; here they are raised.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rerun as rr
+from rerun.error_utils import catch_and_log_exceptions
+
+from flow.contracts import FrameRecord, Loss, counted
+from recordings.atomic_write import give_name, room_to_grow, temporary_name, unwritable, writing
+from recordings.sinks.blueprint import (
+    CLOCK,
+    FRAME,
+    FRAMES,
+    LAYOUT,
+    LEDGER,
+    MAX_LEGEND_LINES,
+    QUEUES,
+    SECONDS,
+    SUMMARY,
+    Layout,
+    Panel,
+    ViewSpec,
+)  # fmt: skip
+from recordings.sinks.canvas import CURVE_RGB, Canvas
+from recordings.sinks.loggers import LOGGERS, same_view
+from recordings.sinks.own_loggers import log_own
+from recordings.sinks.own_types import plain_type
+from stages.data import Array, Disparity, ElevationMap, Pose, StereoFrame
+
+if TYPE_CHECKING:
+    from recordings.sinks.rerun_sink import RerunSink
+
+RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
+PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
+LIVE_MEMORY = "512MB"  # of what a viewer that comes later still gets
+BATCH_BYTES = 4 << 20  # of some frames; each stored chunk takes 3 kB besides its content
+BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
+LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
+STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
+FOOTER_MAGIC = b"RRF2FOOT"  # at the end of a whole recording, before a checksum of 4 bytes
+
+
+class RerunRecording:
+    """A recording that is being written, with the settings of its `RerunSink`.
+
+    streams: name -> type of item, in the pipeline's order; about: facts of the run for its summary.
+    """
+
+    def __init__(self, settings: RerunSink, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
+        self._settings, self._path, self._streams, self._about = settings, Path(path), tuple(streams), dict(about)
+        self._partial = temporary_name(self._path)
+        self._stamp = 0  # the latest, ns
+        self._frames, self._views = 0, -1
+        self._plots: list[tuple[int, int, dict[str, float]]] = []  # per frame: stamp, number, path -> value
+        self._work = Counter[str]()  # stage -> seconds of all frames
+        with writing(self._path):
+            self._partial.open("wb").close()
+        try:
+            with catch_and_log_exceptions(strict=True):
+                self._begin()
+        except BaseException:
+            self._partial.unlink(missing_ok=True)
+            raise
+        sized = [name for name, kind in streams.items() if _is(kind, Disparity) or _is(kind, StereoFrame)]
+        disparities = [name for name in sized if _is(streams[name], Disparity)]
+        self._last_disparity = disparities[-1:]
+        self._canvas = Canvas(
+            self._recording,
+            settings.jpeg_quality,
+            settings.max_points,
+            settings.max_width,
+            sized=frozenset(sized),
+            matched=frozenset(disparities[-2:-1]),
+            counts_bytes=settings.max_megabytes > 0,
+        )
+        self._interval, self._rest = settings.every, 1e6 * settings.max_megabytes
+        self._drawn = 0  # frames with images
+
+    def _check_room(self) -> None:
+        """Raise LogError before the disk is full: rerun's writer never returns from a full one."""
+        if room_to_grow(self._partial) < RESERVED_BYTES:
+            raise unwritable(self._path, f"less than {RESERVED_BYTES >> 20} MB more can be written there")
+
+    def _begin(self) -> None:
+        self._check_room()
+        batches = rr.ChunkBatcherConfig(flush_tick=BATCH_SECONDS, flush_num_bytes=BATCH_BYTES)
+        self._recording = rr.RecordingStream(self._settings.application_id, batcher_config=batches)
+        self._recording.set_log_time_enabled(False)
+        sinks: list[Any] = [rr.FileSink(str(self._partial))]
+        if self._settings.live_port:
+            sinks.append(rr.GrpcServerSink("127.0.0.1", self._settings.live_port, server_memory_limit=LIVE_MEMORY))
+        self._recording.set_sinks(*sinks)
+        self._recording.send_recording_name(self._about.get("log", self._path.stem))
+        self._recording.log(SUMMARY, _document("RUNNING", self._about), static=True)
+        self._recording.flush()  # the file begins with it
+
+    def write(self, record: FrameRecord) -> None:
+        """Draw one frame."""
+        self._check_room()
+        with catch_and_log_exceptions(strict=True):
+            self._set_clocks(record.stamp, self._frames)
+            self._choose_pictures(record.items)
+            for stream in record.unchanged:
+                self._canvas.keep_all(stream)
+            captions = self._draw(record.items)
+            self._plot(record)
+            self._canvas.clear_missing()
+            text = "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions])
+            self._recording.log(FRAMES, rr.TextLog(text, level=rr.TextLogLevel.INFO))
+            self._log_losses(record.entries, self._frames)
+            self._send_blueprint()
+            if self._settings.live_port:
+                self._recording.flush()  # a viewer shows each frame at once
+        self._frames += 1
+
+    def close(self, summary: Mapping[str, Any]) -> None:
+        """End the recording with the run's verdict and give it its name."""
+        try:
+            with catch_and_log_exceptions(strict=True):
+                self._conclude(summary)
+            self._publish()
+        except (OSError, RuntimeError) as error:  # rerun raises RuntimeError if it cannot write its file
+            raise unwritable(self._path, getattr(error, "strerror", None) or str(error)) from error
+        finally:
+            self._partial.unlink(missing_ok=True)
+
+    def discard(self) -> None:
+        """Discard the recording; an earlier file of its name stays."""
+        self._recording.disconnect()
+        self._partial.unlink(missing_ok=True)
+
+    def _conclude(self, summary: Mapping[str, Any]) -> None:
+        """Log the verdict, the remaining losses and the findings."""
+        self._send_plots()
+        verdict = str(summary.get("verdict", "INCOMPLETE"))
+        last = max(0, self._frames - 1)
+        drops = [f"{count} {reason}" for reason, count in dict(summary.get("drops", {})).items()]
+        self._log_losses(summary.get("entries", ()), last)
+        self._set_clocks(self._stamp, last)
+        level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
+        text = f"{verdict}: {counted(self._frames, 'frame')}{''.join(f', {drop}' for drop in drops)}"
+        self._recording.log(LEDGER, rr.TextLog(text, level=level))
+        found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
+        for stream, finding in found:
+            level = LEVELS.get(finding["severity"], rr.TextLogLevel.INFO)
+            self._recording.log(LEDGER, rr.TextLog(f"{stream}: {finding['sentence']}", level=level))
+        facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
+        for key in {"surveys", "findings"} & facts.keys():
+            facts[key] = {name: f"{one['severity']}: {one['sentence']}" for name, one in summary[key].items()}
+        pictures = {"frames with images and clouds": f"{self._drawn} of {self._frames}"}
+        if self._interval > 1:
+            pictures["thinned"] = f"at the end each {self._interval}th frame has images, clouds and surfaces"
+        if self._settings.without:
+            pictures["not drawn"] = ", ".join(self._settings.without)
+        self._recording.log(SUMMARY, _document(verdict, self._about, facts, pictures), static=True)
+        layout = self._layout()
+        for stage, color in zip(layout.slowest, CURVE_RGB, strict=False):
+            path = ViewSpec(Panel.STAGE, SECONDS, rr.escape_entity_path_part(stage), stage).path
+            self._recording.log(path, rr.SeriesLines(colors=[color]), static=True)
+        self._recording.log(LAYOUT, rr.TextDocument(layout.as_json()), static=True)
+        self._views = -1  # the slowest stages are known now
+        self._send_blueprint()
+
+    def _publish(self) -> None:
+        """Finish the file, and name it if its end is there: rerun may not report a full disk."""
+        self._recording.flush()
+        self._recording.disconnect()
+        with self._partial.open("rb") as file:
+            file.seek(max(0, self._partial.stat().st_size - len(FOOTER_MAGIC) - 4))
+            whole = FOOTER_MAGIC in file.read()
+        if not whole:
+            raise OSError("its end is missing, as after a full disk")
+        give_name(self._partial, self._path)
+
+    def _set_clocks(self, stamp: int, frame: int) -> None:
+        """rerun's timelines belong to the calling thread, so every call from outside sets them first."""
+        self._stamp = max(stamp, self._stamp)
+        self._recording.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
+        self._recording.set_time(FRAME, sequence=frame)
+
+    def _choose_pictures(self, items: Mapping[str, Any]) -> None:
+        """Decide whether this frame's images, clouds and surfaces are drawn, and which streams are no intermediates.
+
+        Counted bytes, and not the file's size, decide, so that a recording does not depend on the speed of writing.
+        """
+        canvas, room = self._canvas, 1e6 * self._settings.max_megabytes
+        while room and room - canvas.logged_bytes < self._rest / 2 and self._rest > 1:
+            self._rest, self._interval = self._rest / 2, 2 * self._interval
+        canvas.pictures = self._frames % self._interval == 0
+        self._drawn += canvas.pictures
+        canvas.full_size = frozenset([*self._last_disparity, *_last_of(StereoFrame, items)])
+
+    def _draw(self, items: Mapping[str, Any]) -> list[str]:
+        """Log the items of a frame; returns their captions."""
+        present = {stream: items[stream] for stream in self._streams if stream in items}
+        captions = []
+        for stream, item in present.items():
+            if _drawn_later(stream, present):
+                continue
+            loggers = [log for kinds, log in LOGGERS.items() if len(kinds) == 1 and isinstance(item, kinds[0])]
+            captions += [log(self._canvas, stream, item) for log in loggers or [log_own]]
+        for kinds, log in LOGGERS.items():
+            if len(kinds) > 1:
+                for chosen in _together(present, kinds):
+                    captions.append(log(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
+        return [caption for caption in captions if caption]
+
+    def _plot(self, record: FrameRecord) -> None:
+        """Keep stage times and queues, to send many frames at once: sent one by one they would be half of all calls."""
+        values = {}
+        self._work.update(record.seconds)
+        for root, numbers in ((SECONDS, record.seconds), (QUEUES, record.queues)):
+            for stage, number in numbers.items():
+                view = ViewSpec(Panel.STAGE, root, rr.escape_entity_path_part(stage), stage)
+                values[view.path] = float(number)
+                if root == QUEUES and (Panel.STAGE, view.path) not in self._canvas.views:
+                    self._recording.log(view.path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
+                self._canvas.add_view(view)
+        self._plots.append((record.stamp, self._frames, values))
+        if len(self._plots) == PLOT_BATCH:
+            self._send_plots()
+
+    def _send_plots(self) -> None:
+        """Send the kept numbers; a frame without a stage has a gap in its line."""
+        if not self._plots:
+            return
+        stamps, frames, kept = zip(*self._plots, strict=True)
+        self._plots, clocks = [], _clocks(stamps, frames)
+        for path in [view.path for view in self._canvas.views.values() if view.panel is Panel.STAGE]:
+            columns = rr.Scalars.columns(scalars=[values.get(path, math.nan) for values in kept])
+            self._recording.send_columns(path, indexes=clocks, columns=columns, strict=True)
+
+    def _log_losses(self, entries: Iterable[Loss], frame: int) -> None:
+        """Losses, at their own stamps on the log's clock."""
+        losses = sorted(entries, key=lambda entry: entry.stamp)
+        if not losses:
+            return
+        texts = [f"{entry.stage} lost {entry.stream}: {entry.reason}. {entry.detail}" for entry in losses]
+        clocks = _clocks([entry.stamp for entry in losses], [frame] * len(losses))
+        columns = rr.TextLog.columns(text=texts, level=[rr.TextLogLevel.WARN] * len(losses))
+        self._recording.send_columns(LEDGER, indexes=clocks, columns=columns, strict=True)
+        self._stamp = max(losses[-1].stamp, self._stamp)
+
+    def _send_blueprint(self) -> None:
+        """Send the blueprint again if the frame added a view."""
+        if len(self._canvas.views) != self._views:
+            self._views = len(self._canvas.views)
+            self._recording.send_blueprint(self._layout().blueprint(self._settings.desk))
+
+    def _layout(self) -> Layout:
+        slowest = [stage for stage, _ in self._work.most_common(MAX_LEGEND_LINES)]
+        return Layout(self._settings.application_id, tuple(self._canvas.views.values()), tuple(slowest))
+
+
+def _is(kind: Any, wanted: type) -> bool:
+    plain = plain_type(kind)
+    return isinstance(plain, type) and issubclass(plain, wanted)
+
+
+def _clocks(stamps: Sequence[int], frames: Sequence[int]) -> list[rr.TimeColumn]:
+    """The recording's two timelines at these stamps, ns, and frames."""
+    times = np.array(stamps, "datetime64[ns]")
+    return [rr.TimeColumn(CLOCK, timestamp=times), rr.TimeColumn(FRAME, sequence=frames)]
+
+
+def _together(items: Mapping[str, Any], kinds: tuple[type, ...]) -> Iterator[list[str]]:
+    """The streams for a logger of several types: the last of each type, for every frame of reference.
+
+    A type without a frame of reference goes with every frame. Of stereo frames the last one of the camera's size goes.
+    """
+    frames = {getattr(item, "frame_id", None): None for item in items.values() if isinstance(item, kinds)}
+    for frame in [frame for frame in frames if frame is not None] or [None]:
+        fitting = {stream: item for stream, item in items.items() if getattr(item, "frame_id", frame) == frame}
+        chosen = [_last_of(kind, fitting) for kind in kinds]
+        if all(chosen):
+            yield [stream for streams in chosen for stream in streams]
+
+
+def _last_of(kind: type, items: Mapping[str, Any]) -> list[str]:
+    """The last stream of this type, if there is one."""
+    streams = [stream for stream, item in items.items() if isinstance(item, kind)]
+    if kind is StereoFrame:  # of the camera's size
+        streams = [stream for stream in streams if same_view(items[stream].camera, items[streams[0]].camera)]
+    return streams[-1:]
+
+
+def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
+    """Whether a later stream shows the same.
+
+    That is stereo with the same pixels, as in a log that is rectified already; an elevation map with the same heights
+    and more layers; the very same pose.
+    """
+    mine, later = items[stream], islice(items.values(), list(items).index(stream) + 1, None)
+    if isinstance(mine, Pose):
+        return any(item is mine for item in later)
+    if isinstance(mine, StereoFrame):
+        frames = (item for item in later if isinstance(item, StereoFrame))
+        return any(_same(item.left, mine.left) and _same(item.right, mine.right) for item in frames)
+    if isinstance(mine, ElevationMap):
+        maps = (item.layers for item in later if isinstance(item, ElevationMap))
+        return any(mine.layers.keys() <= layers.keys() and _same(layers["elevation"], mine.layers["elevation"])
+                   for layers in maps)  # fmt: skip
+    return False
+
+
+def _same(one: Array, other: Array) -> bool:
+    return bool(one.__array_interface__ == other.__array_interface__)
+
+
+def _document(verdict: str, *tables: Mapping[str, Any]) -> rr.TextDocument:
+    """The verdict and the facts of the run, as markdown."""
+    values = [(key, value) for table in tables for key, value in table.items() if value not in ({}, "")]
+    rows = [
+        f"| {key} | {', '.join(f'{k} {v}' for k, v in value.items()) if isinstance(value, Mapping) else value} |"
+        for key, value in values
+        if "\n" not in str(value)
+    ]
+    texts = [f"## {key}\n```\n{value}\n```" for key, value in values if "\n" in str(value)]
+    text = "\n".join([f"# {verdict}", "", "| | |", "|---|---|", *rows, "", *texts])
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
