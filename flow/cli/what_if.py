@@ -161,8 +161,8 @@ def run_variants(
     from stages.kernel_loading import loading_kernels
 
     graphs = {label: hastened(load(pipeline, overrides)) for label, overrides in changes.items()}
-    drawing = "recordings.comparison.recording"
-    with loading_kernels(drawing), graphs["A"].source.open(logs) as log, one_thread_per_call():
+    beside = loading_kernels("recordings.comparison.recording")
+    with beside, graphs["A"].source.open(logs) as log, one_thread_per_call():
         part = part_of(log, *place)
         log.narrow(part.start, part.end)
         graphs = {label: fitted(graph, log) for label, graph in graphs.items()}

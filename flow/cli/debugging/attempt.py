@@ -42,9 +42,6 @@ def run(options: argparse.Namespace) -> int:
     out = options.out or options.log[0].with_name(f"{options.log[0].stem}-try.rrd")
     check_outputs({"difference": out}, options.log)
     from flow.cli.what_if import changes_of, run_variants, summary_lines, swept_setting
-    from recordings.comparison.diff import diff
-    from recordings.comparison.recording import DiffRecording
-    from recordings.comparison.text import comparison, markdown
 
     changes = changes_of(options.set)
     place = (without_cursor(options.at), options.frames, options.before)
@@ -53,6 +50,10 @@ def run(options: argparse.Namespace) -> int:
             options.log, options.pipeline, changes, place, Path(folder), options.workers
         )
         say("\n".join(summary_lines(variants, part, options.frames)))
+        from recordings.comparison.diff import diff  # imported beside the run, as rerun takes long
+        from recordings.comparison.recording import DiffRecording
+        from recordings.comparison.text import comparison, markdown
+
         say(f"\nA: {options.pipeline} as it is")
         recording, tables, differences = DiffRecording(), [f"A: {options.pipeline} as it is"], dict[str, "Diff"]()
         for label, path in paths.items():
