@@ -196,7 +196,7 @@ class Canvas:
             dots = [((column + 0.5) * width / columns, (row - rows) * row_height) for row, column in places]
             pins = dots
             # The view ends at the uppermost point, so an invisible one keeps the first row's dots whole.
-            dots, colors = [*dots, (width / 2, -(rows + HEADROOM) * row_height)], [*colors, (0, 0, 0, 0)]
+            dots, colors = [*dots, (width / 2, -(rows + HEADROOM) * row_height)], (*colors, (0, 0, 0, 0))
         dot, pin = rr.Radius.ui_points(5.0), rr.Radius.ui_points(0.5)
         self.keep(path, content, lambda: rr.Points2D(dots, colors=colors, radii=dot, draw_order=30.0))
         # A label takes the colour of its dot, which may be as dark as the background, so labels have dots of their own.

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from flow.contracts import Finding, Severity
 from recordings.discovery.images import looks_rectified
 from recordings.errors import LogError
 from recordings.source.transforms import TRANSFORM_ATOL, TransformTree
@@ -102,21 +103,24 @@ def baseline_note(
     models: tuple[CameraModel, CameraModel],
     names: tuple[str, str],
     tree: TransformTree,
-) -> str:
-    """A note if the baseline of a calibrated pair comes from a static transform, or contradicts it; else empty."""
+) -> Finding | None:
+    """A note if the baseline of a calibrated pair comes from a static transform, a warning if it contradicts it."""
     right_in_left = tree.between(*names)
     if right_in_left is None or not np.any(right_in_left.translation):
-        return ""
+        return None
     baseline = StereoCamera.from_models(cameras[0].model, cameras[1].model, names[0], rectified=True).baseline
     distance = float(np.linalg.norm(right_in_left.translation))
     transform = f"the static transform '{names[0]}' <- '{names[1]}'"
     if not any(model.p[0, 3] for model in models):
-        return f"the baseline of {baseline:.4g} m comes from {transform}, because P[0,3] of both CameraInfo is 0"
+        return Finding(
+            f"the baseline of {baseline:.4g} m comes from {transform}, because P[0,3] of both CameraInfo is 0"
+        )
     if np.isclose(baseline, distance, rtol=BASELINE_RTOL, atol=0):
-        return ""
-    return (
+        return None
+    return Finding(
         f"the baseline is {baseline:.4g} m by P of the CameraInfo, which is used, but {distance:.4g} m by {transform}; "
-        "correct the wrong one"
+        "correct the wrong one",
+        Severity.WARNING,
     )
 
 

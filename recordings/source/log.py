@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.contracts import Finding
+from flow.contracts import Finding, Severity
 from recordings.containers.clock import MAX_JITTER_NS
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.header import peek_stamp
@@ -238,30 +238,23 @@ class McapLog:
 
     def notes(self) -> dict[str, str]:
         """Stream -> note: missing stamps, the source of the baseline, an unknown base frame."""
-        notes = {stream: UNSTAMPED for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)}
+        notes = [(stream, UNSTAMPED) for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)]
         if any(self._schema(side) == VIDEO for side in CAMERAS):
-            notes["left"] = "; ".join((*filter(None, [notes.get("left")]), VIDEO_NOTE))
-        if "right" in self.topics and (note := self.resolution.baseline_note):
-            notes["right"] = "; ".join((*filter(None, [notes.get("right")]), note))
-        if self.resolution.tilt is not None and (note := self.resolution.tilt.note(self._estimator, self.source)):
-            notes["inclinometer"] = "; ".join((*filter(None, [notes.get("inclinometer")]), note))
-        if self.file.notes and "left" in self.topics:
-            notes["left"] = "; ".join((*filter(None, [notes.get("left")]), *self.file.notes))
-        if self.resolution.mount is not None and self.resolution.mount.base_from_camera is None:
-            notes["mount"] = (
-                f"no static transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "
-                "`points.camera_height` (default 1 m) below the camera and x is its viewing direction"
-            )
-        if self.resolution.moving is not None and self.resolution.mount is not None:
-            notes["mount"] = "; ".join((*filter(None, [notes.get("mount")]), self.resolution.moving.note))
-        return notes
+            notes.append(("left", VIDEO_NOTE))
+        notes += self.resolution.notes(self._estimator)
+        notes += [("left", note) for note in self.file.notes if "left" in self.topics]
+        noted = dict.fromkeys(stream for stream, note in notes if note)
+        return {stream: "; ".join(note for of, note in notes if of == stream and note) for stream in noted}
 
     def faults(self) -> dict[str, Finding]:
-        """Stream -> what a run has shown to be wrong with it."""
-        if self._estimator is None or self.resolution.tilt is None:
-            return {}
-        fault = self.resolution.tilt.fault(self._estimator)
-        return {} if fault is None else {"inclinometer": fault}
+        """Stream -> what is wrong with it, by what the log states or by what a run has shown."""
+        found = dict[str, Finding]()
+        note = self.resolution.baseline_note if "right" in self.topics else None
+        if note is not None and note.severity is Severity.WARNING:
+            found["right"] = Finding(self.notes()["right"], Severity.WARNING)
+        if self._estimator and self.resolution.tilt and (fault := self.resolution.tilt.fault(self._estimator)):
+            found["inclinometer"] = fault
+        return found
 
     def _is_unstamped(self, stream: str, topic: str) -> bool:
         raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, LostMessage))

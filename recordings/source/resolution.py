@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from flow.contracts import counted
+from flow.contracts import Finding, counted
 from recordings.calibration.log_calibration import INCLINOMETER, calibrations_of_files
 from recordings.containers.recording import Recording
 from recordings.discovery.discover import discover
 from recordings.discovery.roles import IMU, TRANSFORMS, DiscoveredTopics, Remedy, TiltKind, Topic
 from recordings.errors import LogError
 from recordings.inertial.imu_content import ImuContent, imu_content
+from recordings.inertial.up_estimator import UpEstimator
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
 from recordings.source.calibration import Camera, baseline_note, calibrated_pair
 from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_images, unreadable_images
@@ -137,17 +138,33 @@ class SourceResolution:
                 found.refuse("inclinometer", names, f"the {found.tilt} of {topic}: {checked}")
         return found
 
-    def _paired(self, chosen: Mapping[str, str]) -> tuple[tuple[Camera, Camera] | None, str, dict[str, str]]:
+    def notes(self, estimator: UpEstimator | None) -> list[tuple[str, str]]:
+        """(Stream, note, which may be empty) on baseline, tilt and mount; estimator: of the direction of up, if any."""
+        notes = []
+        if "right" in self.topics and self.baseline_note is not None:
+            notes.append(("right", self.baseline_note.sentence))
+        if self.tilt is not None:
+            notes.append(("inclinometer", self.tilt.note(estimator, self.source)))
+        if self.mount is not None and self.mount.base_from_camera is None:
+            notes.append(("mount", (
+                f"no static transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "
+                "`points.camera_height` (default 1 m) below the camera and x is its viewing direction"
+            )))  # fmt: skip
+        if self.moving is not None and self.mount is not None:
+            notes.append(("mount", self.moving.note))
+        return notes
+
+    def _paired(self, chosen: Mapping[str, str]) -> tuple[tuple[Camera, Camera] | None, Finding | None, dict[str, str]]:
         """The calibrated pair, the note on its baseline, and side -> why there is no pair."""
         if len(self.infos) < len(CAMERAS):
-            return None, "", {}
+            return None, None, {}
         left, right = (self.infos[side] for side in CAMERAS)
         models, names = (left.model, right.model), (left.frame_id, right.frame_id)
         cameras = attempt(calibrated_pair, models, names, (chosen["left"], chosen["right"]), self.static)
         if isinstance(cameras, LogError):
-            return None, "", dict.fromkeys(CAMERAS, str(cameras))
+            return None, None, dict.fromkeys(CAMERAS, str(cameras))
         if self.source.calibration is not None:
-            return cameras, f"the calibration is that of {self.infos['left'].topic}", {}
+            return cameras, Finding(f"the calibration is that of {self.infos['left'].topic}"), {}
         return cameras, baseline_note(cameras, models, names, self.static), {}
 
     def _mounted(

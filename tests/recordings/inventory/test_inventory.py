@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
+from flow.contracts import Severity
 from recordings import McapSource
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
@@ -190,6 +191,9 @@ def test_a_baseline_from_or_against_the_transform_is_noted(tmp_path, errors, tol
     unstamped = "the header stamps are 0, so log times are used"
     assert described["notes"] == {"right": f"{unstamped}; {note}" if note else unstamped}
     assert f"note: right: {described['notes']['right']}" in format_description(described).splitlines()
+    with McapSource().open(path) as log:
+        contradicted = "correct the wrong one" in note
+        assert [finding.severity for finding in log.faults().values()] == [Severity.WARNING] * contradicted
 
 
 def test_a_missing_right_calibration_is_reported(tmp_path):
