@@ -203,14 +203,15 @@ class RerunRecording:
         canvas.full_size = frozenset([*self._last_disparity, *_last_of(StereoFrame, items)])
 
     def _draw(self, items: Mapping[str, Any]) -> list[str]:
-        """Log the items of a frame; returns their captions."""
+        """Log the items of a frame; returns their captions, but for the streams inside a template."""
         present = {stream: items[stream] for stream in self._streams if stream in items}
         captions = []
         for stream, item in present.items():
             if _drawn_later(stream, present):
                 continue
             loggers = [log for kinds, log in LOGGERS.items() if len(kinds) == 1 and isinstance(item, kinds[0])]
-            captions += [log(self._canvas, stream, item) for log in loggers or [log_own]]
+            texts = [log(self._canvas, stream, item) for log in loggers or [log_own]]
+            captions += texts if "/" not in stream else []
         for kinds, log in LOGGERS.items():
             if len(kinds) > 1:
                 for chosen in _together(present, kinds):
