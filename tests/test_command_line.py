@@ -207,6 +207,12 @@ def test_a_score_is_printed_and_written_as_json(traverse, result, tmp_path, caps
     assert json.loads((tmp_path / "score.json").read_text())["frames"] == FRAMES
 
 
+def test_part_of_a_log(traverse, tmp_path):
+    out = tmp_path / "part.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--start", 0.7, "--end", 1.3) == 0
+    assert len([topic for topic, _, _ in raw_messages(out) if topic == "/nav/points"]) == 1
+
+
 def test_the_pose_comes_from_tf_if_so_configured(traverse, tmp_path):
     """The simulator's /odometry is left out; its pose is written as /tf among another transform."""
     from recordings.mcap.writer import Ros2Writer
