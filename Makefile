@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
-# Where bytecode is not kept, every process compiles the sources again: a quarter of the time of the tests.
+# Tests start many processes; without kept bytecode each of them compiles the sources again.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test check-all bench fuzz study pictures docs lint clean
@@ -15,7 +15,7 @@ test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check-all: $(READY) lint
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m ""
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "" --hypothesis-profile=thorough
 
 bench: $(READY)
 	$(BIN)/python -m tests.bench
