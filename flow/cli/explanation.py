@@ -249,17 +249,22 @@ def input_of(graph: Graph, result: Path, log: Path | None = None) -> Iterator[Mc
 
     Raises UsageError if it is not there, cannot be read, or has none of the result's frames.
     """
+    from recordings.containers.digest import log_digest
+    from recordings.containers.finding import find_files
     from recordings.errors import LogError
     from recordings.scoring.result_log import about_run, stamps_of
 
-    named = about_run(result)["log"]
+    about = about_run(result)
+    named = about["log"]
     given = log or result.with_name(named)
     if not given.exists():
         raise UsageError(f"the input of {result}, {named}, is not beside it; give it with --log")
     with ExitStack() as stack:
         try:
             opened = stack.enter_context(graph.source.open(given))
-            if is_other(opened, stamps_of(result)):
+            # A log in another form has another digest, and the same stamps.
+            same = log_digest(find_files(given).files) == about.get("log_digest")
+            if not same and is_other(opened, stamps_of(result)):
                 remedy = "" if log is None else f"; give {named}"
                 raise UsageError(f"{given} is not the input of {result}: its frames have other stamps{remedy}")
         except (LogError, RoverflowError) as error:
