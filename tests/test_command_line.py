@@ -389,7 +389,7 @@ sys.addaudithook(lambda event, what: event == "import" and what[0] == "{}" and o
 AT_EXIT = "atexit.register(os.kill, os.getpid(), signal.SIGINT)"
 
 
-@pytest.mark.parametrize("moment", [ON_IMPORT.format("flow.cli.report"), AT_EXIT, *slow(ON_IMPORT.format("rerun"))])
+@pytest.mark.parametrize("moment", [ON_IMPORT.format("flow.cli.report"), AT_EXIT, *slow(ON_IMPORT.format("numpy"))])
 def test_an_interrupt_at_start_or_exit_prints_no_traceback(moment):
     heard = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # what runs in the background may ignore it
     code = f"import atexit, os, signal, sys\n{heard}\n{moment}\nimport flow.__main__"

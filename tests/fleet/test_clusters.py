@@ -77,6 +77,7 @@ def times(out: Path) -> dict[str, int]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_processes_and_clusters_write_the_bytes_of_run(home, tmp_path):
     for processes in (1, 2):
         ended(home, tmp_path / f"out{processes}", "--processes", processes, "--workers-per-log", 1)
@@ -119,7 +120,8 @@ def test_a_worker_that_is_killed_every_few_seconds_loses_no_log(home, tmp_path):
                 for child in psutil.Process(fleet.pid).children(recursive=True)
                 if "spawn_main" in " ".join(child.cmdline())
             ]
-            if fleet.poll() is None and workers:
+            # No more than five: a log whose worker died twice is set aside, and the retries come last.
+            if fleet.poll() is None and workers and killed < 5:
                 workers[killed % len(workers)].kill()
                 killed += 1
     said = fleet.communicate()
