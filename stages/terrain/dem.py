@@ -53,7 +53,7 @@ class Voxelise(Stage):
     )
     correlated_points: float = parameter(4.0, "neighbouring points that share one matching error", low=1.0)
     systematic_share: float = parameter(
-        0.9, "share of the points' variance that no averaging removes", low=0.0, high=1.0
+        0.86, "share of the points' variance that no averaging removes", low=0.0, high=1.0
     )
     scatter_share: float = parameter(0.2, "share of the scatter beyond slope and noise in the variance", low=0.0)
     curvature_share: float = parameter(0.38, "share of the squared curvature in the variance", low=0.0)
