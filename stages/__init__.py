@@ -139,3 +139,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(f"stages.{_HOMES[name]}"), name)
     raise AttributeError(f"module 'stages' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -8,7 +8,8 @@ import stages
 from flow.config.reference import stage_reference
 from stages.stage import Stage
 
-KINDS = {name: kind for name, kind in vars(stages).items() if isinstance(kind, type) and issubclass(kind, Stage)}
+NAMED = {name: getattr(stages, name) for name in stages.__all__}
+KINDS = {name: kind for name, kind in NAMED.items() if isinstance(kind, type) and issubclass(kind, Stage)}
 
 
 @pytest.mark.parametrize("name", sorted(KINDS))
