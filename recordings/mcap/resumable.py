@@ -50,7 +50,7 @@ class ResumableWriter(Ros2Writer):
         super().__init__(path)
         with writing(self.path):
             self._file.flush()
-            self._end = self._file.tell()  # the log keeps the bytes before it
+            self._end = self._file.tell()  # bytes before it stay in the log
             self._chunks = deque(whole_chunks(self._file, self._end))
             self._definitions: dict[int, Schema] = {}
             self._defined: dict[int, tuple[str, MessageKind]] = {}  # channel -> topic and type

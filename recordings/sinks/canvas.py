@@ -185,6 +185,7 @@ class Canvas:
         height, width = shape
         content = shape, *entries
         names, colors = zip(*content[1:], strict=True)
+        radii = [5.0] * len(names)
         rows = -(-len(names) // (2 if beside else LEGEND_COLUMNS[len(names) > LEGEND_COLUMNS[0]]))
         columns = -(-len(names) // rows)
         places = [divmod(number, columns) for number in range(len(names))]
@@ -195,10 +196,11 @@ class Canvas:
             row_height = LEGEND_ROW[rows > 1] * height
             dots = [((column + 0.5) * width / columns, (row - rows) * row_height) for row, column in places]
             pins = dots
-            # The view ends at the uppermost point, so an invisible one keeps the first row's dots whole.
-            dots, colors = [*dots, (width / 2, -(rows + HEADROOM) * row_height)], (*colors, (0, 0, 0, 0))
-        dot, pin = rr.Radius.ui_points(5.0), rr.Radius.ui_points(0.5)
-        self.keep(path, content, lambda: rr.Points2D(dots, colors=colors, radii=dot, draw_order=30.0))
+            # The view ends at the uppermost point, so one without extent keeps the first row's dots whole.
+            dots, colors = [*dots, (width / 2, -(rows + HEADROOM) * row_height)], (*colors, (0, 0, 0))
+            radii.append(0.0)
+        sizes, pin = rr.Radius.ui_points(radii), rr.Radius.ui_points(0.5)
+        self.keep(path, content, lambda: rr.Points2D(dots, colors=colors, radii=sizes, draw_order=30.0))
         # A label takes the colour of its dot, which may be as dark as the background, so labels have dots of their own.
         texts: dict[str, Any] = {"labels": names, "show_labels": True, "radii": pin, "draw_order": 31.0}
         self.keep(f"{path}/text", content, lambda: rr.Points2D(pins, colors=[TEXT_RGB], **texts))
