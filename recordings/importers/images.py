@@ -32,6 +32,7 @@ from recordings.importers.recording import (
     ImportedRecording,
     Logged,
     beside,
+    image_message,
     raw_models,
     rectified_models,
     write_recording,
@@ -77,8 +78,8 @@ def import_images(
     attitudes: Path | None = None,
     progress: Callable[[int], None] = lambda done: None,
     report: Callable[[str], None] = lambda sentence: None,
-) -> int:
-    """Write image pairs as a log.
+) -> tuple[int, list[str]]:
+    """Write image pairs as a log. The first pair must fit the calibration; later ones that do not are left out.
 
     Parameters
     ----------
@@ -107,13 +108,13 @@ def import_images(
 
     Returns
     -------
-    int
-        The number of pairs.
+    tuple[int, list[str]]
+        The number of frames, and notes about the pairs that are left out.
 
     Raises
     ------
     LogError
-        If a file cannot be read or does not fit the calibration.
+        If the calibration, the attitudes or the first pair cannot be used.
     """
     if len(left) != len(right) or not left:
         raise LogError(f"{len(left)} left and {len(right)} right images are not pairs; give equal numbers")
@@ -131,18 +132,17 @@ def import_images(
     files = [calibration] if isinstance(calibration, Path) else calibration
     if isinstance(files, Mapping) or (len(files) == 1 and _is_of_rectified(files[0])):
         values = _calibration(files if isinstance(files, Mapping) else files[0])
-        camera = [read_frame(0, pair, values).camera for pair in zip(left, right, strict=True)][-1]
+        camera = read_frame(0, (left[0], right[0]), values).camera
         rectified, cameras, beside_it = True, rectified_models(camera), beside(camera)
     else:
-        rectified, (cameras, beside_it) = False, _raw(files, [*left, *right])
+        rectified, (cameras, beside_it) = False, _raw(files, (left[0], right[0]))
     numbered = enumerate(zip(left, right, strict=True))
     paired = [ImagePair(FIRST_STAMP + number * period, *pair) for number, pair in numbered]
     moving = None
     if attitudes is not None:
         paired, moving = read_attitudes(attitudes, paired, rig)
     recording = standing(paired, cameras, beside_it, rig, moving)
-    write_recording(replace(recording, rectified=rectified), out, progress, report)
-    return len(left)
+    return write_recording(replace(recording, rectified=rectified), out, progress, report)
 
 
 def standing(
@@ -171,16 +171,14 @@ def _is_of_rectified(path: Path) -> bool:
     return not isinstance(content, Mapping) or any(known.name in content for known in fields(ImageCalibration))
 
 
-def _raw(files: Sequence[Path], images: Sequence[Path]) -> tuple[tuple[CameraModel, CameraModel], Transform]:
-    """The cameras of images before rectification, and left <- right camera. Raises LogError, also for other sizes."""
-    calibrated, size = read_calibration(files), image_size(images[0])
-    cameras = raw_models(calibrated, size)
+def _raw(files: Sequence[Path], pair: tuple[Path, Path]) -> tuple[tuple[CameraModel, CameraModel], Transform]:
+    """The cameras of images before rectification, and left <- right camera. Raises LogError, also for another pair."""
+    calibrated = read_calibration(files)
+    cameras = raw_models(calibrated, image_size(pair[0]))
     if calibrated.right_in_left is None:
         raise LogError(f"{files[0]} lacks the transform between the cameras; give the files of the stereo calibration")
-    for path in images:
-        if (found := image_size(path)) != (cameras[0].width, cameras[0].height):
-            expected = f"{cameras[0].width}x{cameras[0].height}"
-            raise LogError(f"{path} is {found[0]}x{found[1]}, but the calibration or the first image is {expected}")
+    for path, camera in zip(pair, cameras, strict=True):
+        image_message(FIRST_STAMP, LEFT, path, camera)
     return cameras, rigid(LEFT, RIGHT, calibrated.right_in_left)
 
 
@@ -208,7 +206,7 @@ def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
 def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) -> StereoFrame:
     """The frame of two image files.
 
-    values: fx, fy, cx, cy, cx_right (px), baseline (m), width and height; missing sizes are set. Raises LogError.
+    values: fx, fy, cx, cy, cx_right (px), baseline (m), and maybe width and height. Raises LogError.
     """
     images = [read_pixels(path) for path in pair]
     height, width = images[0].shape[:2]
@@ -221,9 +219,8 @@ def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) ->
             f"the calibration's centre (cx {values['cx']:g}, cy {values['cy']:g}) is outside {pair[0]}, which is "
             f"{width}x{height}; give the calibration of images of this size"
         )
-    if (values.setdefault("width", width), values.setdefault("height", height)) != (width, height):
-        expected = f"{values['width']:g}x{values['height']:g}"
-        raise LogError(f"{pair[0]} is {width}x{height}, but the calibration or the first pair is {expected}")
+    if (size := (values.get("width", width), values.get("height", height))) != (width, height):
+        raise LogError(f"{pair[0]} is {width}x{height}, but the calibration is for {size[0]:g}x{size[1]:g}")
     camera = StereoCamera(**{**values, "width": width, "height": height}, frame_id=LEFT)
     return StereoFrame(stamp, images[0], images[1], camera)
 

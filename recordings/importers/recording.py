@@ -29,6 +29,7 @@ from recordings.importers.track import WORLD, Track, upright
 from recordings.mcap.resumable import ResumableWriter
 from recordings.ros2 import to_msg as ros2
 from recordings.ros2.cdr import make
+from recordings.ros2.image_from_msg import is_cut
 from recordings.source.calibration import Camera, calibrated_pair, pinhole
 from recordings.source.transforms import TransformTree
 from stages.data import CameraModel, Pose, StereoCamera, Transform
@@ -81,8 +82,8 @@ def write_recording(
     """Write the log, or continue it; returns its number of frames and the notes.
 
     progress: called with the frames done so far; report: called with a sentence about an interrupted import. A pair
-    with a file that is no image of the calibration's size, or with the time of the pair before it, is left out with a
-    note. Raises LogError if no log can be made.
+    with a file that is no whole image of the calibration's size, or with the time of the pair before it, is left out
+    with a note. Raises LogError if no log can be made.
     """
     tree = TransformTree()
     for mount in recording.mounts:
@@ -156,7 +157,7 @@ def _images(
 ) -> list[Logged]:
     """The messages of a pair; if an unfinished log contains both, partials that make them. Raises LogError."""
     sides = zip((LEFT, RIGHT), (pair.left, pair.right), cameras, strict=True)
-    makers = [partial(_image, pair.stamp, *side) for side in sides]
+    makers = [partial(image_message, pair.stamp, *side) for side in sides]
     possible = [topic + ending for topic in topics for ending in ENDINGS]
     named = [topic for topic in possible if pair.stamp in contained.get(topic, ())]
     if len(named) == len(makers):
@@ -166,12 +167,14 @@ def _images(
     return [(pair.stamp, topic, message) for topic, message in zip(named, messages, strict=True)]
 
 
-def _image(stamp: int, frame: str, path: Path, model: CameraModel) -> Any:
-    """The message of an image file. Raises LogError if it does not fit the calibration."""
+def image_message(stamp: int, frame: str, path: Path, model: CameraModel) -> Any:
+    """The message of an image file. Raises LogError if it is cut or does not fit the calibration."""
     if (size := image_size(path)) != (model.width, model.height):
         raise LogError(f"{path} is {size[0]}x{size[1]}, but the calibration is for {model.width}x{model.height}")
     content = read_bytes(path)
     if encoding := encoding_of(content):
+        if is_cut(content):
+            raise LogError(f"{path} is cut after {len(content)} bytes")
         return ros2.compressed_image(stamp, frame, np.frombuffer(content, np.uint8), encoding)
     return ros2.image(stamp, frame, read_pixels(path))
 

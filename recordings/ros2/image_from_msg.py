@@ -104,10 +104,7 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None, max_pixels: int) -> 
 def _compressed_pixels(message: Any, size: tuple[int, int] | None, max_pixels: int) -> Array:
     data = np.ascontiguousarray(message.data, np.uint8)
     content = data.tobytes()
-    # OpenCV may silently make a wrong picture of a JPEG whose end is replaced by zeros, the rest of a camera's buffer.
-    # Padding after a complete picture is harmless.
-    end = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(content[:2], b"")
-    if end not in content.rstrip(b"\0")[-_MAX_PADDING_BYTES:]:
+    if is_cut(content):
         raise LogError(f"the compressed image is cut after {data.size} bytes")
     if content.startswith(b"\xff\xd8") and (scans := content.count(b"\xff\xda")) > _MAX_SCANS:
         raise LogError(f"the compressed image has {scans} scans; the limit is {_MAX_SCANS}")
@@ -150,6 +147,16 @@ def stated_size(content: bytes) -> tuple[int, int] | None:
         else:
             position += 2 + length
     return None
+
+
+def is_cut(content: bytes) -> bool:
+    """Whether the bytes of a PNG or JPEG file lack its end.
+
+    OpenCV may silently make a wrong picture of a JPEG whose end is replaced by zeros, the rest of a camera's buffer.
+    Padding after a complete picture is harmless.
+    """
+    end = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}.get(content[:2], b"")
+    return end not in content.rstrip(b"\0")[-_MAX_PADDING_BYTES:]
 
 
 def _has_whole_chunks(data: Array) -> bool:

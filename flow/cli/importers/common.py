@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,9 +37,7 @@ def import_recording(
     recording = read(read_rig(options.rig, entries))
     with progress_bar(options.out, len(recording.pairs)) as shown:
         frames, notes = write_recording(recording, options.out, *shown)
-    for note in notes:
-        say(f"{options.source}: {note}")
-    return complete(options.out, frames)
+    return complete(options, frames, notes)
 
 
 @contextmanager
@@ -63,7 +61,9 @@ def progress_bar(out: Path, frames: int) -> Iterator[tuple[Callable[[int], None]
             raise
 
 
-def complete(out: Path, frames: int) -> int:
-    """Print frames and size of a log; returns the exit code."""
-    say(f"{out}: {counted(frames, 'stereo frame')} ({out.stat().st_size / 1e6:.1f} MB)")
+def complete(options: argparse.Namespace, frames: int, notes: Iterable[str]) -> int:
+    """Print notes, frames and size of a log; returns the exit code."""
+    for note in notes:
+        say(f"{options.source}: {note}")
+    say(f"{options.out}: {counted(frames, 'stereo frame')} ({options.out.stat().st_size / 1e6:.1f} MB)")
     return COMPLETE

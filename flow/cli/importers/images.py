@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
     given = {name: getattr(options, name) for name in ("roll", "height", "rate", "attitudes")}
     given["pitch_down"] = options.pitch_down or 0.0
     with progress_bar(options.out, len(left)) as shown:
-        frames = import_images(
+        frames, notes = import_images(
             left, right, options.calibration, options.out, **given, progress=shown[0], report=shown[1]
         )
-    return complete(options.out, frames)
+    return complete(options, frames, notes)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.errors import LogError
+from recordings.importers import files
 from recordings.importers.images import import_images
 from recordings.importers.pairing import pair_images
 from recordings.source.transforms import BODY_FROM_OPTICAL
@@ -42,7 +43,7 @@ def events(path: Path) -> list[tuple[int, str, Any]]:
 def test_images_are_logged_bit_for_bit_at_the_rate(tmp_path):
     left, right = make_pairs(tmp_path)
     out = tmp_path / "out.mcap"
-    assert import_images(left, right, CALIBRATION, out, pitch_down=15, height=0.9, rate=4) == 3
+    assert import_images(left, right, CALIBRATION, out, pitch_down=15, height=0.9, rate=4) == (3, [])
     read = events(out)
     images = {side: [item for _, stream, item in read if stream == side] for side in ("left", "right")}
     for number in range(3):
@@ -127,7 +128,7 @@ def test_no_image_is_left_out_silently(tmp_path, names, sentence):
         ({"fx": 10**30}, r": fx must be at most 1e\+09 px, not 1e\+30 px"),
         ({"baseline": -0.2}, r": baseline must be at least .* not -20 cm"),
         ({"cx": 24.5}, "the calibration's centre .cx 24.5, cy 7.5. is outside"),
-        ({"width": 640}, "is 24x16, but the calibration or the first pair is 640x16"),
+        ({"width": 640}, "is 24x16, but the calibration is for 640x16"),
     ],
 )
 def test_a_wrong_calibration_is_refused_and_leaves_no_file(tmp_path, change, sentence):
@@ -194,7 +195,7 @@ def test_a_calibration_before_rectification_needs_both_cameras_and_their_size(tm
     assert camera.baseline == pytest.approx(0.25)
     assert [model.d[0] for model in camera.raw] == [0.01, 0.02]
     save(right[0], picture(0)[:8])
-    with pytest.raises(LogError, match="is 24x8, but the calibration or the first image is 24x16"):
+    with pytest.raises(LogError, match="is 24x8, but the calibration is for 24x16"):
         import_images(left, right, file, tmp_path / "other.mcap", pitch_down=10, height=1)
 
 
@@ -206,6 +207,29 @@ def test_images_of_two_sizes_and_other_files_are_refused(tmp_path):
     right[0].write_bytes(b"no picture")
     with pytest.raises(LogError, match=r"0-right\.png is not a readable image"):
         import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1)
+
+
+def test_images_are_read_as_the_log_is_written(tmp_path, monkeypatch):
+    left, right = make_pairs(tmp_path)
+    read, so_far = set(), []
+    monkeypatch.setattr(files, "read_bytes", lambda path: read.add(path.name) or path.read_bytes())
+    given = {"pitch_down": 0, "height": 1, "progress": lambda done: so_far.append(len(read))}
+    assert import_images(left, right, CALIBRATION, tmp_path / "out.mcap", **given) == (3, [])
+    assert so_far == [2, 4, 6]
+
+
+def test_a_later_pair_that_is_cut_or_of_another_size_is_left_out(tmp_path, capsys):
+    left, right = make_pairs(tmp_path / "pairs", 4)
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(CALIBRATION))
+    right[1].write_bytes(right[1].read_bytes()[:-100])
+    save(left[2], picture(0)[:8])
+    given = "--calibration", tmp_path / "camera.yaml", "--pitch-down", 15, "--height", 0.9
+    assert roverflow("import", "images", tmp_path / "pairs", tmp_path / "out.mcap", *given) == 0
+    said = capsys.readouterr().out
+    assert f"2 pairs left out, first: {right[1]} is cut after" in said
+    assert "2 stereo frames" in said
+    read = [item.stamp for _, stream, item in events(tmp_path / "out.mcap") if stream == "left"]
+    assert np.diff(read).tolist() == [3_000_000_000]
 
 
 def test_the_devon_pairs_become_a_log(tmp_path):

@@ -195,7 +195,7 @@ def calibrate(**changes: object):
             spoil("disp0GT.pfm", b"Pf\n96 64\n-1\n" + 96 * 64 * b"\0\0\x80\x7f"),
             r"disp0GT\.pfm has no known pixel",
         ),
-        (calibrate(width=48), r"im0\.png is 96x64, but the calibration or the first pair is 48x64"),
+        (calibrate(width=48), r"im0\.png is 96x64, but the calibration is for 48x64"),
         (spoil("disp0GT.pfm", b"P6\n3 2\n255\n" + bytes(18)), r"disp0GT\.pfm is not a PFM file of one channel"),
         (spoil("disp0GT.pfm", b""), r"disp0GT\.pfm is not a PFM file"),
         (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(23)), r"has 23 bytes of pixels, but 3x2 pixels need 24"),
