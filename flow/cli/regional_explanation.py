@@ -123,7 +123,7 @@ def _contributions(result: Path, navigation: NavigationMap, centre: tuple[float,
         if stamp > navigation.stamp:
             break
         messages = {topic: message for topic, _, message in group}
-        level = _level(messages.get("/tf"), navigation.frame_id)
+        level = level_in(messages.get("/tf"), navigation.frame_id)
         if level is None or "/nav/points" not in messages:
             continue
         heights = _heights(read_point_cloud(messages["/nav/points"]), level, centre, navigation.resolution)
@@ -132,7 +132,7 @@ def _contributions(result: Path, navigation: NavigationMap, centre: tuple[float,
     return found
 
 
-def _level(transforms: object, parent: str) -> Transform | None:
+def level_in(transforms: object, parent: str) -> Transform | None:
     """Frame `level` in the map's frame."""
     for item in getattr(transforms, "transforms", ()):
         if item.child_frame_id == LEVEL_FRAME and item.header.frame_id == parent:

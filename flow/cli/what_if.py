@@ -32,12 +32,13 @@ Instant = float | np.datetime64 | np.timedelta64
 @dataclass(frozen=True)
 class Part:
     """The frames of an instant. start, end: the part to read; at: the first frame of the instant; all in s after the
-    log's first message. before: number of frames before it."""
+    log's first message. before: number of frames before it; stamp: of its first frame, ns."""
 
     start: float
     end: float
     at: float
     before: int
+    stamp: int
 
 
 def changes_of(given: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -78,10 +79,11 @@ def swept_setting(changes: Mapping[str, Sequence[str]]) -> tuple[str, list[float
     return f"{name} ({unit})" if unit else name, [float(match[1]) for match in found if match]
 
 
-def part_of(log: McapLog, at: Instant, frames: int, before: int) -> Part:
+def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64) -> Part:
     """The left images nearest to an instant, and those before them; raises UsageError.
 
-    at: s after the log's first message; or a stamp; or the time of the day, UTC, of one.
+    at: s after the log's first message; or a stamp; or the time of the day, UTC, of one; before: their number, or the
+    stamp of the first of them.
     """
     times = log.file.times(log.channels("left")) if "left" in log.topics else np.zeros(0, np.int64)
     if not times.size:
@@ -91,10 +93,12 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int) -> Part:
     if chosen is None:
         shown = f"{at:g}" if isinstance(at, float | int) else f"{np.datetime64(ns_of(at, log.begin), 'ns')}Z"
         raise UsageError(f"--at {shown} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s")
-    low, high = max(0, chosen - before), min(times.size, chosen + frames) - 1
+    earlier = chosen - (_nearest(log, times, before) or 0) if isinstance(before, np.datetime64) else before
+    low, high = max(0, chosen - earlier), min(times.size, chosen + frames) - 1
     edges = np.concatenate([times[:1] - 1_000_000_000, (times[1:] + times[:-1]) // 2, times[-1:] + 1_000_000_000])
     start, end = (max(0, int(edges[place]) - log.begin) / 1e9 for place in (low, high + 1))
-    return Part(start, end, (int(times[chosen]) - log.begin) / 1e9, chosen - low)
+    stamp = _stamps(log, times, chosen, reach=0).get(int(times[chosen]), int(times[chosen]))
+    return Part(start, end, (int(times[chosen]) - log.begin) / 1e9, chosen - low, stamp)
 
 
 def is_other(log: McapLog, stamps: NDArray[np.int64]) -> bool:
@@ -146,12 +150,13 @@ def hastened(graph: Graph) -> Graph:
 
 
 def run_variants(
-    logs: Sequence[Path], pipeline: str, changes: Mapping[str, Sequence[str]], place: tuple[Instant, int, int],
+    logs: Sequence[Path], pipeline: str | Path, changes: Mapping[str, Sequence[str]], place: tuple[Instant, int, int],
     folder: Path, workers: int,
-) -> tuple[dict[str, Path], Variants, Part]:  # fmt: skip
-    """Run all variants over a part of a log; returns their result logs in `folder`, the graphs and the part.
+) -> tuple[dict[str, Path], Variants, Part, list[str]]:  # fmt: skip
+    """Run all variants over a part of a log; returns their result logs in `folder`, the graphs, the part, and notes.
 
-    place: instant, frames from there on, and frames before it, as for `part_of`.
+    pipeline: its name; or a result log of it, which then has the state before the instant; place: instant, frames from
+    there on, and frames before it, as for `part_of`; notes: on the state, for a terminal.
 
     Raises
     ------
@@ -160,26 +165,39 @@ def run_variants(
     """
     from stages.kernel_loading import loading_kernels
 
-    graphs = {label: hastened(load(pipeline, overrides)) for label, overrides in changes.items()}
+    graphs = {label: hastened(_graph(pipeline, own)) for label, own in changes.items()}
     beside = loading_kernels("recordings.comparison.recording")
     with beside, graphs["A"].source.open(logs) as log, one_thread_per_call():
-        part = part_of(log, *place)
-        log.narrow(part.start, part.end)
         graphs = {label: fitted(graph, log) for label, graph in graphs.items()}
-        variants = merged(graphs)
+        variants, states, notes = merged(graphs), dict[str, Any](), list[str]()
+        part = part_of(log, *place)
+        if isinstance(pipeline, Path):
+            from flow.cli.logged_state import resume  # which imports this module
+
+            first, states, notes = resume(pipeline, (log, logs), graphs, variants, part.stamp)
+            part = part_of(log, *place[:2], first)
+        log.narrow(part.start, part.end)
         about = {
             "roverflow": product_version(), "log": ", ".join(path.name for path in logs),
             "start": repr(part.start), "end": repr(part.end), "every": "",
         }  # fmt: skip
         sinks = tuple((label, _sink(graphs[label], variants, label, changes[label])) for label in graphs)
         paths = {label: folder / f"{label}.mcap" for label in graphs}
-        run(replace(variants.graph, sinks=sinks), log, paths, workers=workers, about=about)
+        run(replace(variants.graph, sinks=sinks), log, paths, workers=workers, about=about, states=states)
     missing = [label for label, path in paths.items() if not path.exists()]
     if missing:
         raise UsageError(
             f"no frame went through at {part.start:.3f} s; roverflow run --start {part.start:.3f} says why"
         )
-    return paths, variants, part
+    return paths, variants, part, notes
+
+
+def _graph(pipeline: str | Path, changes: Sequence[str]) -> Graph:
+    if isinstance(pipeline, str):
+        return load(pipeline, changes)
+    from flow.cli.explanation import graph_of  # which imports this module
+
+    return graph_of(pipeline, changes, with_sinks=True)
 
 
 def summary_lines(variants: Variants, part: Part, frames: int) -> list[str]:

@@ -82,7 +82,8 @@ class Engine:
 
     stages: in topological order; sinks: name -> (sink, the streams it gets); ledger: gets an entry for every loss;
     workers: threads; capacity: frames that an inbox holds, and one more where a stage flushes; max_frames: in flight,
-    at least 2 if a stage flushes; on_frame: called after every frame, with whether it lost nothing.
+    at least 2 if a stage flushes; on_frame: called after every frame, with whether it lost nothing; states: stream ->
+    state that its stage begins with in place of a new one.
     """
 
     def __init__(
@@ -94,12 +95,13 @@ class Engine:
         capacity: int = 2,
         max_frames: int = 1024,
         on_frame: Callable[[bool], None] = lambda complete: None,
+        states: Mapping[str, Any] | None = None,
     ) -> None:
         self._ledger, self._on_frame = ledger, on_frame
         self._capacity, self._max_large = capacity, max(1, workers // 2)
         self._condition = threading.Condition()
         self._frames: deque[_Frame] = deque()
-        self.states = start(stages)  # stream -> state of its stage, of this run
+        self.states = start(stages) | dict(states or {})  # stream -> state of its stage, of this run
         self._work = [self._stage_work(node) for node in stages]
         self._max_frames = max(max_frames, 2) if any(work.flushes for work in self._work) else max_frames
         for name, (sink, streams) in sinks.items():

@@ -98,6 +98,7 @@ def run(
     about: Mapping[str, str] | None = None,
     stop: Stop | None = None,
     on_frame: Callable[[bool], None] = lambda complete: None,
+    states: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Run an opened log through a graph, and return the summary.
 
@@ -118,6 +119,8 @@ def run(
         Requests to stop the run early.
     on_frame
         Called after every frame, with whether all of its streams are there.
+    states
+        Stream -> state that its stage begins with in place of a new one.
 
     Returns
     -------
@@ -144,7 +147,8 @@ def run(
     sinks = _Outputs.of(graph, outputs)
     assembler, started, at_end = FrameAssembler(graph, ledger, selection), 0.0, False
     streams = graph.source_streams | ({selection.odometry} if selection.odometry else set())
-    engine = Engine(graph.stages, sinks.sinks, ledger, workers=workers, max_frames=workers + 1, on_frame=on_frame)
+    room: dict[str, Any] = {"workers": workers, "max_frames": workers + 1}
+    engine = Engine(graph.stages, sinks.sinks, ledger, **room, on_frame=on_frame, states=states)
     try:
         surveys = "\n".join(f"{name}: {finding.sentence}" for name, finding in prepared.findings.items())
         fixed = "\n".join(f"{name}={json.dumps(value)}" for name, value in prepared.fixed.items())

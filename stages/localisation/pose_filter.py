@@ -44,6 +44,8 @@ class PoseMemory:
     estimate: _Estimate | None = None
     poses: int = 0  # made here
     segment: int = 0  # of the last motion
+    logged: Pose | None = None  # of the next frame, from a result log
+    distance: float = 0.0  # m, driven up to there
     check: PoseCheck = field(default_factory=PoseCheck)
 
 
@@ -75,6 +77,10 @@ class PoseFilter(Stage):
         """The state of one run."""
         return PoseMemory()
 
+    def resumed(self, pose: Pose, distance: float) -> PoseMemory:
+        """The state from which the next frame has a pose from a result log, `distance` m after its segment began."""
+        return PoseMemory(logged=pose, distance=distance)
+
     def __call__(
         self, motion: CameraMotion, tilt: Tilt, mount: Mount, logged: Pose | None = None, *, state: PoseMemory
     ) -> Pose:
@@ -90,15 +96,16 @@ class PoseFilter(Stage):
         if motion.camera is None:
             raise StageError(f"PoseFilter: no pose from the images: {motion.lost}")
         before = state.estimate
-        if before is None or before.segment != motion.segment:
+        bias = self._bias(tilt)
+        if state.logged is not None and state.logged.stamp == motion.stamp:
+            estimate = _logged(state.logged, motion, motion.camera, mount, (state.distance, bias))
+        elif before is None or before.segment != motion.segment:
             estimate = self._first(motion, motion.camera, tilt, mount)
         else:
             estimate = self._corrected(_predicted(before, motion, motion.camera), tilt, mount)
         state.estimate = estimate
         state.poses += 1
-        # The error of a filtered tilt is common to its neighbours.
-        bias = np.hypot(self.tilt_bias, tilt.sigma or 0.0) if tilt.filtered else self.tilt_bias
-        return self._pose(motion.stamp, estimate, mount, float(bias))
+        return self._pose(motion.stamp, estimate, mount, bias)
 
     def finding(self, state: PoseMemory) -> Finding | None:
         """The source of the poses if it is not the log; a warning if tracking was lost or the log's poses are wrong."""
@@ -119,6 +126,10 @@ class PoseFilter(Stage):
     def _variance(self, tilt: Tilt) -> float:
         """Variance of a tilt about each horizontal axis, rad^2."""
         return max(self.tilt_noise if tilt.sigma is None else tilt.sigma, MIN_TILT_SIGMA) ** 2
+
+    def _bias(self, tilt: Tilt) -> float:
+        """Standard deviation, rad, of the error common to all tilts, and for a filtered one to its neighbours."""
+        return float(np.hypot(self.tilt_bias, tilt.sigma or 0.0)) if tilt.filtered else self.tilt_bias
 
     def _first(self, motion: CameraMotion, camera: Transform, tilt: Tilt, mount: Mount) -> _Estimate:
         """The first frame of a segment: at its origin, upright by the tilt."""
@@ -148,6 +159,18 @@ class PoseFilter(Stage):
         np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0.0))  # at the origin zero but for rounding
         quaternion = canonical(quaternion_of(rover.rotation))
         return Pose(stamp, rover.translation, quaternion, _frame_of(estimate.segment), rover.child, covariance)
+
+
+def _logged(
+    pose: Pose, motion: CameraMotion, camera: Transform, mount: Mount, common: tuple[float, float]
+) -> _Estimate:
+    """The estimate of a frame that became this pose in a result log. common: distance and bias of its common errors."""
+    base = mount.base_from_camera
+    world = pose.transform if base is None else pose.transform.after(base)
+    errors = _common_errors(pose.position, *common)
+    own = np.zeros((6, 6)) if pose.covariance is None else pose.covariance - errors.T @ errors
+    covariance = translated_covariance(own, world.translation - pose.position)
+    return _Estimate(motion.segment, camera, motion.covariance, world, covariance, common[0])
 
 
 def _predicted(before: _Estimate, motion: CameraMotion, camera: Transform) -> _Estimate:

@@ -57,6 +57,10 @@ class VisualOdometry(Stage):
         """The state of one run."""
         return OdometryMemory()
 
+    def resumed(self, segment: int) -> OdometryMemory:
+        """The state from which the next frame begins a segment of this number, as in the poses of a result log."""
+        return OdometryMemory(segment=segment - 1)
+
     def __call__(self, frame: StereoFrame, disparity: Disparity, *, state: OdometryMemory) -> CameraMotion:
         """The camera's motion since its segment began; `camera` is None if the frame has too few features."""
         check_joined(self, frame, disparity)

@@ -7,20 +7,22 @@ It is fitted where the frame overlaps the map and removed, so neighbouring frame
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from flow.contracts import Finding, Severity, StageError, counted
-from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Region
+from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Region, Transform
 from stages.data.tiles import put, taken
 from stages.stage import Stage, check_cells, parameter
-from stages.terrain.fused_map import FusedMap, Observation, merged, variance_of, with_ceiling
+from stages.terrain.fused_map import FusedMap, Observation, cells_of, merged, variance_of, with_ceiling
 from stages.terrain.height_alignment import fit_plane, plane_height
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
 from stages.terrain.map_levelling import MapLevelling, StatedErrors
 from stages.terrain.map_region import MARGIN, map_around
-from stages.terrain.map_registration import FrameGrid, frame_grid, register, with_plane
+from stages.terrain.map_registration import FrameGrid, frame_grid, plane_between, register, with_plane
 
 MIN_OVERLAP_CELLS = 100  # of a frame and the map, for their heights to show a jump
 MAX_JUMP = 5.0  # standard deviations of the aligning plane from one frame to the next
@@ -64,10 +66,34 @@ class _Fusion(Stage):
         """An empty map, the state of one run."""
         return FusedMap()
 
+    def resumed(self, maps: Sequence[ElevationMap]) -> FusedMap:
+        """The state at the last of some regional maps as they are in a result log, in the order of their stamps.
+
+        The cloud of its stamp must come next: it is in the map already and only shows where the map lies. The log
+        rounds heights and variances, and has no covariance of the alignment; a frame's own is taken.
+
+        Raises
+        ------
+        ValueError
+            If the maps have other cells than `resolution`.
+        """
+        last = maps[-1]
+        if abs(last.resolution / self.resolution - 1) > 1e-6:
+            raise ValueError(f"the map of the log has cells of {last.resolution:g} m, not {self.resolution:g} m")
+        state = FusedMap(last.frame_id, last.epoch or 0, last.stamp, "ceiling" in last.layers, logged=last.level)
+        for part in maps:
+            if (part.frame_id, part.epoch) == (last.frame_id, last.epoch):
+                cells = cells_of(part.layers)
+                row, col = (round(part.origin[axis] / self.resolution) for axis in (1, 0))
+                state.cells.write(row, col, cells, cells["weight"] != 0)
+        return state
+
     def _fused(self, cloud: PointCloud, pose: Pose, mount: Mount | None, state: FusedMap) -> Region:
         """The region in the pose's frame, with a cloud in frame `level` merged in."""
         self._check(cloud, state)
         level, up = register(cloud, pose, mount)
+        if state.logged is not None and pose.frame_id == state.frame_id:
+            return self._placed(cloud, level, up, pose, state)
         frame = frame_grid(cloud, level, self.resolution, self.max_range)
         if pose.frame_id != state.frame_id:
             state.reset(pose.frame_id, cloud.stamp)
@@ -84,6 +110,18 @@ class _Fusion(Stage):
         level = with_plane(frame.level, plane)
         now = state.cells.snapshot()
         return Region(cloud.stamp, now, self.resolution, level, state.epoch, changed, state.has_ceiling)
+
+    def _placed(self, cloud: PointCloud, level: Transform, up: Array, pose: Pose, state: FusedMap) -> Region:
+        """The region of a result log at its last frame, which shows where it lies."""
+        logged = state.logged
+        if logged is None or cloud.stamp != state.last:
+            raise StageError(f"Fuse: the frame of {state.last} ns, the last one in the map of the log, has no cloud")
+        plane, sigma = plane_between(level, logged), cloud.tilt_sigma or self.tilt_sigma
+        levelling = MapLevelling.begin(pose, self._stated).tilted(up, sigma).placed()
+        state.levelling, state.plane, state.logged = levelling.at(plane, up), plane, None
+        col, row = (math.floor(position / self.resolution) for position in level.translation[:2])
+        nothing, cells = (row, col, row, col), state.cells.snapshot()
+        return Region(cloud.stamp, cells, self.resolution, logged, state.epoch, nothing, state.has_ceiling)
 
     def finding(self, state: FusedMap) -> Finding | None:
         """A warning if the map was reset within one frame of the pose, or if that frame leans."""
@@ -106,10 +144,8 @@ class _Fusion(Stage):
             raise StageError(
                 f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; put stages.Level before it"
             )
-        if cloud.stamp <= state.last:
-            raise StageError(
-                f"Fuse: the cloud of {cloud.stamp} ns is not later than the last one, {state.last} ns"
-            )
+        if cloud.stamp <= state.last and state.logged is None:
+            raise StageError(f"Fuse: the cloud of {cloud.stamp} ns is not later than the last one, {state.last} ns")
 
     def _observation(self, frame: FrameGrid) -> Observation:
         """The known cells of a frame; the errors of its position are added to their variance."""
@@ -126,8 +162,7 @@ class _Fusion(Stage):
         self, frame: FrameGrid, observed: Observation, pose: Pose, up: Array, tilt_sigma: float, state: FusedMap
     ) -> tuple[Array, Array]:
         """The map's cells (rows, cols) below the frame, and the plane (3,) that aligns the frame to them."""
-        cells = state.cells.read(frame.row, frame.col, *frame.terrain.shape)
-        stated = StatedErrors(self.attitude_sigma, self.height_drift, self.tilt_bias)
+        cells, stated = state.cells.read(frame.row, frame.col, *frame.terrain.shape), self._stated
         if state.levelling is not None:
             levelling = state.levelling.moved(pose, stated).tilted(up, tilt_sigma)
             expected = levelling.plane(up)
@@ -143,6 +178,10 @@ class _Fusion(Stage):
         levelling = levelling.corrected()
         state.levelling, state.plane, state.rejected = levelling, levelling.plane(up), 0
         return cells, state.plane
+
+    @property
+    def _stated(self) -> StatedErrors:
+        return StatedErrors(self.attitude_sigma, self.height_drift, self.tilt_bias)
 
     @property
     def _plane_sigma(self) -> Array:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from stages.data import Array
+from stages.data import Array, Transform
 from stages.data.tiles import Tiles, copied, put, taken
 from stages.terrain.height_alignment import plane_height
 from stages.terrain.map_levelling import MapLevelling
@@ -42,11 +43,12 @@ class FusedMap:
     up_sum: Array = field(default_factory=lambda: np.zeros(3))  # of the tilts, in the map's frame
     rejected: int = 0  # frames in succession that did not align
     resets: int = 0  # because of them
+    logged: Transform | None = None  # frame `level` at the next frame, which the cells of a result log contain already
 
     def reset(self, frame_id: str, stamp: int) -> None:
         """Start an empty map."""
         self.frame_id, self.epoch, self.cells = frame_id, stamp, Tiles(CELL)
-        self.levelling, self.up_sum = None, np.zeros(3)
+        self.levelling, self.logged, self.up_sum = None, None, np.zeros(3)
 
     def age(self, stamp: int) -> int:
         """Time since the epoch, ms."""
@@ -157,6 +159,26 @@ def layers_of(cells: Array, has_ceiling: bool) -> dict[str, Array]:
         layers["occluded"] = np.where(known, 0, np.where(hidden, 1, np.nan)).astype(np.float32)
         layers["ceiling"] = _scattered(hidden, cells["height"][hidden])
     return layers
+
+
+def cells_of(layers: Mapping[str, Array]) -> Array:
+    """The cells (rows, cols) from `layers_of`, as if all frames of a cell had the same variance, and none a doubt."""
+    known = layers["frames"] > 0
+    cells = np.zeros(known.shape, CELL)
+    seen = {name: layer[known].astype(np.float64) for name, layer in layers.items()}
+    variance = seen["variance"] / ((1 - SHARED_SHARE) / seen["frames"] + SHARED_SHARE)  # of each frame
+    values = {
+        "height": seen["elevation"], "below": seen["elevation"] - seen["minimum"], "best": np.sqrt(variance),
+        "above": seen["maximum"] - seen["elevation"], "weight": seen["frames"] / ((1 - SHARED_SHARE) * variance),
+        "first": np.rint(1e3 * seen["first"]), "last": np.rint(1e3 * seen["last"]),
+        **{name: seen[name] for name in ("count", "frames", "contradictions")},
+    }  # fmt: skip
+    for name, value in values.items():
+        cells[name][known] = value
+    hidden = layers.get("occluded", np.zeros(known.shape)) == 1
+    cells["weight"][hidden] = HIDDEN
+    cells["height"][hidden] = layers["ceiling"][hidden] if hidden.any() else 0
+    return cells
 
 
 def _scattered(where: Array, values: Array) -> Array:

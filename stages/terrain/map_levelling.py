@@ -104,6 +104,12 @@ class MapLevelling:
         covariance[MAP, MAP] += np.diag(FRAME_NOISE**2)
         return replace(self, covariance=covariance)
 
+    def at(self, plane: Array, up: Array) -> MapLevelling:
+        """With the pose where a frame with the tilt `up` got the plane (3,), and without other known errors."""
+        mean = np.zeros(8)
+        mean[POSE] = plane + _leaning(up)
+        return replace(self, mean=mean)
+
     def corrected(self) -> MapLevelling:
         """With a part of the map's estimated error taken out."""
         mean = self.mean.copy()

@@ -14,7 +14,7 @@ from flow.contracts import StageError
 from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
 from stages.data.arrays import Span, spanned
-from stages.data.rotations import turn_about_z, turn_by
+from stages.data.rotations import quaternion_of, turn_about_z, turn_by
 from stages.terrain.dem import Voxelise
 
 # Between z of the pose's frame and up. Odometry without an inclinometer may differ by the slope of the ground.
@@ -122,3 +122,9 @@ def with_plane(level: Transform, plane: Array) -> Transform:
     rotation = turn_by([plane[2], -plane[1], 0.0])
     translation = level.translation + np.array([0, 0, plane[0]])
     return replace(level, rotation=rotation @ level.rotation, translation=translation)
+
+
+def plane_between(level: Transform, after: Transform) -> Array:
+    """The plane (3,) that `with_plane` added to frame `level`."""
+    turn = quaternion_of(after.rotation @ level.rotation.T)  # small
+    return np.array([after.translation[2] - level.translation[2], -2 * turn[1], 2 * turn[0]])

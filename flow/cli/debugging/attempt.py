@@ -13,7 +13,7 @@ from flow.cli.arguments import AT, count, count_or_none, instant, workers
 from flow.cli.debugging.viewer_cursor import without_cursor
 from flow.cli.outputs import add_log, check_outputs
 from flow.cli.report import say
-from flow.errors import COMPLETE
+from flow.errors import COMPLETE, UsageError
 from recordings.containers.finding import find_files
 
 if TYPE_CHECKING:
@@ -28,8 +28,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--at", type=instant, required=True, metavar="T", help=AT)
     sub.add_argument("--frames", type=count, default=1, metavar="N", help="frames from that instant on (1)")
     before = "frames before it, for the stages with memory: regional map, pose, tilt check (0)"
-    sub.add_argument("--before", type=count_or_none, default=0, metavar="N", help=before)
-    sub.add_argument("-p", "--pipeline", default="rover", help="rover, fast, accurate, paper, or a YAML file (rover)")
+    state = sub.add_mutually_exclusive_group()
+    state.add_argument("--before", type=count_or_none, default=0, metavar="N", help=before)
+    logged = "result log of the whole run: regional map and pose begin as it has them, and its pipeline is A"
+    state.add_argument("--result", type=Path, metavar="OUT.mcap", help=logged)
+    sub.add_argument("-p", "--pipeline", help="rover, fast, accurate, paper, or a YAML file (rover)")
     several = "the change; several values of one parameter are compared one by one"
     sub.add_argument("--set", action="append", default=[], required=True, metavar="STREAM.PARAM=VALUE", help=several)
     sub.add_argument("-o", "--out", type=Path, metavar="OUT.rrd", help="recording of the comparison (LOG-try.rrd)")
@@ -40,22 +43,26 @@ def run(options: argparse.Namespace) -> int:
     """Run the variants, print how they differ, and write the recording."""
     find_files(options.log)
     out = options.out or options.log[0].with_name(f"{options.log[0].stem}-try.rrd")
-    check_outputs({"difference": out}, options.log)
+    result: Path | None = options.result
+    if result is not None and options.pipeline:
+        raise UsageError(f"the pipeline is that of {result}; leave out -p")
+    check_outputs({"difference": out}, [*options.log, *filter(None, [result])])
     from flow.cli.what_if import changes_of, run_variants, summary_lines, swept_setting
 
-    changes = changes_of(options.set)
+    changes, pipeline = changes_of(options.set), result or options.pipeline or "rover"
+    unchanged = f"A: {pipeline} as it is" if result is None else f"A: the run of {result}"
     place = (without_cursor(options.at), options.frames, options.before)
     with TemporaryDirectory(prefix="roverflow-try-") as folder:
-        paths, variants, part = run_variants(
-            options.log, options.pipeline, changes, place, Path(folder), options.workers
+        paths, variants, part, notes = run_variants(
+            options.log, pipeline, changes, place, Path(folder), options.workers
         )
-        say("\n".join(summary_lines(variants, part, options.frames)))
+        say("\n".join([*summary_lines(variants, part, options.frames), *notes]))
         from recordings.comparison.diff import diff  # imported beside the run, as rerun takes long
         from recordings.comparison.recording import DiffRecording
         from recordings.comparison.text import comparison, markdown
 
-        say(f"\nA: {options.pipeline} as it is")
-        recording, tables, differences = DiffRecording(), [f"A: {options.pipeline} as it is"], dict[str, "Diff"]()
+        say(f"\n{unchanged}")
+        recording, tables, differences = DiffRecording(), ["\n\n".join([unchanged, *notes])], dict[str, "Diff"]()
         for label, path in paths.items():
             if label != "A":
                 differences[label] = found = diff(paths["A"], path, recording.of(label))

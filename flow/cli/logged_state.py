@@ -1,0 +1,150 @@
+"""The state that a run had before an instant, from its result log: the regional map and the pose.
+
+A log has a regional map for each metre driven. The frame of the last map before the instant runs again: it shows where
+the map lies, and visual odometry continues from its pose. The frames after it are fused into the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flow.cli.explanation import check_input
+from flow.cli.regional_explanation import level_in
+from flow.runtime.graph import Graph, Node
+from flow.runtime.variants import Variants, sink_of
+from recordings.comparison.text import moment
+from recordings.mcap.file import McapFile, iter_decoded
+from recordings.ros2.from_msg import pose_of, read_grid_map
+from stages import Fuse, FuseRegion, MapRegion, PoseFilter, VisualOdometry
+from stages.data import ElevationMap, Pose
+from stages.localisation.pose_filter import VISUAL_FRAME
+
+if TYPE_CHECKING:
+    from recordings.source.log import McapLog
+
+MAP = "grid_map_msgs/msg/GridMap"
+_WITHOUT = (MapRegion, PoseFilter)  # a stage that needs no state at a map, and one that passes logged poses on
+
+
+@dataclass(frozen=True)
+class LoggedState:
+    """What a result log has of the frames before an instant.
+
+    stamp: ns, of the frame whose state it is; maps: stream of `Fuse` or `FuseRegion` -> its regional maps up to there;
+    poses: those of visual odometry up to there.
+    """
+
+    stamp: int
+    maps: Mapping[str, list[ElevationMap]]
+    poses: list[Pose]
+
+    def states(self, graphs: Mapping[str, Graph], variants: Variants) -> tuple[dict[str, Any], dict[str, str]]:
+        """Stream of the joined graph -> the state that its stage begins with; and stream -> why it begins without."""
+        states, without = dict[str, Any](), dict[str, str]()
+        for label, graph in graphs.items():
+            for node in graph.stages:
+                name = variants.names[label][node.name]
+                try:
+                    state = self._state(node)
+                except ValueError as error:
+                    without[name] = str(error)
+                    continue
+                if state is not None:
+                    states[name] = state
+                elif node.stateful and not isinstance(node.actor, _WITHOUT):
+                    without[name] = "a result log does not contain it"
+        return states, without
+
+    def _state(self, node: Node) -> Any:
+        """The state of a stage at `stamp`, None without one; raises ValueError where it has other parameters."""
+        stage = node.actor
+        if isinstance(stage, Fuse | FuseRegion) and node.name in self.maps:
+            return stage.resumed(self.maps[node.name])
+        if isinstance(stage, PoseFilter | VisualOdometry) and self.poses:
+            last = self.poses[-1]
+            if isinstance(stage, VisualOdometry):
+                return stage.resumed(int(last.frame_id.partition("/")[2] or 1))
+            way = np.array([pose.position for pose in self.poses if pose.frame_id == last.frame_id])
+            return stage.resumed(last, float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()))
+        return None
+
+
+def resume(
+    result: Path, opened: tuple[McapLog, Sequence[Path]], graphs: Mapping[str, Graph], variants: Variants, before: int
+) -> tuple[np.datetime64 | int, dict[str, Any], list[str]]:
+    """The first frame to run, the states that stages of the joined graph have there, and what a terminal prints.
+
+    result: a log of the run of the first graph; opened: its input, and the files of it; before: stamp of the instant,
+    ns. Raises UsageError for another input.
+    """
+    check_input(*opened, result)
+    logged = logged_state(result, graphs["A"], before)
+    if logged is None:
+        return 0, {}, [f"{result} has no regional map or visual odometry before the instant, so no stage has a state"]
+    states, without = logged.states(graphs, variants)
+    sink: Any = sink_of(graphs["A"], ".mcap")
+    notes = [f"state of {', '.join(states) or 'no stage'} from {result}, of {moment(logged.stamp)}"]
+    if logged.maps and sink.length_step:
+        step = 1e3 * sink.length_step
+        notes[0] += f"; the log rounds its heights to {step:.1g} mm and its variances to {100 * sink.precision:g} %"
+    reasons = dict.fromkeys(without.values())
+    notes += [
+        f"without state: {', '.join(name for name in without if without[name] == why)} ({why})" for why in reasons
+    ]
+    return np.datetime64(logged.stamp, "ns"), states, notes
+
+
+def logged_state(result: Path, graph: Graph, before: int) -> LoggedState | None:
+    """The state of the run of a graph at its last regional map before a stamp, ns; without maps, at its last pose.
+
+    None if the result log has neither. Raises LogError if it cannot be read.
+    """
+    map_topics, pose_topics = _topics(result, graph)
+    maps: dict[str, list[ElevationMap]] = {stream: [] for stream in map_topics.values()}
+    poses = list[Pose]()
+    topics = [*map_topics, *pose_topics, "/tf", "/nav/diagnostics"]
+    for stamp, group in groupby(iter_decoded(result, topics, part=(None, before)), key=lambda item: item[1]):
+        messages = {topic: message for topic, _, message in group}
+        for topic in messages.keys() & map_topics.keys():
+            maps[map_topics[topic]].append(_regional(messages, topic, stamp))
+        found = (pose_of(messages[topic], stamp, "") for topic in messages.keys() & pose_topics)
+        poses += [pose for pose in found if pose is not None and pose.frame_id.startswith(VISUAL_FRAME)]
+    ends = [{part.stamp for part in parts if part.level is not None} for parts in maps.values()]
+    ends = ends or [{pose.stamp for pose in poses}]
+    stamp = max(set.intersection(*ends), default=None)
+    if stamp is None:
+        return None
+    kept = {stream: [part for part in parts if part.stamp <= stamp] for stream, parts in maps.items()}
+    return LoggedState(stamp, kept, [pose for pose in poses if pose.stamp <= stamp])
+
+
+def _topics(result: Path, graph: Graph) -> tuple[dict[str, str], set[str]]:
+    """Topic of regional maps -> the stream of the stage that fused them; and the topics of filtered poses."""
+    with McapFile(result) as log:
+        schemas = {channel.topic: getattr(channel.schema, "name", "") for channel in log.channels.values()}
+    maps = dict[str, str]()
+    for node in graph.stages:
+        if isinstance(node.actor, Fuse | FuseRegion):
+            made = {node.name}
+            for later in graph.stages:
+                if made & set(later.inputs.values()):
+                    made.add(later.name)
+            topics = [f"/nav/{name}" for name in graph.kinds if name in made and schemas.get(f"/nav/{name}") == MAP]
+            maps |= dict.fromkeys(topics[:1], node.name)
+    poses = {f"/nav/{node.name}" for node in graph.stages if isinstance(node.actor, PoseFilter)}
+    return maps, poses & schemas.keys()
+
+
+def _regional(messages: Mapping[str, Any], topic: str, stamp: int) -> ElevationMap:
+    """A regional map among the messages of a stamp, with its epoch, and with frame `level` if it is of that stamp."""
+    terrain = read_grid_map(messages[topic])
+    level = level_in(messages.get("/tf"), terrain.frame_id) if terrain.stamp == stamp else None
+    statuses = getattr(messages.get("/nav/diagnostics"), "status", ())
+    values = {item.key: item.value for status in statuses for item in status.values if f"/nav/{status.name}" == topic}
+    return replace(terrain, level=level, epoch=int(values["epoch"]) if "epoch" in values else None)

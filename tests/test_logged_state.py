@@ -1,0 +1,115 @@
+"""`roverflow try --result`: the state before an instant comes from the result log."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flow.cli.what_if import run_variants
+from recordings.results import read_result
+from recordings.simulator import Simulation, write_log
+from tests.conftest import SMALL, rewrite, roverflow
+
+AT = 2.0  # s, the last frame
+HEIGHT_STEP = 1 / 1024  # m, to which the log rounds heights
+EVERY_MAP = ("-p", "fast", *SMALL, "--set", "regional_elevation.step=0 m")
+
+
+@pytest.fixture(scope="module", params=["logged poses", "visual odometry"])
+def run(request, traverse, tmp_path_factory):
+    """A log and its result, which has a regional map of every frame."""
+    log = traverse
+    if request.param == "visual odometry":
+        log = tmp_path_factory.mktemp("visual") / "log.mcap"
+        rewrite(traverse, log, lambda topic, _, data: None if topic == "/odometry" else data)
+    out = tmp_path_factory.mktemp("result") / "out.mcap"
+    assert roverflow("run", log, *EVERY_MAP, "-o", out, "--no-rrd") == 0
+    return log, out
+
+
+def last_frame(path):
+    *_, frame = read_result(path, ["regional_map", "pose"])
+    return frame
+
+
+def common(terrain, other):
+    """The layers of a map in the rectangle that both maps have."""
+    corners = [np.rint(np.array(one.origin[::-1]) / one.resolution).astype(int) for one in (terrain, other)]
+    low = np.maximum(*corners)
+    high = np.minimum(*(corner + one.shape for corner, one in zip(corners, (terrain, other), strict=True)))
+    rows, cols = (slice(*edge) for edge in np.stack([low, high], 1) - corners[0][:, None])
+    return {name: layer[rows, cols] for name, layer in terrain.layers.items()}
+
+
+def tried(log, pipeline, folder):
+    """The last frame of the log, run with the state of a result log, or of no other frame; and the number before it."""
+    changes = () if isinstance(pipeline, Path) else EVERY_MAP[3::2]
+    paths, _, part, _ = run_variants([log], pipeline, {"A": changes}, (AT, 1, 0), folder, 2)
+    return last_frame(paths["A"]), part.before
+
+
+def test_the_map_and_the_pose_are_those_of_the_whole_run(run, tmp_path):
+    log, result = run
+    whole = last_frame(result)
+    found, before = tried(log, result, tmp_path)
+    assert (found.stamp, before) == (whole.stamp, 1)
+    pose, own, wanted, terrain = (frame.items[name] for name in ("pose", "regional_map") for frame in (whole, found))
+    assert own.frame_id == pose.frame_id
+    assert own.position == pytest.approx(pose.position, abs=2e-3)
+    layers, expected = (common(one, other) for one, other in ((terrain, wanted), (wanted, terrain)))
+    known = np.isfinite(expected["elevation"])
+    assert known.sum() == np.isfinite(wanted.layers["elevation"]).sum() == np.isfinite(layers["elevation"]).sum()
+    for name in ("frames", "first", "last"):
+        assert np.mean(layers[name][known] == expected[name][known]) > 0.999
+    off = np.abs(layers["elevation"] - expected["elevation"])[known]
+    assert np.median(off) <= HEIGHT_STEP
+    assert np.percentile(off, 99) <= 3 * HEIGHT_STEP
+
+
+def test_without_a_state_the_map_has_only_the_frame(run, tmp_path):
+    log, result = run
+    found, before = tried(log, "fast", tmp_path)
+    terrain, wanted = found.items["regional_map"], last_frame(result).items["regional_map"]
+    assert (before, terrain.layers["frames"].max()) == (0, 1)
+    assert np.isfinite(terrain.layers["elevation"]).sum() < 0.9 * np.isfinite(wanted.layers["elevation"]).sum()
+
+
+def test_it_is_said_what_the_state_is(run, tmp_path, capsys):
+    log, result = run
+    out = tmp_path / "try.rrd"
+    change = ("--set", "regional_cells.max_range=4 m", "-o", out)
+    assert roverflow("try", log, "--at", AT, "--result", result, *change) == 0
+    output = capsys.readouterr().out
+    assert "1 frame from 2.034 s on, after 1 frame before it" in output
+    streams = "regional_cells" if log.name == "traverse.mcap" else "motion, pose, regional_cells"
+    assert f"state of {streams}, regional_cells@B from {result}, of 22:13:21.013 (1700086401013000000 ns)" in output
+    assert "the log rounds its heights to 1 mm and its variances to 1 %" in output
+    assert "(a result log does not contain it)" in output
+    assert f"A: the run of {result}" in output
+    assert "/nav/regional_map: 1 of 2 messages differ" in output  # that of the state is the same
+
+
+def test_cells_of_another_size_begin_without_a_state(run, tmp_path, capsys):
+    log, result = run
+    change = ("--set", "resolution=10 cm", "-o", tmp_path / "try.rrd")
+    assert roverflow("try", log, "--at", AT, "--result", result, *change) == 0
+    reason = "the map of the log has cells of 0.05 m, not 0.1 m"
+    assert f"without state: regional_cells@B ({reason})" in capsys.readouterr().out
+
+
+def test_the_result_of_another_log_or_of_another_pipeline_is_refused(traverse, fast_result, tmp_path, capsys):
+    other, rest = tmp_path / "other.mcap", (*SMALL, "-o", tmp_path / "try.rrd")
+    write_log(Simulation(frames=2, width=160, height=120, seed=9), other)
+    assert roverflow("try", other, "--at", 1, "--result", fast_result, *rest) == 2
+    assert f"{other} is not the input of {fast_result}: its frames have other stamps\n" in capsys.readouterr().err
+    assert roverflow("try", traverse, "--at", 1, "--result", fast_result, "-p", "rover", *rest) == 2
+    assert f"the pipeline is that of {fast_result}; leave out -p\n" in capsys.readouterr().err
+    assert roverflow("try", traverse, "--at", 1, "--result", traverse, *rest) == 2
+    assert f"{traverse} is not a result log; give the log that roverflow run wrote" in capsys.readouterr().err
+
+
+def test_at_the_first_frame_there_is_no_state(traverse, fast_result, tmp_path, capsys):
+    assert roverflow("try", traverse, "--at", 0.5, "--result", fast_result, *SMALL, "-o", tmp_path / "try.rrd") == 0
+    assert (
+        "has no regional map or visual odometry before the instant, so no stage has a state" in capsys.readouterr().out
+    )
