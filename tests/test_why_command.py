@@ -157,3 +157,9 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, cap
     assert "is a regional map: give --cell" in capsys.readouterr().err
     assert roverflow("why", fast_result, *late[:2], "--cell", "999,1", *late[3:]) == 2
     assert "outside the regional map in 'odom'" in capsys.readouterr().err
+
+
+def test_transforms_for_viewers_do_not_hide_the_frames_that_saw_a_cell(traverse, tmp_path):
+    given = "-p", "fast", *SMALL, "--set", "McapSink.viewers=true", "--end", 0.8, "--no-rrd"
+    assert roverflow("run", traverse, *given, "-o", tmp_path / "out.mcap") == 0
+    assert len(why_regional(tmp_path / "out.mcap", 60, (3.0, 0.0), log=traverse).frames) == 1

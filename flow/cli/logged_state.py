@@ -110,9 +110,10 @@ def logged_state(result: Path, graph: Graph, before: int) -> LoggedState | None:
     poses = list[Pose]()
     topics = [*map_topics, *pose_topics, "/tf", "/nav/diagnostics"]
     for stamp, group in groupby(iter_decoded(result, topics, part=(None, before)), key=lambda item: item[1]):
-        messages = {topic: message for topic, _, message in group}
+        of_stamp = [(topic, message) for topic, _, message in group]
+        messages = dict(of_stamp)
         for topic in messages.keys() & map_topics.keys():
-            maps[map_topics[topic]].append(_regional(messages, topic, stamp))
+            maps[map_topics[topic]].append(_regional(of_stamp, topic, stamp))
         found = (pose_of(messages[topic], stamp, "") for topic in messages.keys() & pose_topics)
         poses += [pose for pose in found if pose is not None and pose.frame_id.startswith(VISUAL_FRAME)]
     ends = [{part.stamp for part in parts if part.level is not None} for parts in maps.values()]
@@ -141,10 +142,10 @@ def _topics(result: Path, graph: Graph) -> tuple[dict[str, str], set[str]]:
     return maps, poses & schemas.keys()
 
 
-def _regional(messages: Mapping[str, Any], topic: str, stamp: int) -> ElevationMap:
+def _regional(of_stamp: Sequence[tuple[str, Any]], topic: str, stamp: int) -> ElevationMap:
     """A regional map among the messages of a stamp, with its epoch, and with frame `level` if it is of that stamp."""
-    terrain = read_grid_map(messages[topic])
-    level = level_in(messages.get("/tf"), terrain.frame_id) if terrain.stamp == stamp else None
-    statuses = getattr(messages.get("/nav/diagnostics"), "status", ())
+    terrain, messages = read_grid_map(dict(of_stamp)[topic]), [message for _, message in of_stamp]
+    level = level_in(messages, terrain.frame_id) if terrain.stamp == stamp else None
+    statuses = [status for message in messages for status in getattr(message, "status", ())]
     values = {item.key: item.value for status in statuses for item in status.values if f"/nav/{status.name}" == topic}
     return replace(terrain, level=level, epoch=int(values["epoch"]) if "epoch" in values else None)

@@ -5,9 +5,9 @@ Everything is in the result log, so nothing runs again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -122,8 +122,8 @@ def _contributions(result: Path, navigation: NavigationMap, centre: tuple[float,
     for stamp, group in groupby(iter_decoded(result, ["/nav/points", "/tf"]), key=lambda item: item[1]):
         if stamp > navigation.stamp:
             break
-        messages = {topic: message for topic, _, message in group}
-        level = level_in(messages.get("/tf"), navigation.frame_id)
+        of_stamp = [(topic, message) for topic, _, message in group]
+        messages, level = dict(of_stamp), level_in((message for _, message in of_stamp), navigation.frame_id)
         if level is None or "/nav/points" not in messages:
             continue
         heights = _heights(read_point_cloud(messages["/nav/points"]), level, centre, navigation.resolution)
@@ -132,9 +132,9 @@ def _contributions(result: Path, navigation: NavigationMap, centre: tuple[float,
     return found
 
 
-def level_in(transforms: object, parent: str) -> Transform | None:
-    """Frame `level` in the map's frame."""
-    for item in getattr(transforms, "transforms", ()):
+def level_in(messages: Iterable[Any], parent: str) -> Transform | None:
+    """Frame `level` in the map's frame, by the messages of a stamp: /tf may have several."""
+    for item in chain.from_iterable(getattr(message, "transforms", ()) for message in messages):
         if item.child_frame_id == LEVEL_FRAME and item.header.frame_id == parent:
             return transform_of(item)
     return None
