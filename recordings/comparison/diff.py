@@ -131,13 +131,15 @@ def diff(one: Path, other: Path, on_change: Callable[[MessageDifference], None] 
         readers = _Reader(first), _Reader(second)
         copies = [reader.copied for reader in readers]
         found.copied = {"A": sorted(copies[0] - copies[1]), "B": sorted(copies[1] - copies[0])}
-        rank = _rank_of(about[one]["pipeline"], {topic for reader in readers for topic in reader.topics})
-        topics = {topic: TopicDiff() for topic in sorted(rank, key=lambda topic: rank[topic])}
-        for change in _changes(*readers, topics):
-            topics[change.topic].add(change)
+        topics = {topic for reader in readers for topic in reader.topics}
+        if bool(copies[0]) != bool(copies[1]):
+            topics -= {"/tf", "/tf_static"}  # beside inputs the tree is another one; it follows from the streams
+        rank = _rank_of(about[one]["pipeline"], topics)
+        found.topics = {topic: TopicDiff() for topic in sorted(rank, key=lambda topic: rank[topic])}
+        for change in _changes(*readers, found.topics):
+            found.topics[change.topic].add(change)
             on_change(change)
             found.first = found.first or (change.topic, change.stamp)
-    found.topics = topics
     return found
 
 

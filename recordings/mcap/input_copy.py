@@ -7,13 +7,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from recordings.containers.container import Channel, LostMessage, RawMessage
 from recordings.containers.opening import open_recording
 from recordings.containers.time_range import TimeRange
+from recordings.discovery.roles import TRANSFORMS
+from recordings.encodings.decoding import decoder_of
+from recordings.errors import LogError
 from recordings.mcap.writer import MIN_OWN_CHUNK_BYTES, MessageKind, Ros2Writer
+from recordings.ros2.from_msg import frame_name
 
+OWN_FRAME = "nav/"  # before the name of a camera in the results' tree, if the input has a transform to it
 _COLLECTED_BYTES = 1024 * 1024
 
 
@@ -50,6 +56,23 @@ def copy_inputs(
                     small, size = [], 0
         add(small)
     return lost
+
+
+def parents_in(logs: Sequence[Path]) -> dict[str, str]:
+    """The parent of each frame by the transforms in the logs, as far as they can be read."""
+    parents: dict[str, str] = {}
+    with open_recording(logs) as log:
+        decoders = {}
+        for number, channel in log.channels.items():
+            with suppress(LogError):
+                kind, decode = decoder_of(channel)
+                if kind == TRANSFORMS:
+                    decoders[number] = decode
+        for item in log.messages(set(decoders), allow_repeats=True):
+            with suppress(LogError):
+                found = [] if isinstance(item, LostMessage) else decoders[item.channel](item.data).transforms
+                parents |= {frame_name(each.child_frame_id): frame_name(each.header.frame_id) for each in found}
+    return parents
 
 
 def _kind(channel: Channel) -> MessageKind:

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from recordings.containers.time_range import MAX_LATENESS_NS, TimeRange
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.file import McapFile, iter_decoded
+from recordings.mcap.input_copy import OWN_FRAME
 from recordings.ros2 import from_msg as ros2
 from recordings.scoring.metrics import aligned, angle_between
 from recordings.scoring.pose_metrics import PoseTally
@@ -281,16 +282,15 @@ class _Tally:
 
     def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:
         item, true = frame.get("/tf"), frame["/truth/tilt"]
-        mount = None if item is None else self.mounts.get(item.child_frame_id)
+        camera = "" if item is None else item.child_frame_id.removeprefix(OWN_FRAME)
+        mount = self.mounts.get(camera)
         true_up = _rotation(true.quaternion)[2]  # in the axes of its header
         if item is None:
             why = f"the result has no /tf from '{LEVEL_FRAME}' at that stamp"
-        elif item.child_frame_id != true.header.frame_id and (
-            mount is None or mount.header.frame_id != true.header.frame_id
-        ):
-            why = f"the truth has no mount of '{item.child_frame_id}' on '{true.header.frame_id}'"
+        elif camera != true.header.frame_id and (mount is None or mount.header.frame_id != true.header.frame_id):
+            why = f"the truth has no mount of '{camera}' on '{true.header.frame_id}'"
         else:
-            if mount is not None and item.child_frame_id != true.header.frame_id:
+            if mount is not None and camera != true.header.frame_id:
                 true_up = true_up @ _rotation(mount.transform.rotation)
             # Gravity's opposite in camera axes is independent of the heading.
             self.tilts.append(angle_between(_rotation(item.transform.rotation)[2], true_up))

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 from flow.contracts import FrameRecord, Loss
 from flow.parameters import check_parameters, parameter
 from recordings.errors import LogError
-from recordings.mcap.input_copy import copy_inputs
+from recordings.mcap.input_copy import copy_inputs, parents_in
 from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
 from recordings.ros2.plain import message_of
 from recordings.ros2.to_msg import (
@@ -33,7 +33,7 @@ from recordings.ros2.to_msg import (
 from recordings.sinks.map_cropping import cropped
 from recordings.sinks.own_types import leaves, plain_type, refusal
 from recordings.sinks.thinning import thinned
-from recordings.sinks.viewer_topics import rerun_root, viewer_messages
+from recordings.sinks.viewer_topics import beside_inputs, rerun_root, viewer_messages
 from stages.data import (
     Disparity,
     ElevationMap,
@@ -107,6 +107,7 @@ class McapSink:
     _kinds: Mapping[str, Any] = field(default_factory=dict, init=False, repr=False)
     _owners: dict[str, tuple[str, ...]] = field(default_factory=dict, init=False, repr=False)
     _about: Mapping[str, str] = field(default_factory=dict, init=False, repr=False)
+    _theirs: Mapping[str, str] = field(default_factory=dict, init=False, repr=False)  # frame -> parent in the input
     _rooted: bool = field(default=False, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
     empty: bool = field(default=False, init=False, repr=False)  # whether none of the streams to write had an item
@@ -134,6 +135,7 @@ class McapSink:
         """Start the log. about: facts of the run, kept as the metadata record "roverflow"."""
         self._rooted, self._last_stamp, self.empty = False, None, any(stream in streams for stream in self._written)
         self._kinds, self._owners, self._about = dict(streams), {}, about
+        self._theirs = parents_in([Path(log) for log in self.inputs]) if self.inputs else {}
         self._writer = self._writer_class()(Path(path), keep=True, compression=self.compression)
         try:
             self._writer.metadata("roverflow", about if self.profile == "ros2" else {**about, "profile": self.profile})
@@ -147,12 +149,13 @@ class McapSink:
         writer, stamp = self._writer, record.stamp
         kept = {name: record.items[name] for name in self._written if name in record.items}
         self._write_items(kept, stamp)
-        transforms = {(known.parent, known.child): (known, stamp) for known in _transforms(record.items.values())}
-        if transforms:
-            writer.write("/tf", transform_message(transforms.values()), stamp)
+        own = {(known.parent, known.child): known for known in _transforms(record.items.values())}
+        if transforms := beside_inputs([*own.values()], self._theirs):
+            writer.write("/tf", transform_message((known, stamp) for known in transforms), stamp)
             if self.viewers and not self._rooted:
                 self._rooted = True
-                writer.write("/tf_static", transform_message([(rerun_root(list(transforms)), stamp)]), stamp)
+                root = rerun_root(transforms, self._theirs)
+                writer.write("/tf_static", transform_message([(root, stamp)]), stamp)
         if self.viewers:
             for topic, message in viewer_messages(record.items, kept):
                 writer.write(topic, message, stamp)

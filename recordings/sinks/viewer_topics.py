@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from recordings.mcap.input_copy import OWN_FRAME
 from recordings.ros2.viewer_msgs import camera_above, code_image, depth_messages, left_messages, terrain_points
 from recordings.sinks.colormaps import (
     REASON_LEGEND,
@@ -15,6 +17,7 @@ from recordings.sinks.colormaps import (
     elevation_colors,
     top_eight_bits,
 )  # fmt: skip
+from recordings.source.transforms import TransformTree
 from stages.data import Disparity, ElevationMap, NavigationMap, StereoFrame, Transform
 
 _RERUN_ROOT = "tf#/"  # the frame in which rerun draws a log that it opens by itself
@@ -54,8 +57,29 @@ def viewer_messages(items: Mapping[str, Any], written: Mapping[str, Any]) -> Ite
             yield f"/nav/{stream}{below}", message
 
 
-def rerun_root(pairs: Sequence[tuple[str, str]]) -> Transform:
-    """The transform that joins the root of a tree to rerun's own root frame. pairs: (parent, child) of the tree."""
-    children = {child for _, child in pairs}
-    root = next((parent for parent, _ in pairs if parent not in children), pairs[0][0])
-    return Transform(_RERUN_ROOT, root, np.eye(3), np.zeros(3))
+def rerun_root(transforms: Sequence[Transform], theirs: Mapping[str, str]) -> Transform:
+    """The transform that joins the root of a tree to rerun's own root frame. theirs: frame -> parent in the input."""
+    parents = {**theirs, **{known.child: known.parent for known in transforms}}
+    return Transform(_RERUN_ROOT, _root(transforms[0].child, parents), np.eye(3), np.zeros(3))
+
+
+def beside_inputs(transforms: Sequence[Transform], theirs: Mapping[str, str]) -> list[Transform]:
+    """The transforms of a frame such that no frame has two parents. theirs: frame -> parent in the input.
+
+    A camera that has a parent in the input keeps it, and is `nav/<camera>` in the tree of the results. Where nothing in
+    the input places the root of that tree, the input's camera does.
+    """
+    taken = [known.child for known in transforms if known.child in theirs]
+    placed = [replace(known, child=OWN_FRAME + known.child) if known.child in taken else known for known in transforms]
+    for camera in taken[:1]:
+        root = _root(camera, {known.child: known.parent for known in transforms})
+        if root not in theirs and root != _root(camera, theirs):
+            placed += filter(None, [TransformTree().joined(transforms).between(camera, root)])
+    return placed
+
+
+def _root(frame: str, parents: Mapping[str, str]) -> str:
+    """The frame above all others of its tree; of a circle any."""
+    for _ in parents:
+        frame = parents.get(frame, frame)
+    return frame

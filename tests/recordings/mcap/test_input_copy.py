@@ -1,11 +1,12 @@
 """Result logs that also contain the messages of the input."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 
 import pytest
 from mcap.reader import make_reader
 
-from tests.conftest import SMALL, roverflow
+from recordings.mcap.file import iter_decoded
+from tests.conftest import SMALL, rewrite, roverflow
 
 
 def contents(path):
@@ -27,9 +28,26 @@ def both(traverse, tmp_path_factory):
 def test_a_result_log_contains_the_input_byte_for_byte_beside_the_results(both, traverse, result):
     found, results = contents(both), contents(result)
     for channel, messages in contents(traverse).items():
-        assert sorted(found[channel]) == sorted(messages + results.get(channel, [])), channel[0]
-    for channel, messages in results.items():
-        assert set(messages) <= set(found[channel]), channel[0]
+        own = [] if channel[0] == "/tf" else results.get(channel, [])  # the tree of the results is another one
+        assert not Counter(messages + own) - Counter(found[channel]), channel[0]
+        assert len(found[channel]) == len(messages + results.get(channel, [])), channel[0]
+    for channel in results.keys() - {known for known in results if known[0] == "/tf"}:
+        assert set(results[channel]) <= set(found[channel]), channel[0]
+    assert roverflow("diff", both, result) == 0
+
+
+@pytest.mark.parametrize("left_out", [(), ("/tf",), ("/odometry", "/tf")], ids=" ".join)
+def test_input_and_results_have_one_tree_of_frames(traverse, tmp_path, left_out):
+    log = rewrite(traverse, tmp_path / "log.mcap", lambda topic, _, data: None if topic in left_out else data)
+    given = *SMALL, "--set", "McapSink.viewers=true", "--end", 1
+    assert roverflow("run", log, *given, "-o", tmp_path / "out.mcap", "--no-rrd", "--with-inputs") == 0
+    parents = defaultdict(set)
+    for _, _, message in iter_decoded(tmp_path / "out.mcap", ["/tf", "/tf_static"]):
+        for item in message.transforms:
+            parents[item.child_frame_id].add(item.header.frame_id)
+    assert {frame: names for frame, names in parents.items() if len(names) > 1} == {}
+    assert parents.keys() > {"level", "left_camera_optical"}
+    assert set().union(*parents.values()) - parents.keys() == {"tf#/"}  # one root
 
 
 def test_chunks_with_small_messages_contain_no_images(both):
