@@ -17,17 +17,18 @@ settings.register_profile("quick", deadline=None, max_examples=50)  # the first 
 settings.register_profile("thorough", deadline=None, max_examples=100)
 settings.load_profile("quick")
 
-FRAMES = 4
+FRAMES = 3
+TRAVERSE = {"frames": FRAMES, "width": 320, "height": 240, "relief_cells": 512}  # of Simulation
 SMALL = ("--set", "disparities=64")
 
 
 @pytest.fixture(scope="session")
 def traverse(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated log of four small frames, with ground truth."""
+    """A simulated log of a few small frames, with ground truth."""
     from recordings.simulator import Simulation, write_log
 
     path = tmp_path_factory.mktemp("traverse") / "traverse.mcap"
-    write_log(Simulation(frames=FRAMES, width=320, height=240), path)
+    write_log(Simulation(**TRAVERSE), path)
     return path
 
 

@@ -220,7 +220,7 @@ def test_an_output_that_cannot_be_opened_keeps_earlier_results(traverse, result,
     assert out.read_bytes() == result.read_bytes()
 
 
-@pytest.mark.parametrize("bounds", [("--end", "0"), ("--start", "2.6"), ("--start", "0.1", "--end", "0.2")])
+@pytest.mark.parametrize("bounds", [("--end", "0"), ("--start", "2.1"), ("--start", "0.1", "--end", "0.2")])
 def test_a_range_without_images_is_refused(traverse, result, tmp_path, capsys, bounds):
     out = tmp_path / "out.mcap"
     out.write_bytes(result.read_bytes())

@@ -17,7 +17,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from stages import FuseRegion, Rectify, VisualOdometry
 from stages.data import Cell
-from tests.conftest import SMALL, rewrite, roverflow
+from tests.conftest import FRAMES, SMALL, rewrite, roverflow
 
 AT = 1.0
 
@@ -148,10 +148,10 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, cap
     said = capsys.readouterr().out
     assert f"cell ({x:.3f}, {y:.3f}) m in 'odom', map of {moment(end)}: free, reason clear" in said
     found = why_regional(fast_result, 60, (x, y), log=traverse)
-    assert found.layers["frames"] == len(found.frames) == 4
+    assert found.layers["frames"] == len(found.frames) == FRAMES
     assert all(abs(frame.height - found.layers["elevation"]) < 0.05 for frame in found.frames)
-    assert said.count(" points, height ") == 4
-    assert "frames with points in the cell (of the clouds that the log keeps, thinned to 2 cm): 4\n" in said
+    assert said.count(" points, height ") == FRAMES
+    assert f"frames with points in the cell (of the clouds that the log keeps, thinned to 2 cm): {FRAMES}\n" in said
     assert len(why_regional(fast_result, 0, (x, y), log=traverse).frames) == 1
     assert roverflow("why", fast_result, *late[:2], "--pixel", "9,9", *late[3:]) == 2
     assert "is a regional map: give --cell" in capsys.readouterr().err

@@ -50,7 +50,7 @@ def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("campaign")
     (folder / "site").mkdir()
     for name, frames in (("a", 1), ("b", 2), ("site/c", 1)):
-        write_log(Simulation(frames=frames, width=160, height=120), folder / f"{name}.mcap")
+        write_log(Simulation(frames=frames, width=160, height=120, relief_cells=512), folder / f"{name}.mcap")
     (folder / "junk.mcap").write_text("this is no log")
     return folder
 

@@ -6,11 +6,12 @@ import pytest
 from recordings.errors import LogError
 from recordings.results import read_result
 from stages.data import Disparity, ElevationMap, NavigationMap, PixelOrigin, Pose, known
+from tests.conftest import FRAMES
 
 
 def test_each_stream_is_read_as_its_type(result):
     frames = list(read_result(result))
-    assert len(frames) == 4
+    assert len(frames) == FRAMES
     assert [frame.stamp for frame in frames] == sorted(frame.stamp for frame in frames)
     items = frames[-1].items
     kinds = {"disparity": Disparity, "elevation_map": ElevationMap, "navigation_map": NavigationMap, "pose": Pose,

@@ -74,7 +74,8 @@ def heights_of(log: Path) -> dict[tuple[int, int], float]:
 def traverse(tmp_path_factory):
     """A simulated log without ground truth, and the folder of its results."""
     home = tmp_path_factory.mktemp("traverse")
-    write_log(Simulation(scene="gravel", frames=2, width=240, height=180, seed=1), home / "whole.mcap")
+    simulation = Simulation(scene="gravel", frames=2, width=240, height=180, relief_cells=512, seed=1)
+    write_log(simulation, home / "whole.mcap")
     with Ros2Writer(home / "log.mcap") as writer:
         for topic, log_time, message in iter_decoded(home / "whole.mcap"):
             if not topic.startswith("/truth/"):

@@ -42,7 +42,7 @@ def test_of_a_camera_that_hangs_upside_down_the_nearest_ground_is_above(up, near
 @pytest.fixture(scope="module")
 def frame():
     """A simulated frame of ground up to 46 px near."""
-    simulation = Simulation(frames=1, width=320, height=240, seed=1, abundance=0.1)
+    simulation = Simulation(frames=1, width=320, height=240, relief_cells=512, seed=1, abundance=0.1)
     return StereoFrame(1, *simulation.frame(0).images, simulation.camera)
 
 
