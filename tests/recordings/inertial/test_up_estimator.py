@@ -23,8 +23,8 @@ def rms(values):
     ("changes", "largest", "first"),
     [
         ({}, 0.2, 0.12),
-        ({"rest": 0, "gyroscope_bias": 0.05}, 0.5, 0.85),
         *slow(
+            ({"rest": 0, "gyroscope_bias": 0.05}, 0.5, 0.85),
             ({"rest": 0}, 0.3, 0.55),
             ({"speed": 1.5}, 0.32, 0.12),
             ({"vibration": 2.0}, 0.37, 0.12),
@@ -59,7 +59,7 @@ def test_a_known_gravity_shows_the_bias_along_it():
 
 
 def test_accelerations_and_rates_may_have_stamps_of_their_own():
-    driven = drive(rate=200)
+    driven = drive(seconds=30, rate=200)
     whole, parts = driven.samples(), []
     for number, sample in enumerate(whole):
         parts.append(InertialSample(sample.stamp, sample.rate, None))
@@ -79,11 +79,11 @@ def test_a_new_estimate_after_a_gap_keeps_the_biases():
     assert rms(after) < 0.3
 
 
-@pytest.mark.parametrize("rates_until", [200, 20])
+@pytest.mark.parametrize("rates_until", [100, 20])
 def test_memory_does_not_grow_with_the_log(rates_until):
     """rates_until: s, after which the gyroscope is silent."""
     estimator, most = UpEstimator("imu", 0.03), 0
-    for number, sample in enumerate(drive(seconds=200, rate=50, rest=0).samples()):
+    for number, sample in enumerate(drive(seconds=100, rate=50, rest=0).samples()):
         if number > 50 * rates_until:
             sample = replace(sample, rate=None)
         estimator.push(sample)

@@ -38,13 +38,16 @@ def truth(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def frames():
-    return [SMALL.frame(index) for index in range(SMALL.frames)]
+    return [frame_of(index) for index in range(SMALL.frames)]
+
+
+frame_of = cache(SMALL.frame)
 
 
 @cache
 def truth_of(index):
     """The true disparity and maps of a frame."""
-    stamp, frame = SMALL.stamp(index), SMALL.frame(index)
+    stamp, frame = SMALL.stamp(index), frame_of(index)
     return ground_truth.true_disparity(SMALL, stamp, frame), *ground_truth.truth_maps(SMALL, stamp, frame)
 
 

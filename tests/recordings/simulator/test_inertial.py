@@ -60,7 +60,7 @@ def test_a_drive_begins_at_rest_and_its_frames_do_not_depend_on_that():
 
 def test_a_log_has_a_raw_imu_in_place_of_the_inclinometer(tmp_path):
     path = tmp_path / "log.mcap"
-    write_log(replace(DRIVE, frames=2), path)
+    write_log(replace(DRIVE, frames=2, rest=0.0, map_half_width=1.0), path)
     with McapSource().open(path) as log:
         assert log.missing == {}
         assert log.topics["inclinometer"] == "/imu/data_raw"

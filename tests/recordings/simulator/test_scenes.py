@@ -124,7 +124,7 @@ def test_the_right_image_is_too_low_by_the_set_rows():
 
 
 def test_motion_blur_is_the_mean_of_the_images_during_the_exposure():
-    moving = replace(CALM, speed=2.0, exposure_time=0.03, blur=0.0, vignetting=0.0)
+    moving = replace(CALM, width=240, height=180, speed=2.0, exposure_time=0.03, blur=0.0, vignetting=0.0)
     stamp, half = moving.stamp(0), 15_000_000
     with ThreadPoolExecutor(2) as pool:
         poses = [moving.base_at(stamp + round(t * half)).after(moving.mounts[0]) for t in np.linspace(-1, 1, 17)]

@@ -306,14 +306,14 @@ def test_an_infinite_translation_is_reported_and_left_out(tmp_path):
 
 def test_a_long_chain_of_transforms_is_followed():
     frames, message = TransformTree(), TRANSFORMS[0]
-    links = [Transform(f"link{i}", f"link{i + 1}", np.eye(3), np.array([0.1, 0.0, 0.0])) for i in range(2000)]
+    links = [Transform(f"link{i}", f"link{i + 1}", np.eye(3), np.array([0.1, 0.0, 0.0])) for i in range(1200)]
     for _ in range(3):
         for link in links:
             frames.add(transform_message([(link, 0)]).transforms[0])
-    whole = frames.between("link0", "link2000")
-    assert (whole.parent, whole.child) == ("link0", "link2000")
-    np.testing.assert_allclose(whole.translation, [200.0, 0.0, 0.0], atol=1e-6)
-    assert frames.between("link2000", "link0").translation[0] == pytest.approx(-200.0)
+    whole = frames.between("link0", "link1200")
+    assert (whole.parent, whole.child) == ("link0", "link1200")
+    np.testing.assert_allclose(whole.translation, [120.0, 0.0, 0.0], atol=1e-6)
+    assert frames.between("link1200", "link0").translation[0] == pytest.approx(-120.0)
     assert frames.between("link0", "elsewhere") is None
     assert frames.between("elsewhere", "link0") is None
     assert frames.between(message.parent, "link0") is None

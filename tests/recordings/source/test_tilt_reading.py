@@ -20,7 +20,7 @@ from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
 from recordings.ros2.to_msg import camera_info, header, image, odometry, quaternion, raw_imu, transform_message
 from stages.data import Pose, Tilt, Transform
-from tests.conftest import rewrite
+from tests.conftest import rewrite, slow
 from tests.recordings.encodings.rewritten import ros1_bag
 from tests.recordings.inertial.drive import Drive, drive
 from tests.recordings.sample_log import TRANSFORMS, model, picture
@@ -87,7 +87,7 @@ def default(number: int, stamp: int, rate: np.ndarray, force: np.ndarray) -> dic
     ],
 )
 def test_up_is_estimated_where_an_imu_has_no_orientation(tmp_path, messages, why):
-    driven = drive(seconds=20)
+    driven = drive(seconds=12)
     path = written(tmp_path / "log.mcap", driven, messages)
     tilts, lost, note = read(path)
     assert (len(tilts), lost) == (len(driven.stamps), [])
@@ -95,7 +95,7 @@ def test_up_is_estimated_where_an_imu_has_no_orientation(tmp_path, messages, why
     assert all(0 < tilt.sigma < np.radians(1) and tilt.frame_id == "imu_link" for tilt in tilts)
     assert note.startswith(f"up is estimated from the accelerations and rates on {IMU}, because its orientation is not")
     assert why in note
-    assert "at rest for 4 of 20 s; gravity is 9.79 m/s2, as on Earth" in note
+    assert "at rest for 4 of 12 s; gravity is 9.79 m/s2, as on Earth" in note
     with McapSource().open(path) as log:
         assert f"note: inclinometer: up is estimated from the accelerations and rates on {IMU}" in (
             format_description(describe(log, max_gap_of=lambda intervals: 10**8))
@@ -176,11 +176,10 @@ def test_accelerations_and_rates_may_come_on_two_topics(tmp_path):
     [
         (lambda rate: rate, False),
         (np.degrees, True),
-        (lambda rate: -rate, True),
         (lambda rate: rate[[1, 0, 2]], True),
-        (lambda rate: rate * [1, -1, 1], True),
+        *slow((lambda rate: -rate, True), (lambda rate: rate * [1, -1, 1], True)),
     ],
-    ids=["sound", "degrees", "sign", "exchanged", "left-handed"],
+    ids=["sound", "degrees", "exchanged", "sign", "left-handed"],
 )
 def test_rates_that_contradict_the_accelerations_are_a_fault(tmp_path, rates, wrong):
     path = written(tmp_path / "log.mcap", drive(seconds=20), lambda n, t, rate, force: kalibr(n, t, rates(rate), force))
