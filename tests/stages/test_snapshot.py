@@ -30,7 +30,7 @@ from stages.stage import restore, snapshot
 from tests.stages.localisation.drive import Drive, motions
 from tests.stages.running import Running
 
-FRAMES = 6
+FRAMES = 4
 
 
 @pytest.fixture(scope="module")

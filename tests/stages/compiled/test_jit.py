@@ -71,6 +71,11 @@ def test_kernels_are_cached_loaded_early_and_recompiled_after_a_change(run, tmp_
     assert after.startswith("True 0 0\n")
     assert after != first
     assert "compiling kernels" in stderr
+
+
+@pytest.mark.slow
+def test_kernels_are_recompiled_after_a_change_of_the_codes_in_them(run, tmp_path):
+    run()
     codes = tmp_path / "stages" / "data" / "pixel_validity.py"  # the values of its enumerations are compiled in
     codes.write_text(f"{codes.read_text()}\n# changed\n")
     assert "compiling kernels" in run()[1]

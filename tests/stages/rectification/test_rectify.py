@@ -11,6 +11,7 @@ import pytest
 from stages.data import CameraModel, StereoCamera, StereoFrame
 from stages.rectification.rectify import Rectify, _rectifying_maps
 from stages.rectification.row_offset import measure, offset_field
+from tests.conftest import slow
 
 SIZE = WIDTH, HEIGHT = 320, 240
 K = np.array([[260.0, 0, 158], [0, 262.0, 121], [0, 0, 1]])
@@ -156,9 +157,10 @@ def test_the_cameras_may_differ_in_exposure(gain, bias):
     assert np.abs(offset_field(measured.terms, *LARGE) - offset_field(TURNED, *LARGE)).max() < 0.2
 
 
-def test_aligned_images_with_little_texture_are_left_alone():
+@pytest.mark.parametrize("pairs", [5, *slow(20)])
+def test_aligned_images_with_little_texture_are_left_alone(pairs):
     corrected = 0
-    for seed in range(20):
+    for seed in range(pairs):
         left, right = (image.copy() for image in a_pair(seed=seed, size=LARGE))
         noise = np.random.default_rng(seed).normal(0, 2, (2, *left.shape))
         shown = np.zeros(left.shape, bool)
@@ -167,7 +169,7 @@ def test_aligned_images_with_little_texture_are_left_alone():
                  for image, n in zip((left, right), noise, strict=True)]  # fmt: skip
         offset = measure([tuple(views)])
         corrected += offset is not None and offset.clear
-    assert corrected <= 1
+    assert corrected <= pairs // 20
 
 
 def test_repeated_views_do_not_reduce_the_stated_error():

@@ -39,12 +39,15 @@ def flat(x, y):
     return np.zeros_like(x)
 
 
-def drive(frame, ground=rolling, sigma=0.02, tilt=(0.0, 0.0), at=None, noise=0.0):
-    """Cloud and pose of one frame: 2 to 7 m ahead, 100 degrees wide, 6 points a cell. tilt: slopes by a wrong tilt."""
+def drive(frame, ground=rolling, sigma=0.02, tilt=(0.0, 0.0), at=None, noise=0.0, points=100_000):
+    """Cloud and pose of one frame: 2 to 7 m ahead, 100 degrees wide; 100,000 points are 6 a cell.
+
+    tilt: slopes by a wrong tilt.
+    """
     rng = np.random.default_rng(frame)
     x, y, yaw = at or (0.4 * frame - 3.03, 0.1 * frame + 0.521, 0.4 + 0.1 * frame)
     base = np.array([x, y, float(ground(np.array(x), np.array(y)))])
-    reach, bearing = np.sqrt(rng.uniform(4, 49, 100_000)), rng.uniform(-0.87, 0.87, 100_000)
+    reach, bearing = np.sqrt(rng.uniform(4, 49, points)), rng.uniform(-0.87, 0.87, points)
     ahead = np.column_stack([reach * np.cos(bearing), reach * np.sin(bearing)])
     world = ahead @ Rotation.from_euler("z", yaw).as_matrix()[:2, :2].T + base[:2]
     heights = ground(world[:, 0], world[:, 1]) - base[2] + ahead @ tilt + noise * rng.normal(size=len(ahead))

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from flow.contracts import Severity
 from stages import Fuse, Pose, Transform
 from stages.terrain.map_registration import register
+from tests.conftest import slow
 from tests.stages.running import Running
-from tests.stages.terrain.region_scene import MOUNT, START, centres, drive, flat, part, rolling
+from tests.stages.terrain.region_scene import MOUNT, START, centres, drive, flat, rolling
 
 
 def heights(cloud, placed):
@@ -38,12 +39,13 @@ def test_frames_with_tilt_errors_join_without_a_seam():
     assert np.max(seams, axis=0)[1] < 0.008
 
 
-def leans_of_the_map(covariance):
+def leans_of_the_map(covariance, frames=61):
     """Lean of the map that each frame is placed in, over the error of the first tilt; and the last map."""
     fuse, lean, found = Running(Fuse()), np.radians(0.6), []
-    for frame in range(61):
-        cloud, pose = drive(frame, flat, tilt=(0.0 if frame else lean, 0.0), at=(0.25 * frame, 0.0, 0.0))
-        terrain = fuse(part(cloud, np.s_[::10]), replace(pose, covariance=covariance), MOUNT)
+    for frame in range(frames):
+        at = (0.25 * frame, 0.0, 0.0)
+        cloud, pose = drive(frame, flat, tilt=(0.0 if frame else lean, 0.0), at=at, points=10_000)
+        terrain = fuse(cloud, replace(pose, covariance=covariance), MOUNT)
         found.append(np.arcsin(terrain.level.rotation[2, 0]) / lean)
     return np.array(found), terrain
 
@@ -57,9 +59,10 @@ def test_the_tilt_error_of_the_first_frame_fades_if_the_pose_is_uncertain():
     assert abs(terrain.level.translation[2]) < 0.1
 
 
+@pytest.mark.parametrize("frames", [15, *slow(61)])
 @pytest.mark.parametrize("covariance", [None, np.diag([1e-6] * 3 + [1e-7] * 3)])
-def test_the_tilt_error_of_a_frame_does_not_tilt_the_map_of_a_precise_pose(covariance):
-    found, terrain = leans_of_the_map(covariance)
+def test_the_tilt_error_of_a_frame_does_not_tilt_the_map_of_a_precise_pose(covariance, frames):
+    found, terrain = leans_of_the_map(covariance, frames)
     assert np.abs(found[1:]).max() < 0.1
     assert np.nanmax(np.abs(terrain.layers["elevation"])) < 0.01
 
@@ -67,8 +70,8 @@ def test_the_tilt_error_of_a_frame_does_not_tilt_the_map_of_a_precise_pose(covar
 def test_a_map_of_noisy_tilts_and_exact_poses_is_level_and_at_the_true_height():
     tilts, fuse = np.radians(0.2) * np.random.default_rng(3).normal(size=(50, 2)), Running(Fuse())
     for frame, tilt in enumerate(tilts):
-        cloud, pose = drive(frame, tilt=tuple(tilt), at=(0.3 * frame, 0.0, 0.0))
-        terrain = fuse(replace(part(cloud, np.s_[::20]), tilt_sigma=np.radians(0.2)), pose, MOUNT)
+        cloud, pose = drive(frame, tilt=tuple(tilt), at=(0.3 * frame, 0.0, 0.0), points=5_000)
+        terrain = fuse(replace(cloud, tilt_sigma=np.radians(0.2)), pose, MOUNT)
     x, y = centres(terrain)
     error = terrain.layers["elevation"] - rolling(x, y)
     known = np.isfinite(error)
