@@ -33,9 +33,10 @@ RULE = re.compile("|".join(f"(?:{pattern})" for pattern in FORBIDDEN), re.IGNORE
 def texts(file: Path) -> Iterator[tuple[int, str]]:
     """(line, text) of the comments and string literals of a Python file."""
     source = file.read_text()
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            yield token.start[0], token.string
+    if any(RULE.search(line[line.index("#") :]) for line in source.splitlines() if "#" in line):  # tokens are slow
+        for token in tokenize.generate_tokens(io.StringIO(source).readline):
+            if token.type == tokenize.COMMENT:
+                yield token.start[0], token.string
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.lineno, node.value
