@@ -9,11 +9,12 @@ import pytest
 from flow.cli.main import main
 from recordings.simulator.simulation import Simulation
 from tests.bench.terrain import RUNS, SLOPE, TILT_NOISE, Run, measured_tilts, score, tilt_error
+from tests.conftest import slow
 
 COMPARED = {name: pipeline for name, pipeline in RUNS.items() if pipeline == "rover"}
 
 
-@pytest.mark.parametrize("pipeline", ["rover", "fast", "paper"])
+@pytest.mark.parametrize("pipeline", ["rover", *slow("fast", "paper")])
 def test_tilt_errors_match_the_stated_tilt_sigma(pipeline):
     ground = {"frames": 30, "slope": float(SLOPE), "relief_cells": 512, "abundance": 0.0}
     simulation = Simulation(**ground, tilt_noise=float(TILT_NOISE), seed=21)
@@ -60,6 +61,13 @@ def traverse_of(seed: int, abundance: float, scene: str = "mixed") -> Simulation
     )  # fmt: skip
 
 
+def test_a_frame_has_an_accurate_map():
+    found = score([traverse_of(14, 0.15)], 30, COMPARED)
+    assert found["rover"].tally.metrics()["rocks"]["0.2 m"]["visible"] >= 1
+    check(found, alarms=0.08, slack=0.04)
+
+
+@pytest.mark.slow
 def test_two_frames_have_accurate_maps():
     found = score([traverse_of(11, 0.15)], 15, COMPARED)
     assert found["rover"].tally.metrics()["rocks"]["0.2 m"]["visible"] >= 1
