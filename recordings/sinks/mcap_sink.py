@@ -157,7 +157,8 @@ class McapSink:
                 root = rerun_root(transforms, self._theirs)
                 writer.write("/tf_static", transform_message([(root, stamp)]), stamp)
         if self.viewers:
-            for topic, message in viewer_messages(record.items, kept):
+            taken = {known.child for known in own.values()} & self._theirs.keys()
+            for topic, message in viewer_messages(record.items, kept, taken):
                 writer.write(topic, message, stamp)
         health = [_health(name, item) for name, item in record.items.items() if isinstance(item, TiltHealth)]
         maps = [(name, record.items.get(name)) for name in self._written]

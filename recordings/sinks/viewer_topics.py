@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,19 +20,23 @@ from recordings.sinks.colormaps import (
 from recordings.source.transforms import TransformTree
 from stages.data import Disparity, ElevationMap, NavigationMap, StereoFrame, Transform
 
+_Seen = TypeVar("_Seen", Disparity, StereoFrame)
 _RERUN_ROOT = "tf#/"  # the frame in which rerun draws a log that it opens by itself
 
 
-def viewer_messages(items: Mapping[str, Any], written: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def viewer_messages(
+    items: Mapping[str, Any], written: Mapping[str, Any], taken: Collection[str]
+) -> Iterator[tuple[str, Any]]:
     """Topic and message of a frame for viewers.
 
-    items: stream -> item of the whole frame; written: the streams that the log contains in this frame.
+    items: stream -> item of the whole frame; written: the streams that the log contains in this frame; taken: cameras
+    that the input has too. rerun refuses two calibrations of one camera.
     """
     for stream, item in written.items():
         topic = f"/nav/{stream}"
         match item:
             case Disparity():
-                for below, message in depth_messages(item).items():
+                for below, message in depth_messages(_seen(item, taken)).items():
                     yield topic + below, message
                 colors = {code: rgb for code, (_, rgb) in SOURCE_LEGEND.items()}
                 frame_id = item.camera.frame_id if item.camera is not None else "camera"
@@ -53,8 +57,16 @@ def viewer_messages(items: Mapping[str, Any], written: Mapping[str, Any]) -> Ite
         (left,) = top_eight_bits(frame.left)
         # Two calibrations of one camera would be two parents of its image plane, which rerun refuses.
         has_depth = any(isinstance(item, Disparity) and item.camera is not None for item in written.values())
-        for below, message in left_messages(frame, left, with_calibration=not has_depth).items():
+        for below, message in left_messages(_seen(frame, taken), left, with_calibration=not has_depth).items():
             yield f"/nav/{stream}{below}", message
+
+
+def _seen(item: _Seen, taken: Collection[str]) -> _Seen:
+    """A disparity or a frame with its camera in the tree of the results."""
+    camera = item.camera
+    if camera is None or camera.frame_id not in taken:
+        return item
+    return replace(item, camera=replace(camera, frame_id=OWN_FRAME + camera.frame_id))
 
 
 def rerun_root(transforms: Sequence[Transform], theirs: Mapping[str, str]) -> Transform:

@@ -48,6 +48,11 @@ def test_input_and_results_have_one_tree_of_frames(traverse, tmp_path, left_out)
     assert {frame: names for frame, names in parents.items() if len(names) > 1} == {}
     assert parents.keys() > {"level", "left_camera_optical"}
     assert set().union(*parents.values()) - parents.keys() == {"tf#/"}  # one root
+    topics = "/stereo/left/camera_info", "/nav/disparity/depth/camera_info", "/nav/disparity/depth/image_rect"
+    cameras = {topic: item.header.frame_id for topic, _, item in iter_decoded(tmp_path / "out.mcap", topics)}
+    own = f"nav/{cameras[topics[0]]}"  # rerun refuses two calibrations of one camera
+    assert [cameras[topic] for topic in topics[1:]] == [own, own]
+    assert own in parents
 
 
 def test_chunks_with_small_messages_contain_no_images(both):
