@@ -174,6 +174,16 @@ def test_an_odometry_sequence_is_the_simulators_log(tmp_path, capsys, keys):
     assert "lacks 'height' (height of the left camera above base_link, with m); KITTI's odometry" in said
 
 
+@pytest.mark.slow
+def test_an_odometry_sequence_gives_the_simulators_maps(tmp_path, monkeypatch):
+    simulation = replace(EXACT, slope=0.0)
+    monkeypatch.setattr("recordings.importers.kitti_odometry.FIRST_STAMP", simulation.start)  # seeds derive from stamps
+    (folder, rig), own = write_sequence(gray(simulation), tmp_path), own_log(gray(simulation), tmp_path / "own.mcap")
+    assert roverflow("import", "kitti", folder, tmp_path / "log.mcap", "--rig", rig) == 0
+    assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
+    assert roverflow("score", tmp_path / "imported-out.mcap", "--truth", tmp_path / "log.mcap") == 0
+
+
 def test_a_pair_with_the_time_of_another_is_left_out_with_a_note(tmp_path, capsys):
     folder, rig = write_sequence(gray(EXACT), tmp_path)
     (folder / "times.txt").write_text("0.0\n0.1\n0.1\n")
