@@ -1,8 +1,6 @@
 """`--at`: seconds, times as the viewer shows them, and the cursor of an open viewer."""
 
 import socket
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -14,6 +12,7 @@ from flow.cli.what_if import part_of
 from flow.errors import UsageError
 from recordings import McapSource
 from tests.conftest import SMALL, roverflow
+from tests.viewers import viewer
 
 
 @pytest.fixture(scope="module")
@@ -66,12 +65,11 @@ def test_the_cursor_of_an_open_viewer_is_the_instant(result, stamps):
     from rerun.experimental import ViewerClient
 
     port = free_port()
-    words = ["--headless", "--bind", "127.0.0.1", "--port", str(port), str(result.with_suffix(".rrd"))]
-    viewer = subprocess.Popen([sys.executable, "-m", "rerun", *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    try:
+    words = "--headless", "--bind", "127.0.0.1", "--port", port, result.with_suffix(".rrd")
+    with viewer(*words) as opened:
         for _ in range(120):
             time.sleep(0.5)
-            if viewer.poll() is not None:
+            if opened.poll() is not None:
                 pytest.skip("the viewer has no graphics driver here")
             try:
                 client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
@@ -84,6 +82,3 @@ def test_the_cursor_of_an_open_viewer_is_the_instant(result, stamps):
         client.set_time("frame", sequence=1, play_state="paused")
         with pytest.raises(UsageError, match="choose 'log clock' in its time panel"):
             without_cursor("cursor", port)
-    finally:
-        viewer.kill()
-        viewer.wait()

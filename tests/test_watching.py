@@ -4,15 +4,18 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from contextlib import ExitStack
+from types import SimpleNamespace
 
 import pytest
 
+from flow.cli import watching
 from recordings import RerunSink
 from tests.conftest import SMALL, roverflow
-from tests.recordings.sinks.recorded_scene import START, STREAMS, Record, rows, scene
+from tests.recordings.sinks.recorded_scene import START, STREAMS, Record, pictures, rows, scene
+from tests.viewers import answers, send, viewer, wait_for_bytes
 
-PORT = 19871
+FRAME_BYTES = 100_000  # fewer than a frame of the traverse has in the recording
 
 
 def test_watching_needs_the_recording(traverse, tmp_path, capsys):
@@ -20,41 +23,93 @@ def test_watching_needs_the_recording(traverse, tmp_path, capsys):
     assert "watching needs the recording; leave out --no-rrd" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_a_served_run_writes_the_same_result_and_listens_on_loopback_only(traverse, result, tmp_path, capsys):
+def is_the_same(out, result):
+    return out.read_bytes() == result.read_bytes() and (
+        pictures(out.with_suffix(".rrd")) == pictures(result.with_suffix(".rrd"))
+    )
+
+
+def replaced(monkeypatch, words):
+    """Start a process with other words, `words(those of the product)`, to watch a run; returns the processes."""
+    started, start = [], subprocess.Popen
+
+    def popen(command, **options):
+        started.append(start(words(command), **options))
+        return started[-1]
+
+    monkeypatch.setattr(watching, "subprocess", SimpleNamespace(Popen=popen, DEVNULL=subprocess.DEVNULL))
+    return started
+
+
+def port_of(server):
+    """The port of loopback that a browser gets the recording from."""
+    return int(server.args[server.args.index("--port") + 1])
+
+
+def test_a_viewer_that_never_opens_changes_nothing(traverse, result, tmp_path, capsys, monkeypatch):
+    replaced(monkeypatch, lambda command: [sys.executable, "-c", "raise SystemExit(1)"])
     out = tmp_path / "out.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--view") == 0
+    assert (
+        f"No viewer (no display?). The run goes on; afterwards: rerun {tmp_path / 'out.rrd'}" in capsys.readouterr().out
+    )
+    assert is_the_same(out, result)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fate", [signal.SIGSTOP, signal.SIGKILL])
+@pytest.mark.parametrize("how", ["--view", "--serve"])
+def test_a_viewer_that_stops_or_dies_changes_nothing(traverse, result, tmp_path, monkeypatch, how, fate):
+    """A viewer without a screen saves what it gets; with --serve it is a browser, and the server has the same fate."""
+    seen, out, write = tmp_path / "seen.rrd", tmp_path / "out.mcap", RerunSink.write
+    shown = {"--view": lambda command: [*command[:3], "--save", seen, "-"], "--serve": lambda command: command}
+    started = replaced(monkeypatch, shown[how])
+    with ExitStack() as stack:
+
+        def interrupted(sink, record):
+            if record.index == 0 and how == "--serve":
+                started.append(
+                    stack.enter_context(viewer("--save", seen, f"rerun+http://127.0.0.1:{port_of(started[0])}/proxy"))
+                )
+            if record.index == 1:
+                wait_for_bytes(seen, FRAME_BYTES)
+                for process in started:
+                    send(process, fate)
+            write(sink, record)
+
+        monkeypatch.setattr(RerunSink, "write", interrupted)
+        assert roverflow("run", traverse, *SMALL, "-o", out, how) == 0
+        assert len(started) == 1 + (how == "--serve")
+        assert how == "--view" or not answers(port_of(started[0]))
+        for process in started:
+            send(process, signal.SIGKILL)
+    assert is_the_same(out, result)
+    assert seen.stat().st_size < 0.9 * out.with_suffix(".rrd").stat().st_size  # it did not see the rest
+
+
+@pytest.mark.slow
+def test_a_served_run_writes_the_same_result_and_its_page_ends(traverse, result, tmp_path, capsys, monkeypatch):
+    started, out = replaced(monkeypatch, lambda command: command), tmp_path / "out.mcap"
     assert roverflow("run", traverse, *SMALL, "-o", out, "--serve") == 0
     assert "watch the run at http://127.0.0.1:" in capsys.readouterr().out
-    assert out.read_bytes() == result.read_bytes()
-    for entity, component in (
-        ("/disparity/pixels", "EncodedDepthImage:blob"),
-        ("/navigation_map/cells/labels", "SegmentationImage:buffer"),
-    ):
-        both = [rows(path.with_suffix(".rrd"), entity, component) for path in (out, result)]
-        assert both[0] == both[1] != []
+    assert is_the_same(out, result)
+    assert not answers(port_of(started[0]))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fate", [None, signal.SIGSTOP, signal.SIGKILL])
 def test_a_viewer_that_stops_or_dies_does_not_hold_up_the_recording(tmp_path, fate):
-    port = PORT + (fate or 0)
-    sink, out = RerunSink(live_port=port), tmp_path / "run.rrd"
+    out, seen, (reading, writing) = tmp_path / "run.rrd", tmp_path / "seen.rrd", os.pipe()
+    sink = RerunSink(live_pipe=writing)
     sink.open(out, STREAMS, {})
-    address = f"rerun+http://127.0.0.1:{port}/proxy"
-    seen = tmp_path / "seen.rrd"
-    words = [sys.executable, "-m", "rerun", "--save", str(seen), address]
-    viewer = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        time.sleep(3)
+    with viewer("--save", seen, "-", stdin=reading) as watcher:
+        os.close(reading)
         for number in range(150):
-            if fate is not None and number == 10:
-                os.kill(viewer.pid, fate)
+            if number == 10:
+                wait_for_bytes(seen, 1000)
+                send(watcher, fate or 0)
             sink.write(Record(START + number, scene()))
         sink.close({"verdict": "COMPLETE"})
         assert len(rows(out, "/disparity/pixels", "EncodedDepthImage:blob")) == 150
         if fate is None:
-            time.sleep(3)
-            assert seen.stat().st_size > 0.5 * out.stat().st_size
-    finally:
-        viewer.kill()
-        viewer.wait()
+            wait_for_bytes(seen, out.stat().st_size // 2)

@@ -27,16 +27,16 @@ def replay(
     end: float | None = None,
     every: Every | None = None,
     on_frame: Callable[[bool], None] | None = None,
-    live_port: int = 0,
+    live_pipe: int = 0,
     profile: str | None = None,
     desk: str | None = None,
     with_inputs: bool = False,
 ) -> dict[str, Any]:
     """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary.
 
-    on_frame: called after each frame, with whether it is complete, in place of a progress bar; live_port: of loopback,
-    where a viewer can watch the run; 0: none; profile: of the result log; desk: layout of the recording; None: as the
-    pipeline says; with_inputs: copy the messages of the log into the result log.
+    on_frame: called after each frame, with whether it is complete, in place of a progress bar; live_pipe: file
+    descriptor that gets the recording while it is written; 0: none; profile: of the result log; desk: layout of the
+    recording; None: as the pipeline says; with_inputs: copy the messages of the log into the result log.
     """
     from tqdm import tqdm
 
@@ -50,7 +50,7 @@ def replay(
     logs = (log,) if isinstance(log, Path) else tuple(log)
     files = _files(graph, logs)
     inputs = tuple(map(str, logs)) if with_inputs else ()
-    given = {"live_port": live_port, "profile": profile, "desk": desk, "inputs": inputs}
+    given = {"live_pipe": live_pipe, "profile": profile, "desk": desk, "inputs": inputs}
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()

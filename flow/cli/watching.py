@@ -1,28 +1,31 @@
-"""Watching a run: a viewer of this machine, or a browser, which a server in the sink feeds.
+"""Watching a run: a viewer of this machine, or a browser, which another process serves.
 
-The server holds what came before a viewer and drops the oldest beyond MEMORY. It waits for nobody, so a viewer that is
+Both get the recording through a pipe (`recordings.sinks.follower`), and the run waits for nobody: a viewer that is
 slow, suspended or closed costs only its own picture.
 """
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from flow.cli.report import say
 from flow.errors import UsageError
 
 PORT, WEB_PORT = 9877, 9090  # the first ones tried, on loopback; the viewer itself listens on 9876
+LIVE_MEMORY = "512MB"  # of what a browser that comes later still gets; beyond it the oldest is dropped
 
 
 @contextmanager
 def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
-    """Start what watches a run; yields the port of loopback for the sink, 0 for none.
+    """Start what watches a run; yields the file descriptor that it reads the recording from, 0 for none.
 
     view: open the viewer, which stays open after the run; serve: serve a page to browsers, which ends with the run;
     recording: the file that a viewer can open afterwards.
@@ -30,14 +33,16 @@ def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
     if not (view or serve):
         yield 0
         return
-    port = _free(PORT)
-    address, web = f"rerun+http://127.0.0.1:{port}/proxy", _free(WEB_PORT)
-    words = ["--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(web)] if serve else ["--port", "auto"]
+    port, web = _free(PORT), _free(WEB_PORT)
+    page = ["--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(web), "--server-memory-limit", LIVE_MEMORY]
+    words = [*page, "--port", str(port)] if serve else ["--port", "auto"]
+    reading, writing = os.pipe()
     process = subprocess.Popen(
-        [sys.executable, "-m", "rerun", *words, address],
-        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C is for the run
+        [sys.executable, "-m", "rerun", *words, "-"],
+        stdin=reading, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for the run; its processes are one group
     )  # fmt: skip
+    os.close(reading)
 
     def report_failure() -> None:
         if process.wait() > 0:
@@ -45,14 +50,17 @@ def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
 
     reporter = threading.Thread(target=report_failure, name="viewer", daemon=True)
     if serve:
-        say(f"watch the run at http://127.0.0.1:{web}/?url={address} while it lasts")
+        say(f"watch the run at http://127.0.0.1:{web}/?url=rerun+http://127.0.0.1:{port}/proxy while it lasts")
     else:
         reporter.start()
     try:
-        yield port
+        yield writing
     finally:
-        if serve:
-            process.terminate()
+        os.close(writing)
+        if serve:  # it has started another process, and neither ends by itself while it is suspended
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
         elif process.poll() is not None:
             reporter.join()
 

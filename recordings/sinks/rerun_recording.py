@@ -34,6 +34,7 @@ from recordings.sinks.blueprint import (
     ViewSpec,
 )  # fmt: skip
 from recordings.sinks.canvas import CURVE_RGB, Canvas
+from recordings.sinks.follower import Follower
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import plain_type
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
-LIVE_MEMORY = "512MB"  # of what a viewer that comes later still gets
 BATCH_BYTES = 4 << 20  # of some frames; each stored chunk takes 3 kB besides its content
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
@@ -61,6 +61,7 @@ class RerunRecording:
     def __init__(self, settings: RerunSink, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         self._settings, self._path, self._streams, self._about = settings, Path(path), tuple(streams), dict(about)
         self._partial = temporary_name(self._path)
+        self._viewer: Follower | None = None
         self._stamp = 0  # the latest, ns
         self._frames, self._views = 0, -1
         self._plots: list[tuple[int, int, dict[str, float]]] = []  # per frame: stamp, number, path -> value
@@ -98,10 +99,9 @@ class RerunRecording:
         batches = rr.ChunkBatcherConfig(flush_tick=BATCH_SECONDS, flush_num_bytes=BATCH_BYTES)
         self._recording = rr.RecordingStream(self._settings.application_id, batcher_config=batches)
         self._recording.set_log_time_enabled(False)
-        sinks: list[Any] = [rr.FileSink(str(self._partial))]
-        if self._settings.live_port:
-            sinks.append(rr.GrpcServerSink("127.0.0.1", self._settings.live_port, server_memory_limit=LIVE_MEMORY))
-        self._recording.set_sinks(*sinks)
+        self._recording.set_sinks(rr.FileSink(str(self._partial)))
+        if self._settings.live_pipe:
+            self._viewer = Follower(self._partial, self._settings.live_pipe)
         self._recording.send_recording_name(self._about.get("log", self._path.stem))
         self._recording.log(SUMMARY, _document("RUNNING", self._about), static=True)
         self._recording.flush()  # the file begins with it
@@ -121,8 +121,9 @@ class RerunRecording:
             self._recording.log(FRAMES, rr.TextLog(text, level=rr.TextLogLevel.INFO))
             self._log_losses(record.entries, self._frames)
             self._send_blueprint()
-            if self._settings.live_port:
+            if self._viewer is not None:
                 self._recording.flush()  # a viewer shows each frame at once
+                self._viewer.grown()
         self._frames += 1
 
     def close(self, summary: Mapping[str, Any]) -> None:
@@ -134,12 +135,19 @@ class RerunRecording:
         except (OSError, RuntimeError) as error:  # rerun raises RuntimeError if it cannot write its file
             raise unwritable(self._path, getattr(error, "strerror", None) or str(error)) from error
         finally:
+            self._end_viewer()
             self._partial.unlink(missing_ok=True)
 
     def discard(self) -> None:
         """Discard the recording; an earlier file of its name stays."""
         self._recording.disconnect()
+        self._end_viewer()
         self._partial.unlink(missing_ok=True)
+
+    def _end_viewer(self) -> None:
+        """Let a viewer have the rest of the file."""
+        if self._viewer is not None:
+            self._viewer.finish()
 
     def _conclude(self, summary: Mapping[str, Any]) -> None:
         """Log the verdict, the remaining losses and the findings."""

@@ -48,7 +48,9 @@ class RerunSink:
         "often each time that half of the remaining room is used",
         low=0, unit="MB",
     )  # fmt: skip
-    live_port: int = parameter(0, "port of loopback where a viewer can watch the run; 0: none", low=0, high=65535)
+    live_pipe: int = parameter(
+        0, "file descriptor of a pipe to a viewer, which gets the recording while it is written; 0: none", low=0
+    )
     without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
     desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
 

@@ -67,8 +67,8 @@ def run(options: argparse.Namespace) -> int:
     names = ("workers", "start", "end", "every", "profile", "desk", "with_inputs")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
-        with watched(options.view, options.serve, rrd) as port:
-            summary = replay(options.log, options.pipeline, out, rrd, overrides=options.set, live_port=port, **settings)
+        with watched(options.view, options.serve, rrd) as pipe:
+            summary = replay(options.log, options.pipeline, out, rrd, overrides=options.set, live_pipe=pipe, **settings)
     except SinkError as error:
         say(headline(error.summary))
         with suppress(UnwritableError):  # the failed sink is the error to report

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from recordings.sinks.blueprint import CLOCK, FRAME
+from recordings.sinks.blueprint import CLOCK, FRAME, FRAMES, LAYOUT, QUEUES, SECONDS, SUMMARY
 from recordings.sinks.rerun_sink import RerunSink
 from stages.data import (
     LEVEL_FRAME,
@@ -109,6 +109,9 @@ def record_of(
     return path
 
 
+TIMED = (SECONDS, QUEUES, FRAMES, SUMMARY, LAYOUT, "__properties")  # what depends on the speed and time of a run
+
+
 def rows(path: Path, entity: str, component: str) -> list[tuple[int | None, int | None, Any]]:
     """(log clock ns, frame, value) of every row of an entity's component, in time order; a cleared row is None."""
     found = []
@@ -125,6 +128,19 @@ def rows(path: Path, entity: str, component: str) -> list[tuple[int | None, int 
         ]
         found += list(zip(*clocks, batch.column(component).to_pylist(), strict=True))
     return sorted(found, key=lambda row: (row[0] or 0, row[1] or 0))
+
+
+def pictures(path: Path) -> dict[tuple[str, str], list[Any]]:
+    """(Entity, component) -> its rows as in `rows`, without those of `TIMED`."""
+    found: dict[tuple[str, str], list[Any]] = {}
+    for chunk in rr.chunk.RrdReader(str(path)).stream():
+        if chunk.entity_path.strip("/").partition("/")[0] not in TIMED:
+            batch = chunk.to_record_batch()
+            names = [name for name in batch.schema.names if ":" in name]
+            for name in names:
+                times = batch.column(CLOCK).to_pylist() if CLOCK in batch.schema.names else [None] * len(batch)
+                found.setdefault((chunk.entity_path, name), []).extend(zip(times, batch.column(name), strict=True))
+    return {key: sorted(rows, key=lambda row: (row[0] is not None, row[0])) for key, rows in found.items()}
 
 
 def entities(path: Path) -> set[str]:

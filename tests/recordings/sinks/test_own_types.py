@@ -18,7 +18,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.results import read_result
 from recordings.sinks.own_types import leaves, refusal
 from stages.data import Disparity, StereoFrame, Transform
-from tests.conftest import roverflow
+from tests.conftest import FRAMES, roverflow
 from tests.recordings.sinks.recorded_scene import START, Record, decoded, entities, record_of, rows, scene
 
 PIPELINE = """\
@@ -168,7 +168,7 @@ def test_a_pipeline_of_own_types_runs(tmp_path, traverse):
     file.write_text(PIPELINE)
     assert roverflow("run", traverse, "-p", file, "-o", out) == 0
     read = list(iter_decoded(out, ["/nav/sharpness", "/nav/edges"]))
-    assert [topic for topic, *_ in read] == 4 * ["/nav/sharpness", "/nav/edges"]
+    assert [topic for topic, *_ in read] == FRAMES * ["/nav/sharpness", "/nav/edges"]
     assert [frame.items["sharpness"] for frame in read_result(out, ["sharpness"])] == [m.data for _, _, m in read[::2]]
     with pytest.raises(LogError, match="stream 'edges' is sensor_msgs/msg/Image, which read_result does not read; it"):
         next(read_result(out, ["edges"]))
