@@ -10,7 +10,7 @@ from recordings import McapSource
 from recordings.simulator import Simulation, inertial, write_log
 from tests.recordings.inertial.drive import rms_of_estimate
 
-DRIVE = Simulation(frames=24, width=64, height=48, imu="raw", relief_cells=512, rest=5.0, slope=float(np.radians(8)))
+DRIVE = Simulation(frames=12, width=64, height=48, imu="raw", relief_cells=512, rest=5.0, slope=float(np.radians(8)))
 STAMPS = np.array(DRIVE.sensor_stamps(DRIVE.imu_rate))
 
 
