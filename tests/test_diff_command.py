@@ -6,7 +6,7 @@ import re
 import pytest
 
 from recordings.mcap.file import iter_decoded
-from tests.conftest import SMALL, roverflow
+from tests.conftest import SMALL, roverflow, slow
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +32,10 @@ def test_a_run_and_the_same_run_are_equal(fast_result, variant_of, capsys):
     ("change", "topic", "measure"),
     [
         ("disparity/full.paths=8", "/nav/disparity", "largest px"),
-        ("cells.max_range=4 m", "/nav/elevation_map", "cells known only in A"),
-        ("navigation_map.rover.max_step=5 cm", "/nav/navigation_map", "cells from free to hazard"),
+        *slow(
+            ("cells.max_range=4 m", "/nav/elevation_map", "cells known only in A"),
+            ("navigation_map.rover.max_step=5 cm", "/nav/navigation_map", "cells from free to hazard"),
+        ),
     ],
 )
 def test_the_first_difference_is_in_the_stream_that_a_setting_touches(

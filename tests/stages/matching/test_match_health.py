@@ -7,6 +7,7 @@ from flow.contracts import Severity
 from recordings.simulator import Simulation
 from stages import CheckMatches, Disparity, Mount, PixelOrigin, StereoFrame, Tilt
 from tests.bench.refining import stereo_part
+from tests.conftest import slow
 from tests.stages.running import Running
 
 
@@ -46,7 +47,7 @@ def frame():
     return StereoFrame(1, *simulation.frame(0).images, simulation.camera)
 
 
-@pytest.mark.parametrize("pipeline", ["accurate", "rover", "fast"])
+@pytest.mark.parametrize("pipeline", ["rover", "fast", *slow("accurate")])
 def test_only_a_search_range_that_ends_short_of_the_ground_is_a_warning(frame, pipeline):
     for disparities, words in ((48, None), (16, None), (8, "increase `disparities`")):
         check = Running(CheckMatches())

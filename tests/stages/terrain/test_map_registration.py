@@ -155,9 +155,9 @@ def test_a_refused_frame_does_not_count_as_leaning():
     assert fuse.finding() is None
 
 
-@pytest.mark.parametrize("jump", [np.array([0, 0, up]) for up in (0.6, -0.4, 30.0, -1e3, 1e6)])
-def test_a_pose_that_jumps_is_refused_and_the_third_time_resets_the_map(jump):
-    fuse = Running(Fuse())
+@pytest.mark.parametrize("up", [0.6, -0.4, 1e6, *slow(30.0, -1e3)])
+def test_a_pose_that_jumps_is_refused_and_the_third_time_resets_the_map(up):
+    fuse, jump = Running(Fuse()), np.array([0, 0, up])
     for frame in range(5):
         terrain = fuse(*drive(frame), MOUNT)
     for frame in (5, 6):
