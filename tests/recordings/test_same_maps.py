@@ -12,6 +12,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.from_msg import read_grid_map
 from recordings.simulator import Simulation, write_log
+from tests.conftest import slow
 from tests.recordings.containers.forms import rows_of, write_rosbag2
 from tests.recordings.encodings.rewritten import WRITERS
 from tests.recordings.video.encoder import video_log
@@ -41,6 +42,7 @@ def compressed(source: Path, out: Path) -> Path:
 FORMS: dict[str, Callable[[Path, Path], Path]] = {
     **WRITERS, "split": folder, "stopped": folder_without_metadata, "db3": databases, "compressed": compressed,
 }  # fmt: skip
+QUICK = ("ros1.mcap", "split", "db3")
 
 
 def results_of(log: Path | Sequence[Path], out: Path) -> dict[tuple[str, int], bytes]:
@@ -83,7 +85,7 @@ def traverse(tmp_path_factory):
     return home / "log.mcap", results_of(home / "log.mcap", home / "results" / "out.mcap")
 
 
-@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize("name", [*QUICK, *slow(*(name for name in FORMS if name not in QUICK))])
 def test_a_log_in_another_form_gives_the_same_maps(traverse, tmp_path, name):
     log, expected = traverse
     found = results_of(FORMS[name](log, tmp_path / name), tmp_path / "results" / "out.mcap")
