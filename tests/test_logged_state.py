@@ -8,14 +8,14 @@ import pytest
 from flow.cli.what_if import run_variants
 from recordings.results import read_result
 from recordings.simulator import Simulation, write_log
-from tests.conftest import SMALL, rewrite, roverflow
+from tests.conftest import SMALL, rewrite, roverflow, slow
 
 AT = 1.5  # s, the last frame
 HEIGHT_STEP = 1 / 1024  # m, to which the log rounds heights
 EVERY_MAP = ("-p", "fast", *SMALL, "--set", "regional_elevation.step=0 m")
 
 
-@pytest.fixture(scope="module", params=["logged poses", "visual odometry"])
+@pytest.fixture(scope="module", params=["visual odometry", *slow("logged poses")])
 def run(request, traverse, tmp_path_factory):
     """A log and its result, which has a regional map of every frame."""
     log = traverse
