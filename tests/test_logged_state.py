@@ -1,5 +1,6 @@
 """`roverflow try --result`: the state before an instant comes from the result log."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,6 @@ import pytest
 
 from flow.cli.what_if import run_variants
 from recordings.results import read_result
-from recordings.simulator import Simulation, write_log
 from tests.conftest import SMALL, rewrite, roverflow, slow
 
 AT = 1.5  # s, the last frame
@@ -98,8 +98,11 @@ def test_cells_of_another_size_begin_without_a_state(run, tmp_path, capsys):
 
 
 def test_the_result_of_another_log_or_of_another_pipeline_is_refused(traverse, fast_result, tmp_path, capsys):
-    other, rest = tmp_path / "other.mcap", (*SMALL, "-o", tmp_path / "try.rrd")
-    write_log(Simulation(frames=2, width=160, height=120, seed=9), other)
+    def later(topic, index, data):  # by an hour, in the header
+        return data[:4] + struct.pack("<i", struct.unpack("<i", data[4:8])[0] + 3600) + data[8:]
+
+    rest, images = (*SMALL, "-o", tmp_path / "try.rrd"), ("left/image_rect_color", "right/image_rect_color")
+    other = rewrite(traverse, tmp_path / "b.mcap", lambda *one: later(*one) if one[0].endswith(images) else one[2])
     assert roverflow("try", other, "--at", 1, "--result", fast_result, *rest) == 2
     assert f"{other} is not the input of {fast_result}: its frames have other stamps\n" in capsys.readouterr().err
     assert roverflow("try", traverse, "--at", 1, "--result", fast_result, "-p", "rover", *rest) == 2

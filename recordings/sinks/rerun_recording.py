@@ -165,6 +165,7 @@ class RerunRecording:
             level = LEVELS.get(finding["severity"], rr.TextLogLevel.INFO)
             self._recording.log(LEDGER, rr.TextLog(f"{stream}: {finding['sentence']}", level=level))
         facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
+        facts.pop("bottleneck", None)
         for key in {"surveys", "findings"} & facts.keys():
             facts[key] = {name: f"{one['severity']}: {one['sentence']}" for name, one in summary[key].items()}
         pictures = {"frames with images and clouds": f"{self._drawn} of {self._frames}"}
@@ -172,7 +173,8 @@ class RerunRecording:
             pictures["thinned"] = f"at the end each {self._interval}th frame has images, clouds and surfaces"
         if self._settings.without:
             pictures["not drawn"] = ", ".join(self._settings.without)
-        self._recording.log(SUMMARY, _document(verdict, self._about, facts, pictures), static=True)
+        slowest = _slowest(summary.get("bottleneck", {}))
+        self._recording.log(SUMMARY, _document(verdict, slowest, self._about, facts, pictures), static=True)
         layout = self._layout()
         for stage, color in zip(layout.slowest, CURVE_RGB, strict=False):
             path = ViewSpec(Panel.STAGE, SECONDS, rr.escape_entity_path_part(stage), stage).path
@@ -326,6 +328,15 @@ def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
 
 def _same(one: Array, other: Array) -> bool:
     return bool(one.__array_interface__ == other.__array_interface__)
+
+
+def _slowest(bottleneck: Mapping[str, Any]) -> dict[str, str]:
+    """The rows that name the bottleneck."""
+    named = {kind: bottleneck[kind] for kind in ("stage", "sink") if kind in bottleneck}
+    rows = {
+        f"slowest {kind}": f"{one['name']}, {one['seconds_per_frame']:.3f} s a frame" for kind, one in named.items()
+    }
+    return rows | ({"workers": bottleneck["another_worker"]} if "another_worker" in bottleneck else {})
 
 
 def _document(verdict: str, *tables: Mapping[str, Any]) -> rr.TextDocument:

@@ -137,6 +137,14 @@ def test_losses_are_logged_at_their_own_stamps(tmp_path):
     assert "traverse.mcap" in documents[-1]
 
 
+def test_the_bottleneck_is_named_first(tmp_path):
+    slowest = {"stage": {"name": "disparity", "seconds_per_frame": 0.372138}, "another_worker": "nothing"}
+    path = record_of(tmp_path / "slow.rrd", [Record(START, scene())], {"verdict": "COMPLETE", "bottleneck": slowest})
+    *_, (*_, (document,)) = rows(path, "/summary", "TextDocument:text")
+    table = "\n\n| | |\n|---|---|\n| slowest stage | disparity, 0.372 s a frame |\n| workers | nothing |\n"
+    assert document.startswith(f"# COMPLETE{table}")
+
+
 def test_frames_may_come_from_different_threads(tmp_path):
     """rerun sets its clocks per thread; a thread without them logs for all times."""
     sink = opened(tmp_path / "threads.rrd")
