@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flow.cli.replay import one_thread_per_call
-from flow.cli.what_if import Instant, hastened, is_other, part_of
+from flow.cli.what_if import Instant, is_other, part_of
 from flow.config.loader import load
 from flow.contracts import FrameRecord
 from flow.errors import RoverflowError, UsageError
@@ -225,7 +225,7 @@ def instant(graph: Graph, log: McapLog, at: Instant) -> Mapping[str, Any]:
     with one_thread_per_call():
         part = part_of(log, at, frames=1, before=0)
         log.narrow(part.start, part.end)
-        run(replace(hastened(graph), sinks=(("keep", kept),)), log, {"keep": Path("memory")})
+        run(replace(graph, sinks=(("keep", kept),)), log, {"keep": Path("memory")})
     if not kept.records:
         raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.start:.3f} says why")
     return kept.records[0].items

@@ -142,13 +142,6 @@ def _stamps(log: McapLog, times: NDArray[np.int64], place: int, reach: int = 2) 
     return {raw.log_time: log.stamp_of(raw) or raw.log_time for raw in raws}
 
 
-def hastened(graph: Graph) -> Graph:
-    """A graph for a run of few frames: its stages use two cores for one frame, which never changes a result."""
-    threads = {"threads": 2}
-    nodes = (replace(n, actor=replace(n.actor, **threads)) if hasattr(n.actor, "threads") else n for n in graph.nodes)
-    return replace(graph, nodes=tuple(nodes))
-
-
 def run_variants(
     logs: Sequence[Path], pipeline: str | Path, changes: Mapping[str, Sequence[str]], place: tuple[Instant, int, int],
     folder: Path, workers: int,
@@ -165,7 +158,7 @@ def run_variants(
     """
     from stages.kernel_loading import loading_kernels
 
-    graphs = {label: hastened(_graph(pipeline, own)) for label, own in changes.items()}
+    graphs = {label: _graph(pipeline, own) for label, own in changes.items()}
     beside = loading_kernels("recordings.comparison.recording")
     with beside, graphs["A"].source.open(logs) as log, one_thread_per_call():
         graphs = {label: fitted(graph, log) for label, graph in graphs.items()}

@@ -135,7 +135,7 @@ def run(
     SinkError
         An output could not be written. All outputs are closed by then.
     """
-    graph = fitted(graph, log)
+    graph = hastened(fitted(graph, log), log.frames, workers)
     every = every or Every()
     selection = FrameSelection(every, every.odometry(graph.source.streams, log.missing))
     stop, ledger = stop or Stop(), Ledger()
@@ -191,6 +191,16 @@ def fitted(graph: Graph, log: Log) -> Graph:
         return graph.without(log.missing)
     except PipelineError as error:
         raise UsageError(str(error)) from None
+
+
+def hastened(graph: Graph, frames: int | None, workers: int) -> Graph:
+    """The graph for a run of few frames: a stage with `threads` shares each among the workers that have no frame."""
+    threads = 1 if frames is None else workers // max(frames, 1)
+    if threads < 2:
+        return graph
+    few = (node for node in graph.nodes if getattr(node.actor, "threads", threads) < threads)
+    faster = {node.name: replace(node, actor=replace(node.actor, threads=threads)) for node in few}
+    return replace(graph, nodes=tuple(faster.get(node.name, node) for node in graph.nodes))
 
 
 def _notes(log: Log, graph: Graph) -> dict[str, Finding]:

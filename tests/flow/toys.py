@@ -74,6 +74,7 @@ class Scale:
     bad: tuple[float, ...] = ()
     nap: float = field(default=0.0, metadata={"unit": "s"})
     size: int = field(default=1, metadata={"unit": "px"})
+    threads: int = 1
 
     def __post_init__(self) -> None:
         if not self.factor >= 0:

@@ -9,7 +9,7 @@ import pytest
 
 from flow.errors import SinkError, UsageError
 from flow.runtime.interrupts import Stop, interrupts
-from flow.runtime.run import run
+from flow.runtime.run import hastened, run
 from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, replayed_log, traverse
 
 
@@ -24,6 +24,12 @@ def test_a_failing_frame_is_recorded_and_the_others_go_on(tmp_path):
         ("twice", "cannot scale 7.0"),
     ]
     assert [r.index for r in sink.records if r.entries] == [3, 7]
+
+
+@pytest.mark.parametrize(("frames", "threads"), [(1, 4), (2, 2), (3, 1), (None, 1)])
+def test_stages_share_a_frame_among_the_workers_that_have_none(tmp_path, frames, threads):
+    found = {node.name: getattr(node.actor, "threads", 1) for node in hastened(graph(tmp_path), frames, 4).nodes}
+    assert (found["twice"], found["sum"]) == (threads, 1)
 
 
 def test_frames_without_a_partner_in_another_stream_are_in_the_ledger(tmp_path):
