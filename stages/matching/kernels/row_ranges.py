@@ -1,6 +1,7 @@
 """Search ranges of bands of rows: a row of a rover's image shows ground at similar distances, so its range is small.
 
-Each band is searched for the disparities of a prior in it, plus a margin. Ranges differ in their first disparity and
+Each band is searched for the disparities of a prior in it, plus a margin; a band in which the prior knows little also
+for those of the bands around it. Ranges differ in their first disparity and
 in their number of lanes. Between two bands the costs of the paths are moved to the lanes that have the same disparities
 in the other band; disparities of one band only count as "not searched".
 """
@@ -20,7 +21,7 @@ from stages.data import Array
 
 RANGE_MARGIN = 8  # px to either side of the prior's disparities in a band
 OUTLIER_SHARE = 0.001  # of a band's prior, at either end, is ignored: less than a speckle
-MIN_KNOWN_SHARE = 0.5  # of a band's pixels; with fewer known pixels the whole range is searched
+MIN_KNOWN_SHARE = 0.5  # of a band's pixels; with fewer known pixels, as in the sky, the bands around it count too
 NARROW_LANES = (64, 128)  # of ranges shorter than the whole; each number is compiled at its first use
 
 
@@ -59,14 +60,16 @@ def row_ranges(prior: Array, height: int, minimum: int, disparities: int, thread
 
     by_bands(shared_by(threads), len(counts), count)
     most, ranges = lanes_for(disparities), []
-    for (top, end), number in zip(itertools.pairwise(cuts), counts, strict=True):
-        up_to = np.cumsum(number)
+    for i, (top, end) in enumerate(itertools.pairwise(cuts)):
+        enough = MIN_KNOWN_SHARE * (end - top) * columns
+        around = (counts[max(i - reach, 0) : i + reach + 1].sum(axis=0) for reach in range(len(counts)))
+        up_to = np.cumsum(next((number for number in around if number.sum() >= enough), counts[i]))
         ignored = int(OUTLIER_SHARE * up_to[-1])
         low, high = np.searchsorted(up_to, [ignored, up_to[-1] - ignored - 1], side="right").tolist()
         low, high = max(low - RANGE_MARGIN, 0), min(high + RANGE_MARGIN, disparities - 1)
         needed = high - low + 1
         lanes = next((n for n in NARROW_LANES if needed <= n < most), most)
-        if lanes == most or up_to[-1] < MIN_KNOWN_SHARE * (end - top) * columns:
+        if lanes == most or up_to[-1] < enough:
             ranges.append(Range(top, end, 0, Width(most)))
         else:
             first = low - (lanes - needed) // 2
