@@ -6,7 +6,7 @@ viewer never shows an old picture as this frame's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -182,28 +182,9 @@ class Canvas:
         self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, Rgb]], beside: bool = False
     ) -> None:
         """Named dots above a picture of (H, W), in a row of at most four or rows of three; or in two columns beside."""
-        height, width = shape
-        content = shape, *entries
-        names, colors = zip(*content[1:], strict=True)
-        radii = [5.0] * len(names)
-        rows = -(-len(names) // (2 if beside else LEGEND_COLUMNS[len(names) > LEGEND_COLUMNS[0]]))
-        columns = -(-len(names) // rows)
-        places = [divmod(number, columns) for number in range(len(names))]
-        if beside:
-            dots = [((1.1 + 0.7 * column) * width, (row + 0.5) * height / rows) for row, column in places]
-            pins = [(x + 0.33 * width, y - 0.45 * height / rows) for x, y in dots]  # a label is centred below its pin
-        else:
-            row_height = LEGEND_ROW[rows > 1] * height
-            dots = [((column + 0.5) * width / columns, (row - rows) * row_height) for row, column in places]
-            pins = dots
-            # The view ends at the uppermost point, so one without extent keeps the first row's dots whole.
-            dots, colors = [*dots, (width / 2, -(rows + HEADROOM) * row_height)], (*colors, (0, 0, 0))
-            radii.append(0.0)
-        sizes, pin = rr.Radius.ui_points(radii), rr.Radius.ui_points(0.5)
-        self.keep(path, content, lambda: rr.Points2D(dots, colors=colors, radii=sizes, draw_order=30.0))
-        # A label takes the colour of its dot, which may be as dark as the background, so labels have dots of their own.
-        texts: dict[str, Any] = {"labels": names, "show_labels": True, "radii": pin, "draw_order": 31.0}
-        self.keep(f"{path}/text", content, lambda: rr.Points2D(pins, colors=[TEXT_RGB], **texts))
+        named = tuple(entries)
+        self.keep(path, (shape, named), lambda: _dots(shape, named, beside))
+        self.keep(f"{path}/text", (shape, named), lambda: _names(shape, named, beside))
 
     def limits(self, path: str, low: float, high: float) -> tuple[float, float]:
         """The lowest and the highest value given for `path` so far, so that a scale stays."""
@@ -238,3 +219,38 @@ def _scale(low: float, high: float, unit: str, palette: int) -> tuple[tuple[str,
     colors = [(int(r), int(g), int(b)) for r, g, b in colormaps.apply_palette(values, low, high, palette)]
     names = [f"{colormaps.format_value(value)} {unit}".rstrip() for value in values]
     return tuple(zip(names, colors, strict=True))
+
+
+def _dots(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> rr.Points2D:
+    """The dots of a legend."""
+    dots, _, rows, row_height = _places(shape, len(entries), beside)
+    colors, radii = [rgb for _, rgb in entries], [5.0] * len(entries)
+    if not beside:
+        # The view ends at the uppermost point, so one without extent keeps the first row's dots whole.
+        dots, colors = [*dots, (shape[1] / 2, -(rows + HEADROOM) * row_height)], [*colors, (0, 0, 0)]
+        radii.append(0.0)
+    return rr.Points2D(dots, colors=colors, radii=rr.Radius.ui_points(radii), draw_order=30.0)
+
+
+def _names(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> rr.Points2D:
+    """The names of a legend. A label takes the colour of its dot, which may be as dark as the background, so labels
+    have dots of their own."""
+    _, pins, *_ = _places(shape, len(entries), beside)
+    texts: dict[str, Any] = {"labels": [name for name, _ in entries], "show_labels": True, "draw_order": 31.0}
+    return rr.Points2D(pins, colors=[TEXT_RGB], radii=rr.Radius.ui_points(0.5), **texts)
+
+
+def _places(
+    shape: tuple[int, ...], count: int, beside: bool
+) -> tuple[list[tuple[float, float]], list[tuple[float, float]], int, float]:
+    """The places (x, y) of a legend's dots and of its names, its rows, and the height of one above the picture."""
+    height, width = shape
+    rows = -(-count // (2 if beside else LEGEND_COLUMNS[count > LEGEND_COLUMNS[0]]))
+    columns, row_height = -(-count // rows), LEGEND_ROW[rows > 1] * height
+    places = [divmod(number, columns) for number in range(count)]
+    if beside:
+        dots = [((1.1 + 0.7 * column) * width, (row + 0.5) * height / rows) for row, column in places]
+        # A label is centred below its pin.
+        return dots, [(x + 0.33 * width, y - 0.45 * height / rows) for x, y in dots], rows, row_height
+    dots = [((column + 0.5) * width / columns, (row - rows) * row_height) for row, column in places]
+    return dots, dots, rows, row_height
