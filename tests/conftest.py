@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from flow.cli.main import main
 from recordings.ros2.cdr import standard_types
 
-settings.register_profile("quick", deadline=None, max_examples=50)  # the first example may compile a kernel
+settings.register_profile("quick", deadline=None, max_examples=20)  # the first example may compile a kernel
 settings.register_profile("thorough", deadline=None, max_examples=100)
 settings.load_profile("quick")
 

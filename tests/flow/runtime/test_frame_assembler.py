@@ -3,7 +3,7 @@
 from collections import Counter
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flow.runtime.frame_assembler import FrameAssembler
@@ -52,7 +52,6 @@ def test_a_clock_years_from_that_of_the_log_costs_nothing(tmp_path, frames):
         assert summary["verdict"] == "COMPLETE"
 
 
-@settings(max_examples=50, deadline=None)
 @given(stalls=st.lists(st.tuples(st.integers(0, 9_000), st.integers(1, 9_000)), max_size=4))
 def test_a_log_that_was_written_in_bursts_loses_nothing(tmp_path_factory, stalls):
     """A recorder that stalls for up to nine seconds then logs all waiting messages at once."""

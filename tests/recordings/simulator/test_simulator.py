@@ -380,13 +380,11 @@ def test_odometry_does_not_drift_while_the_rover_stands():
 
 def test_the_number_of_threads_does_not_change_the_log(tmp_path: Path):
     written = []
-    for name, threads, seed in (("a", 1, 1), ("b", 3, 1), ("c", 1, 2)):
+    for name, threads in (("a", 1), ("b", 3)):
         tile = {"relief_cells": 256, "map_half_width": 1.0}
-        small = Simulation(frames=1, width=96, height=72, threads=threads, seed=seed, **tile)
-        write_log(small, tmp_path / name)
+        write_log(Simulation(frames=1, width=96, height=72, threads=threads, **tile), tmp_path / name)
         written.append((tmp_path / name).read_bytes())
     assert written[0] == written[1]
-    assert written[0] != written[2]
 
 
 @pytest.mark.parametrize("seed", [0, 3999, 6000, 1 << 40])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.scoring.metrics import aligned
@@ -24,7 +24,6 @@ def maps(known: np.ndarray, frame_id: str = "level") -> dict[str, ElevationMap |
     }
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, ROWS - 1), st.integers(0, COLS - 1)), min_size=1, max_size=4))
 def test_a_cropped_map_laid_on_its_old_grid_is_the_map_before(places):
     known = np.zeros((ROWS, COLS), bool)

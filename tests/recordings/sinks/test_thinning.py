@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.sinks.thinning import first_in_cubes, first_in_cubes_reference, thinned
 from stages.data import PointCloud
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 20_000), st.sampled_from([0.02, 0.3, 5.0]), st.integers(0, 2**31))
 def test_the_first_point_of_each_cube_is_kept(count, spacing, seed):
     points = np.random.default_rng(seed).normal(0, 1, (count, 3)).astype(np.float32)

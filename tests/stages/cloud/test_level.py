@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -47,7 +47,6 @@ def test_ground_below_a_pitched_camera_is_level_at_height_zero() -> None:
     np.testing.assert_allclose(cloud.sensor(seen), ground, atol=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
 @given(turn=rotations)
 def test_the_level_transform_is_a_rotation_that_maps_up_to_z(turn: Array) -> None:
     up = turn @ UP
@@ -60,7 +59,6 @@ def test_the_level_transform_is_a_rotation_that_maps_up_to_z(turn: Array) -> Non
     assert np.linalg.det(transform.rotation) == pytest.approx(1)
 
 
-@settings(max_examples=50, deadline=None)
 @given(turn=rotations)
 def test_the_orientation_of_the_inclinometer_does_not_matter(turn: Array) -> None:
     level = Level()(cloud_of(scattered()), Tilt(0, UP), BARE)
@@ -68,7 +66,6 @@ def test_the_orientation_of_the_inclinometer_does_not_matter(turn: Array) -> Non
     np.testing.assert_allclose(turned.points, level.points, atol=1e-5)
 
 
-@settings(max_examples=50, deadline=None)
 @given(turn=rotations)
 def test_with_base_link_the_camera_orientation_does_not_matter(turn: Array) -> None:
     points, place = scattered(), np.array([0.3, 0.12, 0.9])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.compiled.hamming import MAX_OTHERS, clear_partners, nearest_two, nearest_two_reference
@@ -19,7 +19,6 @@ def descriptors(count: int, seed: int, flips: int = 128) -> Array:
     return np.packbits(bits, axis=1)
 
 
-@settings(deadline=None)  # the first call may compile
 @given(st.integers(1, 70), st.integers(2, 200), st.integers(0, 99), st.sampled_from([0, 1, 3, 128, 256]))
 def test_the_two_nearest_are_those_of_the_reference(count: int, others: int, seed: int, flips: int) -> None:
     codes, partners = descriptors(count, seed, flips), descriptors(others, seed + 1, 128 if flips == 256 else flips)

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.simulator import Simulation
@@ -150,7 +150,6 @@ def test_a_uniform_image_has_no_disparity(dtype, level):
         assert (result.confidence == 0).all()
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     st.integers(16, 90), st.integers(16, 90), st.sampled_from([4, 8]), st.sampled_from([1, 13, 50, 64, 70, 96]),
     st.integers(-15, 15), st.sampled_from(sorted(COSTS)), st.integers(0, 99),

@@ -1,13 +1,12 @@
 """The prior's cost: what each disparity costs is what the plain reference says, wherever the prior lies."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(1, 6), st.integers(1, 9), st.sampled_from([-40, 0, 7]), st.sampled_from([16, 32, 96]),
        st.sampled_from([0.0, 0.5, 2.3, 16.0]), st.sampled_from([0.0, 4.0, 9.5, 64.0]),
        st.integers(0, 2**31))  # fmt: skip

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages import Disparity, Halve, LeftRightCheck, Match, PixelOrigin, StereoCamera, StereoFrame, SwapViews, Upsample
@@ -71,7 +71,6 @@ def test_swapping_twice_is_the_frame_itself_and_disparities_stay():
     assert camera.cx_right - camera.cx == pytest.approx(frame.camera.cx_right - frame.camera.cx)
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(1, 9), st.integers(1, 30), st.sampled_from([0.5, 1.0, 3.0]), st.integers(0, 2**31),
        st.sampled_from([1, 2]))  # fmt: skip
 def test_contradictions_equal_the_reference(height, width, tolerance, seed, threads):
@@ -146,7 +145,6 @@ def test_what_the_prior_shows_nearer_than_the_range_is_unknown():
     assert np.isfinite(found.pixels[(truth < 11) & (np.arange(131) > 30)]).mean() > 0.9
 
 
-@settings(deadline=None)
 @given(st.integers(1, 9), st.integers(1, 9), st.booleans(), st.booleans(), st.integers(0, 99))
 def test_doubling_is_its_reference_at_any_size(rows, columns, odd_rows, odd_columns, seed):
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages import Disparity, LeftRightCheck, Match, MatchOpenCV, PixelOrigin, known
@@ -24,7 +24,6 @@ def test_known_holds_for_one_code_and_for_an_image_of_codes() -> None:
     assert known(codes).tolist() == [known(code) for code in PixelOrigin] == expected
 
 
-@settings(max_examples=30, deadline=None)
 @given(
     st.sampled_from([24, 48]), st.sampled_from([0, 5, 255]), st.sampled_from([0, 40]), st.sampled_from([0, 6]),
     st.sampled_from([0.0, 1.5]), st.booleans(), st.integers(0, 99),

@@ -33,7 +33,6 @@ from tests.stages.matching.test_match_opencv import slanted_pair
 from tests.stages.matching.test_sgm_local import views
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     st.integers(1, 70), st.integers(1, 40), st.integers(1, 80), st.integers(-40, 40), st.integers(1, 400),
     st.integers(0, 2**32 - 1),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 
@@ -52,7 +52,6 @@ def test_a_row_is_selected_as_by_the_reference_in_either_direction(disparities, 
         assert np.isfinite(layers[0]).sum() > 40
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 12), st.integers(0, 2**32 - 1))
 def test_speckles_are_the_small_components_of_a_graph(height, columns, largest, seed):
     rng = np.random.default_rng(seed)
@@ -70,7 +69,6 @@ def test_speckles_are_the_small_components_of_a_graph(height, columns, largest, 
             np.testing.assert_array_equal(ours, plain)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(1, 12), st.integers(1, 30), st.booleans(), st.integers(0, 2**32 - 1))
 def test_excluded_and_blank_pixels_are_dropped_as_by_the_reference(height, columns, excludes, seed):
     rng = np.random.default_rng(seed)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.compiled.parallel import shared_by
@@ -62,7 +62,6 @@ def test_disparities_and_evidence_are_those_of_the_reference(gradient, diagonals
         np.testing.assert_array_equal(two, plain)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(1, 9), st.integers(1, 300), st.integers(1, 20), st.integers(-40, 40), st.integers(0, 2**32 - 1))
 def test_a_window_reaches_as_far_as_asked_to_either_side_of_the_prior(height, columns, reach, least, seed):
     rng = np.random.default_rng(seed)

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.matching.kernels.texture import (
@@ -27,7 +27,6 @@ def noisy(shape, sigma=1.5, seed=0, level=120.0, contrast=0.0):
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(1, 30), st.integers(1, 40), st.integers(0, 2**31), st.sampled_from([1, 2]))
 def test_information_equals_the_reference(height, width, seed, threads):
     rng = np.random.default_rng(seed)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.refinement.kernels.depth_edges import sharpen_edges, sharpen_edges_reference
@@ -13,7 +13,6 @@ def sharpened(disparity, image):
     return sharpen_edges(disparity, np.zeros(disparity.shape, bool), image, 3, DEPTH_EDGE, DEPTH_EDGE_GRAY)
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(1, 14), st.integers(1, 14), st.integers(1, 5), st.integers(0, 2**31))
 def test_the_median_equals_its_reference(height, width, radius, seed):
     random = np.random.default_rng(seed)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN, fill_holes, fill_holes_reference
@@ -24,7 +24,6 @@ def filled(disparity, image, reach=64, margin=100):
     return fill_holes(disparity, image, extent(disparity), reach, margin)
 
 
-@settings(max_examples=80, deadline=None)
 @given(st.integers(1, 24), st.integers(1, 40), st.sampled_from([0.0, 4.0, 64.0]), st.sampled_from([0.0, 3.0, 16.0]),
        st.integers(0, 2**31), st.sampled_from([1, 2]))  # fmt: skip
 def test_the_fill_equals_its_reference_bit_by_bit(height, width, reach, margin, seed, threads):

@@ -1,7 +1,7 @@
 """Source and confidence of each pixel equal the plain reference."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.data import PixelOrigin
@@ -11,7 +11,6 @@ from stages.refinement.kernels.label_origin import Trust, label_origin, label_or
 TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.83, 0.84, 0.58, 0.56)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1, 2]))
 def test_origin_and_confidence_equal_the_reference(height, width, seed, threads):
     rng = np.random.default_rng(seed)

@@ -1,7 +1,7 @@
 """Trusted matches, medians and applied planes equal plain references, on one thread or two."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.data import PixelOrigin
@@ -26,7 +26,6 @@ def scene(height, width, seed):
     return pixels, coefficients, labels
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(1, 20), st.integers(1, 30), st.sampled_from([-1.0, 0.0, 3.0]), st.integers(0, 2**31),
        st.sampled_from([1, 2]))  # fmt: skip
 def test_planes_pull_and_fill_as_in_the_reference(height, width, margin, seed, threads):
@@ -38,7 +37,6 @@ def test_planes_pull_and_fill_as_in_the_reference(height, width, margin, seed, t
     assert np.array_equal(applied, expected_applied)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(1, 24), st.integers(1, 30), st.sampled_from([3, 5]), st.sampled_from([0.0, 1.5, 1000.0]),
        st.integers(0, 2**31), st.sampled_from([1, 2]))  # fmt: skip
 def test_the_median_equals_that_of_sorted_windows(height, width, side, near, seed, threads):
@@ -47,7 +45,6 @@ def test_the_median_equals_that_of_sorted_windows(height, width, side, near, see
     assert np.array_equal(moved, near_median_reference(pixels, side, near), equal_nan=True)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1, 2]))
 def test_trusted_matches_equal_the_reference(height, width, seed, threads):
     pixels, *_ = scene(height, width, seed)

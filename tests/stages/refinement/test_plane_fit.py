@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.refinement.kernels.plane_fit import fit_planes, fit_planes_reference, known_points
@@ -97,7 +97,6 @@ def test_too_few_or_collinear_pixels_give_no_plane():
     assert np.isnan(render_planes(planes.coefficients, labels)).all()
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 9), st.integers(0, 2**31))
 def test_known_points_are_listed_once_each_under_their_label(height, width, count, seed):
     rng = np.random.default_rng(seed)

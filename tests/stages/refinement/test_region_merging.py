@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from skimage import data
 
@@ -10,7 +10,6 @@ from stages.refinement.kernels.region_merging import merge_regions, merge_region
 from stages.refinement.kernels.slic import superpixels
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(4, 60), st.integers(4, 60), st.integers(1, 40), st.integers(1, 12), st.integers(0, 2**31),
        st.sampled_from([1, 2]))  # fmt: skip
 def test_regions_equal_the_reference(height, width, aimed, groups, seed, threads):

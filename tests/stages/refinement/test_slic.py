@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 from skimage import data, segmentation
@@ -64,7 +64,6 @@ def test_two_threads_give_the_same_labels(photo):
     assert np.array_equal(one[0], two[0])
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(1, 30), st.integers(1, 30), st.integers(1, 4), st.integers(0, 40), st.integers(0, 2**31))
 def test_components_are_numbered_as_a_flood_fill_does(height, width, kinds, smallest, seed):
     labels = np.random.default_rng(seed).integers(0, kinds, (height, width), dtype=np.int32)
@@ -121,7 +120,6 @@ def test_settled_centres_explain_the_image_better_than_a_grid(photo, monkeypatch
     assert settled > grid + 0.002
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 70), st.integers(1, 70), st.integers(1, 400), st.integers(0, 2**31))
 def test_any_size_and_count_gives_connected_labels_twice_the_same(height, width, count, seed):
     image = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)

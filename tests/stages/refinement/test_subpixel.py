@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages import Match, Refine, StereoCamera, StereoFrame
@@ -22,7 +22,6 @@ def shifted(disparity, seed=0, noise=1.0):
     return [np.clip(np.rint(view + rng.normal(0, noise, view.shape)), 0, 255).astype(np.uint8) for view in views]
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(1, 30), st.integers(1, 150), st.integers(1, 4), st.sampled_from([1, 2]), st.integers(0, 2**31))
 def test_the_fit_equals_its_reference(height, width, radius, threads, seed):
     rng = np.random.default_rng(seed)

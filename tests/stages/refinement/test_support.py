@@ -40,7 +40,6 @@ def case(height, width, seed):
     return pixels, rng.random(pixels.shape) < 0.2, images, rng.uniform(0.5, 3, 256).astype(np.float32)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 2**31), st.sampled_from([1, 2]))
 def test_sums_of_both_sizes_equal_the_reference(height, width, seed, threads):
     pixels, guessed, (left, right), noise = case(height, width, seed)

@@ -1,13 +1,12 @@
 """The valid extent equals its plain reference and ignores specks."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.refinement.kernels.valid_extent import extent, extent_reference
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(1, 70), st.integers(1, 40), st.sampled_from([1, 2]), st.integers(0, 2**31))
 def test_the_extent_equals_its_reference(height, width, threads, seed):
     rng = np.random.default_rng(seed)

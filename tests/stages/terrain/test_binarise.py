@@ -73,7 +73,6 @@ def test_every_rock_on_any_ground_is_found_with_few_false_alarms(ground: dict[st
     assert alarms <= 0.002
 
 
-@settings(max_examples=25, deadline=None)
 @given(degrees=st.floats(0, 19.9), heading=st.floats(0, 2 * np.pi), offset=st.floats(-50, 50))
 def test_a_plane_within_the_slope_limit_is_free_where_it_was_seen(
     degrees: float, heading: float, offset: float

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import find_objects
 
@@ -54,7 +54,6 @@ def scattered(seed: int, n: int = 3000, extent: float = 9.0) -> Array:
     return np.column_stack([random.uniform(-extent, extent, (n, 2)), random.normal(0, 0.3, n)])
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), resolution=st.sampled_from([0.05, 0.1, 0.3]), region=st.sampled_from([4.0, 8.0]))
 def test_every_point_in_range_is_counted_once(seed: int, resolution: float, region: float) -> None:
     cloud = cloud_of(scattered(seed))
@@ -65,7 +64,6 @@ def test_every_point_in_range_is_counted_once(seed: int, resolution: float, regi
     assert heights == pytest.approx(cloud.points[within, 2].astype(np.float64).sum(), abs=1e-3)
 
 
-@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_mirrored_cloud_gives_the_mirrored_map(seed: int) -> None:
     points = scattered(seed)

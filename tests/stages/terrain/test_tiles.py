@@ -1,7 +1,7 @@
 """Tiles behave like one large array, and only written cells take memory."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.data.tiles import TILE_SIDE, Tiles, copied, put, taken
@@ -12,7 +12,6 @@ places = st.integers(-3 * TILE_SIDE, 2 * TILE_SIDE)
 sizes = st.integers(1, 2 * TILE_SIDE)
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(places, places, sizes, sizes, st.integers(0, 2**32 - 1)), max_size=4), places, places)
 def test_reads_equal_those_of_one_large_array(writes, row, col):
     model = np.zeros((12 * TILE_SIDE, 12 * TILE_SIDE), DTYPE)
