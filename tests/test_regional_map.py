@@ -65,7 +65,7 @@ def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tm
 
 def test_export_without_a_regional_map_exports_the_frames(traverse, tmp_path, capsys):
     out = tmp_path / "out.mcap"
-    assert roverflow("run", traverse, "-p", "paper", *SMALL, "-o", out, "--no-rrd") == 0
+    assert roverflow("run", traverse, "-p", "paper", *SMALL, "-o", out, "--no-rrd", "--end", 0.8) == 0
     counts = Counter(topic for topic, _, _ in iter_decoded(out))
     assert not REGIONAL & set(counts)
     assert roverflow("export", out, tmp_path / "maps") == 2
@@ -74,7 +74,7 @@ def test_export_without_a_regional_map_exports_the_frames(traverse, tmp_path, ca
     assert "contains no /nav/regional_map, only " in stderr
     assert "--frames" in stderr
     assert roverflow("export", out, tmp_path / "maps", "--frames") == 0
-    assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == FRAMES
+    assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == 1
 
 
 def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, capsys):

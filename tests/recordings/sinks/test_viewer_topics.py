@@ -21,7 +21,7 @@ def messages(traverse, tmp_path_factory):
     """Topic -> its first message, by mcap-ros2-support."""
     out = tmp_path_factory.mktemp("viewers") / "out.mcap"
     viewers = ("--set", "McapSink.viewers=true")
-    assert roverflow("run", traverse, *SMALL, *viewers, "-o", out, "--no-rrd", "--end", 0.8) == 0
+    assert roverflow("run", traverse, "-p", "fast", *SMALL, *viewers, "-o", out, "--no-rrd", "--end", 0.8) == 0
     found, cameras = {}, {}  # cameras: frame -> its first transform
     with out.open("rb") as file:
         for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
