@@ -85,13 +85,27 @@ def _line(level: Array, variance: Array, count: Array) -> tuple[float, float]:
 
     level, variance, count: (n,), of the bins; bins far above the line contain texture and are left out.
     """
-    from scipy import optimize  # takes long to import
-
     weight = np.sqrt(count / variance)
     terms = np.stack([np.ones_like(level), level], axis=1)
     while True:
-        (offset, gain), _ = optimize.nnls(terms * weight[:, None], (variance - MIN_VARIANCE) * weight)
+        offset, gain = nonnegative_pair(terms * weight[:, None], (variance - MIN_VARIANCE) * weight)
         textured = (variance > TEXTURED * (MIN_VARIANCE + terms @ (offset, gain))) & (weight > 0)
         if not textured.any() or textured[weight > 0].all():
             return float(offset), float(gain)
         weight = np.where(textured, 0.0, weight)
+
+
+def nonnegative_pair(terms: Array, values: Array) -> tuple[float, float]:
+    """The two numbers, none of them negative, that fit `terms`, (n, 2), to `values`, (n,), by least squares.
+
+    The same as `scipy.optimize.nnls`, which takes long to import.
+    """
+    both, _, rank, _ = np.linalg.lstsq(terms, values)
+    if rank == 2 and (both >= 0).all():
+        return float(both[0]), float(both[1])
+    # The best pair is at the border: one of them is 0, of equals the first.
+    squares = np.maximum(np.square(terms).sum(axis=0), np.finfo(np.float64).tiny)
+    alone = np.diag(np.maximum(values @ terms / squares, 0))
+    errors = [float(np.square(terms @ pair - values).sum()) for pair in alone]
+    offset, gain = alone[0] if errors[0] < errors[1] - 1e-12 * float(values @ values) else alone[1]
+    return float(offset), float(gain)

@@ -3,9 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from stages import MeasureNoise, StereoCamera, StereoFrame
-from stages.matching.image_noise import noise_levels
+from stages.matching.image_noise import noise_levels, nonnegative_pair
 
 
 def ground(shape=(480, 640), seed=0):
@@ -47,3 +48,13 @@ def test_the_stage_measures_the_left_image_in_gray():
     noise = MeasureNoise()(StereoFrame(7, color, color, camera))
     assert noise.stamp == 7
     assert np.allclose(noise.sigma, noise_levels(gray), rtol=0.05)
+
+
+@pytest.mark.parametrize("size", [1, 2, 9])
+def test_a_pair_without_negatives_is_that_of_scipy(size):
+    rng = np.random.default_rng(size)
+    for _ in range(200):
+        terms = np.stack([np.ones(size), rng.uniform(1, 255, size)], axis=1) * rng.uniform(0, 2, (size, 1))
+        values = rng.normal(0, 1, size) * rng.uniform(0, 3)
+        np.testing.assert_allclose(nonnegative_pair(terms, values), nnls(terms, values)[0], rtol=1e-6, atol=1e-9)
+    assert nonnegative_pair(np.zeros((3, 2)), np.ones(3)) == (0, 0)
