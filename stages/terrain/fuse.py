@@ -114,8 +114,12 @@ class _Fusion(Stage):
     def _placed(self, cloud: PointCloud, level: Transform, up: Array, pose: Pose, state: FusedMap) -> Region:
         """The region of a result log at its last frame, which shows where it lies."""
         logged = state.logged
-        if logged is None or cloud.stamp != state.last:
-            raise StageError(f"Fuse: the frame of {state.last} ns, the last one in the map of the log, has no cloud")
+        apart = math.inf if logged is None else math.dist(level.translation[:2], logged.translation[:2])
+        if logged is None or cloud.stamp != state.last or apart > self.resolution:
+            raise StageError(
+                f"Fuse: the frame of {state.last} ns, the last one in the map of the log, has no cloud, or its pose is "
+                "more than a cell off its place there"
+            )
         plane, sigma = plane_between(level, logged), cloud.tilt_sigma or self.tilt_sigma
         levelling = MapLevelling.begin(pose, self._stated).tilted(up, sigma).placed()
         state.levelling, state.plane, state.logged = levelling.at(plane, up), plane, None

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flow.contracts import StageError
 from stages import Binarise, Cell, Fuse, PixelOrigin, TerrainFeatures
 from stages.data.tiles import Tiles
 from stages.terrain.fused_map import SHARED_SHARE
@@ -258,6 +259,16 @@ def test_filled_points_do_not_enter_the_map():
     assert np.isfinite(terrain.layers["elevation"]).any()
     for name, layer in expected.layers.items():
         np.testing.assert_array_equal(terrain.layers[name], layer)
+
+
+def test_a_map_of_a_log_is_not_continued_from_another_place():
+    fuse, (cloud, pose) = Fuse(), drive(0)
+    terrain = Running(fuse)(cloud, pose, MOUNT)
+    assert fuse(cloud, pose, MOUNT, state=fuse.resumed([terrain])).stamp == START
+    for shift in ([0.06, 0, 0], [0, -0.06, 0]):
+        state = fuse.resumed([terrain])
+        with pytest.raises(StageError, match="its pose is more than a cell off its place"):
+            fuse(cloud, replace(pose, position=pose.position + shift), MOUNT, state=state)
 
 
 def test_a_window_smaller_than_a_frame_is_refused():
