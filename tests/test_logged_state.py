@@ -6,12 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flow.cli.explanation import graph_of
+from flow.cli.logged_state import logged_state
 from flow.cli.what_if import run_variants
+from flow.runtime.variants import merged
 from recordings.results import read_result
-from tests.conftest import SMALL, rewrite, roverflow, slow
+from stages import FuseRegion
+from tests.conftest import SMALL, edit_of, rewrite, roverflow, slow
 
 AT = 1.5  # s, the last frame
 HEIGHT_STEP = 1 / 1024  # m, to which the log rounds heights
+POSE = "nav_msgs/msg/Odometry"
+END = 1 << 62  # ns, after all stamps
 EVERY_MAP = ("-p", "fast", *SMALL, "--set", "regional_elevation.step=0 m")
 
 
@@ -74,7 +80,7 @@ def test_without_a_state_the_map_has_only_the_frame(run, tmp_path):
     assert np.isfinite(terrain.layers["elevation"]).sum() < 0.9 * np.isfinite(wanted.layers["elevation"]).sum()
 
 
-def test_it_is_said_what_the_state_is(run, tmp_path, capsys):
+def test_the_state_is_reported(run, tmp_path, capsys):
     log, result = run
     out = tmp_path / "try.rrd"
     change = ("--set", "regional_cells.max_range=4 m", "-o", out)
@@ -95,6 +101,56 @@ def test_cells_of_another_size_begin_without_a_state(run, tmp_path, capsys):
     assert roverflow("try", log, "--at", AT, "--result", result, *change) == 0
     reason = "the map of the log has cells of 0.05 m, not 0.1 m"
     assert f"without state: regional_cells@B ({reason})" in capsys.readouterr().out
+
+
+def test_without_the_pose_of_visual_odometry_its_map_has_no_state(run, tmp_path):
+    log, result = run
+    bare = rewrite(result, tmp_path / "bare.mcap", lambda topic, _, data: None if topic == "/nav/pose" else data)
+    graphs, visual = {"A": graph_of(result)}, log.name != "traverse.mcap"
+    if visual:
+        graphs = {"A": graphs["A"].without({"odometry": "the log has none"})}
+    states, without = logged_state(bare, graphs["A"], END).states(graphs, merged(graphs))
+    assert list(states) == ([] if visual else ["regional_cells"])
+    assert without.get("regional_cells") == ("the log has no pose in the map's frame 'visual_odom'" if visual else None)
+    assert ("pose" in without) == visual
+
+
+@pytest.mark.parametrize(
+    ("frame", "found"), [("visual_odom", True), ("visual_odom/2", True), ("visual_odom_ekf", False),
+    ("visual_odom/map", False)],
+)  # fmt: skip
+def test_only_poses_in_a_frame_of_visual_odometry_continue(run, frame, found, tmp_path):
+    def rename(_, message):
+        message.header.frame_id = frame
+
+    _, result = run
+    edited = rewrite(result, tmp_path / "b.mcap", edit_of("/nav/pose", POSE, rename))
+    assert bool(logged_state(edited, graph_of(result), END).poses) == found
+
+
+def test_a_state_that_variants_share_is_made_once(run, monkeypatch):
+    _, result = run
+    made, resumed = [], FuseRegion.resumed
+    monkeypatch.setattr(FuseRegion, "resumed", lambda stage, maps: made.append(stage) or resumed(stage, maps))
+    changes = {"A": [], "B": ["rover.max_step=5 cm"], "C": ["regional_cells.max_range=4 m"]}
+    graphs = {label: graph_of(result, own) for label, own in changes.items()}
+    states, _ = logged_state(result, graphs["A"], END).states(graphs, merged(graphs))
+    assert {name for name in states if "cells" in name} == {"regional_cells", "regional_cells@C"}
+    assert [stage.max_range for stage in made] == [8.0, 4.0]
+
+
+@pytest.mark.parametrize(
+    ("option", "sentence"),
+    [
+        (("--every", 2), "has only the frames of --every 2; give the result of a whole run\n"),
+        (("--profile", "foxglove"), "has results in Foxglove's messages; run the log again with --profile ros2\n"),
+    ],
+)
+def test_a_result_without_the_state_of_each_frame_is_refused(traverse, option, sentence, tmp_path, capsys):
+    result, rest = tmp_path / "out.mcap", ("-o", tmp_path / "try.rrd")
+    assert roverflow("run", traverse, "-p", "fast", *SMALL, "--end", 0.7, *option, "-o", result, "--no-rrd") == 0
+    assert roverflow("try", traverse, "--at", 1, "--result", result, *SMALL, *rest) == 2
+    assert f"{result} {sentence}" in capsys.readouterr().err
 
 
 def test_the_result_of_another_log_or_of_another_pipeline_is_refused(traverse, fast_result, tmp_path, capsys):

@@ -16,20 +16,21 @@ import numpy as np
 
 from flow.cli.explanation import check_input
 from flow.cli.regional_explanation import level_in
+from flow.errors import UsageError
 from flow.runtime.graph import Graph, Node
 from flow.runtime.variants import Variants, sink_of
 from recordings.comparison.text import moment
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2.from_msg import pose_of, read_grid_map
+from recordings.scoring.result_log import about_run, check_profile
 from stages import Fuse, FuseRegion, MapRegion, PoseFilter, VisualOdometry
 from stages.data import ElevationMap, Pose
-from stages.localisation.pose_filter import VISUAL_FRAME
+from stages.localisation.pose_filter import segment_of
 
 if TYPE_CHECKING:
     from recordings.source.log import McapLog
 
 MAP = "grid_map_msgs/msg/GridMap"
-_WITHOUT = (MapRegion, PoseFilter)  # a stage that needs no state at a map, and one that passes logged poses on
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class LoggedState:
     """What a result log has of the frames before an instant.
 
     stamp: ns, of the frame whose state it is; maps: stream of `Fuse` or `FuseRegion` -> its regional maps up to there;
-    poses: those of visual odometry up to there.
+    poses: those of visual odometry up to there, none if that frame has none.
     """
 
     stamp: int
@@ -50,6 +51,8 @@ class LoggedState:
         for label, graph in graphs.items():
             for node in graph.stages:
                 name = variants.names[label][node.name]
+                if name in states or name in without:
+                    continue
                 try:
                     state = self._state(node)
                 except ValueError as error:
@@ -57,22 +60,30 @@ class LoggedState:
                     continue
                 if state is not None:
                     states[name] = state
-                elif node.stateful and not isinstance(node.actor, _WITHOUT):
+                elif node.stateful and not _needs_none(node):
                     without[name] = "a result log does not contain it"
         return states, without
 
     def _state(self, node: Node) -> Any:
-        """The state of a stage at `stamp`, None without one; raises ValueError where it has other parameters."""
+        """The state of a stage at `stamp`, None without one; raises ValueError where that of the log does not fit."""
         stage = node.actor
         if isinstance(stage, Fuse | FuseRegion) and node.name in self.maps:
-            return stage.resumed(self.maps[node.name])
+            maps = self.maps[node.name]
+            if segment_of(maps[-1].frame_id) is not None and not self.poses:
+                raise ValueError(f"the log has no pose in the map's frame '{maps[-1].frame_id}'")
+            return stage.resumed(maps)
         if isinstance(stage, PoseFilter | VisualOdometry) and self.poses:
             last = self.poses[-1]
             if isinstance(stage, VisualOdometry):
-                return stage.resumed(int(last.frame_id.partition("/")[2] or 1))
+                return stage.resumed(segment_of(last.frame_id) or 1)
             way = np.array([pose.position for pose in self.poses if pose.frame_id == last.frame_id])
             return stage.resumed(last, float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()))
         return None
+
+
+def _needs_none(node: Node) -> bool:
+    """Whether a stage with a state begins as well without: `MapRegion` at a map, `PoseFilter` with logged poses."""
+    return isinstance(node.actor, MapRegion) or (isinstance(node.actor, PoseFilter) and "logged" in node.inputs)
 
 
 def resume(
@@ -81,8 +92,12 @@ def resume(
     """The first frame to run, the states that stages of the joined graph have there, and what a terminal prints.
 
     result: a log of the run of the first graph; opened: its input, and the files of it; before: stamp of the instant,
-    ns. Raises UsageError for another input.
+    ns. Raises UsageError for another input or a run of selected frames, LogError for messages of another profile.
     """
+    about = about_run(result)
+    check_profile(result, about)
+    if about.get("every"):
+        raise UsageError(f"{result} has only the frames of --every {about['every']}; give the result of a whole run")
     check_input(*opened, result)
     logged = logged_state(result, graphs["A"], before)
     if logged is None:
@@ -115,14 +130,15 @@ def logged_state(result: Path, graph: Graph, before: int) -> LoggedState | None:
         for topic in messages.keys() & map_topics.keys():
             maps[map_topics[topic]].append(_regional(of_stamp, topic, stamp))
         found = (pose_of(messages[topic], stamp, "") for topic in messages.keys() & pose_topics)
-        poses += [pose for pose in found if pose is not None and pose.frame_id.startswith(VISUAL_FRAME)]
+        poses += [pose for pose in found if pose is not None and segment_of(pose.frame_id) is not None]
     ends = [{part.stamp for part in parts if part.level is not None} for parts in maps.values()]
     ends = ends or [{pose.stamp for pose in poses}]
     stamp = max(set.intersection(*ends), default=None)
     if stamp is None:
         return None
     kept = {stream: [part for part in parts if part.stamp <= stamp] for stream, parts in maps.items()}
-    return LoggedState(stamp, kept, [pose for pose in poses if pose.stamp <= stamp])
+    poses = [pose for pose in poses if pose.stamp <= stamp]
+    return LoggedState(stamp, kept, poses if poses and poses[-1].stamp == stamp else [])
 
 
 def _topics(result: Path, graph: Graph) -> tuple[dict[str, str], set[str]]:

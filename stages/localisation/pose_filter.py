@@ -208,3 +208,9 @@ def _common_errors(position: Array, distance: float, bias: float) -> Array:
 
 def _frame_of(segment: int) -> str:
     return VISUAL_FRAME if segment < 2 else f"{VISUAL_FRAME}/{segment}"
+
+
+def segment_of(frame_id: str) -> int | None:
+    """The segment whose poses are in a frame of visual odometry; None for another frame."""
+    name, _, number = frame_id.partition("/")
+    return int(number or 1) if name == VISUAL_FRAME and (number or "1").isdecimal() else None
