@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from flow.cli.explanation import why
+from flow.cli.instants import part_of
 from flow.cli.regional_explanation import why_regional
-from flow.cli.what_if import part_of
 from recordings import McapSource
 from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded

@@ -8,20 +8,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from flow.cli.instants import Instant, part_of
 from flow.cli.replay import one_thread_per_call
-from flow.cli.what_if import Instant, is_other, part_of
-from flow.config.loader import load
+from flow.cli.result_input import graph_of, input_of
 from flow.contracts import FrameRecord
-from flow.errors import RoverflowError, UsageError
+from flow.errors import UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import run
 from stages import Binarise
@@ -229,54 +227,6 @@ def instant(graph: Graph, log: McapLog, at: Instant) -> Mapping[str, Any]:
     if not kept.records:
         raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.start:.3f} says why")
     return kept.records[0].items
-
-
-def graph_of(result: Path, changes: Sequence[str] = (), *, with_sinks: bool = False) -> Graph:
-    """The pipeline of a result log as it ran, with what its survey fixed, and then changed. Raises LogError."""
-    from recordings.scoring.result_log import facts_of, pipeline_of
-
-    about = facts_of(result, "the log that roverflow run wrote")
-    with TemporaryDirectory(prefix="roverflow-why-") as folder:
-        file = Path(folder) / f"{pipeline_of(result)}.yaml"
-        file.write_text(about["pipeline"], encoding="utf-8")
-        own = [*about["overrides"].splitlines(), *about.get("fixed", "").splitlines()]
-        return load(str(file), [*own, *changes], with_sinks=with_sinks)
-
-
-@contextmanager
-def input_of(graph: Graph, result: Path, log: Path | None = None) -> Iterator[McapLog]:
-    """The opened input of a result log: `log`, or the one that the result names, beside it.
-
-    Raises UsageError if it is not there, cannot be read, or has none of the result's frames.
-    """
-    from recordings.errors import LogError
-    from recordings.scoring.result_log import about_run
-
-    named = about_run(result)["log"]
-    given = log or result.with_name(named)
-    if not given.exists():
-        raise UsageError(f"the input of {result}, {named}, is not beside it; give it with --log")
-    with ExitStack() as stack:
-        try:
-            opened = stack.enter_context(graph.source.open(given))
-            check_input(opened, given, result, "" if log is None else f"; give {named}")
-        except (LogError, RoverflowError) as error:
-            taken = f" (taken for the input because the result names {named}; give --log)" if log is None else ""
-            raise UsageError(f"{error}{taken}") from error
-        yield opened
-
-
-def check_input(opened: McapLog, given: Path | Sequence[Path], result: Path, remedy: str = "") -> None:
-    """Raise UsageError if an opened log has none of the frames of a result log."""
-    from recordings.containers.digest import log_digest
-    from recordings.containers.finding import find_files
-    from recordings.scoring.result_log import about_run, stamps_of
-
-    # A log in another form has another digest, and the same stamps.
-    same = log_digest(find_files(given).files) == about_run(result).get("log_digest")
-    if not same and is_other(opened, stamps_of(result)):
-        names = ", ".join(map(str, [given] if isinstance(given, Path) else given))
-        raise UsageError(f"{names} is not the input of {result}: its frames have other stamps{remedy}")
 
 
 @dataclass

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flow.cli.explanation import CellExplanation, centre_of, graph_of, index_of, input_of, verdict_at
-from flow.cli.what_if import Instant, ns_of
+from flow.cli.explanation import CellExplanation, centre_of, index_of, verdict_at
+from flow.cli.instants import Instant, ns_of
+from flow.cli.result_input import graph_of, input_of
 from flow.errors import UsageError
 from recordings.mcap.file import iter_decoded
 from recordings.results import read_result

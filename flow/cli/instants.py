@@ -1,0 +1,94 @@
+"""Instants of a log: the frames at a time or a stamp, and whether a log has those of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.errors import UsageError
+from recordings.containers.container import RawMessage
+
+if TYPE_CHECKING:
+    from recordings.source.log import McapLog
+
+DAY = 86_400_000_000_000  # ns
+MARGIN = 1_000_000_000  # ns before the first and after the last image of a log
+Instant = float | np.datetime64 | np.timedelta64
+
+
+@dataclass(frozen=True)
+class Part:
+    """The frames of an instant. start, end: the part to read; at: the first frame of the instant; all in s after the
+    log's first message. before: number of frames before it; stamp: of its first frame, ns."""
+
+    start: float
+    end: float
+    at: float
+    before: int
+    stamp: int
+
+
+def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64) -> Part:
+    """The left images nearest to an instant, and those before them; raises UsageError.
+
+    at: s after the log's first message; or a stamp; or the time of the day, UTC, of one; before: their number, or the
+    stamp of the first of them.
+    """
+    times = log.file.times(log.channels("left")) if "left" in log.topics else np.zeros(0, np.int64)
+    if not times.size:
+        raise UsageError(f"{log.path} has no left images")
+    first, last = ((int(time) - log.begin) / 1e9 for time in (times[0], times[-1]))
+    chosen = _nearest(log, times, at)
+    if chosen is None:
+        shown = f"{at:g}" if isinstance(at, float | int) else f"{np.datetime64(ns_of(at, log.begin), 'ns')}Z"
+        raise UsageError(f"--at {shown} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s")
+    earlier = chosen - (_nearest(log, times, before) or 0) if isinstance(before, np.datetime64) else before
+    low, high = max(0, chosen - earlier), min(times.size, chosen + frames) - 1
+    edges = np.concatenate([times[:1] - 1_000_000_000, (times[1:] + times[:-1]) // 2, times[-1:] + 1_000_000_000])
+    start, end = (max(0, int(edges[place]) - log.begin) / 1e9 for place in (low, high + 1))
+    stamp = _stamps(log, times, chosen, reach=0).get(int(times[chosen]), int(times[chosen]))
+    return Part(start, end, (int(times[chosen]) - log.begin) / 1e9, chosen - low, stamp)
+
+
+def is_other(log: McapLog, stamps: NDArray[np.int64]) -> bool:
+    """Whether a log has left images, but none of those of a run, whose sorted stamps, ns, are given."""
+    times = log.file.times(log.channels("left")) if "left" in log.topics else np.zeros(0, np.int64)
+    if not (times.size and stamps.size):
+        return False
+    tried = stamps[[0, stamps.size // 2, -1]].astype("datetime64[ns]")
+    places = (place for stamp in tried if (place := _nearest(log, times, stamp)) is not None)
+    return not any(np.isin(list(_stamps(log, times, place).values()), stamps).any() for place in places)
+
+
+def ns_of(at: Instant, begin: int) -> int:
+    """An instant in ns, in a log that begins at `begin`, ns."""
+    if isinstance(at, float | int):
+        return begin + round(at * 1e9)
+    value = int(at.astype(f"{at.dtype.kind}8[ns]").astype(np.int64))
+    if isinstance(at, np.timedelta64):  # of the first day on which the log has it
+        start = begin - MARGIN
+        value = start + (value - start) % DAY
+    return value
+
+
+def _nearest(log: McapLog, times: NDArray[np.int64], at: Instant) -> int | None:
+    """The place of the left image nearest to an instant; None outside the log. times: log times, ns."""
+    when, absolute = ns_of(at, log.begin), not isinstance(at, float | int)
+    delay = sum(time - stamp for time, stamp in _stamps(log, times, 0, 0).items()) if absolute else 0
+    if not times[0] - MARGIN <= when + delay <= times[-1] + MARGIN:
+        return None
+    chosen = int(np.argmin(np.abs(times - when - delay)))
+    if absolute:
+        near = _stamps(log, times, chosen)
+        chosen = int(np.searchsorted(times, min(near, key=lambda time: abs(near[time] - when), default=times[chosen])))
+    return chosen
+
+
+def _stamps(log: McapLog, times: NDArray[np.int64], place: int, reach: int = 2) -> dict[int, int]:
+    """Log time -> stamp, ns, of the left image at a place and of those within `reach` of it."""
+    first, last = times[max(0, place - reach)], times[min(place + reach, times.size - 1)]
+    raws = (raw for raw in log.file.messages(log.channels("left"), first, last + 1) if isinstance(raw, RawMessage))
+    return {raw.log_time: log.stamp_of(raw) or raw.log_time for raw in raws}
