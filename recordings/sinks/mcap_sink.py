@@ -150,7 +150,8 @@ class McapSink:
         kept = {name: record.items[name] for name in self._written if name in record.items}
         self._write_items(kept, stamp)
         own = {(known.parent, known.child): known for known in _transforms(record.items.values())}
-        if transforms := beside_inputs([*own.values()], self._theirs):
+        regional = any(plain_type(kind) is Region for kind in self._kinds.values())
+        if transforms := beside_inputs([*own.values()], self._theirs, regional):
             writer.write("/tf", transform_message((known, stamp) for known in transforms), stamp)
             if self.viewers and not self._rooted:
                 self._rooted = True

@@ -18,7 +18,7 @@ from recordings.sinks.colormaps import (
     top_eight_bits,
 )  # fmt: skip
 from recordings.source.transforms import TransformTree
-from stages.data import Disparity, ElevationMap, NavigationMap, StereoFrame, Transform
+from stages.data import LEVEL_FRAME, Disparity, ElevationMap, NavigationMap, StereoFrame, Transform
 
 _Seen = TypeVar("_Seen", Disparity, StereoFrame)
 _RERUN_ROOT = "tf#/"  # the frame in which rerun draws a log that it opens by itself
@@ -75,17 +75,19 @@ def rerun_root(transforms: Sequence[Transform], theirs: Mapping[str, str]) -> Tr
     return Transform(_RERUN_ROOT, _root(transforms[0].child, parents), np.eye(3), np.zeros(3))
 
 
-def beside_inputs(transforms: Sequence[Transform], theirs: Mapping[str, str]) -> list[Transform]:
+def beside_inputs(transforms: Sequence[Transform], theirs: Mapping[str, str], regional: bool) -> list[Transform]:
     """The transforms of a frame such that no frame has two parents. theirs: frame -> parent in the input.
 
     A camera that has a parent in the input keeps it, and is `nav/<camera>` in the tree of the results. Where nothing in
-    the input places the root of that tree, the input's camera does.
+    the input places the root of that tree, the input's camera does. regional: whether other frames of the run place
+    `level`, as this one may lack a pose.
     """
     taken = [known.child for known in transforms if known.child in theirs]
     placed = [replace(known, child=OWN_FRAME + known.child) if known.child in taken else known for known in transforms]
     for camera in taken[:1]:
         root = _root(camera, {known.child: known.parent for known in transforms})
-        if root not in theirs and root != _root(camera, theirs):
+        unplaced = regional and root == LEVEL_FRAME
+        if root not in theirs and root != _root(camera, theirs) and not unplaced:
             placed += filter(None, [TransformTree().joined(transforms).between(camera, root)])
     return placed
 

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_occupancy_grid, read_point_cloud
 from recordings.sinks.colormaps import REASON_LEGEND, legend_colors
-from stages.data import CellReason
+from recordings.sinks.viewer_topics import beside_inputs
+from stages.data import CellReason, Transform
 from tests.conftest import SMALL, roverflow
 
 
@@ -90,3 +91,10 @@ def test_the_camera_of_the_reasons_sees_each_cell_at_its_pixel(messages, name):
     seen = picture[np.rint(v / depth).astype(int), np.rint(u / depth).astype(int), ::-1]
     np.testing.assert_array_equal(seen, legend_colors(reason[row, col], REASON_LEGEND))
     assert len(np.unique(seen, axis=0)) > 1
+
+
+@pytest.mark.parametrize(("regional", "joined"), [(True, []), (False, [("camera", "level")])])
+def test_a_frame_without_a_pose_does_not_give_level_the_camera_as_its_parent(regional, joined):
+    placed = Transform("level", "camera", np.eye(3), np.array([0.0, 0.0, 1.0]))
+    found = beside_inputs([placed], {"camera": "base_link"}, regional)
+    assert [(item.parent, item.child) for item in found] == [("level", "nav/camera"), *joined]
