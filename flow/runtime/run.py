@@ -135,7 +135,7 @@ def run(
     SinkError
         An output could not be written. All outputs are closed by then.
     """
-    graph = hastened(fitted(graph, log), log.frames, workers)
+    graph = with_spare_threads(fitted(graph, log), log.frames, workers)
     every = every or Every()
     selection = FrameSelection(every, every.odometry(graph.source.streams, log.missing))
     stop, ledger = stop or Stop(), Ledger()
@@ -193,14 +193,16 @@ def fitted(graph: Graph, log: Log) -> Graph:
         raise UsageError(str(error)) from None
 
 
-def hastened(graph: Graph, frames: int | None, workers: int) -> Graph:
-    """The graph for a run of few frames: a stage with `threads` shares each among the workers that have no frame."""
-    threads = 1 if frames is None else workers // max(frames, 1)
-    if threads < 2:
+def with_spare_threads(graph: Graph, frames: int | None, workers: int) -> Graph:
+    """The graph for a run of fewer frames than workers: a stage with `threads` at its default uses two for a frame."""
+    if frames is None or 2 * max(frames, 1) > workers:
         return graph
-    few = (node for node in graph.nodes if getattr(node.actor, "threads", threads) < threads)
-    faster = {node.name: replace(node, actor=replace(node.actor, threads=threads)) for node in few}
-    return replace(graph, nodes=tuple(faster.get(node.name, node) for node in graph.nodes))
+    nodes = {node.name: node for node in graph.nodes}
+    for node in graph.stages:
+        default = getattr(type(node.actor), "threads", None)
+        if default == 1 and node.actor.threads == default:
+            nodes[node.name] = replace(node, actor=replace(node.actor, threads=2))
+    return replace(graph, nodes=tuple(nodes.values()))
 
 
 def _notes(log: Log, graph: Graph) -> dict[str, Finding]:

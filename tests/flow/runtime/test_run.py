@@ -9,7 +9,7 @@ import pytest
 
 from flow.errors import SinkError, UsageError
 from flow.runtime.interrupts import Stop, interrupts
-from flow.runtime.run import hastened, run
+from flow.runtime.run import run, with_spare_threads
 from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, replayed_log, traverse
 
 
@@ -26,10 +26,12 @@ def test_a_failing_frame_is_recorded_and_the_others_go_on(tmp_path):
     assert [r.index for r in sink.records if r.entries] == [3, 7]
 
 
-@pytest.mark.parametrize(("frames", "threads"), [(1, 4), (2, 2), (3, 1), (None, 1)])
-def test_stages_share_a_frame_among_the_workers_that_have_none(tmp_path, frames, threads):
-    found = {node.name: getattr(node.actor, "threads", 1) for node in hastened(graph(tmp_path), frames, 4).nodes}
-    assert (found["twice"], found["sum"]) == (threads, 1)
+@pytest.mark.parametrize(("frames", "threads"), [(1, 2), (2, 2), (3, 1), (None, 1)])
+def test_a_stage_shares_a_frame_among_two_workers_if_there_are_too_few_frames(tmp_path, frames, threads):
+    text = PIPELINE.replace("factor: 3 m,", "factor: 3 m, threads: 3,")
+    found = {node.name: node.actor for node in with_spare_threads(graph(tmp_path, text=text), frames, 4).nodes}
+    assert (found["twice"].threads, found["thrice"].threads) == (threads, 3)
+    assert not hasattr(found["sum"], "threads")
 
 
 def test_frames_without_a_partner_in_another_stream_are_in_the_ledger(tmp_path):
