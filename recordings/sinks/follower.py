@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 BLOCK = 1 << 16  # bytes, that a pipe holds
-PATIENCE = 3.0  # s, that a reader has at the end for the rest
+MAX_WAIT = 3.0  # s, for a reader that does not have the rest at the end
 
 
 class Follower:
@@ -24,14 +24,14 @@ class Follower:
         self._thread.start()
 
     def grown(self) -> None:
-        """The file has grown."""
+        """Copy what the file has more."""
         self._grown.set()
 
     def finish(self) -> None:
-        """The file is complete. Waits until the reader has it, but not for long."""
+        """Copy the rest of the complete file, and wait for its reader for `MAX_WAIT` at most."""
         self._over = True
         self._grown.set()
-        self._thread.join(PATIENCE)
+        self._thread.join(MAX_WAIT)
 
     def _copy(self, file: BinaryIO, pipe: int) -> None:
         with file, suppress(OSError):  # the reader has ended

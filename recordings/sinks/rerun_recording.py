@@ -105,6 +105,8 @@ class RerunRecording:
         self._recording.send_recording_name(self._about.get("log", self._path.stem))
         self._recording.log(SUMMARY, _document("RUNNING", self._about), static=True)
         self._recording.flush()  # the file begins with it
+        if self._viewer is not None:
+            self._viewer.grown()
 
     def write(self, record: FrameRecord) -> None:
         """Draw one frame."""
