@@ -1,9 +1,9 @@
 """Search ranges of bands of rows: a row of a rover's image shows ground at similar distances, so its range is small.
 
-Each band is searched for the disparities of a prior in it, plus a margin; a band in which the prior knows little also
-for those of the bands around it. Ranges differ in their first disparity and
-in their number of lanes. Between two bands the costs of the paths are moved to the lanes that have the same disparities
-in the other band; disparities of one band only count as "not searched".
+Each band is searched for the disparities of a prior in it, plus a margin; where the prior knows little of a band, for
+those of it and of the bands around it. Ranges differ in their first disparity and in their number of lanes. Between two
+bands the costs of the paths are moved to the lanes that have the same disparities in the other band; disparities of one
+band only count as "not searched".
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from stages.compiled.simd import Width
 from stages.data import Array
 
 RANGE_MARGIN = 8  # px to either side of the prior's disparities in a band
-OUTLIER_SHARE = 0.001  # of a band's prior, at either end, is ignored: less than a speckle
+OUTLIER_SHARE = 0.001  # of the prior of a range, at either end, is ignored: less than a speckle
 MIN_KNOWN_SHARE = 0.5  # of a band's pixels; with fewer known pixels, as in the sky, the bands around it count too
 NARROW_LANES = (64, 128)  # of ranges shorter than the whole; each number is compiled at its first use
 

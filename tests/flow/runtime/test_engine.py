@@ -6,7 +6,7 @@ import weakref
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flow.contracts import Absent, Loss, LossReason
@@ -242,6 +242,7 @@ def dataflows(draw):
     return stages
 
 
+@settings(max_examples=150, deadline=None)  # the only property of the scheduler
 @given(
     flow=dataflows(), lost=st.sets(st.integers(0, 11), max_size=4),
     workers=st.integers(1, 5), capacity=st.integers(1, 3), sinks=st.integers(0, 2),

@@ -387,6 +387,13 @@ def test_the_number_of_threads_does_not_change_the_log(tmp_path: Path):
     assert written[0] == written[1]
 
 
+@pytest.mark.slow
+def test_another_seed_makes_another_ground():
+    one, other = (Simulation(frames=1, width=96, height=72, relief_cells=256, seed=seed).frame(0) for seed in (1, 2))
+    assert not np.array_equal(one.images[0], other.images[0])
+    assert not np.array_equal(one.depth, other.depth)
+
+
 @pytest.mark.parametrize("seed", [0, 3999, 6000, 1 << 40])
 def test_a_log_of_any_seed_has_stamps_that_can_be_written(seed):
     start = Simulation(seed=seed).start
