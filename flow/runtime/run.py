@@ -147,8 +147,9 @@ def run(
     sinks = _Outputs.of(graph, outputs)
     assembler, started, at_end = FrameAssembler(graph, ledger, selection), 0.0, False
     streams = graph.source_streams | ({selection.odometry} if selection.odometry else set())
-    room: dict[str, Any] = {"workers": workers, "max_frames": workers + 1}
-    engine = Engine(graph.stages, sinks.sinks, ledger, **room, on_frame=on_frame, states=states)
+    engine = Engine(
+        graph.stages, sinks.sinks, ledger, workers=workers, max_frames=workers + 1, on_frame=on_frame, states=states
+    )
     try:
         surveys = "\n".join(f"{name}: {finding.sentence}" for name, finding in prepared.findings.items())
         fixed = "\n".join(f"{name}={json.dumps(value)}" for name, value in prepared.fixed.items())

@@ -35,6 +35,7 @@ from recordings.sinks.own_types import leaves, plain_type, refusal
 from recordings.sinks.thinning import thinned
 from recordings.sinks.viewer_topics import beside_inputs, rerun_root, viewer_messages
 from stages.data import (
+    LEVEL_FRAME,
     Disparity,
     ElevationMap,
     NavigationMap,
@@ -153,9 +154,9 @@ class McapSink:
         regional = any(plain_type(kind) is Region for kind in self._kinds.values())
         if transforms := beside_inputs([*own.values()], self._theirs, regional):
             writer.write("/tf", transform_message((known, stamp) for known in transforms), stamp)
-            if self.viewers and not self._rooted:
+            root = rerun_root(transforms, self._theirs)
+            if self.viewers and not self._rooted and not (regional and root.child == LEVEL_FRAME):
                 self._rooted = True
-                root = rerun_root(transforms, self._theirs)
                 writer.write("/tf_static", transform_message([(root, stamp)]), stamp)
         if self.viewers:
             taken = {known.child for known in own.values()} & self._theirs.keys()

@@ -245,6 +245,20 @@ def test_frame_level_is_placed_in_frames_without_a_regional_map(tmp_path):
     assert moved == places
 
 
+def test_frame_level_has_one_parent_though_the_first_frame_has_no_pose(tmp_path):
+    fuse, sink, parents = Fusing(), McapSink(viewers=True), set()
+    sink.open(tmp_path / "out.mcap", {"points": PointCloud, "regional_cells": Region}, ABOUT)
+    for frame in range(3):
+        cloud, pose = drive(frame)
+        fuse(cloud, pose, MOUNT)
+        points = replace(items(cloud.stamp)["points"], stamp=cloud.stamp)
+        sink.write(Record(cloud.stamp, {"points": points} | ({"regional_cells": fuse.region} if frame else {})))
+    sink.close({})
+    for _, _, message in iter_decoded(tmp_path / "out.mcap", ["/tf", "/tf_static"]):
+        parents |= {(item.child_frame_id, item.header.frame_id) for item in message.transforms}
+    assert parents == {("left_optical", LEVEL_FRAME), (LEVEL_FRAME, "odom"), ("odom", "tf#/")}
+
+
 def test_equal_drives_give_equal_bytes(tmp_path):
     for name in ("a.mcap", "b.mcap"):
         fuse, sink = Fusing(), McapSink()
