@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 
 from recordings.sinks import colormaps
@@ -65,12 +66,15 @@ class Canvas:
 
     def log(self, path: str, archetype: Any, *views: ViewSpec) -> None:
         """Log an entity at the frame's time; views: where the blueprint shows it."""
-        self.recording.log(path, archetype)
-        self._now[path] = type(archetype)
-        if self.counts_bytes:
-            self.logged_bytes += sum(batch.as_arrow_array().nbytes for batch in archetype.as_component_batches())
+        self._log(path, type(archetype), archetype.as_component_batches())
         for view in views:
             self.add_view(view)
+
+    def _log(self, path: str, kind: type, components: Sequence[rr.DescribedComponentBatch]) -> None:
+        self.recording.log(path, components)
+        self._now[path] = kind
+        if self.counts_bytes:
+            self.logged_bytes += sum(batch.as_arrow_array().nbytes for batch in components)
 
     def add_view(self, view: ViewSpec) -> None:
         """Add a view to the blueprint."""
@@ -113,13 +117,18 @@ class Canvas:
 
     def log_exact(self, path: str, pixels: Array, view: ViewSpec) -> None:
         """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as PNG."""
-        self.log(path, rr.EncodedImage(contents=png(pixels), media_type="image/png"), view)
+        self.log_blob(path, rr.EncodedImage, png(pixels), view, media_type="image/png")
 
     def log_image(self, path: str, pixels: Array, view: ViewSpec) -> None:
         """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as JPEG."""
         stored = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
         _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
-        self.log(path, rr.EncodedImage(contents=blob, media_type="image/jpeg"), view)
+        self.log_blob(path, rr.EncodedImage, blob, view, media_type="image/jpeg")
+
+    def log_blob(self, path: str, kind: type, blob: bytes | Array, view: ViewSpec, **fields: Any) -> None:
+        """An image that is encoded already, and the other fields of its archetype, which recur."""
+        self._log(path, kind, [_content(kind, "blob", blob), *_recurring(kind, **fields)])
+        self.add_view(view)
 
     def log_values(
         self,
@@ -135,8 +144,9 @@ class Canvas:
         """
         low, high = limits
         ends = (low - 0.1 * (high - low), high)
-        layout = _value_layout(values.shape, values.dtype, palette)
-        self.log(view.path, rr.DepthImage.from_fields(buffer=values.tobytes(), depth_range=ends, **layout), view)
+        colours = _recurring(rr.DepthImage, meter=1.0, colormap=VIEWER_COLORMAPS[palette])
+        self._log(view.path, rr.DepthImage, [*_raw(rr.DepthImage, values), *colours, _depth_range(ends)])
+        self.add_view(view)
         if unit is not None:
             self.log_scale(f"{view.path}/scale", values.shape, low, high, unit, palette)
 
@@ -153,11 +163,10 @@ class Canvas:
 
         limit: in units. The viewer draws such images of 8 bits black.
         """
-        image = rr.EncodedDepthImage(
-            png(steps), media_type="image/png", meter=per_unit, colormap=VIEWER_COLORMAPS[palette],
-            depth_range=(0.0, limit * per_unit),
+        self.log_blob(
+            view.path, rr.EncodedDepthImage, png(steps), view, media_type="image/png", meter=per_unit,
+            colormap=VIEWER_COLORMAPS[palette], depth_range=(0.0, limit * per_unit),
         )  # fmt: skip
-        self.log(view.path, image, view)
         self.log_scale(f"{view.path}/scale", steps.shape, 0.0, limit, unit, palette)
 
     def log_labels(self, view: ViewSpec, codes: Array, legend: Legend, beside: bool = False) -> None:
@@ -168,7 +177,8 @@ class Canvas:
             names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
             self.recording.log(path, rr.AnnotationContext(names), static=True)
         labels = codes.astype(np.uint8)
-        self.log(f"{path}/labels", rr.SegmentationImage(labels), view)
+        self._log(f"{path}/labels", rr.SegmentationImage, _raw(rr.SegmentationImage, labels))
+        self.add_view(view)
         counts = cv2.calcHist([labels], [0], None, [256], [0, 256]).ravel()
         present = self._present.setdefault(path, set())  # codes of any frame so far, so that the legend stays
         present.update(code for code in legend if counts[code & 0xFF])
@@ -206,10 +216,35 @@ class Canvas:
 
 
 @lru_cache(maxsize=256)
-def _value_layout(shape: tuple[int, ...], dtype: np.dtype[Any], palette: int) -> dict[str, Any]:
-    """What images of values have in common, as Arrow arrays: to make these takes longer than to log an image."""
-    same = rr.DepthImage(np.zeros(shape, dtype), meter=1.0, colormap=VIEWER_COLORMAPS[palette])
-    return {name: getattr(same, name).as_arrow_array() for name in ("format", "meter", "colormap")}
+def _recurring(kind: Any, **fields: Any) -> tuple[rr.DescribedComponentBatch, ...]:
+    """Fields of an archetype. To make these takes longer than to log an image, so those that recur are kept."""
+    return tuple(kind.from_fields(**fields).as_component_batches())
+
+
+@lru_cache(maxsize=256)
+def _image_format(kind: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[rr.DescribedComponentBatch, ...]:
+    batches = kind(np.zeros(shape, dtype)).as_component_batches()
+    return tuple(batch for batch in batches if batch.component_descriptor().component.endswith(":format"))
+
+
+def _raw(kind: Any, pixels: Array) -> list[rr.DescribedComponentBatch]:
+    """An image that is not encoded."""
+    return [_content(kind, "buffer", pixels), *_image_format(kind, pixels.shape, pixels.dtype)]
+
+
+def _content(kind: Any, field: str, content: bytes | Array) -> rr.DescribedComponentBatch:
+    """The bytes of an image as the field of an archetype, not copied."""
+    (empty,) = _recurring(kind, **{field: b""})
+    stored = pa.py_buffer(content)
+    values = pa.Array.from_buffers(pa.uint8(), stored.size, [None, stored])
+    blob = pa.ListArray.from_arrays([0, stored.size], values, type=empty.as_arrow_array().type)
+    return rr.DescribedComponentBatch(rr.components.BlobBatch(blob), empty.component_descriptor())
+
+
+def _depth_range(ends: tuple[float, float]) -> rr.DescribedComponentBatch:
+    (like,) = _recurring(rr.DepthImage, depth_range=(0.0, 1.0))
+    stored = pa.FixedSizeListArray.from_arrays(np.array(ends, np.float64), type=like.as_arrow_array().type)
+    return rr.DescribedComponentBatch(rr.components.ValueRangeBatch(stored), like.component_descriptor())
 
 
 @lru_cache(maxsize=256)

@@ -123,9 +123,9 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
         segments = colormaps.every_nth(segments, canvas.max_width)
         edges = colormaps.segment_edges(segments).astype(np.uint8) * 255
         _, lines = cv2.imencode(".png", edges, [cv2.IMWRITE_PNG_BILEVEL, 1])
-        overlay = rr.EncodedImage(contents=lines, media_type="image/png", opacity=0.4 / step, draw_order=10.0)
+        style = {"media_type": "image/png", "opacity": 0.4 / step, "draw_order": 10.0}
         view = ViewSpec(Panel.SUPERPIXELS, stream, "superpixels", f"{stream}: superpixels")
-        canvas.log(view.path, overlay, view)
+        canvas.log_blob(view.path, rr.EncodedImage, lines, view, **style)
     return caption
 
 
