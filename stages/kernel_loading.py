@@ -11,8 +11,6 @@ from typing import Any
 
 from numba.core.dispatcher import Dispatcher
 
-SLOW_MODULES = ("scipy.ndimage",)  # that stages import when they use them, late in a frame
-
 
 @contextmanager
 def loading_kernels(*modules: str) -> Iterator[None]:
@@ -20,12 +18,14 @@ def loading_kernels(*modules: str) -> Iterator[None]:
     ended = threading.Event()
 
     def work() -> None:
+        with suppress(Exception):  # numba imports it then as it does by default
+            import_arrays()
         for kernel in imported_kernels():
             if ended.is_set():
                 return
             with suppress(Exception):  # the first call loads or compiles it, and reports what is wrong
                 load(kernel)
-        for module in (*SLOW_MODULES, *modules):
+        for module in modules:
             if not ended.is_set():
                 with suppress(Exception):  # likewise
                     import_module(module)
@@ -37,6 +37,16 @@ def loading_kernels(*modules: str) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+
+
+def import_arrays() -> None:
+    """Import numba's array functions without scipy.linalg, which numba imports only to see whether it is there."""
+    linalg: Any = import_module("numba.np.linalg")
+    found, linalg.ensure_blas = linalg.ensure_blas, lambda: None  # scipy is there: the product depends on it
+    try:
+        import_module("numba.np.arraymath")
+    finally:
+        linalg.ensure_blas = found
 
 
 def imported_kernels() -> list[Any]:

@@ -168,17 +168,33 @@ class TerrainFeatures(Stage):
 def _extrapolated(planes: Array, where: Array, resolution: float) -> Array:
     """Least height of the nearest ground plane extrapolated to the cells `where`, (n,), NaN far from ground; planes:
     (3, rows, cols) of height, m, and rise per cell along columns and rows."""
-    known = np.isfinite(planes[0])
     rows, cols = np.nonzero(where)
-    if not known.any():
-        return np.full(len(rows), np.nan)
-    from scipy.ndimage import distance_transform_edt  # takes long to import
+    row, col, distance = nearest_known(np.isfinite(planes[0]), rows, cols, _cells(_MAX_EXTRAPOLATION, resolution))
+    near = distance * resolution <= _MAX_EXTRAPOLATION
+    extrapolated = np.full(len(rows), np.nan)
+    height, along, across = planes[:, row[near], col[near]]
+    extrapolated[near] = height + along * (cols - col)[near] + across * (rows - row)[near] - _EXTRAPOLATION_ERROR
+    return extrapolated
 
-    distance, nearest = distance_transform_edt(~known, return_indices=True)
-    row, col = nearest[:, rows, cols]
-    height, along, across = planes[:, row, col]
-    extrapolated = height + along * (cols - col) + across * (rows - row) - _EXTRAPOLATION_ERROR
-    return np.where(distance[rows, cols] * resolution <= _MAX_EXTRAPOLATION, extrapolated, np.nan)
+
+def nearest_known(known: Array, rows: Array, cols: Array, reach: int) -> tuple[Array, Array, Array]:
+    """Row, column and distance, cells, of the cell of `known` nearest to each of some cells, as scipy.ndimage finds it.
+
+    Of equally near ones, the first column's, and of that the first. Farther ones than `reach` columns may be left out;
+    the distance is large where there is none.
+    """
+    place, far = np.arange(len(known))[:, None], 1 << 20
+    above = np.maximum.accumulate(np.where(known, place, -far), axis=0)
+    below = np.minimum.accumulate(np.where(known, place, far)[::-1], axis=0)[::-1]
+    closest = np.where(place - above <= below - place, above, below)  # in each column
+    closest = np.pad(closest, ((0, 0), (reach, reach)), constant_values=far)
+    row, col, squared = np.zeros_like(rows), np.zeros_like(cols), np.full(len(rows), far * far)
+    for offset in range(-reach, reach + 1):
+        found = closest[rows, cols + offset + reach]
+        apart = (found - rows) ** 2 + offset**2
+        closer = apart < squared
+        row[closer], col[closer], squared[closer] = found[closer], cols[closer] + offset, apart[closer]
+    return row, col, np.sqrt(squared)
 
 
 def _as_whole_obstacles(step: Array, raised: Array) -> Array:

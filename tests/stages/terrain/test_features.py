@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import distance_transform_edt
 
 from stages.data import Array, Cell
 from stages.terrain.binarise import Binarise
-from stages.terrain.features import TerrainFeatures
+from stages.terrain.features import TerrainFeatures, nearest_known
 from stages.terrain.kernels.local_minimum import local_minimum, local_minimum_reference
 from stages.terrain.kernels.plane_window import window_planes, window_planes_reference
 from tests.stages.terrain.terrain_scene import map_of, rolling_terrain
@@ -36,6 +37,25 @@ def test_plane_kernel_equals_the_reference(seed: int, radius: int, share: float)
     got, want = window_planes(heights, use, radius, 0.2503), window_planes_reference(heights, use, radius, 0.2503)
     np.testing.assert_array_equal(np.isnan(got), np.isnan(want))
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    shape=st.tuples(st.integers(1, 30), st.integers(1, 30)),
+    reach=st.integers(1, 10),
+    share=st.sampled_from((0.0, 0.01, 0.1, 0.5)),
+)
+def test_nearest_known_cells_equal_those_of_scipy(seed: int, shape: tuple[int, int], reach: int, share: float) -> None:
+    known = np.random.default_rng(seed).random(shape) < share
+    known.flat[seed % known.size] = True
+    cells = np.nonzero(~known)
+    distances, nearest = distance_transform_edt(~known, return_indices=True)
+    distances, near = distances[cells], distances[cells] <= reach
+    row, col, distance = nearest_known(known, *cells, reach)
+    assert (distance[near] == distances[near]).all()
+    assert (distance[~near] > reach).all()
+    assert (np.stack([row, col])[:, near] == nearest[:, *cells][:, near]).all()
 
 
 def test_empty_cells_around_the_ground_do_not_change_the_features() -> None:
