@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from importlib import import_module
 from pathlib import Path
 
 from recordings.containers.container import Container
@@ -14,6 +15,12 @@ from recordings.containers.finding import find_files
 from recordings.containers.recording import Recording
 from recordings.containers.unpacking import ZSTD_MAGIC, unpacked
 from recordings.errors import LogError, sentence_of
+
+_CONTAINERS = (  # the first bytes of each, its module, and its class, which takes some time to import
+    (b"\x89MCAP0\r\n", "mcap.file", "McapFile"),
+    (b"SQLite format 3\0", "containers.db3", "Db3File"),
+    (b"#ROSBAG V", "containers.ros1_bag", "Ros1Bag"),
+)
 
 
 def open_recording(given: Path | Sequence[Path]) -> Recording:
@@ -36,22 +43,19 @@ def _open_file(path: Path, stack: ExitStack) -> Container:
     if start.startswith(ZSTD_MAGIC):
         path = unpacked(path, stack)
         start = _first_bytes(path)
-    for magic, opened in _containers().items():
-        if start.startswith(magic):
-            return opened(path)
+    if (opened := _container_of(start)) is not None:
+        return opened(path)
     if not start:
         raise LogError(f"{path} is empty (0 bytes); record it again")
     raise LogError(f"{path} is not an MCAP log, a rosbag2 database or a ROS 1 bag (its first bytes differ); give a log")
 
 
-def _containers() -> dict[bytes, Callable[[Path], Container]]:
-    """The first bytes of each container, and its class."""
-    from recordings.containers.db3 import Db3File
-    from recordings.containers.ros1_bag import Ros1Bag
-    from recordings.mcap.file import McapFile
-    from recordings.mcap.index import MAGIC
-
-    return {MAGIC: McapFile, b"SQLite format 3\0": Db3File, b"#ROSBAG V": Ros1Bag}
+def _container_of(start: bytes) -> Callable[[Path], Container] | None:
+    """The class of a container by the first bytes of its file."""
+    for magic, home, name in _CONTAINERS:
+        if start.startswith(magic):
+            return getattr(import_module(f"recordings.{home}"), name)  # type: ignore[no-any-return]
+    return None
 
 
 def _first_bytes(path: Path) -> bytes:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 from mcap.records import Schema
-from mcap_protobuf.decoder import DecoderFactory
 
 from recordings.containers.container import MessageSchema
 from recordings.errors import LogError, sentence_of
@@ -14,6 +13,8 @@ from recordings.errors import LogError, sentence_of
 
 def protobuf_decoder(schema: MessageSchema) -> Callable[[bytes | memoryview], Any]:
     """A function from bytes to a protobuf message. Raises LogError for descriptors that cannot be used."""
+    from mcap_protobuf.decoder import DecoderFactory  # takes long to import
+
     record = Schema(id=1, name=schema.name, encoding=schema.encoding, data=schema.text)
     try:
         decode = DecoderFactory().decoder_for("protobuf", record)
