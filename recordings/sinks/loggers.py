@@ -15,6 +15,7 @@ from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
 from recordings.sinks.canvas import Canvas
 from recordings.sinks.colormaps import Rgb
+from recordings.sinks.png import png
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -121,8 +122,7 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
         # They lie over the left image. Edges of fewer pixels are denser, so they are fainter.
         segments, step = disparity.segments, colormaps.stride(disparity.segments.shape[1], canvas.max_width)
         segments = colormaps.every_nth(segments, canvas.max_width)
-        edges = colormaps.segment_edges(segments).astype(np.uint8) * 255
-        _, lines = cv2.imencode(".png", edges, [cv2.IMWRITE_PNG_BILEVEL, 1])
+        lines = png(colormaps.segment_edges(segments))
         style = {"media_type": "image/png", "opacity": 0.4 / step, "draw_order": 10.0}
         view = ViewSpec(Panel.SUPERPIXELS, stream, "superpixels", f"{stream}: superpixels")
         canvas.log_blob(view.path, rr.EncodedImage, lines, view, **style)
@@ -317,16 +317,10 @@ def log_camera(canvas: Canvas, stream: str, frame: StereoFrame, cloud: PointClou
 @logger_for(NavigationMap, ElevationMap)
 def log_hazards(canvas: Canvas, stream: str, navigation: NavigationMap, terrain: ElevationMap) -> None:
     """The hazard cells on the ground; a hazard without an elevation is on the map only."""
-    if (navigation.cells.shape, navigation.frame_id) != (terrain.shape, terrain.frame_id):
-        return
-    elevation = terrain.layers["elevation"]
-    row, col = np.nonzero((navigation.cells == Cell.HAZARD) & np.isfinite(elevation))
-    if len(row):
-        x, y = cell_centres(terrain)
-        centres = np.column_stack([x[col], y[row], elevation[row, col] + HAZARD_LIFT])
-        hazards = rr.Points3D(
-            centres, colors=[colormaps.CELL_LEGEND[Cell.HAZARD][1]], radii=0.4 * terrain.resolution
-        )  # fmt: skip
+    centres = _hazards(navigation, terrain)
+    if len(centres):
+        raised, red = centres + np.array([0.0, 0.0, HAZARD_LIFT]), [colormaps.CELL_LEGEND[Cell.HAZARD][1]]
+        hazards = rr.Points3D(raised, colors=red, radii=0.4 * terrain.resolution)
         canvas.log(f"{stream}/hazards", hazards, ViewSpec(Panel.TERRAIN, stream, "hazards", stream, terrain.frame_id))
 
 
@@ -336,13 +330,9 @@ def log_hazards_in_view(
 ) -> None:
     """The hazard cells of the frame's own map over the left image; hidden ones too."""
     camera, sensor = frame.camera, cloud.sensor
-    same = (navigation.cells.shape, navigation.frame_id) == (terrain.shape, terrain.frame_id)
-    if sensor is None or not same or terrain.frame_id != LEVEL_FRAME or not canvas.pictures:
+    if sensor is None or terrain.frame_id != LEVEL_FRAME or not canvas.pictures:
         return
-    elevation = terrain.layers["elevation"]
-    row, col = np.nonzero((navigation.cells == Cell.HAZARD) & np.isfinite(elevation))
-    x, y = cell_centres(terrain)
-    seen = (np.column_stack([x[col], y[row], elevation[row, col]]) - sensor.translation) @ sensor.rotation
+    seen = (_hazards(navigation, terrain) - sensor.translation) @ sensor.rotation
     seen = seen[seen[:, 2] > MIN_DEPTH]
     scale = min(1.0, canvas.width(stream) / camera.width)
     focal = np.array([camera.fx, camera.fy])
@@ -351,6 +341,16 @@ def log_hazards_in_view(
     radii = np.maximum(1.0, 0.4 * terrain.resolution * camera.fx * scale / seen[inside, 2])
     colors = [(*colormaps.CELL_LEGEND[Cell.HAZARD][1], 150)]
     canvas.log(f"{stream}/left/hazards", rr.Points2D(pixels[inside], colors=colors, radii=radii, draw_order=20.0))
+
+
+def _hazards(navigation: NavigationMap, terrain: ElevationMap) -> Array:
+    """The centres (n, 3) of the hazard cells that have an elevation; none if the maps differ in size or frame."""
+    if (navigation.cells.shape, navigation.frame_id) != (terrain.shape, terrain.frame_id):
+        return np.empty((0, 3))
+    row, col = np.divmod(np.flatnonzero(navigation.cells == Cell.HAZARD), navigation.cells.shape[1])
+    elevation, (x, y) = terrain.layers["elevation"][row, col], cell_centres(terrain)
+    centres = np.column_stack([x[col], y[row], elevation])
+    return centres[np.isfinite(elevation)]
 
 
 def _plot_angle(canvas: Canvas, stream: str, name: str, sine: float) -> None:
@@ -366,22 +366,28 @@ def _frame_suffix(frame_id: str) -> str:
 
 def _log_distances(canvas: Canvas, path: str, shape: tuple[int, int], grid: ElevationMap | NavigationMap) -> None:
     """Lines across a bird's-eye view at every second metre of x, with their distances, and the rover's place."""
-    width, rover = float(shape[0]), _rover_place(grid)
-    far, left = (start + count * grid.resolution for start, count in zip(grid.origin, shape[::-1], strict=True))
-    first, last = np.ceil(grid.origin[0] / LINE_SPACING), np.floor(far / LINE_SPACING)
+    content, thin = (shape, grid.origin, grid.resolution, _rover_place(grid)), rr.Radius.ui_points(0.6)
+    lines: dict[str, Any] = {"colors": [(255, 255, 255, 80)], "radii": thin, "draw_order": 20.0}
+    points: dict[str, Any] = {"colors": [(255, 255, 255)], "radii": rr.Radius.ui_points(2.0), "draw_order": 21.0}
+    canvas.keep(path, content, lambda: rr.LineStrips2D(_distances(*content)[0], **lines))
+    canvas.keep(
+        f"{path}/distances", content, lambda: rr.Points2D(**_distances(*content)[1], show_labels=True, **points)
+    )
+
+
+def _distances(
+    shape: tuple[int, int], origin: tuple[float, float], resolution: float, rover: tuple[float, float] | None
+) -> tuple[list[Any], dict[str, Any]]:
+    """The lines, and the points with their names."""
+    width = float(shape[0])
+    far, left = (start + count * resolution for start, count in zip(origin, shape[::-1], strict=True))
+    first, last = np.ceil(origin[0] / LINE_SPACING), np.floor(far / LINE_SPACING)
     ahead = LINE_SPACING * np.arange(first, last + 1) + 0.0  # no minus zero
-    depths = (far - ahead) / grid.resolution
-    lines = [[(0.0, depth), (width, depth)] for depth in depths]
-    marks = [(width, depth) for depth in depths]
-    names = [f"{x:.0f} m" for x in ahead]
+    depths = (far - ahead) / resolution
+    marks, names = [(width, depth) for depth in depths], [f"{x:.0f} m" for x in ahead]
     if rover is not None:
-        spot = ((left - rover[1]) / grid.resolution, (far - rover[0]) / grid.resolution)
-        marks, names = [*marks, spot], [*names, "rover"]
-    content, thin, dot = (tuple(marks), tuple(names)), rr.Radius.ui_points(0.6), rr.Radius.ui_points(2.0)
-    faint, white = [(255, 255, 255, 80)], [(255, 255, 255)]
-    canvas.keep(path, content, lambda: rr.LineStrips2D(lines, colors=faint, radii=thin, draw_order=20.0))
-    points: dict[str, Any] = {"labels": names, "show_labels": True, "colors": white, "radii": dot, "draw_order": 21.0}
-    canvas.keep(f"{path}/distances", content, lambda: rr.Points2D(marks, **points))
+        marks, names = [*marks, ((left - rover[1]) / resolution, (far - rover[0]) / resolution)], [*names, "rover"]
+    return [[(0.0, depth), (width, depth)] for depth in depths], {"positions": marks, "labels": names}
 
 
 def _rover_place(grid: ElevationMap | NavigationMap) -> tuple[float, float] | None:

@@ -33,3 +33,11 @@ def test_pixels_may_lie_in_memory_in_any_way(lie):
 def test_eight_bits_are_rgb_or_gray(shape):
     pixels = np.random.default_rng(3).integers(0, 256, shape, np.uint8)
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png(pixels)))), pixels)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 8), (33, 41)])
+def test_true_and_false_are_white_and_black_in_one_bit(shape):
+    pixels = np.random.default_rng(4).random(shape) < 0.5
+    image = Image.open(io.BytesIO(png(pixels)))
+    assert image.mode == "1"
+    np.testing.assert_array_equal(np.asarray(image), pixels)
