@@ -18,6 +18,7 @@ from stages.data import Array, ElevationMap, Rover
 from stages.data.arrays import Span, spanned
 from stages.stage import Stage, parameter
 from stages.terrain.kernels.local_minimum import local_minimum
+from stages.terrain.kernels.nearest_known import nearest_known
 from stages.terrain.kernels.plane_window import window_planes
 
 SURROUNDINGS = 2.5  # m, width of the window in which an obstacle stands out
@@ -100,8 +101,8 @@ class TerrainFeatures(Stage):
         wheel, footprint = (
             _cells(width / 2, elevation.resolution) for width in (self.rover.wheel, self.rover.footprint)
         )
-        steepness = window_planes(height, passable, wheel, _MAX_WHEEL_VARIANCE)
-        roughness = window_planes(height, passable, footprint, _MAX_VARIANCE)[3]
+        steepness = window_planes(height, passable, wheel, _MAX_WHEEL_VARIANCE, passable)
+        roughness = window_planes(height, passable, footprint, _MAX_VARIANCE, observed)[3]
         layers = {
             "ground": ground.height,
             "step": step,
@@ -128,16 +129,17 @@ class TerrainFeatures(Stage):
         footprint = _cells(self.rover.footprint / 2, resolution)
         obstacle = self.min_obstacle_height
         ground = observed
-        for above, below in _WIDE_BANDS:
-            around = window_planes(height, ground, wide, _MAX_VARIANCE)
+        for count, (above, below) in enumerate(_WIDE_BANDS, 1):
+            asked = observed if count < len(_WIDE_BANDS) else None
+            around = window_planes(height, ground, wide, _MAX_VARIANCE, asked)
             off = height - around[0]
             ground = observed & ~((off > above * obstacle) | (off < -below * obstacle))
         for share in _NARROW_BANDS:
-            local = window_planes(height, ground, narrow, _MAX_VARIANCE)
+            local = window_planes(height, ground, narrow, _MAX_VARIANCE, observed)
             level = np.where(np.isfinite(local[0]), local[0], around[0])
             ground = observed & (np.abs(height - level) <= share * obstacle)
         local = window_planes(height, ground, narrow, _MAX_VARIANCE)
-        under = local if footprint == narrow else window_planes(height, ground, footprint, _MAX_VARIANCE)
+        under = local if footprint == narrow else window_planes(height, ground, footprint, _MAX_VARIANCE, observed)
         level = np.where(np.isfinite(local[0]), local[0], around[0])
         return _Ground(level, around[:3], under[:3], np.where(ground, local[:3], np.nan))
 
@@ -175,26 +177,6 @@ def _extrapolated(planes: Array, where: Array, resolution: float) -> Array:
     height, along, across = planes[:, row[near], col[near]]
     extrapolated[near] = height + along * (cols - col)[near] + across * (rows - row)[near] - _EXTRAPOLATION_ERROR
     return extrapolated
-
-
-def nearest_known(known: Array, rows: Array, cols: Array, reach: int) -> tuple[Array, Array, Array]:
-    """Row, column and distance, cells, of the cell of `known` nearest to each of some cells, as scipy.ndimage finds it.
-
-    Of equally near ones, the first column's, and of that the first. Farther ones than `reach` columns may be left out;
-    the distance is large where there is none.
-    """
-    place, far = np.arange(len(known))[:, None], 1 << 20
-    above = np.maximum.accumulate(np.where(known, place, -far), axis=0)
-    below = np.minimum.accumulate(np.where(known, place, far)[::-1], axis=0)[::-1]
-    closest = np.where(place - above <= below - place, above, below)  # in each column
-    closest = np.pad(closest, ((0, 0), (reach, reach)), constant_values=far)
-    row, col, squared = np.zeros_like(rows), np.zeros_like(cols), np.full(len(rows), far * far)
-    for offset in range(-reach, reach + 1):
-        found = closest[rows, cols + offset + reach]
-        apart = (found - rows) ** 2 + offset**2
-        closer = apart < squared
-        row[closer], col[closer], squared[closer] = found[closer], cols[closer] + offset, apart[closer]
-    return row, col, np.sqrt(squared)
 
 
 def _as_whole_obstacles(step: Array, raised: Array) -> Array:

@@ -17,24 +17,27 @@ from stages.data import Array
 _MIN_WINDOW_WIDTH = 0.2929
 
 
-def window_planes(heights: Array, use: Array, radius: int, max_variance: float) -> Array:
+def window_planes(heights: Array, use: Array, radius: int, max_variance: float, where: Array | None = None) -> Array:
     """The plane fitted to the window of (2 * radius + 1)^2 cells around each cell.
 
     heights: (rows, cols) float64, finite where `use`; use: (rows, cols) bool, the cells that count; max_variance: of
-    the plane's height at the cell, in multiples of one cell's (1 / n in the middle of n cells, more at their edge).
+    the plane's height at the cell, in multiples of one cell's (1 / n in the middle of n cells, more at their edge);
+    where: (rows, cols) bool, the cells whose planes are asked for, all by default. Others may be NaN.
 
     Returns (4, rows, cols) float64: the plane's height at the cell, its slopes per cell along columns (x) and rows (y),
     and the RMS of the window's residuals; NaN if the cells are too few or nearly collinear.
     """
     planes = np.empty((4, *heights.shape))
-    _window_planes(np.ascontiguousarray(heights), np.ascontiguousarray(use), int(radius), float(max_variance), planes)
+    where = np.ones(use.shape, np.bool_) if where is None else np.ascontiguousarray(where)
+    heights, use = np.ascontiguousarray(heights), np.ascontiguousarray(use)
+    _window_planes(heights, use, where, int(radius), float(max_variance), planes)
     return planes
 
 
 @kernel
-def _add_row(sums, heights, use, row, sign):
-    """Add (sign 1) or subtract (sign -1) one row from the six sums of every column."""
-    for col in range(heights.shape[1]):
+def _add_row(sums, heights, use, row, sign, first, stop):
+    """Add (sign 1) or subtract (sign -1) one row from the six sums of the columns from `first` to `stop`."""
+    for col in range(first, stop):
         if use[row, col]:
             z = heights[row, col]
             column = sums[col]
@@ -47,31 +50,55 @@ def _add_row(sums, heights, use, row, sign):
 
 
 @kernel
-def _window_planes(heights, use, radius, max_variance, planes):
+def _window_planes(heights, use, where, radius, max_variance, planes):
     rows, cols = heights.shape
     sums = np.zeros((cols, 6))
     windows = np.empty((10, cols))
+    first, stop = cols, 0  # the columns with cells that count; the sums of others stay 0
+    for row in range(rows):
+        begin, end = _span(use[row])
+        if begin < end:
+            first, stop = min(first, begin), max(stop, end)
     for row in range(min(radius, rows)):
-        _add_row(sums, heights, use, row, 1.0)
+        _add_row(sums, heights, use, row, 1.0, first, stop)
     for row in range(rows):
         if row + radius < rows:
-            _add_row(sums, heights, use, row + radius, 1.0)
+            _add_row(sums, heights, use, row + radius, 1.0, first, stop)
         if row - radius - 1 >= 0:
-            _add_row(sums, heights, use, row - radius - 1, -1.0)
-        _sum_up(sums, radius, windows)
-        _solve(windows, row, max_variance, planes[0, row], planes[1, row], planes[2, row], planes[3, row])
+            _add_row(sums, heights, use, row - radius - 1, -1.0, first, stop)
+        begin, end = _span(where[row])
+        if begin < end:
+            _sum_up(sums, radius, windows, first, stop, begin, end)
+            _solve(windows, row, begin, max_variance, planes[0, row][begin:end], planes[1, row][begin:end],
+                   planes[2, row][begin:end], planes[3, row][begin:end])  # fmt: skip
+        planes[:, row, :begin] = np.nan
+        planes[:, row, end:] = np.nan
 
 
 @kernel
-def _sum_up(sums, radius, windows):
-    """The ten sums of every window of a row: windows (10, cols), of 1, x, y, z, xx, xy, yy, xz, yz and zz."""
-    cols = len(sums)
+def _span(cells):
+    """The first cell of a row that is True and the one after the last; (0, 0) if there is none."""
+    cols = cells.size
+    for begin in range(cols):
+        if cells[begin]:
+            for end in range(cols, begin, -1):
+                if cells[end - 1]:
+                    return begin, end
+    return 0, 0
+
+
+@kernel
+def _sum_up(sums, radius, windows, first, stop, begin, end):
+    """The ten sums of a row's windows from `begin` to `end`: windows (10, n), of 1, x, y, z, xx, xy, yy, xz, yz and zz.
+
+    The columns from `first` to `stop` have cells that count.
+    """
     n = sx = sxx = sy = syy = sxy = sz = sxz = syz = szz = 0.0
-    for ahead in range(-radius, cols):
+    for ahead in range(min(first - radius, 0), end):
         for side in range(2):
             # The column that enters on the right, then the one that leaves on the left.
             col = ahead + radius if side == 0 else ahead - radius - 1
-            if col < 0 or col >= cols:
+            if col < first or col >= stop:
                 continue
             sign = 1.0 if side == 0 else -1.0
             x, s = np.float64(col), sums[col]
@@ -85,15 +112,15 @@ def _sum_up(sums, radius, windows):
             sxz += sign * x * s[3]
             syz += sign * s[4]
             szz += sign * s[5]
-        if ahead >= 0:
+        if ahead >= begin:
             for i, total in enumerate((n, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz)):
-                windows[i, ahead] = total
+                windows[i, ahead - begin] = total
 
 
 @kernel
-def _solve(windows, row, max_variance, height, along, across, rough):
-    """The planes of a row's windows, four numbers (cols,) each; NaN if a plane is not determined."""
-    for col in range(windows.shape[1]):
+def _solve(windows, row, begin, max_variance, height, along, across, rough):
+    """The planes of a row's windows from column `begin` on, four numbers each; NaN if a plane is not determined."""
+    for col in range(height.size):
         n, sx, sy, sz = windows[0, col], windows[1, col], windows[2, col], windows[3, col]
         sxx, sxy, syy = windows[4, col], windows[5, col], windows[6, col]
         sxz, syz, szz = windows[7, col], windows[8, col], windows[9, col]
@@ -101,7 +128,7 @@ def _solve(windows, row, max_variance, height, along, across, rough):
         vxx, vxy, vyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
         vxz, vyz, vzz = sxz / n - mx * mz, syz / n - my * mz, szz / n - mz * mz
         determinant = vxx * vyy - vxy * vxy
-        dx, dy = col - mx, row - my
+        dx, dy = begin + col - mx, row - my
         gx = (vyy * vxz - vxy * vyz) / determinant
         gy = (vxx * vyz - vxy * vxz) / determinant
         # of the height at the cell, in n-ths of one cell's variance

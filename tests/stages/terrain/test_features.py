@@ -11,8 +11,9 @@ from scipy.ndimage import distance_transform_edt
 
 from stages.data import Array, Cell
 from stages.terrain.binarise import Binarise
-from stages.terrain.features import TerrainFeatures, nearest_known
+from stages.terrain.features import TerrainFeatures
 from stages.terrain.kernels.local_minimum import local_minimum, local_minimum_reference
+from stages.terrain.kernels.nearest_known import nearest_known, nearest_known_reference
 from stages.terrain.kernels.plane_window import window_planes, window_planes_reference
 from tests.stages.terrain.terrain_scene import map_of, rolling_terrain
 
@@ -39,6 +40,18 @@ def test_plane_kernel_equals_the_reference(seed: int, radius: int, share: float)
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)
 
 
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), radius=st.integers(1, 20), share=st.floats(0.0, 1.0))
+def test_planes_of_some_cells_are_the_same_to_the_bit(seed: int, radius: int, share: float) -> None:
+    random = np.random.default_rng(seed)
+    heights = random.normal(0, 1, (25, 30))
+    use, where = random.random((2, 25, 30)) < share
+    use[:, 22:], where[:4] = False, False
+    some, everywhere = window_planes(heights, use, radius, 0.2503, where), window_planes(heights, use, radius, 0.2503)
+    np.testing.assert_array_equal(some[:, where], everywhere[:, where])
+    assert np.isnan(some[:, :4]).all()
+
+
 @settings(max_examples=30, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -53,6 +66,8 @@ def test_nearest_known_cells_equal_those_of_scipy(seed: int, shape: tuple[int, i
     distances, nearest = distance_transform_edt(~known, return_indices=True)
     distances, near = distances[cells], distances[cells] <= reach
     row, col, distance = nearest_known(known, *cells, reach)
+    for got, want in zip((row, col, distance), nearest_known_reference(known, *cells, reach), strict=True):
+        np.testing.assert_array_equal(got, want)
     assert (distance[near] == distances[near]).all()
     assert (distance[~near] > reach).all()
     assert (np.stack([row, col])[:, near] == nearest[:, *cells][:, near]).all()
