@@ -15,7 +15,7 @@ import numpy as np
 from flow.contracts import StageError
 from stages.cloud.kernels.depth_order import out_of_order
 from stages.cloud.kernels.outliers import SupportRule, median_slope, supported
-from stages.cloud.kernels.patches import connected_patches, depth_images, in_large_patches, patch_sizes
+from stages.cloud.kernels.patches import connected_patches, depth_images, in_patches
 from stages.data import Array, PointCloud
 from stages.stage import Stage, parameter
 
@@ -92,11 +92,9 @@ class Clean(Stage):
         far = np.flatnonzero(measured & (cloud.points[:, 2] > self._crop))
         used = np.concatenate([kept, far])
         inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, used, shape, MAX_DEVIATIONS)
-        patch = connected_patches(inverse, tolerance, MAX_SLOPE_RATIO * median_slope(inverse))
-        sizes = patch_sizes(patch)
-        pixel = cloud.pixel.take(kept)
-        dropped = out_of_order(inverse, patch, sizes)
-        return in_large_patches(kept, pixel, patch, sizes, self.min_patch_share * len(kept), dropped)
+        patch, sizes = connected_patches(inverse, tolerance, MAX_SLOPE_RATIO * median_slope(inverse))
+        chosen = (sizes >= self.min_patch_share * len(kept)) & ~out_of_order(inverse, patch, sizes)
+        return in_patches(kept, cloud.pixel.take(kept), patch, chosen)
 
     def _knn(self, cloud: PointCloud) -> Array:
         """Indices of the points kept by the mean distance to their nearest neighbours in space."""

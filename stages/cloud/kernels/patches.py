@@ -37,8 +37,9 @@ def _depth_images(points, sigma, pixel, kept, factor, images):
         images[1, pixel[i]] = factor * sigma[i] * inverse * inverse
 
 
-def connected_patches(inverse: Array, tolerance: Array, slope: float) -> Array:
-    """Labels of the patches, (H, W) int32: the flat index of a patch's first pixel, -1 without a point.
+def connected_patches(inverse: Array, tolerance: Array, slope: float) -> tuple[Array, Array]:
+    """Labels of the patches, (H, W) int32: numbers in the order of their first pixels, -1 without a point; and the
+    number of points of each patch, (K,) int32.
 
     inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; tolerance: (H, W) float32, difference explained by
     noise, 1/m (of two points the larger one applies); slope: further difference allowed per pixel of distance, 1/m.
@@ -66,69 +67,61 @@ def _linked(inverse, tolerance, slope, row, col, up, left):
 def _connected_patches(inverse, tolerance, slope):
     height, width = inverse.shape
     parent = np.empty(height * width, np.int32)
+    begun = 0
     for row in range(height):
         for col in range(width):
             i = row * width + col
-            parent[i] = i
             if not inverse[row, col] > 0.0:
+                parent[i] = -1
                 continue
+            parent[i] = i
             left = _linked(inverse, tolerance, slope, row, col, 0, 1)
             above = _linked(inverse, tolerance, slope, row, col, 1, 0)
             if left >= 0:
                 parent[i] = root(parent, left)
             if above >= 0:
                 join(parent, i, above)
-    # Parents come before their children, so one pass in order reaches every root.
+            begun += left < 0 and above < 0
+    # Parents come before their children, so one pass in order numbers every root before its children.
+    sizes = np.zeros(begun, np.int32)
+    patches = 0
     for i in range(height * width):
-        parent[i] = parent[parent[i]] if inverse[i // width, i % width] > 0.0 else -1
-    return parent.reshape(height, width)
+        if parent[i] >= 0:
+            if parent[i] == i:
+                parent[i] = patches
+                patches += 1
+            else:
+                parent[i] = parent[parent[i]]
+            sizes[parent[i]] += 1
+    return parent.reshape(height, width), sizes[:patches]
 
 
-def patch_sizes(patch: Array) -> Array:
-    """The number of points of each patch, (H * W,) int32; patch: (H, W) int32, labels of `connected_patches`."""
-    sizes = np.zeros(patch.size, np.int32)
-    _count(patch.reshape(-1), sizes)
-    return sizes
+def in_patches(kept: Array, pixel: Array, patch: Array, chosen: Array) -> Array:
+    """Those of the points `kept` whose patch is chosen, (N,) int64.
 
-
-@kernel
-def _count(patch, sizes):
-    for label in patch:
-        if label >= 0:
-            sizes[label] += 1
-
-
-def in_large_patches(kept: Array, pixel: Array, patch: Array, sizes: Array, min_points: float, dropped: Array) -> Array:
-    """Those of the points `kept` whose patch has `min_points` and whose pixel is not `dropped`, (K,) int64.
-
-    kept: (M,) int64; pixel: (M,) int32, flat index of each; patch: (H, W) int32, labels of `connected_patches`; sizes:
-    (H * W,) int32, points of each patch; dropped: (H, W) bool.
+    kept: (M,) int64; pixel: (M,) int32, flat index of each; patch: (H, W) int32, labels of `connected_patches`; chosen:
+    (K,) bool, of each patch.
     """
-    chosen = np.empty(len(kept), np.int64)
-    count = _in_large_patches(kept, pixel, patch.reshape(-1), sizes, float(min_points), dropped.reshape(-1), chosen)
-    return chosen[:count]
+    found = np.empty(len(kept), np.int64)
+    return found[: _in_patches(kept, pixel, patch.reshape(-1), chosen, found)]
 
 
 @kernel
-def _in_large_patches(kept, pixel, patch, sizes, min_points, dropped, chosen):
+def _in_patches(kept, pixel, patch, chosen, found):
     count = 0
     for k in range(kept.size):
-        at = pixel[k]
-        if sizes[patch[at]] >= min_points and not dropped[at]:
-            chosen[count] = kept[k]
+        if chosen[patch[pixel[k]]]:
+            found[count] = kept[k]
             count += 1
     return count
 
 
-def in_large_patches_reference(
-    kept: Array, pixel: Array, patch: Array, sizes: Array, min_points: float, dropped: Array
-) -> Array:
-    """The same as `in_large_patches`, in plain numpy."""
-    large = sizes[patch.ravel()[pixel]] >= min_points
-    return np.asarray(kept[large & ~dropped.ravel()[pixel]])
+def in_patches_reference(kept: Array, pixel: Array, patch: Array, chosen: Array) -> Array:
+    """The same as `in_patches`, in plain numpy."""
+    return np.asarray(kept[chosen[patch.ravel()[pixel]]])
 
 
-def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) -> Array:
+def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) -> tuple[Array, Array]:
     """The same as `connected_patches`: scipy's connected components of the graph of links."""
     from scipy.sparse import coo_array  # takes long to import
     from scipy.sparse.csgraph import connected_components
@@ -148,5 +141,9 @@ def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) 
     one, other = np.concatenate(links, axis=1)
     graph = coo_array((np.ones(len(one)), (one, other)), shape=(inverse.size, inverse.size))
     label = connected_components(graph, directed=False)[1]
-    _, first = np.unique(label, return_index=True)
-    return np.where(present, first[label].reshape(inverse.shape), -1).astype(np.int32)
+    first, label, sizes = np.unique(label[present.ravel()], return_index=True, return_inverse=True, return_counts=True)[
+        1:
+    ]
+    patch = np.full(inverse.shape, -1, np.int32)
+    patch[present] = np.argsort(np.argsort(first))[label]
+    return patch, sizes[np.argsort(first)].astype(np.int32)
