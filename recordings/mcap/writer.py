@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
+import mcap.writer
+from isal import isal_zlib
 from mcap.writer import CompressionType, Writer
 
 from flow.contracts import counted
@@ -19,6 +21,7 @@ from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 from recordings.ros2.cdr import LAST_STAMP, standard_types
 
+mcap.writer.zlib = isal_zlib  # type: ignore[attr-defined]  # the same checksums in a tenth of the time
 MIN_OWN_CHUNK_BYTES = 64 * 1024  # of a message that gets a chunk of its own
 COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
 
