@@ -169,17 +169,19 @@ class Canvas:
         )  # fmt: skip
         self.log_scale(f"{view.path}/scale", steps.shape, 0.0, limit, unit, palette)
 
-    def log_labels(self, view: ViewSpec, codes: Array, legend: Legend, beside: bool = False) -> None:
-        """A label image (H, W); its names are above or beside it and appear on hover."""
+    def log_labels(
+        self, view: ViewSpec, codes: Array, legend: Legend, beside: bool = False, counts: Array | None = None
+    ) -> None:
+        """A label image (H, W); its names are above or beside it and appear on hover. counts: its `label_counts`."""
         path = view.path
         if self._legends.get(path) != legend:
             self._legends[path] = legend
             names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
             self.recording.log(path, rr.AnnotationContext(names), static=True)
-        labels = codes.astype(np.uint8)
+        labels = codes.astype(np.uint8, copy=False)
         self._log(f"{path}/labels", rr.SegmentationImage, _raw(rr.SegmentationImage, labels))
         self.add_view(view)
-        counts = cv2.calcHist([labels], [0], None, [256], [0, 256]).ravel()
+        counts = label_counts(labels) if counts is None else counts
         present = self._present.setdefault(path, set())  # codes of any frame so far, so that the legend stays
         present.update(code for code in legend if counts[code & 0xFF])
         self.log_legend(f"{path}/legend", codes.shape, [legend[code] for code in legend if code in present], beside)
@@ -213,6 +215,11 @@ class Canvas:
             else:
                 self.recording.log(path, rr.Clear(recursive=False))
         self._before, self._now = self._now, {}
+
+
+def label_counts(labels: Array) -> Array:
+    """The number of pixels with each of 256 labels, (256,); labels: (H, W) uint8."""
+    return np.ravel(cv2.calcHist([labels], [0], None, [256], [0, 256]))
 
 
 @lru_cache(maxsize=256)

@@ -13,7 +13,7 @@ from flow.contracts import counted
 from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
-from recordings.sinks.canvas import Canvas
+from recordings.sinks.canvas import Canvas, label_counts
 from recordings.sinks.colormaps import Rgb
 from recordings.sinks.png import png
 from stages.data import (
@@ -101,7 +101,7 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     """
     width = canvas.width(stream)
     source = np.ascontiguousarray(colormaps.every_nth(disparity.source, width))
-    counts = cv2.calcHist([source], [0], None, [256], [0, 256]).ravel()
+    counts = label_counts(source)
     shares = {kind: 100.0 * counts[kind] / source.size for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
     parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in shares.items() if share)
     share = 100.0 * counts[known(ALL_CODES)].sum() / source.size
@@ -111,7 +111,7 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     _log_pixels(canvas, stream, disparity.pixels, width)
     if not {*np.flatnonzero(counts).tolist()} <= {PixelOrigin.UNKNOWN, PixelOrigin.MEASURED}:
         view = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
-        canvas.log_labels(view, source, colormaps.SOURCE_LEGEND, beside=True)
+        canvas.log_labels(view, source, colormaps.SOURCE_LEGEND, beside=True, counts=counts)
     if stream in canvas.full_size:
         _log_confidence(canvas, ViewSpec(Panel.CONFIDENCE, stream, "confidence", f"{stream}: confidence"), disparity)
         _log_sigma(canvas, stream, disparity)
@@ -121,7 +121,7 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     if disparity.segments is not None:
         # They lie over the left image. Edges of fewer pixels are denser, so they are fainter.
         segments, step = disparity.segments, colormaps.stride(disparity.segments.shape[1], canvas.max_width)
-        segments = colormaps.every_nth(segments, canvas.max_width)
+        segments = np.ascontiguousarray(colormaps.every_nth(segments, canvas.max_width))
         lines = png(colormaps.segment_edges(segments))
         style = {"media_type": "image/png", "opacity": 0.4 / step, "draw_order": 10.0}
         view = ViewSpec(Panel.SUPERPIXELS, stream, "superpixels", f"{stream}: superpixels")
@@ -153,7 +153,7 @@ def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int) -> N
     # Rounded; NaN and negative values become 0.
     thinned = np.ascontiguousarray(colormaps.every_nth(pixels, max_width))
     steps: Array = cv2.multiply(thinned, DISPARITY_STEPS, dtype=cv2.CV_16U)  # type: ignore[call-overload]
-    _, limit = canvas.limits(stream, 0.0, colormaps.disparity_limit(pixels))
+    _, limit = canvas.limits(stream, 0.0, colormaps.disparity_limit(thinned))
     canvas.log_steps(steps, DISPARITY_STEPS, limit, ViewSpec(Panel.DISPARITY, stream, "pixels", stream), "px")
 
 
