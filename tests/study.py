@@ -254,7 +254,7 @@ def print_worth(cases: list[Case]) -> None:
     for name, source in (("replaced", 2), ("plane", 2), ("mismatch", 3), ("occlusion", 3)):
         value = np.float32(getattr(TRUST, name))
         origins[name] = lambda found, source=source, value=value: (found.source == source) & (found.confidence == value)
-    assert len({*TRUST[2:]}) == 4, "origins of equal confidence cannot be distinguished"
+    assert len({*TRUST[3:]}) == 4, "origins of equal confidence cannot be distinguished"
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for case in cases:
         found = stereo_part("accurate", case.frame, case.disparities, entry="rectified")["disparity"]

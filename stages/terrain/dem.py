@@ -53,10 +53,10 @@ class Voxelise(Stage):
     )
     correlated_points: float = parameter(4.0, "neighbouring points that share one matching error", low=1.0)
     systematic_share: float = parameter(
-        0.86, "share of the points' variance that no averaging removes", low=0.0, high=1.0
+        0.8, "share of the points' variance that no averaging removes", low=0.0, high=1.0
     )
     scatter_share: float = parameter(0.2, "share of the scatter beyond slope and noise in the variance", low=0.0)
-    curvature_share: float = parameter(0.38, "share of the squared curvature in the variance", low=0.0)
+    curvature_share: float = parameter(0.34, "share of the squared curvature in the variance", low=0.0)
     rim_share: float = parameter(0.15, "share of the squared rise in the variance of a cell beside a hole", low=0.0)
     sight_share: float = parameter(
         1.0, "share of the squared fall of the line of sight within a cell, in the variance of an interpolated cell "

@@ -23,6 +23,7 @@ class Trust(NamedTuple):
 
     agreed: tuple[float, float, float]  # a match near its plane
     alone: tuple[float, float, float]  # a match without a plane near it
+    backed: float  # a hole filled from its neighbours, with which both images agree
     replaced: float  # a match replaced by its neighbours
     plane: float  # a hole filled by a plane
     mismatch: float  # a hole filled from its neighbours, visible to both cameras
@@ -47,7 +48,7 @@ def label_origin(
     tables = np.array(
         [np.interp(steps, MATCH_CONFIDENCES, values) for values in (trust.agreed, trust.alone)], np.float32
     )
-    others = np.array([np.interp(0.5, MATCH_CONFIDENCES, trust.agreed), *trust[2:]], np.float32)
+    others = np.array(trust[2:], np.float32)
     within = np.array([math.erf(SIGMA_STEPS / max(code, 1) / math.sqrt(2)) for code in range(256)], np.float32)
 
     def label(first: int, end: int) -> None:
@@ -112,7 +113,7 @@ def label_origin_reference(
         0.0,
         trust.mismatch,
         *tables,
-        np.interp(0.5, MATCH_CONFIDENCES, trust.agreed) * within,
+        trust.backed * within,
         trust.replaced,
         trust.plane,
         trust.mismatch,

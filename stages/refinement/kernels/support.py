@@ -49,8 +49,9 @@ F32 = np.float32
 LEVELS = 3  # sizes of blocks: 4, 8 and 16 px
 RADIUS = 2  # blocks; windows of 5 x 5 blocks are 20, 40 and 80 px wide
 CORRELATED = 100.0  # px, the area over which the errors of matches are alike
-EXCESS, SYSTEMATIC = 1.9, 0.04  # of the errors over the bound; px, of what no averaging removes
-BEND_REACH, MAX_BEND = 3, 0.45  # px; where the surface bends, an error is about as large as the bend
+EXCESS, EXACT = 1.95, 0.001  # of the errors over the bound; px^2, a variance at which half of its square is left
+SYSTEMATIC = 0.03  # px, of what no averaging removes
+BEND_REACH, MIN_BEND, MAX_BEND = 5, 0.06, 0.47  # px; an error is about as large as a bend is over the least one
 PIXEL_SIGMAS, PIXEL_DEVIATION = 10.0, 0.1  # a match farther off the plane than both together is of another surface
 MIN_BACKING = 4  # matches in the block of a guessed pixel that is supported
 MIDDLE = 0.5 * (BLOCK - 1)  # of a block, from its first pixel
@@ -220,13 +221,14 @@ def _mix(work, across):
         random = share * share * random * mean + (F32(1) - share) * (F32(1) - share) * own
         alone = work[NEAR * LANES + i]
         work[RESULT * LANES + i] = d + share * value * mean
-        work[(RESULT + 1) * LANES + i] = np.sqrt(F32(EXCESS**2) * random + F32(SYSTEMATIC**2))
+        random *= F32(EXCESS**2) * random / (random + F32(EXACT))
+        work[(RESULT + 1) * LANES + i] = np.sqrt(random + F32(SYSTEMATIC**2))
         work[(RESULT + 2) * LANES + i] = min((F32(1) - share) * alone + share * common * mean, F32(2) * alone)
 
 
 @kernel
 def _add_bend(pixels, first, end, sigma):
-    """Add, in place, how far each pixel is off the middle between those at BEND_REACH on both sides."""
+    """Add, in place, how far over MIN_BEND each pixel is off the middle between those at BEND_REACH on both sides."""
     height, width = pixels.shape
     for y in range(first, end):
         above, below = y - BEND_REACH, y + BEND_REACH
@@ -238,7 +240,7 @@ def _add_bend(pixels, first, end, sigma):
             if BEND_REACH <= x < width - BEND_REACH:
                 off = F32(0.5) * abs(pixels[y, x - BEND_REACH] + pixels[y, x + BEND_REACH] - d - d)
                 bend = off if off > bend else bend
-            bend = min(bend, F32(MAX_BEND))
+            bend = max(min(bend, F32(MAX_BEND)) - F32(MIN_BEND), F32(0))
             sigma[y, x] = np.sqrt(sigma[y, x] * sigma[y, x] + bend * bend)
 
 
@@ -249,7 +251,7 @@ def add_bend_reference(pixels: Array, sigma: Array) -> Array:
     for axis in (0, 1):
         both = sum(np.roll(wide, shift, axis)[inner, inner] for shift in (BEND_REACH, -BEND_REACH))
         bends.append(np.abs(both / 2 - pixels))
-    return np.asarray(np.hypot(sigma, np.minimum(np.nan_to_num(np.fmax(*bends)), MAX_BEND)))
+    return np.asarray(np.hypot(sigma, np.clip(np.nan_to_num(np.fmax(*bends)), MIN_BEND, MAX_BEND) - MIN_BEND))
 
 
 def blend_reference(
@@ -274,6 +276,6 @@ def blend_reference(
         result.pixels[y, x] = d + share * mean[1]
         if y >= first_row[x] and (not guessed[y, x] or matches[y // BLOCK, x // BLOCK] >= MIN_BACKING):
             random, near_correlation = share**2 * mean[3] + (1 - share) ** 2 * own, correlated[y // BLOCK, x // BLOCK]
-            result.sigma[y, x] = np.sqrt(EXCESS**2 * random + SYSTEMATIC**2)
+            result.sigma[y, x] = np.sqrt(EXCESS**2 * random**2 / (random + EXACT) + SYSTEMATIC**2)
             result.correlation[y, x] = min(share * mean[4] + (1 - share) * near_correlation, 2 * near_correlation)
     return result

@@ -8,7 +8,7 @@ from stages.data import PixelOrigin
 from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN
 from stages.refinement.kernels.label_origin import Trust, label_origin, label_origin_reference
 
-TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.83, 0.84, 0.58, 0.56)
+TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.85, 0.83, 0.84, 0.58, 0.56)
 
 
 @given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1, 2]))

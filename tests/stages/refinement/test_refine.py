@@ -93,7 +93,7 @@ def test_a_replaced_match_becomes_plane_with_less_confidence(median, monkeypatch
     assert (replaced.source == PixelOrigin.MEASURED).sum() == HEIGHT * WIDTH - 1
     kept = Refine(median_size=median, bilateral_radius=0, edge_radius=0, support=False)(frame, matches)
     assert (kept.pixels[60, 80], kept.source[60, 80]) == (30, PixelOrigin.MEASURED)
-    assert kept.confidence[60, 80] == np.float32(0.97)
+    assert kept.confidence[60, 80] == np.float32(0.99)
 
 
 def test_a_lone_match_has_no_median_and_stays(monkeypatch):
