@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.compiled.union_find import join, root
 from stages.data import Array
 
@@ -49,7 +49,7 @@ def connected_patches(inverse: Array, tolerance: Array, slope: float) -> tuple[A
     )
 
 
-@kernel
+@part
 def _linked(inverse, tolerance, slope, row, col, up, left):
     """Flat index of the next point above or to the left if it is linked to this one, else -1."""
     width = inverse.shape[1]

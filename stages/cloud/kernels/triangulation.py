@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.data import Array, Disparity, PixelOrigin, StereoCamera
 
 _FILLED = int(PixelOrigin.FILLED)
@@ -67,7 +67,7 @@ def _dense_limits(camera: StereoCamera, max_spacing: float) -> Array:
     return np.asarray(np.minimum(rows[:, None], rows / COLUMN_SPACING))
 
 
-@kernel
+@part
 def _depth(disparity, source, shift, focal_baseline, max_depth, filled):
     """Depth of a pixel, or 0 where it has no point."""
     if source == _UNKNOWN or (source == _FILLED and not filled):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 from stages.refinement.kernels.valid_extent import Extent
@@ -119,7 +119,7 @@ def _count_steps(disparity, first, holes, sign, steps):
                 steps[ray, i] = taken
 
 
-@kernel
+@part
 def _occlusion_limit(row, bound):
     """bound becomes, per pixel of a row, the disparity below which the right camera does not see it."""
     hidden = -NO_VALUE
@@ -130,7 +130,7 @@ def _occlusion_limit(row, bound):
         bound[x] = hidden
 
 
-@kernel
+@part
 def _read_ray(disparity, colour, y, columns, down, across, steps, values, colours):
     """First disparity on one ray from each hole of a row, inf = none, and the colour behind it."""
     height, width = disparity.shape
@@ -142,7 +142,7 @@ def _read_ray(disparity, colour, y, columns, down, across, steps, values, colour
         colours[i] = colour[place_y, place_x]
 
 
-@kernel
+@part
 def _weigh_ray(own, hidden, max_distance, ray_weight, length, steps, colours, values, weights):
     """Weights of the disparities on one ray for holes of colours `own`; a value without weight becomes inf."""
     for i in range(own.size):
@@ -162,7 +162,7 @@ def _weigh_ray(own, hidden, max_distance, ray_weight, length, steps, colours, va
         values[i] = value if counts else NO_VALUE
 
 
-@kernel
+@part
 def _quantile(values, weights, total, share, least):
     """The weighted quantile `FILL_QUANTILE` of eight values per hole, inf where all weights are 0.
 
@@ -227,7 +227,7 @@ def _fill(disparity, colour, within, max_distance, margin, first, holes, steps, 
             kinds[y, x] = OCCLUSION if value < hidden[i] else MISMATCH
 
 
-@kernel
+@part
 def _row_value(left, right, before, after, value):
     """`value`, or the row's end on the same surface, interpolated where both ends are."""
     if abs(right - left) < F32(MIN_SURFACE_STEP):

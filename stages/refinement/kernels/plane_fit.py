@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.compiled.jit import fast_part, kernel
+from stages.compiled.jit import fast_part, kernel, part
 from stages.compiled.parallel import Fork, by_bands, in_turn, shared_by
 from stages.data import Array
 
@@ -114,7 +114,7 @@ def _gather(disparity, labels, weights, first, end, place, points):
             place[region] = n
 
 
-@kernel
+@part
 def _random_index(seed, region, counter, n):
     """A number below n: splitmix64 of (seed, segment, counter)."""
     z = seed + U64(region) * U64(0xD1B54A32D192ED03) + U64(counter) * U64(0x9E3779B97F4A7C15)

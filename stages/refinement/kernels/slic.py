@@ -13,7 +13,7 @@ import math
 import cv2
 import numpy as np
 
-from stages.compiled.jit import fast_kernel, fast_part, kernel
+from stages.compiled.jit import fast_kernel, fast_part, kernel, part
 from stages.compiled.parallel import Fork, by_bands, in_turn, shared_by
 from stages.compiled.union_find import join, root
 from stages.compiled.workspace import Workspaces
@@ -213,7 +213,7 @@ def connect(labels: Array, min_size: int, scratch: Array, both: Fork = in_turn) 
     return total
 
 
-@kernel
+@part
 def _join(labels, y, rows, ends, parent):
     """Join the runs of row y with those of equal label in the row above; the earliest run becomes the root."""
     width = labels.shape[1]

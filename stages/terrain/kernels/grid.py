@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.data import Array
 
 FIGURES = ("count", "sum", "sum_of_squares", "minimum", "maximum", "noise")
@@ -77,7 +77,7 @@ def no_figures(grid: Grid) -> Array:
     return cells
 
 
-@kernel
+@part
 def cell_of(x, y, raster):
     """Row and column of a point in the window of a grid; -1, -1 outside it or beyond the range."""
     cells_per_metre, x0, y0, max_range, first_row, first_col, rows, cols = raster
@@ -90,7 +90,7 @@ def cell_of(x, y, raster):
     return row, col
 
 
-@kernel
+@part
 def add_point(cell, z, sigma):
     """Add a point to the six figures of its cell."""
     cell[0] += 1.0

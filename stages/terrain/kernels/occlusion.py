@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.data import Array
 from stages.terrain.kernels.grid import Grid, cell_of, cells_of
 
@@ -27,7 +27,7 @@ def occlusion_ceiling(points: Array, pixel: Array, width: int, camera: Array, gr
     return ceiling
 
 
-@kernel
+@part
 def _lower(ceiling, x, y, z, dx, dy, dz, length, raster):
     """Lower the ceiling to a line from (x, y, z) along (dx, dy, dz), where (dx, dy) is a unit vector.
 

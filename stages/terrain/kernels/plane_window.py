@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.data import Array
 
 # Smallest determinant / trace of the covariance of the cells' positions, close to its smaller eigenvalue: 1/3 for 3x3
@@ -34,7 +34,7 @@ def window_planes(heights: Array, use: Array, radius: int, max_variance: float, 
     return planes
 
 
-@kernel
+@part
 def _add_row(sums, heights, use, row, sign, first, stop):
     """Add (sign 1) or subtract (sign -1) one row from the six sums of the columns from `first` to `stop`."""
     for col in range(first, stop):
@@ -75,7 +75,7 @@ def _window_planes(heights, use, where, radius, max_variance, planes):
         planes[:, row, end:] = np.nan
 
 
-@kernel
+@part
 def _span(cells):
     """The first cell of a row that is True and the one after the last; (0, 0) if there is none."""
     cols = cells.size
@@ -87,7 +87,7 @@ def _span(cells):
     return 0, 0
 
 
-@kernel
+@part
 def _sum_up(sums, radius, windows, first, stop, begin, end):
     """The ten sums of a row's windows from `begin` to `end`: windows (10, n), of 1, x, y, z, xx, xy, yy, xz, yz and zz.
 
@@ -117,7 +117,7 @@ def _sum_up(sums, radius, windows, first, stop, begin, end):
                 windows[i, ahead - begin] = total
 
 
-@kernel
+@part
 def _solve(windows, row, begin, max_variance, height, along, across, rough):
     """The planes of a row's windows from column `begin` on, four numbers each; NaN if a plane is not determined."""
     for col in range(height.size):
