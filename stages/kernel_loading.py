@@ -9,12 +9,19 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any
 
+import cv2
+import numpy as np
 from numba.core.dispatcher import Dispatcher
+
+SLOW_MODULES = ("numpy.ma",)  # that numpy imports when a stage first takes a median
 
 
 @contextmanager
 def loading_kernels(*modules: str) -> Iterator[None]:
-    """Load the machine code of earlier runs in a thread, for all kernels of imported stages; then import `modules`."""
+    """Load the machine code of earlier runs in a thread, for all kernels of imported stages; then import `modules`.
+
+    Beside it, make the tables of colours.
+    """
     ended = threading.Event()
 
     def work() -> None:
@@ -25,18 +32,25 @@ def loading_kernels(*modules: str) -> Iterator[None]:
                 return
             with suppress(Exception):  # the first call loads or compiles it, and reports what is wrong
                 load(kernel)
-        for module in modules:
+        for module in (*SLOW_MODULES, *modules):
             if not ended.is_set():
                 with suppress(Exception):  # likewise
                     import_module(module)
 
-    thread = threading.Thread(target=work, name="kernels", daemon=True)
-    thread.start()
+    threads = [threading.Thread(target=each, name="kernels", daemon=True) for each in (make_colour_tables, work)]
+    for thread in threads:
+        thread.start()
     try:
         yield
     finally:
         ended.set()
-        thread.join()
+        for thread in threads:
+            thread.join()
+
+
+def make_colour_tables() -> None:
+    """Let OpenCV compute its tables for Lab colours, which takes a tenth of a second, and needs no lock of Python's."""
+    cv2.cvtColor(np.zeros((1, 1, 3), np.uint8), cv2.COLOR_RGB2LAB)
 
 
 def import_arrays() -> None:

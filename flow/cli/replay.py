@@ -14,6 +14,9 @@ from flow.errors import UsageError
 from flow.runtime.frame_selection import Every
 from flow.runtime.graph import Graph
 
+RESULT_TYPES = "rosbags.typesys.stores.ros2_jazzy"  # the module of a result log's message types
+ARROW_EXTRA = "pandas"  # which the library of recordings imports, where it is installed
+
 
 def replay(
     log: Path | Sequence[Path],
@@ -54,8 +57,12 @@ def replay(
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()
-    drawing = () if rrd is None else ("recordings.sinks.rerun_recording",)
-    with loading_kernels(*drawing), graph.source.open(log, start=start, end=end) as opened, one_thread_per_call():
+    drawing = () if rrd is None else ("recordings.sinks.rerun_recording", ARROW_EXTRA)
+    with (
+        loading_kernels(RESULT_TYPES, *drawing),
+        graph.source.open(log, start=start, end=end) as opened,
+        one_thread_per_call(),
+    ):
         about = {
             "roverflow": product_version(),
             "pipeline": graph.text,

@@ -10,7 +10,7 @@ from typing import Any
 
 from flow.cli.instants import Instant, Part, part_of
 from flow.cli.logged_state import resume
-from flow.cli.replay import one_thread_per_call, product_version
+from flow.cli.replay import ARROW_EXTRA, RESULT_TYPES, one_thread_per_call, product_version
 from flow.cli.result_input import graph_of
 from flow.config.loader import load
 from flow.contracts import counted
@@ -80,7 +80,7 @@ def run_variants(
         label: load(pipeline, own) if isinstance(pipeline, str) else graph_of(pipeline, own, with_sinks=True)
         for label, own in changes.items()
     }
-    beside = loading_kernels("recordings.comparison.recording")
+    beside = loading_kernels(RESULT_TYPES, "recordings.comparison.recording", ARROW_EXTRA)
     with beside, graphs["A"].source.open(logs) as log, one_thread_per_call():
         graphs = {label: fitted(graph, log) for label, graph in graphs.items()}
         variants, states, notes = merged(graphs), dict[str, Any](), list[str]()
