@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -17,8 +17,10 @@ from recordings.comparison.pages import pages
 from recordings.comparison.sweep import Sweep
 from recordings.ros2.cdr import full_name
 from recordings.sinks.blueprint import CLOCK, FRAME
+from recordings.sinks.png import png
 
 MAX_FRAMES = 50  # stamps that are drawn
+MAX_WAITING = 4  # messages that wait for a thread that draws them
 _SIDES = {"a": "A", "b": "B", "difference": "B less A"}  # entity -> name of its view
 
 
@@ -33,9 +35,16 @@ class DiffRecording:
     """
 
     def __init__(self) -> None:
-        self.pictures: list[tuple[str, int, tuple[bytes, ...]]] = []
         self.stamps: list[int] = []
         self.left_out = 0
+        self._drawing: list[tuple[str, int, Future[tuple[bytes, ...]]]] = []
+        self._threads = ThreadPoolExecutor(2, thread_name_prefix="pages")
+
+    @property
+    def pictures(self) -> list[tuple[str, int, tuple[bytes, ...]]]:
+        """Topic, stamp, and the pages of A, B and their difference."""
+        drawn = ((topic, stamp, pages.result()) for topic, stamp, pages in self._drawing)
+        return [each for each in drawn if each[2]]
 
     def of(self, variant: str = "") -> Callable[[MessageDifference], None]:
         """A function that draws differences, unless enough stamps are drawn; variant: the name of B."""
@@ -49,12 +58,13 @@ class DiffRecording:
                 self.left_out += 1
                 return
             self.stamps.append(change.stamp)
-        found = pages(full_name(change.one.__msgtype__), change.one, change.other)
-        if found is not None:
-            self.pictures.append((prefix + change.topic, change.stamp, tuple(map(_png, found))))
+        self._drawing.append((prefix + change.topic, change.stamp, self._threads.submit(_drawn, change)))
+        if len(self._drawing) > MAX_WAITING:
+            self._drawing[-MAX_WAITING - 1][2].result()
 
     def write(self, path: Path, name: str, tables: str = "", sweep: Sweep | None = None) -> None:
         """Write the recording. tables: Markdown that is shown beside the pictures. Raises UnwritableError."""
+        pictures = self.pictures
         with written(path) as temporary:
             stream = rr.RecordingStream("roverflow_diff")
             stream.set_log_time_enabled(False)
@@ -63,10 +73,10 @@ class DiffRecording:
             stream.log("tables", rr.TextDocument(tables, media_type=rr.MediaType.MARKDOWN), static=True)
             if sweep is not None:
                 sweep.log(stream)
-            for topic, stamp, pictures in self.pictures:
+            for topic, stamp, sides in pictures:
                 stream.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
                 stream.set_time(FRAME, sequence=self.stamps.index(stamp))
-                for side, picture in zip(_SIDES, pictures, strict=True):
+                for side, picture in zip(_SIDES, sides, strict=True):
                     stream.log(f"{topic}/{side}", rr.EncodedImage(contents=picture, media_type="image/png"))
             stream.send_blueprint(self._blueprint([] if sweep is None else [sweep.views()]))
             stream.flush()
@@ -92,6 +102,7 @@ class DiffRecording:
         )
 
 
-def _png(page: np.ndarray) -> bytes:
-    _, blob = cv2.imencode(".png", cv2.cvtColor(page, cv2.COLOR_RGB2BGR))
-    return blob.tobytes()
+def _drawn(change: MessageDifference) -> tuple[bytes, ...]:
+    """The pages of a difference as PNG files; none for a type without pages."""
+    found = pages(full_name(change.one.__msgtype__), change.one, change.other)
+    return () if found is None else tuple(map(png, found))
