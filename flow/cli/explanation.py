@@ -300,9 +300,8 @@ def _recorded(result: Path, stream: str, stamp: int, x: float, y: float) -> Cell
     from recordings.mcap.file import iter_decoded
     from recordings.ros2.from_msg import read_occupancy_grid
 
-    for _, time, message in iter_decoded(result, [f"/nav/{stream}"]):
-        if time == stamp:
-            navigation = read_occupancy_grid(message)
-            place = index_of(navigation, x, y)
-            return None if place is None else Cell(int(navigation.cells[place]))
+    for _, _, message in iter_decoded(result, [f"/nav/{stream}"], part=(stamp, stamp + 1)):
+        navigation = read_occupancy_grid(message)
+        place = index_of(navigation, x, y)
+        return None if place is None else Cell(int(navigation.cells[place]))
     return None
