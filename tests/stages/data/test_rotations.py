@@ -36,6 +36,7 @@ def test_matrices_turn_as_those_of_scipy_also_rounded_ones(quaternion, rounding)
     assert same(rotations.canonical(rotations.quaternion_of(matrix)), turn.as_quat(canonical=True))
     assert same(rotations.nearest_rotation(matrix), turn.as_matrix())
     assert same(rotations.angle_of(matrix), turn.magnitude())
+    assert same(rotations.rotation_vector(matrix), turn.as_rotvec())
 
 
 @given(VECTOR)
