@@ -15,8 +15,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from recordings.errors import LogError
-from recordings.mcap import chunk, message_order
+from recordings.mcap import chunk, message_order, walk
 from recordings.mcap.file import McapFile
+from recordings.mcap.index import MESSAGE
 from recordings.ros2.cdr import make
 from tests.conftest import rewrite
 from tests.fuzz.isolation import isolated
@@ -185,6 +186,22 @@ def test_a_log_that_unpacks_to_far_more_than_its_size_is_refused(tmp_path, monke
     monkeypatch.setattr(chunk, "_FREE_FILE_BYTES", 1 << 20)
     with pytest.raises(LogError, match="times its size: no recording does"):
         McapFile(path)
+
+
+@pytest.mark.parametrize("cut", [0, 2000, 2020])
+def test_messages_outside_chunks_are_noted_together_as_one_by_one(tmp_path, monkeypatch, cut):
+    path = with_extra(lambda *to: many_messages(*to, 30), use_chunking=False)(tmp_path)
+    data = bytearray(path.read_bytes()[: path.stat().st_size - cut])
+    last = data.rindex(NOTHING) - MESSAGE.size
+    data[last + 6 : last + 14] = bytes([255] * 8)  # a damaged log time
+    path.write_bytes(data)
+    found = []
+    for alike in (2, 8, 1 << 40):
+        monkeypatch.setattr(walk, "_MIN_ALIKE", alike)
+        with path.open("rb") as file:
+            found.append(vars(walk.walk(file, len(data))))
+    assert found[0] == found[1] == found[2]
+    assert len(found[0]["counted_times"]) > 30
 
 
 def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tmp_path, monkeypatch):
