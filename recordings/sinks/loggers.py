@@ -249,14 +249,15 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     coarse = colormaps.every_nth_cell(terrain, MAX_CELLS)
     for name, layer in coarse.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
         view = ViewSpec(Panel.LAYER, stream, f"layers/{rr.escape_entity_path_part(name)}", f"{name}{suffix}")
-        values = colormaps.birds_eye(layer.astype(np.float16))
+        picture = colormaps.birds_eye(layer)
+        values: Array = cv2.multiply(picture, 1.0, dtype=cv2.CV_16F)  # type: ignore[call-overload]
         if name == "elevation":
             canvas.log_values(values, (low, high), view, "m", cv2.COLORMAP_VIRIDIS)
         elif name in LAYER_SCALES:
             end, unit = LAYER_SCALES[name]
             canvas.log_values(values, (0.0, end), view, unit)
         else:
-            canvas.log_values(values, colormaps.value_limits(layer), view)
+            canvas.log_values(values, colormaps.value_limits(picture), view)
     vertices, triangles = colormaps.surface(coarse)
     if len(triangles):
         colors = colormaps.elevation_colors(coarse, (low, high))[np.isfinite(coarse.layers["elevation"])]
