@@ -71,7 +71,7 @@ class Canvas:
             self.add_view(view)
 
     def _log(self, path: str, kind: type, components: Sequence[rr.DescribedComponentBatch]) -> None:
-        self.recording.log(path, components)
+        rr.log(path, components, recording=self.recording)
         self._now[path] = kind
         if self.counts_bytes:
             self.logged_bytes += sum(batch.as_arrow_array().nbytes for batch in components)
