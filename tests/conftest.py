@@ -1,5 +1,8 @@
 """Fixtures of several test files: a short simulated traverse, and logs cut out of it."""
 
+import fcntl
+import os
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -27,25 +30,51 @@ def traverse(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated log of a few small frames, with ground truth."""
     from recordings.simulator import Simulation, write_log
 
-    path = tmp_path_factory.mktemp("traverse") / "traverse.mcap"
-    write_log(Simulation(**TRAVERSE), path)
-    return path
+    simulation = Simulation(**TRAVERSE)
+    return made_once(tmp_path_factory, "traverse/traverse.mcap", lambda path: write_log(simulation, path))
 
 
 @pytest.fixture(scope="session")
 def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The traverse, run through the default pipeline; its recording and its summary are beside it."""
-    out = tmp_path_factory.mktemp("result") / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", out, "--summary", out.with_suffix(".json")) == 0
-    return out
+
+    def run(out: Path) -> None:
+        assert roverflow("run", traverse, *SMALL, "-o", out, "--summary", out.with_suffix(".json")) == 0
+
+    return made_once(tmp_path_factory, "result/out.mcap", run)
 
 
 @pytest.fixture(scope="session")
 def fast_result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The traverse, run through the fastest pipeline."""
-    out = tmp_path_factory.mktemp("fast") / "out.mcap"
-    assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
-    return out
+
+    def run(out: Path) -> None:
+        assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
+
+    return made_once(tmp_path_factory, "fast/out.mcap", run)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kernels(request: pytest.FixtureRequest) -> None:
+    """Of several processes of pytest, one compiles the kernels of the default pipeline, and the others wait for it."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        request.getfixturevalue("result")
+
+
+def made_once(factory: pytest.TempPathFactory, place: str, make: Callable[[Path], object]) -> Path:
+    """The file that `make` writes, with those beside it, in a folder of this process's own. place: folder/file.
+
+    Of several processes of pytest, one makes the files, and the others copy them.
+    """
+    folder, name = place.split("/")
+    shared = factory.getbasetemp().parent if "PYTEST_XDIST_WORKER" in os.environ else factory.getbasetemp()
+    made = shared / f"{folder}-made"
+    with shared.joinpath(f"{folder}-lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (made / name).exists():
+            made.mkdir(exist_ok=True)
+            make(made / name)
+    return shutil.copytree(made, factory.mktemp(folder) / folder) / name
 
 
 def slow(*cases: Any) -> list[Any]:

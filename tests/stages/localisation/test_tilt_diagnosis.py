@@ -19,8 +19,8 @@ from tests.stages.localisation.drive import Drive
 from tests.tilt_faults import degrees_as_radians, exchanged, flipped, radians_as_degrees
 
 DRIVES = [
-    Drive(1, 4.0, 0.3), Drive(2, 8.0, 0.1),
-    *slow(Drive(1, 4.0, 0.1), Drive(2, 8.0, 0.3), Drive(3, 5.0, 0.3), Drive(3, 5.0, 0.1)),
+    Drive(1, 4.0, 0.3),
+    *slow(Drive(2, 8.0, 0.1), Drive(1, 4.0, 0.1), Drive(2, 8.0, 0.3), Drive(3, 5.0, 0.3), Drive(3, 5.0, 0.1)),
 ]  # fmt: skip
 
 
