@@ -57,7 +57,7 @@ def test_source_is_the_origin_of_every_pixel(box):
     assert np.array_equal(known_origin(refined.source), known)
     confidence = {code: refined.confidence[refined.source == code] for code in list(PixelOrigin)[:4]}
     # as calibrated: of matches by their own confidence, 0.8, and by whether a plane agrees
-    assert np.unique(confidence[PixelOrigin.MEASURED]) == pytest.approx([0.882, 0.984], abs=0.002)
+    assert np.unique(confidence[PixelOrigin.MEASURED]) == pytest.approx([0.926, 0.994], abs=0.002)
     assert np.unique(confidence[PixelOrigin.PLANE]) == pytest.approx([0.79, 0.81])
     assert set(np.unique(confidence[PixelOrigin.FILLED])) <= {np.float32(0.72), np.float32(0.66)}
     assert (confidence[PixelOrigin.UNKNOWN] == 0).all()
