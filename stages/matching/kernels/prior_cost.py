@@ -16,7 +16,7 @@ from stages.matching.kernels.texture import BLOCK
 
 F32 = np.float32
 PHASES = 4
-GAINS, MAX_GAIN = 7, 4.0  # factors of the weight, 1 to the largest, with tables of their own
+GAINS, MAX_GAIN = 15, 8.0  # factors of the weight, 1 to the largest by halves, with tables of their own
 TABLE_MARGIN = 16  # lanes
 
 
