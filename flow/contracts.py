@@ -72,7 +72,7 @@ class FrameRecord:
     entries
         The losses of this frame, and those of the log since the frame before.
     seconds
-        Stage -> wall time.
+        Stage -> wall time; sink -> that of the last frame that was through, with what it prepared.
     queues
         Stage -> frames in its inbox when this frame was delivered.
     unchanged

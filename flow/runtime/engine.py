@@ -39,7 +39,8 @@ _NO_ITEM = (Absent, Unchanged)
 @dataclass(eq=False)
 class _Frame:
     """A frame in flight. values: stream -> item, Absent, Unchanged, or None where the item was freed; coming: its
-    streams that are there or being made; begun, done: the work on it."""
+    streams that are there or being made; seconds: of its stages, and of sinks with what they prepare; begun, done: the
+    work on it."""
 
     index: int
     stamp: int
@@ -103,6 +104,7 @@ class Engine:
         self._frames: deque[_Frame] = deque()
         self.states = start(stages) | dict(states or {})  # stream -> state of its stage, of this run
         self._work = [self._stage_work(node) for node in stages]
+        self._sink_seconds = dict.fromkeys(sinks, 0.0)  # of the last frame that was through
         self._max_frames = max(max_frames, 2) if any(work.flushes for work in self._work) else max_frames
         for name, (sink, streams) in sinks.items():
             self._work += self._sink_work(name, sink, streams)
@@ -228,8 +230,8 @@ class Engine:
                     self._in_large -= work.large
                     work.seconds += seconds
                     work.cpu_seconds += cpu
-                    if not (work.sink and work.output):
-                        frame.seconds[work.name] = seconds
+                    name = work.sink or work.name
+                    frame.seconds[name] = frame.seconds.get(name, 0.0) + seconds
                     retired = self._deliver(work, frame, value)
                 except BaseException as error:  # a worker must not die silently
                     self.failure = self.failure or (work.name, error)
@@ -332,6 +334,7 @@ class Engine:
         while self._frames and len(self._frames[0].done) == len(self._work):
             frame = self._frames.popleft()
             complete = not self.failure and not any(isinstance(value, Absent) for value in frame.values.values())
+            self._sink_seconds = {name: frame.seconds[name] for name in self._sink_seconds}
             self.through += 1
             self.complete += complete
             yield complete
@@ -371,7 +374,7 @@ class Engine:
             unchanged = frozenset(stream for stream, value in values.items() if isinstance(value, Unchanged))
             entries = tuple(sorted(frame.entries, key=lambda entry: (order.get(entry.stage, -1), entry.stamp)))
             with self._condition:
-                seconds = dict(frame.seconds)
+                seconds = frame.seconds | self._sink_seconds
                 queues = {work.name: len(work.inbox) for work in stages}
             sink.write(FrameRecord(frame.index, frame.stamp, items, entries, seconds, queues, unchanged))
 

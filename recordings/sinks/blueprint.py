@@ -308,13 +308,13 @@ def _stage_plots(drawn: Specs, slowest: Sequence[str]) -> list[tuple[_Part, floa
     """The times of the stages and their queues, each with its share of the width."""
     plots: list[tuple[_Part, float]] = []
     named = [spec for spec in _at(drawn, Panel.STAGE) if spec.stream == SECONDS and spec.title in slowest]
-    for root, title in ((SECONDS, "stage time (s)"), (QUEUES, "queue depth (frames)")):
+    for root, title in ((SECONDS, "time of stages and sinks (s)"), (QUEUES, "queue depth (frames)")):
         lines = sum(spec.stream == root for spec in _at(drawn, Panel.STAGE))
         few = lines <= MAX_LEGEND_LINES
         if lines:
             name = title if few else f"{title}: hover for names"
             every = rrb.TimeSeriesView(origin=root, name=name, plot_legend=rrb.PlotLegend("LeftTop", visible=few))
-            first = _plot(named, "slowest stages (s)") if root == SECONDS and not few else None
+            first = _plot(named, "slowest stages and sinks (s)") if root == SECONDS and not few else None
             plots.append((_tabs([first, every]) or every, 1.4))
     return plots
 

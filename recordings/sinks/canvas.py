@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import cv2
@@ -138,7 +138,7 @@ class Canvas:
         unit: str | None = None,
         palette: int = cv2.COLORMAP_TURBO,
     ) -> None:
-        """Values (H, W) in colours over a range; hover reads them. The palette's darkest end is left to unknown.
+        """Values (H, W) in colours over a range; hover reads them. Unknown ones have `UNKNOWN_RGB` or nearly black.
 
         unit: of the scale above the picture; None: no scale.
         """
@@ -147,6 +147,9 @@ class Canvas:
         colours = _recurring(rr.DepthImage, meter=1.0, colormap=VIEWER_COLORMAPS[palette])
         self._log(view.path, rr.DepthImage, [*_raw(rr.DepthImage, values), *colours, _depth_range(ends)])
         self.add_view(view)
+        if palette != cv2.COLORMAP_TURBO:  # which begins with nearly black
+            mask = _raw(rr.SegmentationImage, np.isnan(values).view(np.uint8))
+            self._log(f"{view.path}/unknown", rr.SegmentationImage, [*mask, *_opaque_where_unknown()])
         if unit is not None:
             self.log_scale(f"{view.path}/scale", values.shape, low, high, unit, palette)
 
@@ -226,6 +229,17 @@ def label_counts(labels: Array) -> Array:
 def _recurring(kind: Any, **fields: Any) -> tuple[rr.DescribedComponentBatch, ...]:
     """Fields of an archetype. To make these takes longer than to log an image, so those that recur are kept."""
     return tuple(kind.from_fields(**fields).as_component_batches())
+
+
+@cache
+def _opaque_where_unknown() -> list[rr.DescribedComponentBatch]:
+    """How a mask of unknown values is drawn: 1 in `UNKNOWN_RGB`, 0 not at all."""
+    labels = [
+        rr.AnnotationInfo(id=0, label="known", color=(0, 0, 0, 0)),
+        rr.AnnotationInfo(id=1, label="unknown", color=colormaps.UNKNOWN_RGB),
+    ]
+    opaque = _recurring(rr.SegmentationImage, opacity=1.0)
+    return [*opaque, *rr.AnnotationContext(labels).as_component_batches()]
 
 
 @lru_cache(maxsize=256)

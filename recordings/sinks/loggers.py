@@ -338,10 +338,12 @@ def log_hazards_in_view(
     scale = min(1.0, canvas.width(stream) / camera.width)
     focal = np.array([camera.fx, camera.fy])
     pixels = (seen[:, :2] / seen[:, 2:] * focal + (camera.cx, camera.cy) + 0.5) * scale
-    inside = np.all((pixels >= 0) & (pixels < (scale * camera.width, scale * camera.height)), axis=1)
+    size = scale * np.array([camera.width, camera.height])
+    inside = np.all((pixels >= 0) & (pixels < size), axis=1)
     radii = np.maximum(1.0, 0.4 * terrain.resolution * camera.fx * scale / seen[inside, 2])
+    whole = np.clip(pixels[inside], radii[:, None], size - radii[:, None])  # a dot over the edge would move the image
     colors = [(*colormaps.CELL_LEGEND[Cell.HAZARD][1], 150)]
-    canvas.log(f"{stream}/left/hazards", rr.Points2D(pixels[inside], colors=colors, radii=radii, draw_order=20.0))
+    canvas.log(f"{stream}/left/hazards", rr.Points2D(whole, colors=colors, radii=radii, draw_order=20.0))
 
 
 def _hazards(navigation: NavigationMap, terrain: ElevationMap) -> Array:

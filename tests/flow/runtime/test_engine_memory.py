@@ -45,7 +45,8 @@ def test_a_sink_gets_what_it_prepared_in_order(tmp_path):
     del whole[2]["twice"]
     assert texts == whole
     assert isinstance(sink.records[0], FrameRecord)
-    assert set(sink.records[0].seconds) == {"twice", "thrice", "sum", "raised", "total"}
+    assert set(sink.records[0].seconds) == {"twice", "thrice", "sum", "raised", "total", "sink"}
+    assert sink.records[0].seconds["sink"] == 0 < sink.records[-1].seconds["sink"] < engine.seconds["sink"]
     assert engine.seconds["sink"] >= 0
     assert not any("sink:" in name for name in engine.seconds)
 
