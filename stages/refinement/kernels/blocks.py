@@ -3,7 +3,7 @@
 Sums count from the block's centre and mean disparity, so that they are exact in single precision. A plane is fitted
 again to the residuals from an earlier one, with the weight of each block falling with its distance from that one. The
 trick: windows of neighbouring blocks are summed side by side in one array, at constant distances, so the compiler knows
-that nothing overlaps and vectorises.
+that nothing overlaps and vectorises. The blocks of a row are copied once for all the windows that contain them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ WEIGHT, RESIDUAL, EXPECTED = 3, 4, 5  # of the matches: their weight, variance a
 BOUND, CORRELATION = 6, 7  # variance of the plane by the images' gradients; correlation of these
 PLANE_LAYERS = 8
 LANES = 16  # windows that are summed side by side
-START, SUMS = BLOCK_LAYERS, BLOCK_LAYERS + 3  # in the work array, after a block: its plane; sums over the window:
+MAX_RADIUS = 2  # blocks, of a window
+WIDE = LANES + 2 * MAX_RADIUS  # blocks of a row that these windows contain
+START, SUMS = 0, 3  # in the work array: the planes that the windows start from; sums over the windows:
 S_N, S_X, S_Y, S_XX, S_XY, S_YY, S_R, S_XR, S_YR, S_RR, S_VARIANCE, S_LR, S_LL, S_RIGHT = range(SUMS, SUMS + 14)
 WORK_LAYERS = SUMS + 14
 
@@ -126,45 +128,47 @@ def _fitted(blocks: Array, start: Array, radius: int, size: int, gated: bool, bo
 @kernel
 def _fit(blocks, start, radius, size, gated, first, end, planes):
     _, height, width = blocks.shape
-    work = np.zeros(WORK_LAYERS * LANES, np.float32)
+    work, row = np.zeros(WORK_LAYERS * LANES, np.float32), np.zeros(BLOCK_LAYERS * WIDE, np.float32)
     for j in range(first, end):
         for i in range(0, width, LANES):
             work[SUMS * LANES :] = 0
             for layer in range(3):
-                _copy(start[layer, j], i, work, START + layer)
+                _copy(start[layer, j], i, work[(START + layer) * LANES :], LANES)
             for down in range(max(-radius, -j), min(radius, height - 1 - j) + 1):
+                for layer in range(BLOCK_LAYERS):
+                    _copy(blocks[layer, j + down], i - MAX_RADIUS, row[layer * WIDE :], WIDE)
                 for across in range(-radius, radius + 1):
-                    for layer in range(BLOCK_LAYERS):
-                        _copy(blocks[layer, j + down], i + across, work, layer)
-                    _add(work, F32(across) * size, F32(down) * size, gated)
+                    _add(row[MAX_RADIUS + across :], work, F32(across) * size, F32(down) * size, gated)
             for lane in range(min(LANES, width - i)):
                 _solve(work, lane, planes[:, j, i + lane])
 
 
 @part
-def _copy(row, start, work, layer):
-    """Copy LANES values of a row into a layer of the work array; beyond the row they are 0."""
-    first, end = max(-start, 0), min(LANES, row.size - start)
-    if first > 0 or end < LANES:
-        work[layer * LANES : (layer + 1) * LANES] = 0
-    source, target = row[start + first :], work[layer * LANES + first :]
-    for lane in range(end - first):
-        target[lane] = source[lane]
+def _copy(row, start, target, count):
+    """Copy `count` values of a row; beyond the row they are 0."""
+    first, end = max(-start, 0), min(count, row.size - start)
+    if first > 0 or end < count:
+        target[:count] = 0
+    for lane in range(first, end):
+        target[lane] = row[start + lane]
 
 
 @fast_part
-def _add(work, u, v, gated):
-    """Add one block of each of `LANES` windows, (u, v) px from its middle, to the window's sums."""
+def _add(row, work, u, v, gated):
+    """Add one block of each of `LANES` windows, (u, v) px from its middle, to the window's sums.
+
+    row: layers of WIDE blocks, from the block of the first window.
+    """
     for i in range(LANES):
-        n, x, y = work[N * LANES + i], work[X * LANES + i], work[Y * LANES + i]
-        xx, xy, yy = work[XX * LANES + i], work[XY * LANES + i], work[YY * LANES + i]
-        xd, yd, expected = work[XD * LANES + i], work[YD * LANES + i], work[VARIANCE * LANES + i]
+        n, x, y = row[N * WIDE + i], row[X * WIDE + i], row[Y * WIDE + i]
+        xx, xy, yy = row[XX * WIDE + i], row[XY * WIDE + i], row[YY * WIDE + i]
+        xd, yd, expected = row[XD * WIDE + i], row[YD * WIDE + i], row[VARIANCE * WIDE + i]
         a, b = work[(START + A) * LANES + i], work[(START + B) * LANES + i]
         # Residuals of the block's matches from the plane: their sum, times x, times y, squared
-        offset = work[MEAN * LANES + i] - work[(START + C) * LANES + i] - a * u - b * v
+        offset = row[MEAN * WIDE + i] - work[(START + C) * LANES + i] - a * u - b * v
         r = offset * n - a * x - b * y
         xr, yr = xd + offset * x - a * xx - b * xy, yd + offset * y - a * xy - b * yy
-        rr = work[DD * LANES + i] + offset * (r - a * x - b * y) - a * xd - b * yd
+        rr = row[DD * WIDE + i] + offset * (r - a * x - b * y) - a * xd - b * yd
         rr -= a * (xd - a * xx - b * xy) + b * (yd - a * xy - b * yy)
         weight = F32(1)
         if gated:
@@ -182,9 +186,9 @@ def _add(work, u, v, gated):
         work[S_YR * LANES + i] += weight * (yr + v * r)
         work[S_RR * LANES + i] += weight * rr
         work[S_VARIANCE * LANES + i] += weight * n * expected
-        work[S_LR * LANES + i] += weight * work[LR * LANES + i]
-        work[S_LL * LANES + i] += weight * work[LL * LANES + i]
-        work[S_RIGHT * LANES + i] += weight * work[RR * LANES + i]
+        work[S_LR * LANES + i] += weight * row[LR * WIDE + i]
+        work[S_LL * LANES + i] += weight * row[LL * WIDE + i]
+        work[S_RIGHT * LANES + i] += weight * row[RR * WIDE + i]
 
 
 @fast_part
