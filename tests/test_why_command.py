@@ -136,6 +136,15 @@ def test_a_log_of_other_stamps_is_not_taken_for_the_input(traverse, fast_result,
     assert "other stamps (taken for the input because the result names traverse.mcap; give --log)" in said
 
 
+def test_a_log_of_the_same_stamps_and_other_content_is_noted(traverse, fast_result, tmp_path, capsys):
+    other = rewrite(traverse, tmp_path / "other.mcap", lambda *one: one[2], chunk_size=1 << 16)
+    assert roverflow("why", fast_result, "--at", AT, "--cell", "3,0", "--log", other) == 0
+    noted = f"note: {other} is another form of the input of {fast_result}, or another log with its stamps\n"
+    assert noted in capsys.readouterr().out
+    assert roverflow("why", fast_result, "--at", AT, "--cell", "3,0", "--log", tmp_path / "none.mcap") == 2
+    assert f"there is no log {tmp_path / 'none.mcap'}, which --log names\n" in capsys.readouterr().err
+
+
 def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, capsys):
     grids = messages(fast_result, "/nav/regional_navigation_map")
     end, grid = max(grids), read_occupancy_grid(grids[max(grids)])
@@ -151,6 +160,7 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, cap
     assert found.layers["frames"] == len(found.frames) == FRAMES
     assert all(abs(frame.height - found.layers["elevation"]) < 0.05 for frame in found.frames)
     assert said.count(" points, height ") == FRAMES
+    assert why_regional(fast_result, np.datetime64(end, "ns"), (x, y)).frames == found.frames  # no log beside the result
     assert f"frames with points in the cell (of the clouds that the log keeps, thinned to 2 cm): {FRAMES}\n" in said
     assert len(why_regional(fast_result, 0, (x, y), log=traverse).frames) == 1
     assert roverflow("why", fast_result, *late[:2], "--pixel", "9,9", *late[3:]) == 2

@@ -20,6 +20,7 @@ from flow.errors import UsageError
 from recordings.mcap.file import iter_decoded
 from recordings.results import read_result
 from recordings.ros2.from_msg import read_point_cloud, transform_of
+from recordings.scoring.result_log import stamps_of
 from stages import Binarise
 from stages.data import LEVEL_FRAME, Array, ElevationMap, NavigationMap, Transform
 
@@ -70,7 +71,7 @@ def why_regional(
     cell : (float, float)
         x and y in the map's frame, m.
     log : Path, optional
-        The input log; by default the one that the result names, beside it.
+        The input log; by default the one that the result names, beside it. Only seconds after its start need it.
     stream : str
         The navigation map.
 
@@ -89,8 +90,11 @@ def why_regional(
     if node is None:
         raise UsageError(f"the pipeline of {result} has no navigation map '{stream}'")
     rule: Any = node.actor
-    with input_of(graph, result, log) as opened:
-        stamp = ns_of(at, opened.begin)
+    if log is None and not isinstance(at, float | int):
+        stamp = ns_of(at, int(stamps_of(result)[0]))
+    else:
+        with input_of(graph, result, log) as opened:
+            stamp = ns_of(at, opened.begin)
     navigation, terrain = _maps(result, stamp, stream, node.inputs["elevation"])
     place = index_of(navigation, *cell)
     if place is None:

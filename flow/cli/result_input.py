@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from flow.cli.instants import is_other
+from flow.cli.report import say
 from flow.config.loader import load
 from flow.errors import RoverflowError, UsageError
 from flow.runtime.graph import Graph
@@ -41,7 +42,8 @@ def input_of(graph: Graph, result: Path, log: Path | None = None) -> Iterator[Mc
     named = about_run(result)["log"]
     given = log or result.with_name(named)
     if not given.exists():
-        raise UsageError(f"the input of {result}, {named}, is not beside it; give it with --log")
+        missing = f"the input of {result}, {named}, is not beside it; give it with --log"
+        raise UsageError(missing if log is None else f"there is no log {log}, which --log names")
     with ExitStack() as stack:
         try:
             opened = stack.enter_context(graph.source.open(given))
@@ -53,13 +55,17 @@ def input_of(graph: Graph, result: Path, log: Path | None = None) -> Iterator[Mc
 
 
 def check_input(opened: McapLog, given: Path | Sequence[Path], result: Path, remedy: str = "") -> None:
-    """Raise UsageError if an opened log has none of the frames of a result log."""
+    """Raise UsageError if an opened log has none of the frames of a result log; say if it has other bytes."""
     from recordings.containers.digest import log_digest
     from recordings.containers.finding import find_files
     from recordings.scoring.result_log import about_run, stamps_of
 
     # A log in another form has another digest, and the same stamps.
-    same = log_digest(find_files(given).files) == about_run(result).get("log_digest")
-    if not same and is_other(opened, stamps_of(result)):
-        names = ", ".join(map(str, [given] if isinstance(given, Path) else given))
+    digest = about_run(result).get("log_digest")
+    if digest == log_digest(find_files(given).files):
+        return
+    names = ", ".join(map(str, [given] if isinstance(given, Path) else given))
+    if is_other(opened, stamps_of(result)):
         raise UsageError(f"{names} is not the input of {result}: its frames have other stamps{remedy}")
+    if digest is not None:
+        say(f"note: {names} is another form of the input of {result}, or another log with its stamps")
