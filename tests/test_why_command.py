@@ -160,7 +160,7 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, cap
     assert found.layers["frames"] == len(found.frames) == FRAMES
     assert all(abs(frame.height - found.layers["elevation"]) < 0.05 for frame in found.frames)
     assert said.count(" points, height ") == FRAMES
-    assert why_regional(fast_result, np.datetime64(end, "ns"), (x, y)).frames == found.frames  # no log beside the result
+    assert why_regional(fast_result, np.datetime64(end, "ns"), (x, y)).frames == found.frames  # without input
     assert f"frames with points in the cell (of the clouds that the log keeps, thinned to 2 cm): {FRAMES}\n" in said
     assert len(why_regional(fast_result, 0, (x, y), log=traverse).frames) == 1
     assert roverflow("why", fast_result, *late[:2], "--pixel", "9,9", *late[3:]) == 2
