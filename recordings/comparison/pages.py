@@ -53,14 +53,14 @@ def signed_colors(change: Array, limit: float) -> Array:
 def _disparities(one: Any, other: Any) -> tuple[Array, Array, Array]:
     first, second = read_disparity(one), read_disparity(other)
     page = page_of(_change_colors(first, second, DISPARITY_LIMIT), "B less A, px")
-    add_bar(page, -DISPARITY_LIMIT, DISPARITY_LIMIT, lambda values: signed_colors(values, DISPARITY_LIMIT))
+    add_bar(page, -DISPARITY_LIMIT, DISPARITY_LIMIT, lambda values: signed_colors(values, DISPARITY_LIMIT), ONLY_ONE)
     return disparity_page(first), disparity_page(second), page
 
 
 def _elevations(one: Any, other: Any) -> tuple[Array, Array, Array]:
     first, second = read_grid_map(one), read_grid_map(other)
     page = _map(_change_colors(*elevations(first, second), HEIGHT_LIMIT), first, second, "B less A, m")
-    add_bar(page, -HEIGHT_LIMIT, HEIGHT_LIMIT, lambda values: signed_colors(values, HEIGHT_LIMIT))
+    add_bar(page, -HEIGHT_LIMIT, HEIGHT_LIMIT, lambda values: signed_colors(values, HEIGHT_LIMIT), ONLY_ONE)
     return elevation_page(first), elevation_page(second), page
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -67,8 +68,11 @@ def _ticks(start: float, length: float) -> Array:
     return 2.0 * np.arange(np.ceil(start / 2.0), np.floor((start + length) / 2.0) + 1) + 0.0  # no minus zero
 
 
-def add_bar(page: Array, low: float, high: float, colors: Callable[[Array], Array]) -> None:
-    """Draw a vertical colour bar with five values, and the colour of unknown below it."""
+def add_bar(
+    page: Array, low: float, high: float, colors: Callable[[Array], Array],
+    others: Mapping[int, tuple[str, colormaps.Rgb]] = MappingProxyType({}),
+) -> None:  # fmt: skip
+    """Draw a vertical colour bar with five values, and below it the colours of unknown and of others."""
     height, width = page.shape[0] - 2 * MARGIN_PX, page.shape[1]
     left, top, length = width - 2 * MARGIN_PX - 32, MARGIN_PX, height * 3 // 4
     ramp = colors(np.linspace(high, low, length))
@@ -76,7 +80,8 @@ def add_bar(page: Array, low: float, high: float, colors: Callable[[Array], Arra
     for share in np.linspace(0.0, 1.0, 5):
         value = high + share * (low - high)
         _text(page, colormaps.format_value(value), (left + 36, round(top + share * (length - 1)) + 6))
-    _swatch(page, (left, top + length + 20), "unknown", colormaps.UNKNOWN_RGB)
+    for place, (name, rgb) in enumerate((("unknown", colormaps.UNKNOWN_RGB), *others.values())):
+        _swatch(page, (left, top + length + 20 + 36 * place), name, rgb)
 
 
 def add_legend(page: Array, legend: Mapping[int, tuple[str, colormaps.Rgb]]) -> None:

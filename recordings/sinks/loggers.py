@@ -130,12 +130,12 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
 
 
 def _log_confidence(canvas: Canvas, view: ViewSpec, disparity: Disparity) -> None:
-    """The confidence of every n-th pixel, in percent; 0 is unknown."""
+    """The confidence of every n-th pixel, in percent; 0 is unknown, and as dark as the least."""
     pixels, confidence = (
         colormaps.every_nth(layer, canvas.small_width) for layer in (disparity.pixels, disparity.confidence)
     )
     percent = np.where(np.isnan(pixels), np.float32(0), 100 * confidence)
-    canvas.log_values(np.rint(percent).astype(np.uint8), (0.0, 100.0), view, "%")
+    canvas.log_values(np.rint(percent).astype(np.uint8), (20.0, 100.0), view, "%")
 
 
 def _log_sigma(canvas: Canvas, stream: str, disparity: Disparity) -> None:
