@@ -103,17 +103,6 @@ def angle_of(matrix: Array) -> float:
     return 2 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
 
 
-def rotation_vector(matrix: Array) -> Array:
-    """The rotation vector (3,) of the rotation nearest to a matrix (3, 3), rad, at most pi long."""
-    quaternion = quaternion_of(matrix)
-    if quaternion[3] < 0:
-        quaternion = -quaternion
-    x, y, z, w = quaternion.tolist()
-    half = math.sqrt(x * x + y * y + z * z)
-    angle = 2 * math.atan2(half, w)
-    return quaternion[:3] * (angle / half if angle > _SMALL_ANGLE else 2 + angle * angle / 12)
-
-
 def _unit(quaternion: list[float]) -> list[float]:
     x, y, z, w = quaternion
     length = math.sqrt(x * x + y * y + z * z + w * w)

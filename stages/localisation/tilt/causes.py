@@ -8,12 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations, product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.data import Array
-from stages.data.rotations import canonical, quaternion_of, rotation_vector, turn_by
-from stages.localisation.tilt.rotation_spline import RotationSpline
+from stages.data.rotations import canonical, quaternion_of, turn_by
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import RotationSpline
 
 GROUND_SIGMA = float(np.deg2rad(8))  # rad, of the mean slope of the ground in view
 PARAMETER_COST = 4.0  # added to the score for each fitted number
@@ -158,6 +161,8 @@ def _right_angles() -> Array:
 
 def wrong_mount(fit: Fit) -> Cause:
     """The rotation missing from the mount, by Gauss-Newton from the best of the right angles."""
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     mount = fit.evidence.mount
     starts = [mount @ turn @ mount.T for turn in _right_angles()]
     cost = [fit.misfit_of(fit.ups @ s.T) + fit.slope_of(fit.ups @ s.T) for s in starts]
@@ -174,7 +179,7 @@ def wrong_mount(fit: Fit) -> Cause:
         change = -np.linalg.solve(normal, columns.T @ fit.residuals(ups).ravel())
         turn = turn_by(change) @ turn
     ups = fit.ups @ turn.T
-    error = rotation_vector(turn)
+    error = Rotation.from_matrix(turn).as_rotvec()
     angle = float(np.linalg.norm(error))
     sigma = float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(normal))[-1]))
     along = mount.T @ error / max(angle, 1e-12)
@@ -208,7 +213,7 @@ def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
         for stretch, spline in splines.items():
             inside = within[kept] == stretch
             if inside.any():
-                cameras[inside] = spline(seconds[inside] - late)
+                cameras[inside] = spline(seconds[inside] - late).as_matrix()
         return fit.misfit_of(fit.ups, cameras)
 
     step = 0.05
@@ -231,6 +236,8 @@ def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
 def _splines(evidence: Evidence) -> tuple[Array, dict[int, RotationSpline]]:
     """The camera's rotation over time, s, for each stretch of rising stamps without long gaps; and the stretch of each
     frame, -1 within `MAX_OFFSET` of its ends."""
+    from scipy.spatial.transform import Rotation, RotationSpline  # takes long to import
+
     seconds = (evidence.stamps - evidence.stamps[0]) / 1e9
     steps = np.diff(seconds)
     breaks = (steps <= 0) | (steps > MAX_FRAME_GAP) | (np.diff(evidence.segments) != 0)
@@ -241,7 +248,7 @@ def _splines(evidence: Evidence) -> tuple[Array, dict[int, RotationSpline]]:
         times = seconds[inside]
         if len(times) < 4:
             continue
-        splines[int(stretch)] = RotationSpline(times, evidence.cameras[inside])
+        splines[int(stretch)] = RotationSpline(times, Rotation.from_matrix(evidence.cameras[inside]))
         within[inside & (seconds - MAX_OFFSET >= times[0]) & (seconds + MAX_OFFSET <= times[-1])] = stretch
     return within, splines
 
