@@ -14,7 +14,6 @@ def program() -> int:
     import signal
 
     gc.set_threshold(20_000, 50, 50)  # imports make many objects and no garbage
-    sys.setswitchinterval(0.0005)  # s; a thread that reads or computes outside of Python waits less for its next turn
     try:
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is signal.SIG_DFL:

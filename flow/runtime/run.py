@@ -258,6 +258,9 @@ def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
 
 def _peak_memory_mb() -> float:
     """Largest resident size of this process so far."""
+    with suppress(OSError, KeyError):  # ru_maxrss may be that of the process that started this one
+        status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+        return round(int(status["VmHWM"].split()[0]) * 1024 / 1e6, 1)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak * (1 if sys.platform == "darwin" else 1024) / 1e6, 1)
 

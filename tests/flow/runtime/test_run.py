@@ -2,6 +2,8 @@
 
 import re
 import signal
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -24,6 +26,14 @@ def test_a_failing_frame_is_recorded_and_the_others_go_on(tmp_path):
         ("twice", "cannot scale 7.0"),
     ]
     assert [r.index for r in sink.records if r.entries] == [3, 7]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the peak may be that of the process before")
+def test_the_peak_memory_is_not_that_of_the_process_that_starts_a_run():
+    own = "from flow.runtime.run import _peak_memory_mb as peak; print(peak())"
+    large = f"import subprocess, sys; kept = b'1' * 600_000_000; subprocess.run([sys.executable, '-c', {own!r}])"
+    said = subprocess.run([sys.executable, "-c", large], capture_output=True, text=True, check=True).stdout
+    assert 10 < float(said) < 500
 
 
 @pytest.mark.parametrize(("frames", "threads"), [(1, 2), (2, 2), (3, 1), (None, 1)])
