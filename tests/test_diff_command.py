@@ -28,6 +28,12 @@ def test_a_run_and_the_same_run_are_equal(fast_result, variant_of, capsys):
     assert capsys.readouterr().out.splitlines()[-1].startswith("equal: all ")
 
 
+def test_equal_results_make_no_recording(fast_result, tmp_path, capsys):
+    assert roverflow("diff", fast_result, fast_result, "-o", tmp_path / "diff.rrd") == 0
+    assert capsys.readouterr().out.endswith(f"\n{tmp_path / 'diff.rrd'} is not written, as nothing differs\n")
+    assert not (tmp_path / "diff.rrd").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "topic", "measure"),
     [

@@ -56,6 +56,19 @@ def test_a_report_stands_alone_and_shows_maps_frames_and_losses(result, tmp_path
     assert "COMPLETE" in text
     assert "Nothing was lost." in text
     assert re.search(r"disparities=64", text)
+    assert "Template parts/match_pyramid.yaml" in text
+    assert "\n# Matches at a quarter" in "\n".join(page.words)
+    assert "# #" not in text
+
+
+def test_the_report_of_a_result_that_was_cut_says_so(result, tmp_path):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(result.read_bytes()[: result.stat().st_size // 2])
+    assert roverflow("report", cut) == 0
+    text = " ".join(Page(cut.with_suffix(".html").read_text()).words)
+    assert "the log was cut before its verdict" in text
+    assert "No loss is recorded before the log ends." in text
+    assert re.search(r"unreadable the log is cut or damaged at byte \d+", text)
 
 
 def test_two_results_stand_beside_each_other(traverse, result, tmp_path):

@@ -8,9 +8,10 @@ import rerun as rr
 
 import stages
 from recordings.comparison.text import moment
-from tests.conftest import FRAMES, SMALL, roverflow
+from tests.conftest import FRAMES, SMALL, rewrite, roverflow
 
 AT = ("--at", "0.5", "-p", "fast")
+RIGHT = "/stereo/right/image_rect_color"
 
 
 def test_stages_before_the_change_run_once(traverse, tmp_path, capsys, monkeypatch):
@@ -65,7 +66,43 @@ def test_frames_before_the_instant_give_the_stages_with_memory_their_state(trave
     assert roverflow("try", traverse, "--at", "1.05", "--before", FRAMES, *change) == 0
     output = capsys.readouterr().out
     assert "1 frame from 1.034 s on, after 1 frame before it" in output
-    assert "/nav/regional_map: 2 of 2 messages differ" in output
+    assert "/nav/regional_map: 1 of 1 messages differ" in output
+
+
+def test_frames_before_the_instant_are_neither_compared_nor_scored(traverse, tmp_path, capsys):
+    def tried(*before):
+        change = ("-p", "fast", "--set", "disparity/full.paths=8", "-o", tmp_path / "try.rrd")
+        assert roverflow("try", traverse, "--at", "1.05", *before, *change) == 0
+        output = capsys.readouterr().out
+        first = re.search(r"first differ at /nav/disparity, \S+ \((\d+) ns\)", output)
+        disparities = re.search(r"  /nav/disparity: .*", output)
+        assert first is not None
+        assert disparities is not None
+        return first[1], disparities[0], [row.split()[:8] for row in output.splitlines() if re.match(" +[AB] +", row)]
+
+    assert tried("--before", FRAMES) == tried()
+
+
+def test_the_frames_that_were_compared_are_counted(traverse, tmp_path, capsys):
+    assert roverflow("try", traverse, "--at", "1.05", "--frames", 99, "-p", "fast", *SMALL, "-o", tmp_path / "b") == 0
+    output = capsys.readouterr().out
+    assert "2 frames from 1.034 s on: " in output
+    assert "\nnote: the log has only 2 frames from there on, not 99\n" in output
+
+
+def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_path, capsys):
+    log = rewrite(traverse, tmp_path / "a.mcap", lambda *one: None if one[0] == RIGHT and one[1] == 1 else one[2])
+    assert roverflow("try", log, "--at", "0.5", "--frames", 3, "-p", "fast", *SMALL, "-o", tmp_path / "b") == 0
+    output = capsys.readouterr().out
+    assert "2 frames from 0.534 s on: " in output
+    assert "\nnote: 1 frame gave no result; roverflow run --start " in output
+
+
+def test_a_change_without_effect_writes_no_recording(traverse, tmp_path, capsys):
+    out = tmp_path / "try.rrd"
+    assert roverflow("try", traverse, *AT, "--set", "navigation_map.rover.max_step=20 cm", "-o", out) == 0
+    assert "\nthe change has no effect on 1 frame, so there is no recording to write\n" in capsys.readouterr().out
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

@@ -145,6 +145,18 @@ def test_a_log_of_the_same_stamps_and_other_content_is_noted(traverse, fast_resu
     assert f"there is no log {tmp_path / 'none.mcap'}, which --log names\n" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9999])
+def test_a_result_that_was_cut_is_said_to_be_incomplete(traverse, fast_result, share, tmp_path, capsys):
+    data, cut = fast_result.read_bytes(), tmp_path / "out.mcap"
+    cut.write_bytes(data[: int(share * len(data))])
+    assert roverflow("why", cut, "--at", 0.6, "--cell", "3,0", "--log", traverse) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    why = "its end is missing" if share > 0.99 else "the log is cut or damaged"
+    assert [note.partition(" at byte ")[0] for note in notes] == [f"note: {cut} is incomplete: {why}"]
+    assert roverflow("why", fast_result, "--at", 0.6, "--cell", "3,0", "--log", traverse) == 0
+    assert "note: " not in capsys.readouterr().out
+
+
 def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, capsys):
     grids = messages(fast_result, "/nav/regional_navigation_map")
     end, grid = max(grids), read_occupancy_grid(grids[max(grids)])
@@ -156,6 +168,7 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, cap
     assert roverflow("why", fast_result, *late) == 0
     said = capsys.readouterr().out
     assert f"cell ({x:.3f}, {y:.3f}) m in 'odom', map of {moment(end)}: free, reason clear" in said
+    assert said.startswith("note: --at is after the last 'regional_navigation_map', which is explained; it is at 1.5")
     found = why_regional(fast_result, 60, (x, y), log=traverse)
     assert found.layers["frames"] == len(found.frames) == FRAMES
     assert all(abs(frame.height - found.layers["elevation"]) < 0.05 for frame in found.frames)

@@ -17,6 +17,7 @@ import numpy as np
 
 from flow.cli.instants import Instant, part_of
 from flow.cli.replay import one_thread_per_call
+from flow.cli.report import say
 from flow.cli.result_input import graph_of, input_of
 from flow.contracts import FrameRecord
 from flow.errors import UsageError
@@ -222,6 +223,8 @@ def instant(graph: Graph, log: McapLog, at: Instant) -> Mapping[str, Any]:
     kept = _Keep()
     with one_thread_per_call():
         part = part_of(log, at, frames=1, before=0)
+        if part.note:
+            say(f"note: {part.note}")
         log.narrow(part.start, part.end)
         run(replace(graph, sinks=(("keep", kept),)), log, {"keep": Path("memory")})
     if not kept.records:
@@ -300,7 +303,7 @@ def _recorded(result: Path, stream: str, stamp: int, x: float, y: float) -> Cell
     from recordings.mcap.file import iter_decoded
     from recordings.ros2.from_msg import read_occupancy_grid
 
-    for _, _, message in iter_decoded(result, [f"/nav/{stream}"], part=(stamp, stamp + 1)):
+    for _, _, message in iter_decoded(result, [f"/nav/{stream}"], Counter(), part=(stamp, stamp + 1)):
         navigation = read_occupancy_grid(message)
         place = index_of(navigation, x, y)
         return None if place is None else Cell(int(navigation.cells[place]))

@@ -22,13 +22,17 @@ Instant = float | np.datetime64 | np.timedelta64
 @dataclass(frozen=True)
 class Part:
     """The frames of an instant. start, end: the part to read; at: the first frame of the instant; all in s after the
-    log's first message. before: number of frames before it; stamp: of its first frame, ns."""
+    log's first message. frames, before: numbers of images from the instant on and before it; stamp: of its first
+    frame, ns; first: where the part begins without those before it; note: why the frame is not at the instant."""
 
     start: float
     end: float
     at: float
+    frames: int
     before: int
     stamp: int
+    first: float
+    note: str
 
 
 def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64) -> Part:
@@ -40,17 +44,33 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64)
     times = log.file.times(log.channels("left")) if "left" in log.topics else np.zeros(0, np.int64)
     if not times.size:
         raise UsageError(f"{log.path} has no left images")
-    first, last = ((int(time) - log.begin) / 1e9 for time in (times[0], times[-1]))
     chosen = _nearest(log, times, at)
     if chosen is None:
-        shown = f"{at:g}" if isinstance(at, float | int) else f"{np.datetime64(ns_of(at, log.begin), 'ns')}Z"
-        raise UsageError(f"--at {shown} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s")
+        raise UsageError(_outside(log, times, at))
     earlier = chosen - (_nearest(log, times, before) or 0) if isinstance(before, np.datetime64) else before
     low, high = max(0, chosen - earlier), min(times.size, chosen + frames) - 1
-    edges = np.concatenate([times[:1] - 1_000_000_000, (times[1:] + times[:-1]) // 2, times[-1:] + 1_000_000_000])
-    start, end = (max(0, int(edges[place]) - log.begin) / 1e9 for place in (low, high + 1))
-    stamp = _stamps(log, times, chosen, reach=0).get(int(times[chosen]), int(times[chosen]))
-    return Part(start, end, (int(times[chosen]) - log.begin) / 1e9, chosen - low, stamp)
+    edges = np.concatenate([times[:1] - MARGIN, (times[1:] + times[:-1]) // 2, times[-1:] + MARGIN])
+    start, first, end = (max(0, int(edges[place]) - log.begin) / 1e9 for place in (low, chosen, high + 1))
+    time, stamp = int(times[chosen]), _stamp(log, times, chosen)
+    off = ns_of(at, log.begin) - (time if isinstance(at, float | int) else stamp)
+    half = int(np.median(np.diff(times))) // 2 if times.size > 1 else 0
+    beyond = (chosen == 0 and off < -half) or (chosen == times.size - 1 and off > half)
+    note = f"{_outside(log, times, at)}; the {'last' if off > 0 else 'first'} one is taken" if beyond else ""
+    return Part(start, end, (time - log.begin) / 1e9, high - chosen + 1, chosen - low, stamp, first, note)
+
+
+def _outside(log: McapLog, times: NDArray[np.int64], at: Instant) -> str:
+    """That an instant is outside the images of a log, whose log times, ns, are given."""
+    if isinstance(at, float | int):
+        first, last = ((int(time) - log.begin) / 1e9 for time in times[[0, -1]])
+        return f"--at {at:g} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s"
+    given, *ends = map(_shown, (ns_of(at, log.begin), _stamp(log, times, 0), _stamp(log, times, -1)))
+    return f"--at {given} is outside the images of the log, which lie from {ends[0]} to {ends[1]}"
+
+
+def _shown(stamp: int) -> str:
+    """A stamp, ns, as `--at` takes it, and in ns."""
+    return f"{np.datetime64(stamp // 1_000_000, 'ms')}Z ({stamp} ns)"
 
 
 def is_other(log: McapLog, stamps: NDArray[np.int64]) -> bool:
@@ -85,6 +105,12 @@ def _nearest(log: McapLog, times: NDArray[np.int64], at: Instant) -> int | None:
         near = _stamps(log, times, chosen)
         chosen = int(np.searchsorted(times, min(near, key=lambda time: abs(near[time] - when), default=times[chosen])))
     return chosen
+
+
+def _stamp(log: McapLog, times: NDArray[np.int64], place: int) -> int:
+    """The stamp, ns, of the left image at a place."""
+    time = int(times[place])
+    return _stamps(log, times, place % times.size, reach=0).get(time, time)
 
 
 def _stamps(log: McapLog, times: NDArray[np.int64], place: int, reach: int = 2) -> dict[int, int]:

@@ -15,8 +15,10 @@ import numpy as np
 
 from flow.cli.explanation import CellExplanation, centre_of, index_of, verdict_at
 from flow.cli.instants import Instant, ns_of
+from flow.cli.report import say
 from flow.cli.result_input import graph_of, input_of
 from flow.errors import UsageError
+from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded
 from recordings.results import read_result
 from recordings.ros2.from_msg import read_point_cloud, transform_of
@@ -90,12 +92,16 @@ def why_regional(
     if node is None:
         raise UsageError(f"the pipeline of {result} has no navigation map '{stream}'")
     rule: Any = node.actor
+    begin = 0
     if log is None and not isinstance(at, float | int):
         stamp = ns_of(at, int(stamps_of(result)[0]))
     else:
         with input_of(graph, result, log) as opened:
-            stamp = ns_of(at, opened.begin)
+            stamp, begin = ns_of(at, opened.begin), opened.begin
     navigation, terrain = _maps(result, stamp, stream, node.inputs["elevation"])
+    if navigation.stamp < stamp:
+        late = f"{(navigation.stamp - begin) / 1e9:.3f} s" if isinstance(at, float | int) else moment(navigation.stamp)
+        say(f"note: --at is after the last '{stream}', which is explained; it is at {late}")
     place = index_of(navigation, *cell)
     if place is None:
         raise UsageError(f"({cell[0]:g}, {cell[1]:g}) is outside the regional map in '{navigation.frame_id}'")

@@ -30,6 +30,16 @@ def graph_of(result: Path, changes: Sequence[str] = (), *, with_sinks: bool = Fa
         return load(str(file), [*own, *changes], with_sinks=with_sinks)
 
 
+def note_damage(result: Path) -> None:
+    """Say if a result log is incomplete, as a copy that broke off is."""
+    from recordings.mcap.file import McapFile
+
+    with McapFile(result) as log:
+        end = ["its end is missing"] if log.index.walked else []
+        for reason in dict.fromkeys(item.reason for item in log.index.lost) or end:
+            say(f"note: {result} is incomplete: {reason}")
+
+
 @contextmanager
 def input_of(graph: Graph, result: Path, log: Path | None = None) -> Iterator[McapLog]:
     """The opened input of a result log: `log`, or the one that the result names, beside it.

@@ -18,6 +18,7 @@ from flow.errors import UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import fitted, run
 from flow.runtime.variants import Variants, VariantSink, merged, sink_of
+from recordings.scoring.result_log import stamps_of
 
 MAX_VARIANTS = 26  # one letter each
 
@@ -64,10 +65,11 @@ def run_variants(
     logs: Sequence[Path], pipeline: str | Path, changes: Mapping[str, Sequence[str]], place: tuple[Instant, int, int],
     folder: Path, workers: int,
 ) -> tuple[dict[str, Path], Variants, Part, list[str]]:  # fmt: skip
-    """Run all variants over a part of a log; returns their result logs in `folder`, the graphs, the part, and notes.
+    """Run all variants over a part of a log; returns their result logs in `folder`, the graphs, and the part that these
+    logs are of, and what a terminal prints of it.
 
     pipeline: its name; or a result log of it, which then has the state before the instant; place: instant, frames from
-    there on, and frames before it, as for `part_of`; notes: on the state, for a terminal.
+    there on, and frames before it, as for `part_of`. The logs have only the frames from the instant on.
 
     Raises
     ------
@@ -88,23 +90,27 @@ def run_variants(
         if isinstance(pipeline, Path):
             first, states, notes = resume(pipeline, (log, logs), graphs, variants, part.stamp)
             part = part_of(log, *place[:2], first)
+        if part.frames < place[1]:
+            notes.append(f"note: the log has only {counted(part.frames, 'frame')} from there on, not {place[1]}")
         log.narrow(part.start, part.end)
         about = {
             "roverflow": product_version(), "log": ", ".join(path.name for path in logs),
-            "start": repr(part.start), "end": repr(part.end), "every": "",
+            "start": repr(part.first), "end": repr(part.end), "every": "",
         }  # fmt: skip
-        sinks = tuple((label, _sink(graphs[label], variants, label, changes[label])) for label in graphs)
+        sinks = tuple((label, _sink(graphs[label], variants, label, (changes[label], part.stamp))) for label in graphs)
         paths = {label: folder / f"{label}.mcap" for label in graphs}
         run(replace(variants.graph, sinks=sinks), log, paths, workers=workers, about=about, states=states)
     missing = [label for label, path in paths.items() if not path.exists()]
     if missing:
-        raise UsageError(
-            f"no frame went through at {part.start:.3f} s; roverflow run --start {part.start:.3f} says why"
-        )
-    return paths, variants, part, notes
+        raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.first:.3f} says why")
+    frames = stamps_of(paths["A"], results=True).size
+    if frames < part.frames:
+        says_why = f"roverflow run --start {part.first:.3f} --end {part.end:.3f} says why"
+        notes.append(f"note: {counted(part.frames - frames, 'frame')} gave no result; {says_why}")
+    return paths, variants, replace(part, frames=frames), [*([f"note: {part.note}"] if part.note else []), *notes]
 
 
-def summary_lines(variants: Variants, part: Part, frames: int) -> list[str]:
+def summary_lines(variants: Variants, part: Part) -> list[str]:
     """What ran, for a terminal."""
     again = [name for label, own in variants.own.items() if label != "A" for name in own]
     once = len(variants.graph.stages) - len(again)
@@ -112,13 +118,14 @@ def summary_lines(variants: Variants, part: Part, frames: int) -> list[str]:
     before = f", after {counted(part.before, 'frame')} before it" if part.before else ""
     ran = f"{counted(once, 'stage')} run once, {len(again)} again with the {change}"
     return [
-        f"{counted(frames, 'frame')} from {part.at:.3f} s on{before}: {ran}",
+        f"{counted(part.frames, 'frame')} from {part.at:.3f} s on{before}: {ran}",
         f"the change touches {', '.join(dict.fromkeys(again)) or 'no stage'}",
     ]
 
 
-def _sink(graph: Graph, variants: Variants, label: str, changes: Sequence[str]) -> Any:
-    """The result log of a variant."""
+def _sink(graph: Graph, variants: Variants, label: str, part: tuple[Sequence[str], int]) -> Any:
+    """The result log of a variant. part: its changes, and the stamp, ns, of its first frame."""
+    changes, first = part
     own = {merged_name: name for name, merged_name in variants.names[label].items()}
     about = {"pipeline": graph.text, "overrides": "\n".join(changes)}
-    return VariantSink(sink_of(graph, ".mcap"), own, about)
+    return VariantSink(sink_of(graph, ".mcap"), own, about, first)

@@ -60,12 +60,14 @@ def merged(variants: Mapping[str, Graph]) -> Variants:
 class VariantSink:
     """Passes the streams of one variant to a sink, under the names that they have in it.
 
-    names: stream of the joined graph -> stream of the variant; about: facts of the variant.
+    names: stream of the joined graph -> stream of the variant; about: facts of the variant; first: stamp, ns, of the
+    first frame that the sink gets; the earlier ones only give the stages their state.
     """
 
     sink: Any
     names: Mapping[str, str]
     about: Mapping[str, str]
+    first: int
 
     @property
     def suffix(self) -> str:
@@ -81,7 +83,9 @@ class VariantSink:
         self.sink.open(path, {self.names[stream]: kind for stream, kind in streams.items()}, {**about, **self.about})
 
     def write(self, record: FrameRecord) -> None:
-        """Write what the variant has of a frame."""
+        """Write what the variant has of a frame from `first` on."""
+        if record.stamp < self.first:
+            return
         items = {self.names[stream]: item for stream, item in record.items.items() if stream in self.names}
         entries = tuple(loss for loss in record.entries if "@" not in loss.stage or loss.stage in self.names)
         unchanged = frozenset(self.names[stream] for stream in record.unchanged if stream in self.names)

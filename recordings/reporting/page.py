@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -80,6 +81,7 @@ def _verdict(facts: RunFacts) -> str:
         ("frames", f"{facts.counts.get('frames_out', '?')} of {facts.counts.get('frames_in', '?')} complete"),
         ("losses", ", ".join(f"{number} {reason}" for reason, number in drops.items()) or "none"),
         *findings,
+        *(("unreadable", reason) for reason in facts.unreadable),
         ("version", facts.about.get("roverflow", "")),
     ]
     return f'<p class="verdict {escape(verdict)}">{escape(verdict)}</p>{html_table(rows)}'
@@ -129,7 +131,7 @@ def _frame(facts: RunFacts, name: str) -> str:
 
 def _losses(facts: RunFacts) -> str:
     if not facts.losses:
-        return "<p>Nothing was lost.</p>"
+        return f"<p>{'No loss is recorded before the log ends' if facts.unreadable else 'Nothing was lost'}.</p>"
     left_out = len(facts.losses) - MAX_LOSSES
     more = f"<p>{counted(left_out, 'more loss', 'more losses')} in /nav/diagnostics.</p>" if left_out > 0 else ""
     return html_table(facts.losses[:MAX_LOSSES], ("stream", "stamp, ns", "reason", "detail")) + more
@@ -138,4 +140,17 @@ def _losses(facts: RunFacts) -> str:
 def _parameters(facts: RunFacts) -> str:
     changes = facts.about.get("overrides", "")
     shown = f"<p>Changes:</p><pre>{escape(changes)}</pre>" if changes else "<p>The pipeline as it is.</p>"
-    return f"{shown}<details><summary>Pipeline</summary><pre>{escape(facts.about.get('pipeline', ''))}</pre></details>"
+    files = _files(facts.about.get("pipeline", ""))
+    return shown + "".join(
+        f"<details><summary>{escape(name)}</summary><pre>{escape(text)}</pre></details>" for name, text in files.items()
+    )
+
+
+def _files(pipeline: str) -> dict[str, str]:
+    """Name -> text of the pipeline file and of its templates, which stand at its end as comments."""
+    main, *templates = re.split(r"^# (?=\S+\.ya?ml:$)", pipeline, flags=re.MULTILINE)
+    found = {"Pipeline": main}
+    for text in templates:
+        name, _, lines = text.partition(":\n")
+        found[f"Template {name}"] = re.sub("^# ?", "", lines, flags=re.MULTILINE)
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,14 +26,16 @@ REGIONAL = ("/nav/regional_map", "/nav/regional_navigation_map")
 class RunFacts:
     """A result log in figures.
 
-    about, counts: facts of the run, and its verdict, counts and findings; stamps: of the frames, ns; series: name with
-    unit -> stamp -> value; track: (x, y) of the rover, m; losses: (stream, stamp, reason, detail); drawn: name -> stamp
-    and messages by topic, of the frames that are drawn; regional: topic -> last message.
+    about, counts: facts of the run, and its verdict, counts and findings; unreadable: reason -> number of messages;
+    stamps: of the frames, ns; series: name with unit -> stamp -> value; track: (x, y) of the rover, m; losses: (stream,
+    stamp, reason, detail); drawn: name -> stamp and messages by topic, of the frames that are drawn; regional: topic ->
+    last message.
     """
 
     path: Path
     about: dict[str, str]
     counts: dict[str, str]
+    unreadable: Counter[str] = field(default_factory=Counter)
     stamps: list[int] = field(default_factory=list)
     series: dict[str, dict[int, float]] = field(default_factory=dict)
     track: list[tuple[float, float]] = field(default_factory=list)
@@ -52,13 +55,13 @@ def read_facts(path: Path) -> RunFacts:
     about = facts_of(path, "a log that roverflow run wrote")
     check_profile(path, about)
     facts = RunFacts(path, about, _counts(path))
-    for topic, stamp, message in iter_decoded(path, TOPICS):
+    for topic, stamp, message in iter_decoded(path, TOPICS, facts.unreadable):
         _add(facts, topic, stamp, message)
     facts.stamps = sorted({stamp for values in facts.series.values() for stamp in values})
     chosen = _chosen(facts)
     frames = {stamp: dict[str, Any]() for stamp in chosen.values()}
     if frames:
-        for topic, stamp, message in iter_decoded(path, TOPICS[:3]):
+        for topic, stamp, message in iter_decoded(path, TOPICS[:3], Counter()):
             if stamp in frames:
                 frames[stamp][topic] = message
     facts.drawn = {name: (stamp, frames[stamp]) for name, stamp in chosen.items()}

@@ -64,10 +64,16 @@ def part_run(result: Path, log: Path) -> tuple[float | None, float | None]:
     return start, end
 
 
-def stamps_of(result: Path) -> NDArray[np.int64]:
-    """The sorted stamps, ns, of the diagnostics in a result log, which each frame and each loss have."""
+def stamps_of(result: Path, results: bool = False) -> NDArray[np.int64]:
+    """The sorted stamps, ns, of the diagnostics in a result log, which each frame and each loss have.
+
+    results: those of frames with a result instead, each once.
+    """
     with McapFile(result) as log:
-        return log.times(log.channels_of(["/nav/diagnostics"]))
+        if not results:
+            return log.times(log.channels_of(["/nav/diagnostics"]))
+        topics = {channel.topic for channel in log.channels.values() if channel.topic.startswith("/nav/")}
+        return np.unique(log.times(log.channels_of(topics - {"/nav/diagnostics"})))
 
 
 def stamps_run(result: Path) -> set[int] | None:

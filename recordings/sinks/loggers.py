@@ -175,7 +175,7 @@ def log_cloud(canvas: Canvas, stream: str, cloud: PointCloud) -> str:
 @logger_for(VoxelMap)
 def log_voxels(canvas: Canvas, stream: str, voxels: VoxelMap) -> str:
     """Every n-th cube, in its mean colour."""
-    caption = f"{stream} {len(voxels.index)} voxels"
+    caption = f"{stream} {counted(len(voxels.index), 'voxel')}"
     if not canvas.pictures:
         return caption
     some = slice(None, None, max(1, -(-len(voxels.index) // canvas.max_points)))

@@ -13,6 +13,7 @@ from flow.cli.arguments import AT, count, count_or_none, instant, workers
 from flow.cli.debugging.viewer_cursor import without_cursor
 from flow.cli.outputs import add_log, check_outputs
 from flow.cli.report import say
+from flow.contracts import counted
 from flow.errors import COMPLETE, UsageError
 from recordings.containers.finding import find_files
 
@@ -56,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
         paths, variants, part, notes = run_variants(
             options.log, pipeline, changes, place, Path(folder), options.workers
         )
-        say("\n".join([*summary_lines(variants, part, options.frames), *notes]))
+        say("\n".join([*summary_lines(variants, part), *notes]))
         from recordings.comparison.diff import diff  # imported beside the run, as rerun takes long
         from recordings.comparison.recording import DiffRecording
         from recordings.comparison.text import comparison, markdown
@@ -68,6 +69,9 @@ def run(options: argparse.Namespace) -> int:
                 differences[label] = found = diff(paths["A"], path, recording.of(label))
                 say(f"\n{label}: {', '.join(changes[label])}\n{comparison(found)}")
                 tables += [f"## {label}: {', '.join(changes[label])}", markdown(found)]
+        if all(found.equal for found in differences.values()):
+            say(f"\nthe change has no effect on {counted(part.frames, 'frame')}, so there is no recording to write")
+            return COMPLETE
         title, setting = f"{options.log[0].name} at {part.at:g} s", swept_setting(changes)
         recording.write(out, title, "\n\n".join(tables), _sweep(setting, [], differences))
         say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")

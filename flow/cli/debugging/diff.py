@@ -31,7 +31,10 @@ def run(options: argparse.Namespace) -> int:
     recording = DiffRecording()
     found = diff(options.one, options.other, recording.of() if options.out else lambda change: None)
     say(json.dumps(asdict(found) | {"equal": found.equal}, indent=2) if options.json else format_diff(found))
-    if options.out:
+    if options.out and found.equal:
+        if not options.json:
+            say(f"{options.out} is not written, as nothing differs")
+    elif options.out:
         recording.write(options.out, f"{options.one.name} and {options.other.name}", markdown(found))
         if not options.json:
             more = f"; {recording.left_out} later differences are not drawn" if recording.left_out else ""

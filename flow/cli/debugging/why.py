@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from flow.cli.arguments import AT, instant, pair
 from flow.cli.debugging.viewer_cursor import without_cursor
 from flow.cli.outputs import check_outputs
 from flow.cli.report import say
+from flow.contracts import counted
 from flow.errors import COMPLETE, UsageError
 
 if TYPE_CHECKING:
@@ -40,9 +42,11 @@ def run(options: argparse.Namespace) -> int:
     out = options.out or options.result.with_name(f"{options.result.stem}-why.png")
     check_outputs({"picture": out}, [options.result])
     from flow.cli.explanation import why
+    from flow.cli.result_input import note_damage
     from recordings.comparison.marked_pixels import write_marked
 
     options.at = without_cursor(options.at)
+    note_damage(options.result)
     if _is_regional(options.result, options.map):
         return _regional(options)
     pixel = None if options.pixel is None else (round(options.pixel[0]), round(options.pixel[1]))
@@ -60,7 +64,7 @@ def _is_regional(result: Path, stream: str) -> bool:
     from recordings.mcap.file import iter_decoded
     from stages.data import LEVEL_FRAME
 
-    first = next(iter_decoded(result, [f"/nav/{stream}"]), None)
+    first = next(iter_decoded(result, [f"/nav/{stream}"], Counter()), None)
     return first is not None and first[2].header.frame_id != LEVEL_FRAME
 
 
@@ -103,7 +107,7 @@ def _cell_lines(found: Explanation | RegionalExplanation) -> list[str]:
     layers, lines = found.layers, list[str]()
     if math.isfinite(layers.get("elevation", math.nan)):
         sigma = f" +- {math.sqrt(layers['variance']):.3f} m" if layers.get("variance", -1.0) >= 0 else ""
-        points = f", {layers['count']:.0f} points" if "count" in layers else ""
+        points = f", {counted(round(layers['count']), 'point')}" if "count" in layers else ""
         lines.append(f"height: {layers['elevation']:.3f} m{sigma}{points}")
     if all(math.isnan(limit.value) for limit in found.limits.values()):
         lines.append("no height, so no limit applies")
